@@ -1,0 +1,27 @@
+# `make demo` and `make test` work on a machine with nothing but Python 3.10-3.12 and make: each builds .venv first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO_ARGS ?=
+
+.PHONY: demo test test-slow lint clean
+
+demo: $(VENV)/.installed  ## make a scene, train NRF and SH on it, compare them
+	$(BIN)/nrfgs demo $(DEMO_ARGS)
+
+test: $(VENV)/.installed  ## the default test suite
+	$(BIN)/python -m pytest
+
+test-slow: $(VENV)/.installed  ## real training runs
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/.installed
+	$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+$(VENV)/.installed: pyproject.toml requirements.lock
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --constraint requirements.lock --editable '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV)

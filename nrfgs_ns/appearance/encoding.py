@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a splat sees the camera: direction, distance, and the direction's Fourier bands.
+
+For camera centre o and mean x: v = o - x, r = max(|v|, eps), d = v / r, distance feature log r. The floor is applied
+once, inside the square root, so that direction, distance and both their gradients stay finite when the camera sits on
+the splat: there |d| < 1, log r = log eps, and the gradient of d is bounded by 1 / eps.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+LOW_DIM = 9
+"""Numbers in the low bands: the raw direction (3), sin and cos of band 0 (6)."""
+
+
+def view_geometry(means: Tensor, camera_centers: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """Unit directions from splats to their cameras, and log distances.
+
+    Args:
+        means: [M, 3], world units.
+        camera_centers: [3] or [M, 3], world units.
+        eps: smallest distance told apart, world units, > 0.
+
+    Returns:
+        directions [M, 3] with norm <= 1 (1 wherever |v| >= eps), and log distances [M, 1] >= log eps.
+    """
+    v = camera_centers - means
+    r = v.square().sum(dim=-1, keepdim=True).clamp_min(eps * eps).sqrt()
+    return v / r, r.log()
+
+
+def high_dim(num_bands: int) -> int:
+    """Numbers in the high bands 1..K-1 of a K-band encoding: sin and cos of three coordinates each."""
+    return 6 * (num_bands - 1)
+
+
+def fourier_bands(directions: Tensor, num_bands: int) -> tuple[Tensor, Tensor]:
+    """Split Fourier encoding of directions.
+
+    Band k holds sin(2^k pi d) and cos(2^k pi d). Low: raw d and band 0. High: bands 1..K-1.
+
+    Args:
+        directions: [M, 3].
+        num_bands: K >= 1.
+
+    Returns:
+        low [M, 9] and high [M, 6 (K - 1)].
+    """
+    frequencies = math.pi * 2.0 ** torch.arange(num_bands, device=directions.device, dtype=directions.dtype)
+    angles = directions[:, None, :] * frequencies[:, None]  # [M, K, 3]
+    waves = torch.cat([angles.sin(), angles.cos()], dim=-1)  # [M, K, 6]
+    return torch.cat([directions, waves[:, 0]], dim=-1), waves[:, 1:].flatten(1)

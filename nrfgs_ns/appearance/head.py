@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The appearance head: the one seam between a splat's looks and everything else.
+
+The model asks a head three things. Which numbers does a splat store (`splat_params`)? They join the model's
+`gauss_params`, so that densification, optimisers and checkpoints carry them without knowing what they mean. What do
+the splats that this camera sees look like from it (`forward`)? And what do they look like from nowhere in particular
+(`base_appearance`)? Shared weights are the head's own parameters and never enter `gauss_params`.
+
+Nothing here knows nerfstudio or the rasterizer.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+class SplatAppearance(NamedTuple):
+    """What M splats look like from one camera position each."""
+
+    colors: Tensor
+    """Linear blend colours, [M, 3], >= 0; 1 is white."""
+    opacities: Tensor
+    """Peak opacities, [M], in [0, 1]."""
+
+
+@dataclass
+class AppearanceHeadConfig:
+    """What every head's configuration has: the class that it builds."""
+
+    _target: type = field(default_factory=lambda: AppearanceHead)
+    """the head class that this configuration builds"""
+
+    def setup(self) -> "AppearanceHead":
+        """Build the head.
+
+        Raises:
+            ValueError: a field is out of range; the message names it.
+        """
+        self.validate()
+        return self._target(self)
+
+    def validate(self) -> None:
+        """Raise ValueError, naming the field and the mend, if a value cannot work."""
+
+    def require(self, holds: bool, name: str, needed: str) -> None:
+        """Raise ValueError naming field `name`, its value and what is `needed`, unless the condition holds."""
+        if not holds:
+            raise ValueError(
+                f"pipeline.model.appearance.{name} is {getattr(self, name)!r}, but it must be {needed}. "
+                f"Set --pipeline.model.appearance.{name.replace('_', '-')} accordingly."
+            )
+
+
+class AppearanceHead(nn.Module, ABC):
+    """Maps visible splats and the camera's centre to colours and opacities.
+
+    A splat's base colour is stored as `features_dc` [N, 3], the coefficient of the constant spherical harmonic, as in
+    3DGS: colour = 1/2 + SH_C0 * features_dc. Its base opacity is sigmoid(`opacities`), with `opacities` [N, 1].
+    """
+
+    name: str
+    """Short name, written into checkpoints."""
+    sh_degree: int = 0
+    """Degree of the spherical harmonics among the splats' parameters; 0 if there are none."""
+
+    def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
+        """The tensors that each splat stores for this head, at the start of a training.
+
+        Args:
+            rgb: initial base colours [N, 3] in [0, 1].
+
+        Returns:
+            name -> tensor [N, ...] on rgb's device. Each name needs an optimiser of the same name in the method's
+            configuration.
+        """
+        return {"features_dc": (rgb - 0.5) / SH_C0}
+
+    @abstractmethod
+    def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
+        """Colours and opacities of the visible splats, seen from their cameras.
+
+        Args:
+            splats: the whole table: "means" [N, 3], "opacities" (logits) [N, 1], and this head's `splat_params`.
+            visible: rows of the table, int64 [M]; a row occurs once for each camera that sees the splat.
+            camera_centers: where each visible splat is seen from, in world coordinates: [3] or [M, 3].
+        """
+
+    def base_appearance(self, splats: Mapping[str, Tensor], visible: Tensor) -> SplatAppearance:
+        """The part of the visible splats' appearance that does not depend on the camera."""
+        return SplatAppearance(
+            colors=base_colors(splats["features_dc"].index_select(0, visible)).clamp_min(0.0),
+            opacities=torch.sigmoid(splats["opacities"].index_select(0, visible)).squeeze(-1),
+        )
+
+    def set_step(self, step: int) -> None:  # noqa: B027  (most heads have no schedule)
+        """Tell the head which training step it is, for heads that grow with training."""
+
+    def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor | None:
+        """How far the head is from adding nothing to the base appearance, as a scalar to minimise in the warm-up.
+
+        None if the head has no shared weights that could be taught.
+        """
+        return None
+
+
+def base_colors(features_dc: Tensor) -> Tensor:
+    """Base colours [M, 3] from the constant harmonic's coefficients [M, 3]."""
+    return 0.5 + SH_C0 * features_dc

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real spherical harmonics of any degree, in the order and with the signs that 3DGS uses.
+
+With unit direction (x, y, z), order m and degree l,
+
+    Y_{l, m} = (-1)^m q_{l, m}(z) C_m(x, y)   for m >= 0,        Y_{l, -m} = (-1)^m q_{l, m}(z) S_m(x, y)   for m > 0,
+
+where C_m + i S_m = (x + i y)^m and q_{l, m} is the normalised associated Legendre polynomial without its factor
+(1 - z^2)^(m/2), which C_m and S_m carry. Both come from short recurrences (P.-P. Sloan, "Efficient Spherical Harmonic
+Evaluation", JCGT 2(2), 2013):
+
+    q_{0, 0} = 1 / sqrt(4 pi)
+    q_{m, m} = q_{m-1, m-1} sqrt((2 m + 1) / (2 m)), times sqrt(2) once on the way from m = 0 to m = 1
+    q_{l, m} = a_{l, m} (z q_{l-1, m} - q_{l-2, m} / a_{l-1, m}),     a_{l, m} = sqrt((4 l^2 - 1) / (l^2 - m^2))
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def num_bases(degree: int) -> int:
+    """Harmonics of degree 0..degree."""
+    return (degree + 1) ** 2
+
+
+def sh_bases(degree: int, directions: Tensor) -> Tensor:
+    """Harmonics at unit directions.
+
+    Args:
+        degree: highest degree, >= 0.
+        directions: unit vectors [M, 3].
+
+    Returns:
+        [M, (degree + 1)^2], harmonic (l, m) at index l (l + 1) + m.
+    """
+    x, y, z = directions.unbind(-1)
+    bases: dict[tuple[int, int], Tensor] = {}
+    cos_m, sin_m = torch.ones_like(z), torch.zeros_like(z)  # C_m and S_m
+    q_mm = 1.0 / math.sqrt(4.0 * math.pi)
+    for m in range(degree + 1):
+        if m > 0:
+            cos_m, sin_m = x * cos_m - y * sin_m, x * sin_m + y * cos_m
+            q_mm *= -math.sqrt((2 * m + 1) / (2 * m)) * (math.sqrt(2.0) if m == 1 else 1.0)
+        before, q = torch.zeros_like(z), torch.full_like(z, q_mm)
+        for degree_l in range(m, degree + 1):
+            if degree_l > m:
+                step_back = 1.0 / _recurrence(degree_l - 1, m) if degree_l - 1 > m else 0.0
+                before, q = q, _recurrence(degree_l, m) * (z * q - step_back * before)
+            bases[degree_l, m] = q * cos_m
+            if m > 0:
+                bases[degree_l, -m] = q * sin_m
+    return torch.stack([bases[lm] for lm in sorted(bases)], dim=-1)
+
+
+def eval_sh(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
+    """Sum of harmonics up to `degree`.
+
+    On CUDA this is gsplat's kernel, elsewhere its torch twin above.
+
+    Args:
+        degree: highest degree used; coefficients beyond it are ignored.
+        directions: [M, 3], any length but zero.
+        coefficients: [M, B, 3] with B >= (degree + 1)^2.
+
+    Returns:
+        [M, 3].
+    """
+    if directions.is_cuda:
+        from gsplat.cuda._wrapper import spherical_harmonics  # loads compiled kernels: never on a machine without CUDA
+
+        return spherical_harmonics(degree, directions, coefficients)
+    bases = sh_bases(degree, torch.nn.functional.normalize(directions, dim=-1))
+    return torch.einsum("mb,mbc->mc", bases, coefficients[:, : num_bases(degree)])
+
+
+def _recurrence(degree_l: int, m: int) -> float:
+    """a_{l, m} of the module's docstring, for l > m."""
+    return math.sqrt((4.0 * degree_l**2 - 1.0) / (degree_l**2 - m**2))

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images in memory, and the order in which training sees them: nerfstudio's datamanager made to fail early and clearly,
+to run without an accelerator, and to continue where it stopped."""
+
+import random
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
+from torch import Tensor
+
+from nrfgs_ns.data.checks import UNREADABLE
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.errors import InputError
+
+
+class NrfgsInputDataset(InputDataset):
+    """nerfstudio's dataset, whose errors name the file and the mend.
+
+    Grey, palette, bilevel, CMYK and YCbCr images are converted to RGB, grey or palette with transparency to RGBA;
+    nerfstudio takes most of these for something else without a word (a palette's indices for grey, CMYK for RGBA).
+    Images of more than 8 bits are refused: their range is unknown, and nerfstudio would keep the low byte.
+    """
+
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
+        super().__init__(dataparser_outputs, scale_factor)
+        # A copy: the datamanager removes entries in place, and the original is shared by all datasets of the process.
+        self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
+        # A copy too: undistortion crops the cameras while it loads the images.
+        self._sizes = torch.cat([self.cameras.width, self.cameras.height], dim=-1).tolist()
+
+    def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
+        """Decodes an image, uint8 [H, W, 3 or 4], scaled by scale_factor."""
+        path = self.image_filenames[image_idx]
+        try:
+            with Image.open(path) as image:
+                mode = image.mode
+                transparent = mode.endswith(("A", "a")) or (mode == "P" and "transparency" in image.info)
+                pixels = image.convert("RGBA" if transparent else "RGB")
+        except UNREADABLE as error:
+            raise InputError(
+                f"{path} cannot be decoded ({error}). Restore the file, or remove its frame from the data set."
+            ) from error
+        if mode[0] in "IF":
+            raise InputError(
+                f"{path} has more than 8 bits per channel (mode {mode}). Convert it to an 8-bit PNG or JPEG."
+            )
+        if self.scale_factor != 1.0:
+            size = [int(side * self.scale_factor) for side in pixels.size]
+            pixels = pixels.resize(size, resample=Image.Resampling.BILINEAR)
+        width, height = self._sizes[image_idx]
+        if pixels.size != (width, height):
+            raise InputError(
+                f"{path} is {pixels.width} x {pixels.height}, but its camera {width} x {height}. "
+                "Use the image that the pose was computed from, or scale the intrinsics with it."
+            )
+        return np.array(pixels)
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        """The image with its mask and index; InputError if either file cannot be used."""
+        if self.mask_color and image_type == "uint8":
+            # nerfstudio paints a colour in [0, 1] into whatever it has; among bytes that would be black.
+            data = self.get_data(image_idx, "float32")
+            return {**data, "image": (data["image"] * 255).round().to(torch.uint8)}
+        try:
+            return super().get_data(image_idx, image_type)
+        except InputError:
+            raise
+        except (*UNREADABLE, AssertionError) as error:
+            if self._dataparser_outputs.mask_filenames is None:
+                raise
+            raise InputError(
+                f"{self._dataparser_outputs.mask_filenames[image_idx]} cannot be used as the mask of "
+                f"{self.image_filenames[image_idx]} ({error}). Give an 8-bit grey image of the same size."
+            ) from error
+
+
+@dataclass
+class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
+    """nerfstudio's full-image datamanager, keeping images as uint8: a quarter of the memory and no other pixel."""
+
+    _target: type = field(default_factory=lambda: NrfgsDatamanager)
+    """target class to instantiate"""
+    dataparser: AnnotatedDataParserUnion = field(default_factory=NrfgsDataParserConfig)
+    """specifies the dataparser config"""
+    cache_images_type: Literal["uint8", "float32"] = "uint8"
+    """The image type returned from manager, caching images in uint8 saves memory"""
+
+
+class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
+    """nerfstudio's datamanager that can load everything at once, run on a CPU, and tell and restore its place."""
+
+    config: NrfgsDatamanagerConfig
+
+    def load_all_images(self) -> tuple[int, int]:
+        """Decodes all images now, so that a broken one is found before the first step.
+
+        Returns:
+            The numbers of training and evaluation images.
+        """
+        return len(self.cached_train), len(self.cached_eval)
+
+    def _load_images(
+        self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
+    ) -> list[dict[str, Tensor]]:
+        if torch.device(self.device).type == "cpu":
+            # "gpu" means `self.device`. "cpu" means pinned memory, which needs an accelerator's driver, and which
+            # nerfstudio chooses by itself above 500 images.
+            cache_images_device = "gpu"
+        return super()._load_images(split, cache_images_device)
+
+    def sampling_state(self) -> dict[str, Any]:
+        """Everything that decides which training camera comes next, as plain numbers, strings, lists and tuples.
+
+        Under the strategy `fps` that includes numpy's global generator, from which nerfstudio draws.
+        """
+        state = {
+            "strategy": self.config.train_cameras_sampling_strategy,
+            "num_images": len(self.train_dataset),
+            "unseen_cameras": list(self.train_unseen_cameras),
+        }
+        if state["strategy"] == "random":
+            return {**state, "generator": self.random_generator.getstate()}
+        name, keys, position, has_gauss, gauss = np.random.get_state()
+        return {
+            **state,
+            "generator": (name, keys.tolist(), int(position), int(has_gauss), float(gauss)),
+            "epochs_unsampled": self.train_unsampled_epoch_count.tolist(),
+        }
+
+    def load_sampling_state(self, state: dict[str, Any]) -> None:
+        """Continues the order of cameras from `sampling_state()`.
+
+        Raises:
+            InputError: the state is that of another number of images or of another strategy.
+        """
+        if state["num_images"] != len(self.train_dataset):
+            raise InputError(
+                f"{self.get_datapath()}: the checkpoint was trained on {state['num_images']} images, but there are "
+                f"{len(self.train_dataset)} now. Continue with the same images and split, or train anew."
+            )
+        strategy = self.config.train_cameras_sampling_strategy
+        if state["strategy"] != strategy:
+            raise InputError(
+                f"train_cameras_sampling_strategy is {strategy}, but the checkpoint was trained with "
+                f"{state['strategy']}. Set it back, or train anew."
+            )
+        self.train_unseen_cameras = list(state["unseen_cameras"])
+        if state["strategy"] == "random":
+            version, words, gauss = state["generator"]
+            self.random_generator = random.Random()
+            self.random_generator.setstate((version, tuple(words), gauss))
+        else:
+            np.random.set_state(tuple(state["generator"]))
+            self.train_unsampled_epoch_count = np.array(state["epochs_unsampled"])

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The registered methods: configuration only.
+
+Everything but the appearance head is splatfacto's, to the number: learning rates, schedules, densification, steps.
+"""
+
+from typing import Any
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from nrfgs_ns.appearance.head import AppearanceHeadConfig
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.model import NrfgsModelConfig
+from nrfgs_ns.pipeline import NrfgsPipelineConfig
+from nrfgs_ns.trainer import NrfgsTrainerConfig
+
+STEPS = 30_000
+
+
+def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str, Any]:
+    """Adam at learning rate `lr`, decaying exponentially to `lr_final` over the training if that is given."""
+    decay = ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=STEPS, **schedule) if lr_final else None
+    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay}
+
+
+def method(name: str, appearance: AppearanceHeadConfig, description: str, **optimizers: Any) -> MethodSpecification:
+    """Splatfacto with another appearance head.
+
+    Args:
+        name: the command, as in `ns-train NAME`.
+        appearance: the head.
+        description: one line for `ns-train --help`.
+        optimizers: the head's own parameter groups, beside the base colour.
+    """
+    return MethodSpecification(
+        config=NrfgsTrainerConfig(
+            method_name=name,
+            max_num_iterations=STEPS,
+            steps_per_eval_image=100,
+            steps_per_eval_batch=0,
+            steps_per_save=2000,
+            steps_per_eval_all_images=1000,
+            mixed_precision=False,
+            machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+            pipeline=NrfgsPipelineConfig(model=NrfgsModelConfig(appearance=appearance)),
+            optimizers={
+                "means": adam(1.6e-4, lr_final=1.6e-6),
+                "scales": adam(0.005),
+                "quats": adam(0.001),
+                "opacities": adam(0.05),
+                "features_dc": adam(0.0025),
+                **optimizers,
+                "camera_opt": adam(1e-4, lr_final=5e-7, warmup_steps=1000, lr_pre_warmup=0),
+                "bilateral_grid": adam(2e-3, lr_final=1e-4, warmup_steps=1000, lr_pre_warmup=0),
+            },
+            viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+            vis="viewer",
+        ),
+        description=description,
+    )
+
+
+nrfgs = method(
+    "nrfgs",
+    NrfConfig(),
+    "Gaussian splatting with a neural residual field for view-dependent colour and opacity.",
+    latents=adam(0.0025),
+    field=adam(1e-3, lr_final=1e-4),
+)
+
+nrfgs_sh = method(
+    "nrfgs-sh",
+    ShConfig(),
+    "The same model with spherical harmonics: 3DGS as in splatfacto, for comparison.",
+    features_rest=adam(0.0025 / 20),
+)

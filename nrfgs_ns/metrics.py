@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Image metrics that honour masks: PSNR, L1, SSIM, MS-SSIM, LPIPS.
+
+Conventions, for every function of this module:
+
+- `pred` and `gt` are images [H, W, 3] in [0, 1] of a floating dtype; `mask` is [H, W, 1] bool, True inside, or None for
+  the whole image.
+- The result is a Python float, or None where the metric is undefined: an empty mask, or an image (or a mask) too small
+  for the metric's window. It is NaN only if the prediction itself is not finite, so that a diverged model is seen.
+- Without a mask the values are those that the host reports (torchmetrics, pytorch_msssim); an all-True mask changes
+  nothing.
+- Under a mask PSNR and L1 are means over the pixels inside. The windowed metrics first replace the prediction outside
+  the mask by the truth, so that nothing outside can cost anything; SSIM and MS-SSIM then average over the windows whose
+  centre is inside. LPIPS cannot leave pixels out of its average: under a mask it is a lower bound.
+- Arithmetic is float32, or float64 if the images are, or if they are on CUDA: there a float32 convolution may run in
+  TF32, whose 10 bits of mantissa SSIM's differences of squares cannot stand. On a CPU float64 convolutions are several
+  times slower, and not needed. No gradient is recorded.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+
+import torch
+import torch.nn.functional as F
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+METRIC_NAMES = ("psnr", "ssim", "ms_ssim", "l1", "lpips")
+"""The keys of ImageMetrics' answer, in the order of reports."""
+WINDOW_SIZE = 11
+"""Side of the SSIM window, pixels (Wang et al. 2004)."""
+WINDOW_SIGMA = 1.5
+"""Standard deviation of the Gaussian inside the window, pixels."""
+SSIM_C1 = 0.01**2
+"""Stabiliser of the luminance term, (K1 * data range)^2."""
+SSIM_C2 = 0.03**2
+"""Stabiliser of the contrast-structure term, (K2 * data range)^2."""
+MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+"""Exponents of the five scales, finest first (Wang et al. 2003)."""
+MS_SSIM_MIN_SIDE = (WINDOW_SIZE - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1) + 1
+"""Smallest image side with a full window at the coarsest scale: 161 pixels."""
+MIN_MSE = 1e-10
+"""Floor of the mean squared error: PSNR is capped at 100 dB. A perfect prediction would be infinite, which neither JSON
+nor an average can hold; rounding the truth to 8 bits alone costs 59 dB, so no real image comes near the cap."""
+LPIPS_MIN_SIDE = 31
+"""Smallest image side that passes AlexNet's first convolution (11, stride 4, padding 2) and its pools (3, stride 2)."""
+
+
+def psnr(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
+    """Peak signal-to-noise ratio in dB for a peak of 1: -10 log10(mean squared error), at most 100."""
+    error = _errors_inside(pred, gt, mask)
+    return None if error is None else -10.0 * error.square().mean().clamp_min(MIN_MSE).log10().item()
+
+
+def l1(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
+    """Mean absolute error over pixels and channels, in [0, 1]."""
+    error = _errors_inside(pred, gt, mask)
+    return None if error is None else error.abs().mean().item()
+
+
+def ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
+    """Structural similarity (Wang et al. 2004), mean over channels and valid windows; 1 is identical.
+
+    None if a side is shorter than 11 pixels, or if no valid window has its centre inside the mask.
+    """
+    with torch.no_grad():
+        pred, gt, mask = _planes(pred, gt, mask)
+        if min(gt.shape[-2:]) < WINDOW_SIZE:
+            return None
+        per_channel = _mean_over_centres(ssim_maps(pred, gt)[0], mask)
+        return None if per_channel is None else per_channel.mean().item()
+
+
+def ms_ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
+    """Multi-scale SSIM (Wang et al. 2003) over five scales: prod_j cs_j^w_j, times ssim^w at the coarsest scale.
+
+    Each channel's means are clamped at zero before the powers, and the product is averaged over the channels. From one
+    scale to the next the images are averaged over 2 x 2 pixels; a coarse pixel is inside the mask if any of its fine
+    pixels is, so that a thin mask does not vanish on the way.
+
+    None if a side is shorter than 161 pixels, or if at some scale no valid window has its centre inside the mask.
+    """
+    with torch.no_grad():
+        pred, gt, mask = _planes(pred, gt, mask)
+        if min(gt.shape[-2:]) < MS_SSIM_MIN_SIDE:
+            return None
+        product = torch.ones(3, dtype=gt.dtype, device=gt.device)
+        coarsest = len(MS_SSIM_WEIGHTS) - 1
+        for scale, weight in enumerate(MS_SSIM_WEIGHTS):
+            ssim_map, cs_map = ssim_maps(pred, gt)
+            per_channel = _mean_over_centres(ssim_map if scale == coarsest else cs_map, mask)
+            if per_channel is None:
+                return None
+            product = product * per_channel.relu() ** weight
+            if scale < coarsest:
+                pred, gt, mask = _halve(pred, gt, mask)
+        return product.mean().item()
+
+
+def ssim_maps(pred: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
+    """The SSIM map and its contrast-structure factor, one value per channel and valid window.
+
+    With the moments mu, var, cov under an 11 x 11 Gaussian of sigma 1.5:
+    cs = (2 cov + C2) / (var_p + var_g + C2), ssim = cs (2 mu_p mu_g + C1) / (mu_p^2 + mu_g^2 + C1).
+
+    Args:
+        pred: [3, H, W], sides of at least 11.
+        gt: [3, H, W].
+
+    Returns:
+        ssim [3, H - 10, W - 10] and cs [3, H - 10, W - 10]; entry (i, j) is the window centred on pixel (i + 5, j + 5).
+    """
+    taps = torch.arange(WINDOW_SIZE, dtype=gt.dtype, device=gt.device) - WINDOW_SIZE // 2
+    gauss = torch.exp(-taps.square() / (2 * WINDOW_SIGMA**2))
+    gauss = gauss / gauss.sum()
+    # Five images of three channels blurred as fifteen channels of one image: along the rows, then along the columns.
+    moments = torch.cat([pred, gt, pred * pred, gt * gt, pred * gt])
+    for shape in ((-1, 1), (1, -1)):
+        moments = F.conv2d(moments, gauss.view(1, 1, *shape).expand(len(moments), -1, -1, -1), groups=len(moments))
+    mu_p, mu_g, square_p, square_g, cross = moments.split(3)
+    cs_map = (2 * (cross - mu_p * mu_g) + SSIM_C2) / (square_p - mu_p**2 + square_g - mu_g**2 + SSIM_C2)
+    ssim_map = cs_map * (2 * mu_p * mu_g + SSIM_C1) / (mu_p**2 + mu_g**2 + SSIM_C1)
+    return ssim_map, cs_map
+
+
+class ImageMetrics:
+    """All metrics of one image at once. Not an nn.Module: nothing of it may enter a model's checkpoints.
+
+    LPIPS (Zhang et al. 2018, AlexNet) needs backbone weights that torchvision would download. They are used if they are
+    on disk and never fetched: without them `lpips` is None, and one warning per process says how to get them. The
+    network is loaded at the first call, so that building a model costs nothing.
+    """
+
+    def __init__(self) -> None:
+        self._lpips_net: torch.nn.Module | None = None
+        self._lpips_tried = False
+
+    def __call__(self, pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[str, float | None]:
+        """Compares `pred` with `gt` (shapes, range and masks: see the module), on the device of `pred`.
+
+        Returns:
+            psnr (dB), ssim, ms_ssim, l1 and lpips; None where undefined.
+        """
+        gt = gt.to(pred.device)
+        mask = None if mask is None else mask.to(pred.device)
+        return {
+            "psnr": psnr(pred, gt, mask),
+            "ssim": ssim(pred, gt, mask),
+            "ms_ssim": ms_ssim(pred, gt, mask),
+            "l1": l1(pred, gt, mask),
+            "lpips": self._lpips(pred, gt, mask),
+        }
+
+    def _lpips(self, pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
+        if not self._lpips_tried:
+            self._lpips_net = _load_lpips_net()
+            self._lpips_tried = True
+        if self._lpips_net is None:
+            return None
+        with torch.no_grad():
+            pred, gt, mask = _planes(pred, gt, mask)
+            if min(gt.shape[-2:]) < LPIPS_MIN_SIDE or (mask is not None and not mask.any()):
+                return None
+            # The network was trained on images in range; a rasterizer can overshoot.
+            pred, gt = (image.clamp(0.0, 1.0).float()[None] for image in (pred, gt))
+            return self._lpips_net.to(gt.device)(pred, gt, normalize=True).item()
+
+
+def _check(pred: Tensor, gt: Tensor, mask: Tensor | None) -> None:
+    """Raises ValueError unless the shapes and dtypes are those of the module's conventions."""
+    if pred.shape != gt.shape or gt.ndim != 3 or gt.shape[-1] != 3 or gt.numel() == 0:
+        raise ValueError(f"pred and gt must be [H, W, 3] alike, got {tuple(pred.shape)} and {tuple(gt.shape)}")
+    if not (pred.is_floating_point() and gt.is_floating_point()):
+        raise ValueError(f"pred and gt must be floats in [0, 1], got {pred.dtype} and {gt.dtype}")
+    if mask is not None and (mask.shape != (*gt.shape[:2], 1) or mask.dtype != torch.bool):
+        raise ValueError(f"mask must be {(*gt.shape[:2], 1)} bool, got {tuple(mask.shape)} {mask.dtype}")
+
+
+def _precise(image: Tensor) -> Tensor:
+    """The image in the dtype that this module calculates in (see its docstring)."""
+    return image.to(torch.promote_types(image.dtype, torch.float64 if image.is_cuda else torch.float32))
+
+
+def _errors_inside(pred: Tensor, gt: Tensor, mask: Tensor | None) -> Tensor | None:
+    """pred - gt of the pixels inside, [N, 3], without gradient; None if there are none."""
+    _check(pred, gt, mask)
+    error = _precise(pred.detach()) - _precise(gt.detach())
+    if mask is None:
+        return error.reshape(-1, 3)
+    inside = error[mask[..., 0]]
+    return inside if len(inside) else None
+
+
+def _planes(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Images channel-first [3, H, W] and the mask [H, W], with the truth in place of the prediction outside."""
+    _check(pred, gt, mask)
+    pred, gt = (_precise(image).movedim(-1, 0).contiguous() for image in (pred, gt))
+    if mask is None:
+        return pred, gt, None
+    inside = mask[..., 0]
+    return torch.where(inside, pred, gt), gt, inside
+
+
+def _mean_over_centres(maps: Tensor, mask: Tensor | None) -> Tensor | None:
+    """Mean per channel [3] of maps [3, H - 10, W - 10] over the windows centred inside mask [H, W]; None if none is."""
+    if mask is None:
+        return maps.mean((-2, -1))
+    margin = WINDOW_SIZE // 2
+    inside = maps[:, mask[margin:-margin, margin:-margin]]
+    return inside.mean(-1) if inside.shape[-1] else None
+
+
+def _halve(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The next coarser scale. Odd sides are padded with one zero at either end, as in pytorch_msssim."""
+    padding = [side % 2 for side in gt.shape[-2:]]
+    pred, gt = (F.avg_pool2d(image[None], 2, padding=padding)[0] for image in (pred, gt))
+    if mask is not None:
+        mask = F.max_pool2d(mask[None].float(), 2, padding=padding)[0] > 0
+    return pred, gt, mask
+
+
+_lpips_warned = False
+
+
+def _load_lpips_net() -> torch.nn.Module | None:
+    """torchmetrics' LPIPS network if its AlexNet weights are on disk, else None and (once per process) a warning."""
+    # Both imports cost seconds, and only evaluation needs them.
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+    from torchvision.models import AlexNet_Weights
+
+    url = AlexNet_Weights.DEFAULT.url
+    path = os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
+    if not os.path.isfile(path):
+        _warn_lpips(f"{path} is missing", url)
+        return None
+    try:
+        metric = LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
+    except (OSError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
+        _warn_lpips(f"{path} cannot be loaded ({type(error).__name__}): delete it", url)
+        return None
+    # The bare network: the metric around it would keep every score it ever gave.
+    return metric.net
+
+
+def _warn_lpips(finding: str, url: str) -> None:
+    """Says once per process why LPIPS is not reported, and how to change that."""
+    global _lpips_warned
+    if _lpips_warned:
+        return
+    _lpips_warned = True
+    CONSOLE.print(
+        f"Warning: LPIPS is not reported: {finding}. Training and all other metrics are intact. "
+        "To get it, run this on a connected machine, and copy the file here if that is another one:\n"
+        f'  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"',
+        style="bold yellow",
+        markup=False,
+        soft_wrap=True,
+    )

@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splatfacto with an appearance head: geometry -> head -> rasterizer -> image.
+
+Loss, densification, pruning, opacity reset, schedules and crop are nerfstudio's. What differs: colours and opacities
+come from the head, for the splats that the camera sees only; nothing needs CUDA; metrics respect masks; and loading a
+checkpoint keeps the parameter objects that the optimisers hold, so that an interrupted training can go on.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+import tyro
+from gsplat.strategy import DefaultStrategy
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.model_components.lib_bilagrid import BilateralGrid
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
+from nerfstudio.utils.colors import get_color
+from pytorch_msssim import SSIM
+from torch import Tensor
+from torch.nn import Parameter
+
+from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.checkpoint import check_compatible
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.metrics import ImageMetrics
+from nrfgs_ns.rasterizer import Projection, composite, project
+from nrfgs_ns.warmup import warm_up
+
+VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+"""What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
+
+
+@dataclass
+class NrfgsModelConfig(SplatfactoModelConfig):
+    """Splatfacto's options, and the appearance head's."""
+
+    _target: type = field(default_factory=lambda: NrfgsModel)
+    """target class to instantiate"""
+    appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
+    """the appearance head: what a splat's colour and opacity are, seen from a camera"""
+    warmup_steps: int | None = None
+    """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
+    A head that adds nothing from the start skips them."""
+    warmup_lr: float = 1e-3
+    """learning rate of the warm-up's Adam"""
+    # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
+    sh_degree: tyro.conf.Suppress[int] = 3
+    sh_degree_interval: tyro.conf.Suppress[int] = 1000
+
+
+class View(NamedTuple):
+    """One camera as the rasterizer wants it, and what it sees."""
+
+    projection: Projection
+    """the visible splats on the image plane, M of them"""
+    splats: dict[str, Tensor]
+    """the table of splats that was projected: all of them, or those in the crop box"""
+    center: Tensor
+    """camera centre in world coordinates, [3]"""
+
+    @property
+    def visible(self) -> Tensor:
+        """Rows of `splats` that are visible, int64 [M]."""
+        return self.projection.gaussian_ids
+
+
+class NrfgsModel(SplatfactoModel):
+    """Gaussian splatting with an appearance head.
+
+    Args:
+        config: which head, and splatfacto's options.
+        seed_points: points [P, 3] in scene units and their colours [P, 3] in 0..255, to start from.
+    """
+
+    config: NrfgsModelConfig
+
+    def populate_modules(self):
+        # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
+        if not isinstance(self.config.appearance, AppearanceHeadConfig):
+            raise InputError(
+                f"pipeline.model.appearance is {self.config.appearance!r}, which is not the configuration of an "
+                "appearance head. Use one from nrfgs_ns.appearance, such as NrfConfig or ShConfig."
+            )
+        self.head = self.config.appearance.setup()
+        self.config.sh_degree = self.head.sh_degree
+        self.gauss_params = torch.nn.ParameterDict(self._initial_splats())
+        self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        if self.config.use_bilateral_grid:
+            self.bil_grids = BilateralGrid(self.num_train_data, *self.config.grid_shape)
+
+        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+        self.image_metrics = ImageMetrics()
+        self.step = 0
+        self.crop_box = None
+        self.background_color = (
+            torch.tensor(VISER_BACKGROUND)
+            if self.config.background_color == "random"
+            else get_color(self.config.background_color)
+        )
+        self.strategy = DefaultStrategy(
+            prune_opa=self.config.cull_alpha_thresh,
+            grow_grad2d=self.config.densify_grad_thresh,
+            grow_scale3d=self.config.densify_size_thresh,
+            grow_scale2d=self.config.split_screen_size,
+            prune_scale3d=self.config.cull_scale_thresh,
+            prune_scale2d=self.config.cull_screen_size,
+            refine_scale2d_stop_iter=self.config.stop_screen_size_at,
+            refine_start_iter=self.config.warmup_length,
+            refine_stop_iter=self.config.stop_split_at,
+            reset_every=self.config.reset_alpha_every * self.config.refine_every,
+            refine_every=self.config.refine_every,
+            pause_refine_after_reset=self.num_train_data + self.config.refine_every,
+            absgrad=self.config.use_absgrad,
+            revised_opacity=False,
+            verbose=True,
+        )
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+
+    def _initial_splats(self) -> dict[str, Parameter]:
+        """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
+        if self.seed_points is not None and not self.config.random_init:
+            means, rgb = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
+        else:
+            means = (torch.rand(self.config.num_random, 3) - 0.5) * self.config.random_scale
+            rgb = torch.rand(len(means), 3)
+        neighbours = min(3, len(means) - 1)
+        if neighbours > 0:
+            distances, _ = self.k_nearest_sklearn(means, neighbours)
+            width = torch.from_numpy(distances).mean(dim=-1, keepdim=True)
+        else:
+            width = torch.full((len(means), 1), self.config.densify_size_thresh)
+        return {
+            name: Parameter(value)
+            for name, value in {
+                "means": means.clone(),
+                "scales": width.clamp_min(1e-7).log().repeat(1, 3),  # duplicate points have distance 0
+                "quats": random_quat_tensor(len(means)),
+                "opacities": torch.logit(torch.full((len(means), 1), 0.1)),
+                **self.head.splat_params(rgb),
+            }.items()
+        }
+
+    # What nerfstudio's exporter and viewer read.
+
+    @property
+    def colors(self) -> Tensor:
+        """Base colours [N, 3]."""
+        return base_colors(self.features_dc)
+
+    @property
+    def shs_0(self) -> Tensor:
+        """Coefficients of the constant harmonic [N, 3]."""
+        return self.features_dc
+
+    @property
+    def features_rest(self) -> Tensor:
+        """Coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any."""
+        return self.gauss_params["features_rest"] if "features_rest" in self.gauss_params else self._no_harmonics
+
+    @property
+    def _no_harmonics(self) -> Tensor:
+        return self.features_dc.new_zeros(self.num_points, 0, 3)
+
+    @property
+    def parameter_bytes(self) -> int:
+        """Bytes of all that a renderer needs: the splats' parameters and the head's shared weights."""
+        stored = [*self.gauss_params.values(), *self.head.parameters()]
+        return sum(parameter.numel() * parameter.element_size() for parameter in stored)
+
+    # Training.
+
+    def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
+        return {name: [parameter] for name, parameter in self.gauss_params.items()}
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """One group for each per-splat tensor, and "field" for the head's shared weights if it has any."""
+        groups = super().get_param_groups()
+        shared = list(self.head.parameters())
+        return {**groups, "field": shared} if shared else groups
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        def before_first_step(step: int) -> None:
+            cameras = attributes.pipeline.datamanager.train_dataset.cameras
+            steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
+            warm_up(self, cameras, steps, self.config.warmup_lr)
+
+        return [
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before_first_step, iters=(0,)),
+            *super().get_training_callbacks(attributes),
+        ]
+
+    def step_cb(self, optimizers, step: int) -> None:
+        super().step_cb(optimizers, step)
+        self.head.set_step(step)
+
+    def step_post_backward(self, step: int) -> None:
+        assert step == self.step
+        self.strategy.step_post_backward(
+            params=self.gauss_params,
+            optimizers=self.optimizers,
+            state=self.strategy_state,
+            step=self.step,
+            info=self.info,
+            packed=True,
+        )
+
+    # Rendering.
+
+    def look(self, camera: Cameras) -> View:
+        """Project the splats into one camera.
+
+        Args:
+            camera: a batch of one camera, [1].
+        """
+        if self.training:
+            assert camera.shape[0] == 1, "Only one camera at a time"
+            camera_to_world = self.camera_optimizer.apply_to_camera(camera)
+        else:
+            camera_to_world = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
+        if self.config.rasterize_mode not in ("antialiased", "classic"):
+            raise InputError(
+                f"pipeline.model.rasterize_mode is {self.config.rasterize_mode!r}; use 'classic' or 'antialiased'."
+            )
+        splats: dict[str, Tensor] = dict(self.gauss_params.items())
+        if self.crop_box is not None and not self.training:
+            inside = self.crop_box.within(splats["means"]).reshape(-1)
+            splats = {name: value[inside] for name, value in splats.items()}
+        K, width, height = intrinsics(camera, self._get_downscale_factor(), self.device)
+        projection = project(
+            splats["means"],
+            splats["quats"],
+            splats["scales"].exp(),
+            world_to_camera(camera_to_world),
+            K,
+            width,
+            height,
+            rasterize_mode=self.config.rasterize_mode,
+        )
+        return View(projection, splats, camera_to_world[0, :3, 3])
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
+        """Render one camera.
+
+        Returns:
+            "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [3] in training and [H, W, 3] otherwise,
+            and "depth" [H, W, 1], which is left out of training unless `output_depth_during_training`.
+        """
+        view = self.look(camera)
+        appearance = self.head(view.splats, view.visible, view.center)
+        outputs, self.info = self._paint(view, appearance)
+        if self.training:
+            self.strategy.step_pre_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
+            )
+            if self.config.use_bilateral_grid and "cam_idx" in (camera.metadata or {}):
+                height, width = outputs["rgb"].shape[:2]
+                index = camera.metadata["cam_idx"]
+                outputs["rgb"] = self._apply_bilateral_grid(outputs["rgb"][None], index, height, width)[0]
+        return outputs
+
+    @torch.no_grad()
+    def get_base_color(self, camera: Cameras) -> Tensor:
+        """The image [H, W, 3] of the base colours and opacities alone, without what depends on the view."""
+        view = self.look(camera)
+        return self._paint(view, self.head.base_appearance(view.splats, view.visible))[0]["rgb"]
+
+    def _paint(self, view: View, appearance: SplatAppearance) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Composite the visible splats over the background; also the rasterizer's `info`, for densification."""
+        with_depth = self.config.output_depth_during_training or not self.training
+        render, alpha, info = composite(
+            view.projection,
+            appearance.colors,
+            appearance.opacities,
+            render_mode="RGB+ED" if with_depth else "RGB",
+            absgrad=self.strategy.absgrad and self.training,
+        )
+        render, alpha = render[0], alpha[0]
+        height, width = alpha.shape[:2]
+        self.last_size = (height, width)
+        background = self._get_background_color()
+        outputs = {
+            "rgb": torch.clamp(render[..., :3] + (1 - alpha) * background, 0.0, 1.0),
+            "accumulation": alpha,
+            "background": background if self.training else background.expand(height, width, 3),
+        }
+        if with_depth:
+            depth = render[..., 3:4]
+            outputs["depth"] = torch.where(alpha > 0, depth, depth.detach().max())
+        return outputs, info
+
+    # Metrics.
+
+    @torch.no_grad()
+    def get_metrics_dict(self, outputs, batch) -> dict[str, Any]:
+        """What is logged while training: PSNR (inside the mask) and the number of splats. Nothing waits for the GPU."""
+        truth = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        error = (outputs["rgb"] - truth).square().mean(dim=-1, keepdim=True)
+        mask = self._mask(batch)
+        mse = error.mean() if mask is None else (error * mask).sum() / mask.sum()
+        metrics = {"psnr": -10.0 * torch.log10(mse), "gaussian_count": self.num_points}
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics of one image, inside the mask if there is one, and truth and rendering side by side.
+
+        A metric that cannot be had (LPIPS without its weights, MS-SSIM of a small image) is left out.
+        """
+        truth = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        rgb = outputs["rgb"]
+        metrics = self.image_metrics(rgb, truth, self._mask(batch))
+        return (
+            {name: value for name, value in metrics.items() if value is not None},
+            {"img": torch.cat([truth, rgb], dim=1)},
+        )
+
+    def _mask(self, batch) -> Tensor | None:
+        """The image's mask at the rendered size, bool [H, W, 1], or None. A pixel half covered counts as inside."""
+        if "mask" not in batch:
+            return None
+        return self._downscale_if_required(batch["mask"]).to(self.device) >= 0.5
+
+    # Checkpoints.
+
+    def update_to_step(self, step: int) -> None:
+        self.step = step
+        self.head.set_step(step)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a checkpoint holds beside tensors: the head's name, and densification's running statistics."""
+        return {"head": self.head.name, "strategy": dict(self.strategy_state)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self.strategy_state = {
+            name: value.to(self.device) if isinstance(value, Tensor) else value
+            for name, value in state["strategy"].items()
+        }
+
+    def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):
+        """Load a checkpoint with any number of splats.
+
+        The parameters are resized in place: the optimisers were built on these very objects before the checkpoint was
+        read, and would go on training orphans if they were replaced.
+
+        Raises:
+            InputError: the checkpoint belongs to another head, or to another size of this one.
+        """
+        check_compatible(self, state)
+        for name, parameter in self.gauss_params.items():
+            parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)
+        return super(SplatfactoModel, self).load_state_dict(state, strict=strict, **kwargs)
+
+
+def world_to_camera(camera_to_world: Tensor) -> Tensor:
+    """World-to-camera matrices from nerfstudio's poses.
+
+    Args:
+        camera_to_world: [C, 3, 4], with y up and z backwards (OpenGL).
+
+    Returns:
+        [C, 4, 4], with y down and z forwards (OpenCV, gsplat).
+    """
+    rotation = (camera_to_world[:, :3, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).transpose(1, 2)
+    translation = -rotation @ camera_to_world[:, :3, 3:4]
+    last = camera_to_world.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(camera_to_world), 1, 4)
+    return torch.cat([torch.cat([rotation, translation], dim=2), last], dim=1)
+
+
+def intrinsics(camera: Cameras, downscale: int, device) -> tuple[Tensor, int, int]:
+    """Intrinsics [1, 3, 3], width and height of one camera, scaled by 1 / downscale and rounded down like its image."""
+    K = camera.get_intrinsics_matrices().reshape(1, 3, 3).to(device)
+    K = K / K.new_tensor([[downscale], [downscale], [1.0]])
+    return K, int(camera.width.item()) // downscale, int(camera.height.item()) // downscale

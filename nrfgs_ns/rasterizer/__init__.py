@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splats + colours + opacities -> image. gsplat 1.4's call, conventions and `info`, on the GPU and on the CPU.
+
+Two stages, because colours and opacities come from an appearance head that should see visible splats only:
+
+    projection = project(means, quats, scales, viewmats, Ks, width, height)      # which splats, where
+    colors, opacities = head(projection.gaussian_ids, ...)                       # one row per visible splat
+    render, alphas, info = composite(projection, colors, opacities)              # the image
+
+`rasterization` is both at once, with the signature of `gsplat.rasterization`. The device of the means picks the back end:
+gsplat's kernels on CUDA, `torch_cpu` (plain torch, no compiler) elsewhere on the CPU.
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from .contract import Projection
+
+__all__ = ["Projection", "composite", "project", "rasterization"]
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RasterizeMode = Literal["classic", "antialiased"]
+_RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+_RASTERIZE_MODES = ("classic", "antialiased")
+
+
+def _backend(device: torch.device):
+    """The module that projects and composites on a device. Imported late: the CPU path must never load CUDA code."""
+    if device.type == "cuda":
+        from . import gsplat_cuda
+
+        return gsplat_cuda
+    if device.type == "cpu":
+        from . import torch_cpu
+
+        return torch_cpu
+    raise NotImplementedError(f"splats are on device {device}; the rasterizer runs on 'cuda' and 'cpu'")
+
+
+def _check_shape(name: str, tensor: Tensor, *shape: int) -> None:
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name} must have shape {list(shape)}, got {list(tensor.shape)}")
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    rasterize_mode: RasterizeMode = "classic",
+) -> Projection:
+    """Find the splats that each camera sees and project them. Differentiable in all tensors but Ks.
+
+    Args:
+        means: centres in world units. [N, 3]
+        quats: rotations (w, x, y, z), not necessarily of unit length. [N, 4]
+        scales: standard deviations along the splat's axes, in world units (not their logarithms). [N, 3]
+        viewmats: world-to-camera transforms, x right, y down, z forward. [C, 4, 4]
+        Ks: pinhole intrinsics in pixels, without skew. [C, 3, 3]
+        width, height: image size in pixels.
+        near_plane, far_plane: depths, inclusive, between which splats are visible.
+        radius_clip: splats whose radius is at most this many pixels are skipped.
+        eps2d: blur added to the 2D covariances, in square pixels.
+        rasterize_mode: "antialiased" also computes the opacity factor that compensates for the blur.
+
+    Raises:
+        ValueError: a tensor has the wrong shape, or the mode is unknown.
+        NotImplementedError: the device is neither CUDA nor CPU.
+    """
+    n, c = means.shape[0], viewmats.shape[0]
+    for name, tensor, shape in (
+        ("means", means, (n, 3)),
+        ("quats", quats, (n, 4)),
+        ("scales", scales, (n, 3)),
+        ("viewmats", viewmats, (c, 4, 4)),
+        ("Ks", Ks, (c, 3, 3)),
+    ):
+        _check_shape(name, tensor, *shape)
+    if rasterize_mode not in _RASTERIZE_MODES:
+        raise ValueError(f"rasterize_mode must be one of {_RASTERIZE_MODES}, got {rasterize_mode!r}")
+    return _backend(means.device).project(
+        means,
+        quats,
+        scales,
+        viewmats,
+        Ks,
+        width,
+        height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        radius_clip=radius_clip,
+        eps2d=eps2d,
+        rasterize_mode=rasterize_mode,
+    )
+
+
+def composite(
+    projection: Projection,
+    colors: Tensor,
+    opacities: Tensor,
+    *,
+    backgrounds: Tensor | None = None,
+    render_mode: RenderMode = "RGB",
+    tile_size: int = 16,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Blend the projected splats into images.
+
+    Args:
+        projection: the result of `project`, M rows.
+        colors: any number of channels D per row; ignored by the modes "D" and "ED". [M, D]
+        opacities: opacity per row, before antialiasing compensation. Below 1/255 nothing is drawn. [M]
+        backgrounds: colour behind the splats; depth is always composited over 0. [C, D]
+        render_mode: channels of the render: colours, accumulated depth sum(w z) ("D"), expected depth sum(w z) / sum(w)
+            ("ED"), or colours followed by one of the depths.
+        tile_size: side in pixels of the tiles that cut a splat off beyond its radius, as in gsplat.
+        absgrad: leave sum |dL/dmean2d| over pixels in `projection.means2d.absgrad` when going backward. [M, 2]
+
+    Returns:
+        render [C, H, W, X], alphas [C, H, W, 1], and gsplat's `info`: camera_ids, gaussian_ids, radii, means2d, depths, conics,
+        opacities (compensated), width, height, tile_size, tile_width, tile_height, n_cameras; on CUDA also tiles_per_gauss,
+        isect_ids, flatten_ids and isect_offsets, which index gsplat's own lists and have no counterpart on the CPU.
+
+    Raises:
+        ValueError: a tensor has the wrong shape, or the mode is unknown.
+    """
+    m, c = projection.gaussian_ids.shape[0], projection.n_cameras
+    _check_shape("opacities", opacities, m)
+    _check_shape("colors", colors, m, colors.shape[-1])
+    if render_mode not in _RENDER_MODES:
+        raise ValueError(f"render_mode must be one of {_RENDER_MODES}, got {render_mode!r}")
+    if backgrounds is not None:
+        _check_shape("backgrounds", backgrounds, c, colors.shape[-1])
+
+    if projection.compensations is not None:
+        opacities = opacities * projection.compensations
+    depths = projection.depths[:, None]
+    if render_mode in ("D", "ED"):
+        colors, backgrounds = depths, None
+    elif render_mode in ("RGB+D", "RGB+ED"):
+        colors = torch.cat([colors, depths], dim=-1)
+        if backgrounds is not None:
+            backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(c, 1)], dim=-1)
+
+    render, alphas, lists = _backend(colors.device).composite(
+        projection, colors, opacities, backgrounds=backgrounds, tile_size=tile_size, absgrad=absgrad
+    )
+    if render_mode in ("ED", "RGB+ED"):
+        render = torch.cat([render[..., :-1], render[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
+    info = {
+        "camera_ids": projection.camera_ids,
+        "gaussian_ids": projection.gaussian_ids,
+        "radii": projection.radii,
+        "means2d": projection.means2d,
+        "depths": projection.depths,
+        "conics": projection.conics,
+        "opacities": opacities,
+        "tile_width": -(-projection.width // tile_size),
+        "tile_height": -(-projection.height // tile_size),
+        **lists,
+        "width": projection.width,
+        "height": projection.height,
+        "tile_size": tile_size,
+        "n_cameras": c,
+    }
+    return render, alphas, info
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: RasterizeMode = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    covars: Tensor | None = None,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """`gsplat.rasterization` on CUDA and CPU: `project`, then `composite` with the same arguments.
+
+    Args:
+        opacities: one per splat. [N]
+        colors: one per splat, or per camera and splat. [N, D] or [C, N, D]
+        packed: False gives `info` gsplat's dense layout: radii, means2d, depths, conics and opacities with leading dimensions
+            [C, N] and zeros where a splat is not visible; camera_ids and gaussian_ids are None.
+        channel_chunk: accepted for the signature's sake; any number of channels is composited at once.
+
+        The others: see `project` and `composite`.
+
+    Raises:
+        ValueError: a tensor has the wrong shape, a mode is unknown, or spherical harmonics were asked for: colours are the
+            business of an appearance head.
+        NotImplementedError: distributed, sparse_grad, covars, or a camera that is not a pinhole.
+    """
+    if sh_degree is not None:
+        raise ValueError("sh_degree must be None: evaluate colours first (see nrfgs_ns.appearance) and pass them as `colors`")
+    unsupported = {
+        "distributed": distributed,
+        "sparse_grad": sparse_grad,
+        "covars": covars is not None,
+        f"camera_model={camera_model!r}": camera_model != "pinhole",
+    }
+    if any(unsupported.values()):
+        raise NotImplementedError(f"not supported: {', '.join(name for name, asked in unsupported.items() if asked)}")
+    n, c = means.shape[0], viewmats.shape[0]
+    _check_shape("opacities", opacities, n)
+    _check_shape("colors", colors, *((n,) if colors.dim() == 2 else (c, n)), colors.shape[-1])
+
+    projection = project(
+        means,
+        quats,
+        scales,
+        viewmats,
+        Ks,
+        width,
+        height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        radius_clip=radius_clip,
+        eps2d=eps2d,
+        rasterize_mode=rasterize_mode,
+    )
+    cell = (projection.camera_ids, projection.gaussian_ids)
+    if not packed:
+        dense_means2d = means.new_zeros(c, n, 2).index_put(cell, projection.means2d)
+        projection = replace(projection, means2d=dense_means2d[cell])
+    render, alphas, info = composite(
+        projection,
+        colors[cell] if colors.dim() == 3 else colors[projection.gaussian_ids],
+        opacities[projection.gaussian_ids],
+        backgrounds=backgrounds,
+        render_mode=render_mode,
+        tile_size=tile_size,
+        absgrad=absgrad,
+    )
+    if not packed:
+        for name in ("radii", "depths", "conics", "opacities"):
+            rows = info[name]
+            info[name] = rows.new_zeros(c, n, *rows.shape[1:]).index_put(cell, rows)
+        info.update(means2d=dense_means2d, camera_ids=None, gaussian_ids=None)
+        if absgrad and dense_means2d.requires_grad:
+            _densify_absgrad(dense_means2d, projection.means2d, cell)
+    return render, alphas, info
+
+
+def _densify_absgrad(dense: Tensor, packed: Tensor, cell: tuple[Tensor, Tensor]) -> None:
+    """Copy `packed.absgrad` [M, 2] to `dense.absgrad` [C, N, 2] as soon as the backward pass has produced it."""
+    target = weakref.ref(dense)  # a hook that owned its own tensor would keep it alive for ever
+
+    def copy(grad: Tensor) -> None:
+        if (tensor := target()) is not None:
+            tensor.absgrad = torch.zeros_like(grad).index_put(cell, packed.absgrad)
+
+    dense.register_hook(copy)

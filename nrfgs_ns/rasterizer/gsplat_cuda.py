@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The CUDA back end: gsplat 1.4's kernels, called stage by stage as its packed rasterization calls them."""
+
+from __future__ import annotations
+
+import torch
+from gsplat.cuda._wrapper import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
+from torch import Tensor
+
+from .contract import Projection
+
+CHANNEL_CHUNK = 32  # more channels at once slow the kernels down
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    rasterize_mode: str,
+) -> Projection:
+    """See `nrfgs_ns.rasterizer.project`."""
+    rows = fully_fused_projection(
+        means,
+        None,
+        quats,
+        scales,
+        viewmats,
+        Ks,
+        width,
+        height,
+        eps2d=eps2d,
+        packed=True,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        radius_clip=radius_clip,
+        calc_compensations=rasterize_mode == "antialiased",
+    )
+    return Projection(*rows, width=width, height=height, n_cameras=viewmats.shape[0])
+
+
+def composite(
+    projection: Projection,
+    colors: Tensor,
+    opacities: Tensor,
+    *,
+    backgrounds: Tensor | None,
+    tile_size: int,
+    absgrad: bool,
+) -> tuple[Tensor, Tensor, dict]:
+    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`."""
+    tile_width, tile_height = -(-projection.width // tile_size), -(-projection.height // tile_size)
+    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
+        projection.means2d,
+        projection.radii,
+        projection.depths,
+        tile_size,
+        tile_width,
+        tile_height,
+        packed=True,
+        n_cameras=projection.n_cameras,
+        camera_ids=projection.camera_ids,
+        gaussian_ids=projection.gaussian_ids,
+    )
+    isect_offsets = isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height)
+
+    renders, alphas = [], None
+    for begin in range(0, colors.shape[-1], CHANNEL_CHUNK):
+        channels = slice(begin, begin + CHANNEL_CHUNK)
+        render, chunk_alphas = rasterize_to_pixels(
+            projection.means2d,
+            projection.conics,
+            colors[:, channels],
+            opacities,
+            projection.width,
+            projection.height,
+            tile_size,
+            isect_offsets,
+            flatten_ids,
+            backgrounds=None if backgrounds is None else backgrounds[:, channels],
+            packed=True,
+            absgrad=absgrad,
+        )
+        renders.append(render)
+        alphas = chunk_alphas if alphas is None else alphas
+    lists = {
+        "tiles_per_gauss": tiles_per_gauss,
+        "isect_ids": isect_ids,
+        "flatten_ids": flatten_ids,
+        "isect_offsets": isect_offsets,
+    }
+    return torch.cat(renders, dim=-1), alphas, lists

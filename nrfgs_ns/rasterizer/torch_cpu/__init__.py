@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The CPU back end: `projection`, `tiles`, `compositing`, in this order, and their float64 twin in `reference`."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ..contract import Projection
+from . import compositing
+from .projection import project
+
+__all__ = ["composite", "project"]
+
+
+def composite(
+    projection: Projection,
+    colors: Tensor,
+    opacities: Tensor,
+    *,
+    backgrounds: Tensor | None,
+    tile_size: int,
+    absgrad: bool,
+) -> tuple[Tensor, Tensor, dict]:
+    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and no lists to add to `info`."""
+    render, transmittance = compositing.composite(projection, colors, opacities, tile_size=tile_size, absgrad=absgrad)
+    if backgrounds is not None:
+        render = render + transmittance * backgrounds[:, None, None, :]
+    return render, 1 - transmittance, {}

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The slow twin: the same image from dense float64 arithmetic, every splat against every pixel, gradients by autograd.
+
+Written to be checked by eye against the definition and sharing no code with the fast path. Arrays are [N, H, W] for one camera, so
+this is for small images. It also says how sure its decisions are: a cut-off (1/255, 1e-4, 0.999, the radius and its tiles) is a step,
+float32 may fall on its other side, and a comparison must know at which pixels that can happen, and how far it can go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE = 1 / 255, 0.999, 1e-4
+
+
+@dataclass
+class Screen:
+    """N splats seen by one camera; rows of invisible splats are meaningless. float64"""
+
+    means2d: Tensor
+    """[N, 2]"""
+    depths: Tensor
+    """[N]"""
+    conics: Tensor
+    """Inverse of the blurred covariance. [N, 2, 2]"""
+    compensations: Tensor
+    """sqrt(det / det_blurred). [N]"""
+    sigma3: Tensor
+    """The radius before it is rounded up. [N]"""
+    visible: Tensor
+    """[N], bool"""
+
+
+@dataclass
+class Image:
+    """One camera's image and what is needed to judge another one by it. float64"""
+
+    render: Tensor
+    """[H, W, D]"""
+    alphas: Tensor
+    """[H, W, 1]"""
+    order: Tensor
+    """The n visible splats, nearest first. [n], int64"""
+    pixel_means2d: Tensor
+    """One copy of means2d[order] per pixel: absgrad is the sum over pixels of its |.grad|. [n, H, W, 2]"""
+    rounding: Tensor
+    """First-order bound of the image's rounding error per unit of colour range, for the `unit` asked for. [H, W]"""
+    undecided: Tensor
+    """Pixels where a cut-off lies within rounding error. [H, W], bool"""
+    jump: Tensor
+    """How far an undecided pixel may move per unit of colour range. [H, W]"""
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+) -> Screen:
+    """Project N splats into one camera: cov2d = J W Sigma W^T J^T + eps2d I. Everything in float64."""
+    means, quats, scales, viewmat, K = (t.double() for t in (means, quats, scales, viewmat, K))
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    W, t = viewmat[:3, :3], viewmat[:3, 3]
+
+    points = means @ W.T + t
+    depths = points[:, 2]
+    # Splats behind the camera are computed at depth 1 and marked invisible, so that no infinity enters a gradient.
+    in_range = (depths >= near_plane) & (depths <= far_plane)
+    x, y, z = torch.where(in_range[:, None], points, torch.ones_like(points)).unbind(-1)
+
+    w, i, j, k = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    R = torch.stack(
+        [
+            torch.stack([1 - 2 * (j**2 + k**2), 2 * (i * j - w * k), 2 * (i * k + w * j)], -1),
+            torch.stack([2 * (i * j + w * k), 1 - 2 * (i**2 + k**2), 2 * (j * k - w * i)], -1),
+            torch.stack([2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i**2 + j**2)], -1),
+        ],
+        -2,
+    )
+    sigma_world = R @ torch.diag_embed(scales**2) @ R.mT
+
+    slack_x, slack_y = 0.3 * width / (2 * fx), 0.3 * height / (2 * fy)
+    u = (x / z).clamp(-cx / fx - slack_x, (width - cx) / fx + slack_x)
+    v = (y / z).clamp(-cy / fy - slack_y, (height - cy) / fy + slack_y)
+    zero = torch.zeros_like(z)
+    J = torch.stack([torch.stack([fx / z, zero, -fx * u / z], -1), torch.stack([zero, fy / z, -fy * v / z], -1)], -2)
+
+    cov2d = J @ W @ sigma_world @ W.T @ J.mT
+    blurred = cov2d + eps2d * torch.eye(2, dtype=torch.float64)
+    ratio = torch.linalg.det(cov2d) / torch.linalg.det(blurred)
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
+
+    half_trace = 0.5 * (blurred[:, 0, 0] + blurred[:, 1, 1])
+    longest = half_trace + (half_trace**2 - torch.linalg.det(blurred)).clamp(min=0.1).sqrt()
+    sigma3 = 3 * longest.sqrt()
+    radius = sigma3.ceil()
+    size = torch.tensor([width, height])
+    on_image = ((means2d + radius[:, None] > 0) & (means2d - radius[:, None] < size)).all(-1)
+    visible = in_range & on_image & (radius > radius_clip)
+    return Screen(means2d, depths, torch.linalg.inv(blurred), ratio.clamp(min=0).sqrt(), sigma3, visible)
+
+
+def _covered(centre: Tensor, radius: Tensor, n_pixels: int, tile_size: int) -> Tensor:
+    """Whether each pixel of an axis lies in a tile that [centre - radius, centre + radius] meets. [N, n_pixels]"""
+    tile = torch.arange(n_pixels) // tile_size
+    first = ((centre - radius) / tile_size).floor()[:, None]
+    end = ((centre + radius) / tile_size).ceil()[:, None]
+    return (tile >= first) & (tile < end)
+
+
+def composite(
+    screen: Screen,
+    colors: Tensor,
+    opacities: Tensor,
+    width: int,
+    height: int,
+    *,
+    background: Tensor | None = None,
+    tile_size: int = 16,
+    unit: float = 2.0**-24,
+) -> Image:
+    """Blend N splats into one image.
+
+    Args:
+        colors: [N, D]
+        opacities: as composited, compensation included. [N]
+        background: [D]
+        unit: rounding unit of the arithmetic that will be compared (float32 by default); it shapes `rounding`, `undecided`
+            and `jump` only, never the image.
+    """
+    order = torch.argsort(screen.depths.detach(), stable=True)
+    order = order[screen.visible[order]]
+    means2d, conics, sigma3 = screen.means2d[order], screen.conics[order], screen.sigma3[order].detach()
+    opacities, colors = opacities.double()[order, None, None], colors.double()[order]
+
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixel_means2d = means2d[:, None, None, :].expand(-1, height, width, -1)
+    if pixel_means2d.requires_grad:
+        pixel_means2d = pixel_means2d.clone()
+        pixel_means2d.retain_grad()
+    d = torch.stack([x, y], -1).double() - pixel_means2d  # [n, H, W, 2]
+    sigma = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", d, conics, d)
+    raw = opacities * torch.exp(-sigma)
+
+    def reach(radius: Tensor, shift: float = 0.0) -> Tensor:
+        columns = _covered(means2d[:, 0].detach(), radius + shift, width, tile_size)
+        rows = _covered(means2d[:, 1].detach(), radius + shift, height, tile_size)
+        return rows[:, :, None] & columns[:, None, :]
+
+    within = reach(sigma3.ceil())
+    counts = within & (raw >= MIN_ALPHA) & (sigma >= 0)
+    alpha = torch.where(counts, raw.clamp(max=MAX_ALPHA), 0.0)
+    after = torch.cumprod(1 - alpha, dim=0)
+    drawn = after > MIN_TRANSMITTANCE
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    weights = torch.where(drawn, alpha * before, 0.0)
+    transmittance = torch.where(drawn, 1 - alpha, 1.0).prod(0)
+    render = torch.einsum("nhw,nd->hwd", weights, colors)
+    if background is not None:
+        render = render + transmittance[..., None] * background.double()
+
+    with torch.no_grad():
+        # Error of l in roundings: 8 in opacity and exp; 8 in each entry of the conic, whose terms may cancel; 8 in the
+        # determinant as a difference of products (a c / det of them); 8 in positions, times the slope of sigma there.
+        terms = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", d.abs(), conics.abs(), d.abs())
+        cancelled = (conics[:, 0, 0] * conics[:, 1, 1] / torch.linalg.det(conics))[:, None, None]
+        slope = torch.einsum("nij,nhwj->nhwi", conics, d).abs().sum(-1)
+        where = means2d.abs().amax(-1)[:, None, None] + max(width, height)
+        error = 8 * unit * (1 + terms + cancelled * sigma + slope * where)
+        rounding = 2 * (weights * error).sum(0) + 8 * unit
+        lost = torch.cumsum(torch.where(counts, alpha / (1 - alpha) * error, 0.0), 0) + 8 * unit  # relative error of T
+
+        fuzz = 8 * unit * (sigma3 * (1 + cancelled[:, 0, 0]) + means2d.abs().amax(-1) + max(width, height))
+        may_reach = reach((sigma3 + fuzz).ceil(), fuzz) != reach((sigma3 - fuzz).ceil(), -fuzz)
+        near_min = (raw / MIN_ALPHA - 1).abs() <= error
+        reached = torch.cat([torch.ones_like(drawn[:1]), drawn[:-1]])
+        maybe_cut = reached & ((within & near_min) | (may_reach & (raw >= MIN_ALPHA * (1 - error))))
+        maybe_capped = reached & within & ((raw / MAX_ALPHA - 1).abs() <= error)
+        maybe_ended = reached & counts & ((after / MIN_TRANSMITTANCE - 1).abs() <= lost)
+        jump = (torch.where(maybe_cut, raw.clamp(max=MAX_ALPHA), 0.0) * before).sum(0)
+        jump = 2 * jump + 2 * torch.where(maybe_ended, before, 0.0).sum(0)
+        undecided = (maybe_cut | maybe_capped | maybe_ended).any(0)
+
+    return Image(render, 1 - transmittance[..., None], order, pixel_means2d, rounding, undecided, jump)
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
+    tile_size: int = 16,
+    unit: float = 2.0**-24,
+    perturb: Callable[[Tensor], Tensor] = lambda t: t,
+    **limits: float,
+) -> tuple[Tensor, Tensor, list[Screen], list[Image]]:
+    """The twin of `nrfgs_ns.rasterizer.rasterization`, camera by camera.
+
+    Args:
+        perturb: applied to the projected means, depths, conics and compensations; with noise of a few rounding units it
+            shows what rounding does to the image and to its gradients.
+        limits: near_plane, far_plane, radius_clip, eps2d.
+
+    Returns:
+        render [C, H, W, X], alphas [C, H, W, 1], and the screens and images of the C cameras.
+    """
+    renders, screens, images = [], [], []
+    for camera, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
+        screen = project(means, quats, scales, viewmat, K, width, height, **limits)
+        noisy = {name: perturb(getattr(screen, name)) for name in ("means2d", "depths", "conics", "compensations")}
+        screen = replace(screen, **noisy)
+        color = (colors[camera] if colors.dim() == 3 else colors).double()
+        background = None if backgrounds is None else backgrounds[camera].double()
+        depths = screen.depths[:, None]
+        if render_mode in ("D", "ED"):
+            color, background = depths, None
+        elif render_mode in ("RGB+D", "RGB+ED"):
+            color = torch.cat([color, depths], -1)
+            background = None if background is None else torch.cat([background, background.new_zeros(1)])
+        opacity = opacities.double() * screen.compensations if rasterize_mode == "antialiased" else opacities
+        image = composite(screen, color, opacity, width, height, background=background, tile_size=tile_size, unit=unit)
+        render = image.render
+        if render_mode in ("ED", "RGB+ED"):
+            render = torch.cat([render[..., :-1], render[..., -1:] / image.alphas.clamp(min=1e-10)], -1)
+        renders.append(render)
+        screens.append(screen)
+        images.append(image)
+    return torch.stack(renders), torch.stack([image.alphas for image in images]), screens, images

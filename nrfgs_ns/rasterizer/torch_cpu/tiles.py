@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tiles: which splats can touch which pixels, sorted front to back.
+
+gsplat lets a splat touch exactly the `tile_size` tiles that its radius square meets. That rule is part of its image (it
+truncates tails at tile borders), so it is kept. Inside these tiles the splats are listed per *sub-tile* of 8 x 8 pixels, and
+only where they can matter: alpha = o exp(-sigma) >= 1/255 holds inside the ellipse
+
+    sigma(d) = (a dx^2 + 2 b dx dy + c dy^2) / 2 <= s,        s = ln(255 o),
+
+and nowhere else. On the horizontal line dy the ellipse spans
+
+    dx = (-b dy -+ sqrt(2 a s - (a c - b^2) dy^2)) / a,
+
+and its extreme points lie at dx = -+ sqrt(2 s c / (a c - b^2)), dy = +- (b / c) times that. Within a row of sub-tiles the
+leftmost point is therefore the one on the line nearest to the leftmost extreme, and likewise on the right: each (splat, row)
+yields one exact interval of columns, so a long diagonal needle is listed along its length and not over its bounding box.
+
+Sorting: splats are put in depth order once (stable, so equal depths keep their index order, as in gsplat), expanded into
+pairs in that order, and the pairs are stably sorted by tile. Both sorts are radix sorts on integers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..contract import Projection
+
+SUB_TILE = 8  # pixels; smaller wastes work on lists, larger on pixels that a splat does not reach
+MIN_ALPHA = 1.0 / 255.0
+REACH_SLACK = 1e-3  # added to s: covers the rounding of sigma in float32 (below 1e-4), so that no pair is lost
+
+
+class Block(NamedTuple):
+    """A rectangle of sub-tiles. Rows of all cameras are stacked: row = camera * tiles_y + y."""
+
+    row0: int
+    row1: int
+    col0: int
+    col1: int
+
+
+@dataclass
+class Footprints:
+    """The splats that can leave a mark, in depth order, and the sub-tiles around them; F of the M projected rows."""
+
+    edge: int
+    """Side of a sub-tile in pixels."""
+    tiles_x: int
+    """Sub-tiles per image row."""
+    tiles_y: int
+    """Sub-tiles per image column."""
+    rows: Tensor
+    """Row of the projection. [F], int64"""
+    shape: Tensor
+    """Columns: centre x, centre y, conic a, b, c, ln(opacity). [F, 6], float64"""
+    spans: Tensor
+    """Bounding box in sub-tiles: first row, end row, first column, end column; rows of all cameras stacked. [4, F], int64"""
+
+    @property
+    def whole(self) -> Block:
+        """All rows that any splat meets, all columns."""
+        if self.rows.numel() == 0:
+            return Block(0, 0, 0, self.tiles_x)
+        return Block(int(self.spans[0].min()), int(self.spans[1].max()), 0, self.tiles_x)
+
+
+@dataclass
+class TileLists:
+    """The (sub-tile, splat) pairs of a block; K pairs."""
+
+    tiles: Tensor
+    """Sub-tiles that have splats, as indices into all [C * tiles_y * tiles_x]. [L], int64"""
+    start: Tensor
+    """First pair of each of these sub-tiles. [L], int64"""
+    count: Tensor
+    """Number of its pairs. [L], int64"""
+    splat: Tensor
+    """Footprint of each pair, sorted by sub-tile, then depth. [K], int64"""
+    slot: Tensor
+    """Position of each pair when sorted by splat instead: where its gradient is collected. [K], int64"""
+    splat_start: Tensor
+    """First slot of each footprint. [F], int64"""
+
+
+def _inclusive_range(low: Tensor, high: Tensor, edge: int) -> tuple[Tensor, Tensor]:
+    """Sub-tiles [first, end) that have a pixel centre in [low, high] (pixels, float64). Centres lie at +0.5."""
+    first = torch.ceil((low - (edge - 0.5)) / edge)
+    end = torch.floor((high - 0.5) / edge) + 1
+    return first, end
+
+
+def _square_range(centre: Tensor, radius: Tensor, tile_size: int, n_tiles: int) -> tuple[Tensor, Tensor]:
+    """gsplat's rule: tiles [floor((m - r) / size), ceil((m + r) / size)), in the precision of the input."""
+    centre, radius = centre / tile_size, radius / tile_size
+    return (centre - radius).floor().clamp(0, n_tiles), (centre + radius).ceil().clamp(0, n_tiles)
+
+
+def footprints(projection: Projection, opacities: Tensor, tile_size: int) -> Footprints:
+    """Bound every splat: where gsplat's tiles and its own 1/255 ellipse allow it to be seen. Opacities: [M]."""
+    edge = math.gcd(tile_size, SUB_TILE)
+    per_tile = tile_size // edge
+    width, height = projection.width, projection.height
+    tiles_x, tiles_y = -(-width // edge), -(-height // edge)
+
+    # The bits of a positive float sort like the float; the integer sort is an order of magnitude faster.
+    bits = projection.depths.view(torch.int32 if projection.depths.dtype == torch.float32 else torch.int64)
+    order = torch.sort(bits, stable=True).indices
+    order = order[opacities.index_select(0, order) >= MIN_ALPHA]
+
+    means2d = projection.means2d.index_select(0, order)
+    radii = projection.radii.index_select(0, order).to(means2d.dtype)
+    x, y = means2d.t()
+    x0, x1 = _square_range(x, radii, tile_size, -(-width // tile_size))
+    y0, y1 = _square_range(y, radii, tile_size, -(-height // tile_size))
+
+    a, b, c = projection.conics.index_select(0, order).double().t()
+    # Rounding can make the stored conic of an extreme needle indefinite; an ulp off b makes it definite again.
+    limit = (a * c).sqrt() * (1 - 2.0**-22)
+    b = torch.maximum(torch.minimum(b, limit), -limit)
+    log_opacity = opacities.index_select(0, order).double().log()
+    shape = torch.stack([x.double(), y.double(), a, b, c, log_opacity], dim=-1)
+
+    det = a * c - b * b
+    reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
+    half_x, half_y = (reach * c / det).sqrt(), (reach * a / det).sqrt()
+    col0, col1 = _inclusive_range(shape[:, 0] - half_x, shape[:, 0] + half_x, edge)
+    row0, row1 = _inclusive_range(shape[:, 1] - half_y, shape[:, 1] + half_y, edge)
+    col0, col1 = col0.maximum(x0 * per_tile), col1.minimum((x1 * per_tile).clamp(max=tiles_x))
+    row0, row1 = row0.maximum(y0 * per_tile), row1.minimum((y1 * per_tile).clamp(max=tiles_y))
+
+    kept = ((col0 < col1) & (row0 < row1)).nonzero().squeeze(1)
+    spans = torch.stack([row0, row1, col0, col1]).index_select(1, kept).long()
+    order = order.index_select(0, kept)
+    spans[:2] += projection.camera_ids.index_select(0, order) * tiles_y
+    return Footprints(edge, tiles_x, tiles_y, order, shape.index_select(0, kept), spans)
+
+
+def _clip(spans: Tensor, block: Block) -> Tensor:
+    """Spans within a block; a splat outside gets an empty row range. [4, F]"""
+    row0, row1 = spans[0].clamp(min=block.row0), spans[1].clamp(max=block.row1)
+    col0, col1 = spans[2].clamp(min=block.col0), spans[3].clamp(max=block.col1)
+    row1 = torch.where(col0 < col1, row1.maximum(row0), row0)
+    return torch.stack([row0, row1, col0, col1])
+
+
+def split_into_blocks(prints: Footprints, max_pairs: int) -> list[Block]:
+    """Cut the sub-tiles into blocks of at most `max_pairs` bounding-box pairs (or a single sub-tile): bounded memory."""
+
+    def split(block: Block) -> list[Block]:
+        row0, row1, col0, col1 = block
+        if row0 >= row1 or col0 >= col1:
+            return []
+        clipped = _clip(prints.spans, block)
+        pairs = ((clipped[1] - clipped[0]) * (clipped[3] - clipped[2])).sum()
+        if pairs <= max_pairs or (row1 - row0 == 1 and col1 - col0 == 1):
+            return [block] if pairs > 0 else []
+        if row1 - row0 > 1:
+            middle = (row0 + row1) // 2
+            return split(block._replace(row1=middle)) + split(block._replace(row0=middle))
+        middle = (col0 + col1) // 2
+        return split(block._replace(col1=middle)) + split(block._replace(col0=middle))
+
+    return split(prints.whole)
+
+
+def list_tiles(prints: Footprints, block: Block) -> TileLists:
+    """List the splats of each sub-tile of a block, front to back. Two expansions: splat -> rows -> columns."""
+    edge = prints.edge
+    row0, row1, col0, col1 = _clip(prints.spans, block)
+
+    # (splat, row) pairs, splat by splat.
+    n_rows = row1 - row0
+    row_end = n_rows.cumsum(0)
+    total = int(row_end[-1])
+    splat = torch.repeat_interleave(n_rows, output_size=total)
+    row = torch.arange(total) + (row0 - row_end + n_rows).index_select(0, splat)
+
+    # The interval of columns that the ellipse covers on the pixel rows [y0, y1] of each.
+    x, y, a, b, c, log_opacity = prints.shape.index_select(0, splat).t().contiguous()
+    det = a * c - b * b
+    reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
+    y0 = (row % prints.tiles_y * edge + 0.5) - y
+    y1 = y0 + (edge - 1)
+    rightmost = -(b / c) * (reach * c / det).sqrt()
+    ends = []
+    for side, extreme in ((-1, -rightmost), (1, rightmost)):
+        dy = extreme.clamp(y0, y1)
+        ends.append(x + (-b * dy + side * (a * reach - det * dy * dy).clamp(min=0).sqrt()) / a)
+    first, end = _inclusive_range(*ends, edge)
+    first = first.maximum(col0.index_select(0, splat)).long()
+    n_cols = (end.minimum(col1.index_select(0, splat)).long() - first).clamp(min=0)
+
+    # (splat, row, column) pairs.
+    col_end = n_cols.cumsum(0)
+    total = int(col_end[-1])
+    entry = torch.repeat_interleave(n_cols, output_size=total)
+    tile = torch.arange(total) + (row * prints.tiles_x + first - col_end + n_cols).index_select(0, entry)
+    splat_start = torch.cat([col_end.new_zeros(1), col_end]).index_select(0, row_end - n_rows)
+
+    tile, slot = torch.sort(tile.to(torch.int32), stable=True)
+    tiles, count = torch.unique_consecutive(tile, return_counts=True)
+    splat = splat.index_select(0, entry).index_select(0, slot)
+    return TileLists(tiles.long(), count.cumsum(0) - count, count, splat, slot, splat_start)

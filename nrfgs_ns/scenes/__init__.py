@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Procedural ray-traced scenes whose reflectance is known exactly, with one dial for gloss.
+
+A textured diffuse floor, glossy and mirror-like spheres and a box, three coloured lamps and a luminous sky dome. At
+gloss 0 every surface point has one colour from everywhere; view dependence grows with the dial. The scene can be
+written as a nerfstudio data set, or asked for its colour along any ray:
+
+    from nrfgs_ns.scenes import SceneConfig, build_scene, write_scene
+
+    write_scene(SceneConfig(gloss=0.5), Path("data/spheres"))
+    scene = build_scene(SceneConfig(gloss=0.5))
+    colours = scene.radiance(origins, directions)  # [N, 3] linear RGB
+
+Read `shading.py` for the equations, `scene.py` for how they are put together and for the layout, `geometry.py` for the
+ray tracing, `textures.py` for the patterns, `cameras.py` for the views and `dataset.py` for the files. Only numpy is
+needed, and Pillow and plyfile for writing.
+"""
+
+from .cameras import camera_rays, dome_cameras, project, render
+from .config import SceneConfig
+from .dataset import split_names, write_scene
+from .geometry import FIRST_SOLID, GROUND, SKY
+from .scene import Scene, build_scene
+from .shading import tone_curve
+
+__all__ = [
+    "FIRST_SOLID",
+    "GROUND",
+    "SKY",
+    "Scene",
+    "SceneConfig",
+    "build_scene",
+    "camera_rays",
+    "dome_cameras",
+    "project",
+    "render",
+    "split_names",
+    "tone_curve",
+    "write_scene",
+]

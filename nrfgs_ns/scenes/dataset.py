@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene as a nerfstudio data set: pictures, cameras, split and sparse points, reproducible to the byte.
+
+<out>/transforms.json       cameras (OpenGL camera-to-world), split, name of the point cloud
+<out>/images/view_000.png   display values (see `shading.tone_curve`) x 255, rounded
+<out>/sparse.ply            points on visible surfaces, with their mean display colour over the training views
+<out>/scene.json            version, config, description, and the SHA-256 of every other file
+"""
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from .cameras import camera_rays, dome_cameras, project, render
+from .config import SceneConfig
+from .geometry import Array
+from .scene import Scene, build_scene
+from .shading import tone_curve
+
+SCENE_VERSION = 1
+"""Raise it when the same config and description begin to give different pictures."""
+SEEN_TOLERANCE = 1e-3
+"""A view sees a surface point when its ray ends within this distance of it, world units."""
+
+Progress = Callable[[int, int], None]
+"""Called after each picture with (pictures done, pictures in all)."""
+
+
+def split_names(config: SceneConfig) -> tuple[list[str], list[str]]:
+    """Paths of the training and the test images, relative to the data set; every `test_every`-th is a test image."""
+    names = [f"images/view_{i:03d}.png" for i in range(config.views)]
+    test = names[:: config.test_every]
+    return [name for name in names if name not in set(test)], test
+
+
+def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None) -> Path:
+    """Render a scene and write it as a nerfstudio data set; reuse `out` when it already holds exactly that.
+
+    The data set is written beside `out` and moved there when it is complete: an interrupted run leaves no half of one.
+
+    Args:
+        out: folder to write; its parents are made.
+
+    Returns:
+        `out`.
+
+    Raises:
+        FileExistsError: when `out` holds anything else: another scene, a damaged copy of this one, other files.
+    """
+    out = Path(out)
+    scene = build_scene(config)
+    record = {"version": SCENE_VERSION, "config": asdict(config), "description": scene.describe()}
+    if out.is_file() or (out.is_dir() and any(out.iterdir())):
+        _require_same_scene(out, record)
+        return out
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as workshop:
+        staged = Path(workshop) / "scene"
+        _write_files(scene, staged, progress)
+        files = sorted(path.relative_to(staged).as_posix() for path in staged.rglob("*") if path.is_file())
+        _write_json(staged / "scene.json", {**record, "files": {name: _digest(staged / name) for name in files}})
+        if out.is_dir():
+            out.rmdir()  # it is empty; a folder cannot be moved onto another on every system
+        staged.rename(out)
+    return out
+
+
+def sparse_points(scene: Scene, cameras: Array) -> tuple[Array, Array]:
+    """Points on visible surfaces, as structure from motion would find them, and their colours.
+
+    Positions are the ends of rays through uniformly random image positions of random views, so that every visible
+    surface, floor and sky included, is covered in proportion to the pixels that it fills. Colours are display values,
+    averaged over the views that see the point.
+
+    Args:
+        cameras: [V, 4, 4] camera-to-world matrices of the training views.
+
+    Returns:
+        points [P, 3] and colours [P, 3] in [0, 1), both float32.
+    """
+    config = scene.config
+    rng = np.random.default_rng([config.seed, 2])
+    chosen = cameras[rng.integers(len(cameras), size=config.points)]
+    pixels = rng.uniform((0.0, 0.0), (config.width, config.height), size=(config.points, 2))
+    points, surfaces = scene.first_hit(*camera_rays(config, chosen, pixels))
+
+    # The view that a point was found in sees it by construction: it starts the mean, so that no mean is empty.
+    total = tone_curve(scene.outgoing_radiance(points, surfaces, chosen[:, :3, 3].astype(np.float32) - points))
+    count = np.ones(len(points), dtype=np.float32)
+    for camera in cameras:
+        seen = np.flatnonzero(_sees(scene, camera, points))
+        towards = camera[:3, 3].astype(np.float32) - points[seen]
+        total[seen] += tone_curve(scene.outgoing_radiance(points[seen], surfaces[seen], towards))
+        count[seen] += 1.0
+    return points, total / count[:, None]
+
+
+def _sees(scene: Scene, camera: Array, points: Array) -> Array:
+    """Whether points [N, 3] are in a camera's picture and nothing stands before them, [N]."""
+    config = scene.config
+    pixels, depth = project(config, camera, points)
+    inside = (depth > 0.0) & (pixels >= 0.0).all(axis=1) & (pixels < (config.width, config.height)).all(axis=1)
+    hits, _ = scene.first_hit(*camera_rays(config, camera, pixels))
+    return inside & (np.linalg.norm(hits - points, axis=1) < SEEN_TOLERANCE)
+
+
+def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
+    config = scene.config
+    cameras = dome_cameras(config)
+    train, test = split_names(config)
+    names = sorted(train + test)
+    (folder / "images").mkdir(parents=True)
+    for i, (name, camera) in enumerate(zip(names, cameras, strict=True), start=1):
+        values = np.round(255.0 * render(scene, camera)).astype(np.uint8)
+        Image.fromarray(values).save(folder / name)
+        if progress is not None:
+            progress(i, config.views)
+
+    is_train = np.isin(names, train)
+    _write_ply(folder / "sparse.ply", *sparse_points(scene, cameras[is_train]))
+    transforms = {
+        "camera_model": "OPENCV",
+        "w": config.width,
+        "h": config.height,
+        "fl_x": config.focal_length,
+        "fl_y": config.focal_length,
+        "cx": 0.5 * config.width,
+        "cy": 0.5 * config.height,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "ply_file_path": "sparse.ply",
+        "train_filenames": train,
+        "val_filenames": test,
+        "test_filenames": test,
+        "frames": [
+            {"file_path": name, "transform_matrix": camera.tolist()}
+            for name, camera in zip(names, cameras, strict=True)
+        ],
+    }
+    _write_json(folder / "transforms.json", transforms)
+
+
+def _write_ply(path: Path, points: Array, colours: Array) -> None:
+    fields = [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
+    vertices = np.empty(len(points), dtype=fields)
+    for axis, name in enumerate(("x", "y", "z")):
+        vertices[name] = points[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        vertices[name] = np.round(255.0 * colours[:, channel]).astype(np.uint8)
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
+
+
+def _write_json(path: Path, content: dict) -> None:
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal; empty when there is no such file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def _require_same_scene(out: Path, record: dict) -> None:
+    """Pass when `out` is a complete data set of the scene that `record` describes; raise FileExistsError otherwise."""
+    mend = "Choose another folder, or delete this one to have it written again."
+    try:
+        found = json.loads((out / "scene.json").read_text(encoding="utf-8"))
+        files, config = found.pop("files"), dict(found["config"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise FileExistsError(f"{out} exists and is not a procedural scene (no readable scene.json). {mend}") from error
+    if found != json.loads(json.dumps(record)):  # through JSON, which turns tuples into lists
+        differing = [key for key, value in record["config"].items() if config.get(key) != value]
+        what = f"another {', '.join(differing)}" if differing else "another version of the scene"
+        raise FileExistsError(f"{out} holds a procedural scene with {what}. {mend}")
+    damaged = sorted(name for name, digest in files.items() if _digest(out / name) != digest)
+    if damaged:
+        raise FileExistsError(f"{out} holds this scene, but {damaged[0]} is missing or was changed. {mend}")

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.head import SH_C0
+from nrfgs_ns.appearance.nrf import NrfConfig
+
+
+def weights(head) -> int:
+    return sum(parameter.numel() for parameter in head.parameters())
+
+
+def scene(head, count=11, dtype=torch.float64, seed=0):
+    """A table of random splats, two thirds of which are visible, out of order, from one camera each."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator, dtype=dtype)
+
+    torch.manual_seed(seed)
+    splats = {"means": 2 * rand(count, 3) - 1, "opacities": 2 * rand(count, 1) - 1}
+    splats |= {name: value.to(dtype) for name, value in head.splat_params(rand(count, 3)).items()}
+    visible = torch.randperm(count, generator=generator)[: 2 * count // 3]
+    return splats, visible, 4 * rand(len(visible), 3) - 2
+
+
+def awake(**config):
+    """A head whose residual is not zero, in float64."""
+    torch.manual_seed(1)
+    return NrfConfig(output_init="default", **config).setup().double()
+
+
+def by_hand(head, splats, visible, centers):
+    """The paper's formulas, one splat at a time, with nothing shared with the implementation but the weights."""
+    low, high = head.low, head.high
+
+    def layer(net, x):
+        return net[2].weight @ torch.relu(net[0].weight @ x + net[0].bias) + net[2].bias
+
+    colors, opacities = [], []
+    for row, center in zip(visible.tolist(), centers, strict=True):
+        v = center - splats["means"][row]
+        r = v.norm().reshape(1)
+        d = v / r
+        c, z = 0.5 + SH_C0 * splats["features_dc"][row], splats["latents"][row]
+        alpha = 1 / (1 + torch.exp(-splats["opacities"][row]))
+        low_d = torch.cat([d, torch.sin(math.pi * d), torch.cos(math.pi * d)])
+        high_d = torch.cat([f(2.0**k * math.pi * d) for k in (1, 2) for f in (torch.sin, torch.cos)])
+        a = layer(low, torch.cat([z, c, r.log(), alpha, low_d]))
+        b = layer(high, torch.cat([z, c, r.log(), high_d]))
+        gate = 1 / (1 + torch.exp(-b[3]))
+        colors.append((c + 0.2 * torch.tanh(a[:3] + gate * b[:3])).clamp_min(0))
+        opacities.append((alpha + 0.2 * torch.tanh(a[3:])).clamp(0, 1))
+    return torch.stack(colors), torch.cat(opacities)
+
+
+def test_paper_counts():
+    assert weights(NrfConfig().setup()) == 6664
+    assert weights(NrfConfig(split_bands=False).setup()) == 8068
+
+
+def test_matches_the_formulas():
+    head = awake()
+    colors, opacities = head(*scene(head))
+    expected_colors, expected_opacities = by_hand(head, *scene(head))
+    assert_close(colors, expected_colors)
+    assert_close(opacities, expected_opacities)
+
+
+@pytest.mark.parametrize("split_bands", [True, False])
+@pytest.mark.parametrize("opacity_residual", [True, False])
+@pytest.mark.parametrize("use_distance", [True, False])
+@pytest.mark.parametrize("num_bands", [1, 2, 5])
+def test_every_switch_builds_and_is_felt(split_bands, opacity_residual, use_distance, num_bands):
+    head = awake(
+        split_bands=split_bands,
+        opacity_residual=opacity_residual,
+        use_distance=use_distance,
+        num_bands=num_bands,
+        latent_dim=7,
+        hidden_width=16,
+    )
+    splats, visible, centers = scene(head)
+    colors, opacities = head(splats, visible, centers)
+    assert colors.shape == (len(visible), 3) and opacities.shape == (len(visible),)
+    assert (head.high is not None) == (split_bands and num_bands > 1)
+
+    base = head.base_appearance(splats, visible)
+    assert ((colors - base.colors).abs() <= 0.2 + 1e-12).all()
+    assert torch.equal(opacities, base.opacities) == (not opacity_residual)
+    # Twice as far in the same direction changes something exactly if distance is seen.
+    means = splats["means"].index_select(0, visible)
+    further = head(splats, visible, means + 2 * (centers - means)).colors
+    assert torch.allclose(further, colors, atol=1e-12) == (not use_distance)
+
+
+def test_zero_outputs_add_nothing():
+    head = NrfConfig().setup().double()
+    splats, visible, centers = scene(head)
+    appearance, base = head(splats, visible, centers), head.base_appearance(splats, visible)
+    assert torch.equal(appearance.colors, base.colors)
+    assert torch.equal(appearance.opacities, base.opacities)
+    assert head.neutral_loss(splats, visible, centers) == 0.0
+    assert awake().neutral_loss(*scene(awake())) > 0.0
+
+
+def test_zero_scales_add_nothing():
+    head = awake(color_scale=0.0, opacity_scale=0.0)
+    splats, visible, centers = scene(head)
+    assert torch.equal(head(splats, visible, centers).colors, head.base_appearance(splats, visible).colors)
+
+
+@pytest.mark.parametrize("config", [{}, {"split_bands": False}, {"opacity_bound": "straight-through"}])
+def test_gradients_agree_with_finite_differences(config):
+    """To means, base colours, latents, opacities, camera centres and every shared weight."""
+    head = awake(latent_dim=3, hidden_width=5, num_bands=2, **config)
+    splats, visible, centers = scene(head, count=6)
+    names = list(splats)
+    parameters = list(head.parameters())
+
+    def f(*tensors):
+        table = dict(zip(names, tensors, strict=False))
+        for parameter, value in zip(parameters, tensors[len(names) + 1 :], strict=True):
+            parameter.data = value.data
+        colors, opacities = torch.func.functional_call(
+            head,
+            dict(zip(dict(head.named_parameters()), tensors[len(names) + 1 :], strict=True)),
+            (table, visible, tensors[len(names)]),
+        )
+        return colors, opacities
+
+    inputs = [*splats.values(), centers, *(parameter.detach().clone() for parameter in parameters)]
+    assert torch.autograd.gradcheck(f, [x.requires_grad_() for x in inputs])
+
+
+def test_opacity_bounds_differ_only_in_the_gradient():
+    for bound, slope in (("clamp", 0.0), ("straight-through", 1.0)):
+        head = awake(opacity_bound=bound)
+        opacity = torch.tensor([[-0.1], [0.5], [1.1]], dtype=torch.double, requires_grad=True)
+        bounded = head._bounded(opacity)
+        assert_close(bounded.detach().squeeze(), torch.tensor([0.0, 0.5, 1.0], dtype=torch.double))
+        bounded.sum().backward()
+        assert opacity.grad.squeeze().tolist() == [slope, 1.0, slope]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.floats(-12, 12), st.floats(-3, 3), st.floats(-40, 40))
+def test_float32_stays_finite_bounded_and_near_float64(seed, log_size, color, logit):
+    head = awake()
+    splats, visible, centers = scene(head, seed=seed)
+    splats["means"] = splats["means"] * math.exp(log_size)
+    splats["features_dc"] = splats["features_dc"] + color
+    splats["opacities"] = splats["opacities"] + logit
+    exact = head(splats, visible, centers)
+    single = {name: value.float().requires_grad_() for name, value in splats.items()}
+    head.float()
+    colors, opacities = head(single, visible, centers.float())
+    assert ((opacities >= 0) & (opacities <= 1)).all() and (colors >= 0).all()
+    # tanh is 1-Lipschitz, so an error e before it is at most 0.2 e after it. With |weights| <= 1/sqrt(fan in) and at
+    # most |log r| = 13 at the input, the sums before it stay under 100: 2e-5 in float32 with rounding in both layers.
+    # Band 2 multiplies the direction's 1e-7 by 4 pi; that is smaller.
+    assert_close(colors.double(), exact.colors, rtol=1e-5, atol=2e-5)
+    assert_close(opacities.double(), exact.opacities, rtol=1e-5, atol=2e-5)
+    (colors.sum() + opacities.sum()).backward()
+    assert all(torch.isfinite(value.grad).all() for value in single.values())
+
+
+@pytest.mark.parametrize(
+    "field, value",
+    [
+        ("num_bands", 0),
+        ("latent_dim", 0),
+        ("hidden_width", 0),
+        ("color_scale", -0.1),
+        ("opacity_scale", -1.0),
+        ("distance_eps", 0.0),
+        ("latent_std", -1.0),
+        ("output_init", "ones"),
+        ("opacity_bound", "none"),
+    ],
+)
+def test_impossible_settings_are_named(field, value):
+    with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):
+        NrfConfig(**{field: value}).setup()
+
+
+def test_hidden_rows_do_not_matter_and_get_no_gradient():
+    head = awake()
+    splats, visible, centers = scene(head)
+    splats = {name: value.requires_grad_() for name, value in splats.items()}
+    colors, opacities = head(splats, visible, centers)
+    (colors.sum() + opacities.sum()).backward()
+    hidden = torch.ones(len(splats["means"]), dtype=torch.bool)
+    hidden[visible] = False
+    for name in ("means", "opacities", "features_dc", "latents"):
+        assert (splats[name].grad[hidden] == 0).all()
+        assert (splats[name].grad[visible] != 0).any()

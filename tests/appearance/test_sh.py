@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+import torch
+from gsplat.cuda._torch_impl import _eval_sh_bases_fast, _spherical_harmonics
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases, sh_bases
+
+
+def unit(count):
+    directions = torch.randn(count, 3, dtype=torch.double, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.normalize(directions, dim=-1)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_bases_are_gsplats(degree):
+    # gsplat's constants carry 13 digits or more.
+    assert_close(sh_bases(degree, unit(200)), _eval_sh_bases_fast(num_bases(degree), unit(200)), rtol=0, atol=1e-12)
+
+
+def test_bases_are_orthonormal_to_degree_five():
+    """Gauss-Legendre in z and equal steps in azimuth integrate products of degree 10 exactly."""
+    import numpy as np
+
+    z, weight = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(8))
+    phi = torch.arange(16, dtype=torch.double) * (2 * torch.pi / 16)
+    s = (1 - z**2).sqrt()[:, None]
+    points = torch.stack([s * phi.cos(), s * phi.sin(), z[:, None].expand(-1, 16)], dim=-1).reshape(-1, 3)
+    area = (weight[:, None] * (2 * torch.pi / 16)).expand(-1, 16).reshape(-1)
+    bases = sh_bases(5, points)
+    assert_close((bases * area[:, None]).T @ bases, torch.eye(36, dtype=torch.double), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_sum_ignores_higher_coefficients(degree):
+    coefficients = torch.randn(50, 16, 3, dtype=torch.double)
+    expected = _spherical_harmonics(degree, unit(50), coefficients)
+    assert_close(eval_sh(degree, 3.0 * unit(50), coefficients), expected, rtol=0, atol=1e-12)
+
+
+def test_degree_ramp_is_splatfactos():
+    head = ShConfig(degree=3, degree_interval=1000).setup()
+    for step, degree in ((0, 0), (999, 0), (1000, 1), (2500, 2), (3000, 3), (30_000, 3)):
+        head.set_step(step)
+        assert head.active_degree == degree
+
+
+def test_degree_zero_is_the_same_from_everywhere_and_colours_are_not_negative():
+    head = ShConfig(degree=3).setup()
+    head.set_step(0)
+    splats = {"means": unit(9), "opacities": torch.zeros(9, 1).double(), **head.splat_params(torch.rand(9, 3).double())}
+    splats["features_rest"] = torch.randn(9, 15, 3).double()
+    visible = torch.arange(9)
+    here = head(splats, visible, torch.tensor([3.0, 0, 0]).double())
+    assert_close(here.colors, head(splats, visible, torch.tensor([0, -2.0, 1]).double()).colors)
+    head.set_step(3000)
+    there = head(splats, visible, torch.tensor([3.0, 0, 0]).double())
+    assert not torch.allclose(here.colors, there.colors)
+    assert (there.colors >= 0).all() and (there.colors == 0).any()
+    assert_close(there.opacities, torch.full((9,), 0.5).double())
+
+
+def test_impossible_degree_is_named():
+    with pytest.raises(ValueError, match="appearance.degree is 4"):
+        ShConfig(degree=4).setup()

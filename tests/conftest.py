@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# A first example pays for imports and allocations; how long one takes says nothing.
+settings.register_profile("nrfgs", deadline=None)
+settings.load_profile("nrfgs")
+
+SCENES = Path(os.environ.get("NRFGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
+
+
+@pytest.fixture
+def captures() -> Path:
+    """Folder of real captures (NRFGS_SCENES, else shared/scenes beside the checkout); skips where there is none."""
+    if not (SCENES / "fox" / "transforms.json").exists():
+        pytest.skip(f"no real captures in {SCENES}; set NRFGS_SCENES to a folder that has fox, kitchen, ...")
+    return SCENES
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory) -> Path:
+    """A procedural data set of 10 views, 48 x 36, with 300 points."""
+    from nrfgs_ns.scenes import SceneConfig, write_scene
+
+    config = SceneConfig(views=10, width=48, height=36, points=300, samples=1)
+    return write_scene(config, tmp_path_factory.mktemp("data") / "tiny")
+
+
+@pytest.fixture
+def no_cuda(monkeypatch):
+    """Make anything that needs CUDA fail: gsplat's compiled kernels, `.cuda()`, and torch's idea that there is a GPU."""
+    import sys
+
+    import torch
+
+    def refuse(*_, **__):
+        raise AssertionError("CUDA was asked for on the CPU path")
+
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.Tensor, "cuda", refuse)
+    monkeypatch.setattr(torch.nn.Module, "cuda", refuse)

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+import io
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
+
+from nrfgs_ns.data.datamanager import NrfgsDatamanager, NrfgsDatamanagerConfig, NrfgsInputDataset
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.errors import InputError
+
+
+def manager(capture, parser_options=None, **options) -> NrfgsDatamanager:
+    capture.save()
+    dataparser = NrfgsDataParserConfig(data=capture.folder, load_3D_points=False, **(parser_options or {}))
+    return NrfgsDatamanagerConfig(dataparser=dataparser, **options).setup(device="cpu")
+
+
+# Images.
+
+
+def test_everything_loads_at_once(capture):
+    capture.add_masks()
+    data = manager(capture)
+    assert data.load_all_images() == (8, 2)
+    image, mask = data.cached_train[3]["image"], data.cached_train[3]["mask"]
+    assert image.shape == (9, 12, 3) and image.dtype == torch.uint8
+    assert mask.shape == (9, 12, 1) and mask.dtype == torch.bool
+    np.testing.assert_array_equal(image, Image.open(capture.folder / "images/004.png"))
+    np.testing.assert_array_equal(mask[..., 0], np.array(Image.open(capture.folder / "masks/004.png")) > 0)
+
+
+@pytest.mark.parametrize("cache_images", ["cpu", "gpu"])
+def test_no_pinned_memory_on_a_cpu(capture, monkeypatch, cache_images):
+    """nerfstudio's cache for "cpu" pins memory, which fails without an accelerator's driver."""
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda *_: pytest.fail("memory was pinned"))
+    data = manager(capture, cache_images=cache_images)
+    data.load_all_images()
+    camera, batch = data.next_train(0)
+    assert camera.device.type == batch["image"].device.type == "cpu"
+
+
+def test_dataset_type_survives_subclassing_and_yaml(capture):
+    class Derived(NrfgsDatamanager):
+        pass
+
+    config = manager(capture).config
+    restored = yaml.load(yaml.dump(config), Loader=yaml.Loader)
+    assert restored == config
+    data = restored.setup(device="cpu")
+    assert type(data) is NrfgsDatamanager
+    for one in (data, Derived(config, device="cpu")):
+        assert type(one.train_dataset) is type(one.eval_dataset) is NrfgsInputDataset
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L"])
+@pytest.mark.parametrize("kind", ["uint8", "float32"])
+def test_ordinary_images_are_read_as_nerfstudio_reads_them(capture, mode, scale, kind):
+    pixels = capture.rng.integers(0, 256, (9, 12, len(mode)), dtype=np.uint8)
+    Image.fromarray(pixels.squeeze()).save(capture.folder / "images/001.png")
+    outputs = capture.parse()
+    ours, theirs = (dataset(outputs, scale).get_data(0, kind) for dataset in (NrfgsInputDataset, InputDataset))
+    assert torch.equal(ours["image"], theirs["image"])
+
+
+@pytest.mark.parametrize("mode, channels, tolerance", [
+    ("P", 3, 0),
+    ("CMYK", 3, 0),
+    ("YCbCr", 3, 2),  # two conversions, each rounded
+    ("1", 3, 0),
+    ("LA", 4, 0),
+    ("transparent P", 4, 0),
+])  # fmt: skip
+def test_other_images_are_converted_to_colour(capture, mode, channels, tolerance):
+    """nerfstudio takes each of these for something else, or stops without naming the file."""
+    colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]], dtype=np.uint8)
+    if mode in ("1", "LA"):
+        colours = np.array([[0] * 3, [255] * 3], dtype=np.uint8)
+    pixels = colours[capture.rng.integers(0, len(colours), (9, 12))]
+    image = Image.fromarray(pixels).convert(mode.split()[-1])
+    options = {"transparency": 0} if mode == "transparent P" else {}
+    image.save(capture.folder / "images/001.png", "TIFF" if mode in ("CMYK", "YCbCr") else "PNG", **options)
+    data = NrfgsInputDataset(capture.parse()).get_data(0, "uint8")["image"]
+    assert data.shape == (9, 12, channels)
+    assert np.abs(data[..., :3].numpy().astype(int) - pixels).max() <= tolerance
+
+
+@pytest.mark.parametrize("mode", ["I;16", "I", "F"])
+def test_images_of_more_than_eight_bits_are_refused(capture, mode):
+    dtype = {"I;16": np.uint16, "I": np.int32, "F": np.float32}[mode]
+    Image.fromarray(np.full((9, 12), 1000, dtype)).save(capture.folder / "images/003.png", "TIFF")
+    with pytest.raises(InputError, match=r"003.png has more than 8 bits.*Convert"):
+        manager(capture).load_all_images()
+
+
+@pytest.mark.parametrize("name", ["images/003.png", "images/008.png"])  # of train and of eval
+def test_truncated_image_is_named(capture, name):
+    path = capture.folder / name
+    path.write_bytes(path.read_bytes()[:-150])  # the header is whole, the pixels are not
+    data = manager(capture)
+    with pytest.raises(InputError, match=rf"{name} cannot be decoded.*Restore"):
+        data.load_all_images()
+
+
+def test_image_of_another_size_is_named(capture):
+    """Other parsers than ours do not compare sizes; here the file changes after parsing."""
+    data = manager(capture)
+    Image.new("RGB", (9, 12)).save(capture.folder / "images/003.png")
+    with pytest.raises(InputError, match=r"003.png is 9 x 12, but its camera 12 x 9"):
+        data.load_all_images()
+
+
+@pytest.mark.parametrize("mode, size", [("RGB", (12, 9)), ("L", (9, 12)), (None, None)])
+def test_unusable_mask_is_named(capture, mode, size):
+    capture.add_masks()
+    data = manager(capture)
+    path = capture.folder / "masks/003.png"
+    if mode is None:
+        path.write_bytes(path.read_bytes()[:-20])
+    else:
+        Image.new(mode, size).save(path)
+    with pytest.raises(InputError, match=r"masks/003.png cannot be used as the mask of .*images/003.png"):
+        data.load_all_images()
+
+
+def test_mask_colour_on_bytes_is_that_on_floats(capture):
+    capture.add_masks()
+    colour = (1.0, 0.4, 0.0)
+    as_bytes, as_floats = (
+        manager(capture, {"mask_color": colour}, cache_images_type=kind).cached_train[2] for kind in ("uint8", "float32")
+    )
+    assert as_bytes["image"].dtype == torch.uint8
+    torch.testing.assert_close(as_bytes["image"].float(), as_floats["image"] * 255, atol=1e-3, rtol=0)
+    outside = as_bytes["image"][~as_bytes["mask"][..., 0]]
+    assert len(outside) > 0 and (outside == torch.tensor([255, 102, 0])).all()
+
+
+def test_undistorted_images_can_be_read_again(capture):
+    """Undistortion crops the cameras; the file keeps its size, and the viewer reads it a second time."""
+    capture.meta |= {"k1": 0.3, "fl_x": 12.0, "fl_y": 12.0}
+    data = manager(capture)
+    data.load_all_images()
+    heights = {cache["image"].shape[0] for cache in data.cached_train}
+    assert heights == {int(data.train_dataset.cameras.height[0])} and heights != {9}
+    assert data.train_dataset[0]["image"].shape == (9, 12, 3)
+
+
+def test_two_managers_with_masks_on_the_device(capture):
+    """nerfstudio removes an entry from a list that all its datasets share: the second manager would find none."""
+    for _ in range(2):
+        assert manager(capture, masks_on_gpu=True).exclude_batch_keys_from_device == ["image"]
+    assert InputDataset.exclude_batch_keys_from_device == ["image", "mask"]
+
+
+# The order of cameras.
+
+
+def next_cameras(data, count: int) -> list[int]:
+    return [data.next_train(0)[0].metadata["cam_idx"] for _ in range(count)]
+
+
+def through_a_checkpoint(state: dict) -> dict:
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@pytest.mark.parametrize("strategy", ["random", "fps"])
+@pytest.mark.parametrize("steps", [0, 3, 7, 8, 20])  # 8 cameras: before, at and after the end of a round
+def test_order_continues_after_a_restore(capture, strategy, steps):
+    first = manager(capture, train_cameras_sampling_strategy=strategy)
+    next_cameras(first, steps)
+    state = through_a_checkpoint(first.sampling_state())
+    expected = next_cameras(first, 30)
+
+    second = manager(capture, train_cameras_sampling_strategy=strategy)
+    next_cameras(second, 5)
+    np.random.rand(3)
+    second.load_sampling_state(state)
+    assert next_cameras(second, 30) == expected
+    assert sorted(expected[-30:][:8]) != expected[:8] or strategy == "fps"  # shuffled at all
+
+
+def test_a_state_is_not_changed_by_what_happens_later(capture):
+    data = manager(capture)
+    state = data.sampling_state()
+    expected = next_cameras(data, 20)
+    data.load_sampling_state(state)
+    next_cameras(data, 3)
+    data.load_sampling_state(state)
+    assert next_cameras(data, 20) == expected
+
+
+def test_states_of_other_runs_are_refused(capture):
+    state = manager(capture).sampling_state()
+    with pytest.raises(InputError, match=r"train_cameras_sampling_strategy is fps.*random"):
+        manager(capture, train_cameras_sampling_strategy="fps").load_sampling_state(state)
+    with pytest.raises(InputError, match=r"trained on 8 images, but there are 5 now"):
+        manager(capture, {"eval_interval": 2}).load_sampling_state(state)

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.utils.colmap_parsing_utils import Point3D, write_points3D_binary, write_points3D_text
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from PIL import Image
+
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, nrfgs_dataparser
+from nrfgs_ns.errors import InputError
+
+
+def names(outputs) -> list[int]:
+    return [int(Path(path).stem) for path in outputs.image_filenames]
+
+
+def files(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def cloud(n: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    return rng.normal((5, 6, 7), 2, (n, 3)).astype(np.float32), rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+def seen_from(poses: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    """Points [N, 3] in the axes of each camera [C, 3, 4]: [C, N, 3]."""
+    return np.einsum("cij,cni->cnj", poses[:, :, :3], xyz[None] - poses[:, None, :, 3])
+
+
+def assert_points_stay_in_front_of_cameras(capture, outputs, xyz):
+    """Parsing turns, moves and scales cameras and points together: what a camera sees changes by the scale only."""
+    poses = {Path(f["file_path"]).stem: np.array(f["transform_matrix"])[:3] for f in capture.meta["frames"]}
+    before = np.stack([poses[Path(path).stem] for path in outputs.image_filenames])
+    after = outputs.cameras.camera_to_worlds.numpy().astype(np.float64)
+    seen = seen_from(after, outputs.metadata["points3D_xyz"].numpy().astype(np.float64))
+    # float32 poses with entries below 10: 10 x 2^-24 from rounding them, times the few sums of a product: 1e-5.
+    np.testing.assert_allclose(seen, outputs.dataparser_scale * seen_from(before, xyz), atol=1e-5)
+
+
+def test_every_eighth_image_by_sorted_name_is_test(capture):
+    assert names(capture.parse("train")) == [1, 2, 3, 4, 5, 6, 7, 9]
+    assert names(capture.parse("val")) == names(capture.parse("test")) == [0, 8]
+
+
+@pytest.mark.parametrize("split", ["train", "val", "test"])
+@pytest.mark.parametrize("distortion", [{}, {"k1": 0.01, "p2": 0.02}])
+def test_cameras_are_those_of_nerfstudio(capture, split, distortion):
+    capture.meta |= distortion
+    ours = capture.parse(split)
+    config = NerfstudioDataParserConfig(data=capture.folder, eval_mode="interval")
+    theirs = config.setup().get_dataparser_outputs(split)
+    assert ours.image_filenames == theirs.image_filenames
+    for name in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height", "distortion_params"):
+        assert torch.equal(getattr(ours.cameras, name), getattr(theirs.cameras, name)), name
+    assert torch.equal(ours.dataparser_transform, theirs.dataparser_transform)
+    assert ours.dataparser_scale == theirs.dataparser_scale
+
+
+def test_downscaled_images(capture):
+    (capture.folder / "images_2").mkdir()
+    for path in (capture.folder / "images").iterdir():
+        Image.new("RGB", (6, 4)).save(capture.folder / "images_2" / path.name)  # 9 / 2 rounded down
+    outputs = capture.parse(downscale_factor=2)
+    assert outputs.image_filenames[0].parent.name == "images_2"
+    assert (outputs.cameras.width == 6).all() and (outputs.cameras.height == 4).all()
+
+
+def test_masks_follow_their_images(capture):
+    capture.add_masks()
+    outputs = capture.parse("val")
+    assert [path.name for path in outputs.mask_filenames] == [path.name for path in outputs.image_filenames]
+
+
+# Splits.
+
+
+@pytest.mark.parametrize("kept", ["val", "test"])
+@pytest.mark.parametrize("other", [{}, "empty"])
+def test_val_and_test_stand_in_for_each_other(capture, printed, kept, other):
+    path = [frame["file_path"] for frame in capture.meta["frames"]]
+    capture.meta |= {"train_filenames": path[3:], f"{kept}_filenames": path[:3]}
+    if other == "empty":
+        capture.meta[{"val": "test", "test": "val"}[kept] + "_filenames"] = []
+    parser = capture.parser()
+    assert names(parser.get_dataparser_outputs("train")) == list(range(7))
+    assert names(parser.get_dataparser_outputs("val")) == [7, 8, 9]
+    assert names(parser.get_dataparser_outputs("test")) == [7, 8, 9]
+    assert "evaluated instead" not in printed()
+
+
+def test_without_eval_images_the_training_images_are_evaluated(capture, printed):
+    capture.meta["train_filenames"] = [frame["file_path"] for frame in capture.meta["frames"][:4]]
+    assert names(capture.parse("test")) == [6, 7, 8, 9]
+    assert "no image is kept for test" in printed()
+
+
+def test_overlapping_splits_are_mentioned(capture, printed):
+    path = [frame["file_path"] for frame in capture.meta["frames"]]
+    capture.meta |= {"train_filenames": path, "test_filenames": path[:2]}
+    assert names(capture.parse("test")) == [8, 9]
+    assert "008.png" in (text := printed()) and "for training and for evaluation" in text
+
+
+@pytest.mark.parametrize("orientation", ["pca", "up", "vertical", "none"])
+@pytest.mark.parametrize("center", ["poses", "focus", "none"])
+@pytest.mark.parametrize("mode", ["interval", "fraction", "all"])
+def test_one_image(single, printed, orientation, center, mode):
+    single.add_ply(*cloud())
+    parser = single.parser(orientation_method=orientation, center_method=center, eval_mode=mode)
+    train, val = (parser.get_dataparser_outputs(split) for split in ("train", "val"))
+    assert names(train) == names(val) == [0]
+    assert "The training images are evaluated instead" in printed()
+    assert_points_stay_in_front_of_cameras(single, train, cloud()[0])
+    assert train.dataparser_scale == 1.0
+
+
+# Points.
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("kind", ["uchar", "int", "float", "none"])
+def test_ply(capture, printed, monkeypatch, text, kind):
+    monkeypatch.setitem(sys.modules, "open3d", None)  # importing it would raise
+    xyz, rgb = cloud()
+    stored = {"uchar": rgb, "int": rgb.astype(np.int32), "float": (rgb / 255).astype(np.float32), "none": None}[kind]
+    capture.add_ply(xyz, stored, text)
+    outputs = capture.parse()
+    points, colours = outputs.metadata["points3D_xyz"], outputs.metadata["points3D_rgb"]
+    assert points.shape == colours.shape == (20, 3) and points.dtype == torch.float32 and colours.dtype == torch.uint8
+    assert_points_stay_in_front_of_cameras(capture, outputs, xyz)
+    np.testing.assert_array_equal(colours, np.full_like(rgb, 127) if kind == "none" else rgb)
+    assert ("points.ply has no colours" in printed()) == (kind == "none")
+
+
+def test_double_precision_points_far_from_the_origin(capture):
+    """A georeferenced cloud: positions of a million metres, details of a millimetre."""
+    xyz, rgb = cloud()
+    capture.add_ply(xyz.astype(np.float64) + 1e6, rgb)
+    points = capture.parse(center_method="none", orientation_method="none", auto_scale_poses=False, scale_factor=1e-3)
+    # Stored as float32 at 1,000: a spacing of 2^-14; float32 on the way (spacing 2^-4 at 10^6) would be 60 times that.
+    error = points.metadata["points3D_xyz"].double().numpy() - (xyz.astype(np.float64) + 1e6) * 1e-3
+    assert np.abs(error).max() <= 2**-14
+
+
+def test_points_that_are_not_finite_are_dropped_and_counted(capture, printed):
+    xyz, rgb = cloud()
+    colours = (rgb / 255).astype(np.float32)
+    xyz[3, 1], xyz[5, 0], colours[9, 2] = np.nan, np.inf, np.nan
+    capture.add_ply(xyz, colours)
+    parser = capture.parser()
+    for split in ("train", "val"):
+        kept = parser.get_dataparser_outputs(split).metadata["points3D_rgb"]
+        np.testing.assert_array_equal(kept, np.delete(rgb, [3, 5, 9], axis=0))
+    assert printed().count("3 of 20 points have a NaN or infinite value") == 1
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def drop_vertices(path):
+    path.write_bytes(path.read_bytes().replace(b"element vertex", b"element corner"))
+
+
+def drop_z(path):
+    path.write_bytes(path.read_bytes().replace(b"float z", b"float w"))
+
+
+def claim_more(path):
+    path.write_bytes(path.read_bytes().replace(b"vertex 20", b"vertex 20000000000"))
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(
+    "spoil",
+    [truncate, drop_vertices, drop_z, claim_more, Path.unlink, lambda p: p.write_bytes(b""), lambda p: p.write_bytes(b"ply?")],
+    ids=["truncated", "no vertices", "no z", "too few", "missing", "empty file", "no ply"],
+)  # fmt: skip
+def test_unusable_ply(capture, spoil, text):
+    spoil(capture.add_ply(*cloud(), text))
+    with pytest.raises(InputError, match=r"points.ply.*remove ply_file_path"):
+        capture.parse()
+
+
+@pytest.mark.parametrize("colours", [np.full((20, 3), 2.0), np.full((20, 3), 300, "i4"), np.full((20, 3), -1, "i2")])
+def test_colours_out_of_range(capture, colours):
+    capture.add_ply(cloud()[0], colours)
+    with pytest.raises(InputError, match=r"points.ply.*colours"):
+        capture.parse()
+
+
+@pytest.mark.parametrize("points", [None, 0, 3])
+def test_without_points_one_warning(capture, printed, points):
+    if points is not None:
+        capture.add_ply(*cloud(points))
+    parser = capture.parser()
+    for split in ("train", "val"):
+        assert "points3D_xyz" not in parser.get_dataparser_outputs(split).metadata
+    assert printed().count("Training starts from random points") == 1
+    capture.parse(load_3D_points=False)
+    assert "random points" not in printed()
+
+
+@pytest.mark.parametrize("applied", [None, [[0, 0, 1, 3], [1, 0, 0, 4], [0, 1, 0, 5]]])
+@pytest.mark.parametrize("as_file", [False, True])
+@pytest.mark.parametrize("write, name", [(write_points3D_binary, "points3D.bin"), (write_points3D_text, "points3D.txt")])
+def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, as_file, applied):
+    """They land where nerfstudio's own conversion to a .ply puts them: moved into the world of the poses first."""
+    monkeypatch.setattr("rich.prompt.Confirm.ask", lambda *_, **__: pytest.fail("asked a question"))
+    xyz, rgb = cloud()
+    folder = capture.folder / "colmap" / "sparse" / "0"
+    folder.mkdir(parents=True)
+    nothing = np.empty(0, dtype=int)
+    points = {i: Point3D(i, p.astype(float), c, 0.5, nothing, nothing) for i, (p, c) in enumerate(zip(xyz, rgb, strict=True))}
+    write(points, folder / name)
+    if applied is not None:
+        capture.meta["applied_transform"] = applied
+    capture.save()
+    before = files(capture.folder)
+    outputs = capture.parse(data=capture.folder / "transforms.json" if as_file else capture.folder)
+    assert files(capture.folder) == before
+
+    # nerfstudio's axes for data sets from before it wrote applied_transform.
+    world = np.array(applied or [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], dtype=np.float64)
+    assert_points_stay_in_front_of_cameras(capture, outputs, xyz @ world[:, :3].T + world[:, 3])
+    np.testing.assert_array_equal(outputs.metadata["points3D_rgb"], rgb)
+
+
+def test_unreadable_colmap_points(capture):
+    folder = capture.folder / "colmap" / "sparse" / "0"
+    folder.mkdir(parents=True)
+    with pytest.raises(InputError, match=r"neither points3D.bin nor points3D.txt"):
+        capture.parse()
+    (folder / "points3D.bin").write_bytes(b"\x05\0\0\0\0\0\0\0half a point")
+    with pytest.raises(InputError, match=r"points3D.bin cannot be read"):
+        capture.parse()
+
+
+# The house around it.
+
+
+def test_rendering_from_a_checkpoint_needs_no_files(capture):
+    capture.add_masks()
+    capture.add_ply(*cloud()).unlink()
+    for path in [*capture.folder.rglob("*.png")]:
+        path.unlink()
+    parser = capture.parser()
+    parser.downscale_factor = 1  # how nerfstudio's datamanager announces it
+    for split in ("train", "test"):
+        assert len(parser.get_dataparser_outputs(split).cameras) > 0
+
+
+def test_the_users_configuration_is_left_alone(single):
+    config = NrfgsDataParserConfig(data=single.save(), orientation_method="vertical")
+    before = repr(config)
+    parser = config.setup()
+    parser.get_dataparser_outputs("train")
+    assert parser.config is config and repr(config) == before
+
+
+def test_plugin():
+    assert isinstance(nrfgs_dataparser, DataParserSpecification)
+    assert isinstance(nrfgs_dataparser.config, NrfgsDataParserConfig)
+
+
+@pytest.mark.parametrize("first", ["nrfgs_ns.data.dataparser", "nerfstudio.configs.dataparser_configs"])
+def test_nerfstudio_finds_the_plugin_whichever_is_imported_first(first):
+    """nerfstudio loads plugins while it imports itself: a circle of imports would show in one of the two orders."""
+    code = f"import {first}; from nerfstudio.configs.dataparser_configs import all_dataparsers as a; print(a['nrfgs-data'])"
+    plugin = "nrfgs-data=nrfgs_ns.data.dataparser:nrfgs_dataparser"
+    environment = {**os.environ, "NERFSTUDIO_DATAPARSER_CONFIGS": plugin, "PYTHONPATH": os.pathsep.join(sys.path)}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0 and "NrfgsDataParserConfig" in result.stdout, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("name, train, test, points, masks", [
+    ("bonsai", 255, 37, 72486, False),
+    ("goldcape", 74, 11, 21640, True),
+    ("kitchen", 21, 3, 2630, False),
+    ("fox", 43, 7, 11030, False),
+    ("fern", 17, 3, 6407, False),
+])  # fmt: skip
+def test_real_captures(captures, name, train, test, points, masks):
+    parser = NrfgsDataParserConfig(data=captures / name).setup()
+    outputs = parser.get_dataparser_outputs("train")
+    assert len(outputs.image_filenames) == train
+    assert len(parser.get_dataparser_outputs("test").image_filenames) == test
+    assert outputs.metadata["points3D_xyz"].shape == outputs.metadata["points3D_rgb"].shape == (points, 3)
+    assert (outputs.mask_filenames is not None) == masks

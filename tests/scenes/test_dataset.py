@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The written data set: conventions, split, points, determinism, reuse, and that nerfstudio reads it."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from plyfile import PlyData
+
+from nrfgs_ns.scenes import (
+    FIRST_SOLID,
+    SceneConfig,
+    build_scene,
+    camera_rays,
+    dome_cameras,
+    project,
+    render,
+    split_names,
+    tone_curve,
+    write_scene,
+)
+from nrfgs_ns.scenes.dataset import sparse_points
+
+MATT = SceneConfig(gloss=0.0, views=10, width=96, height=72, points=1500)
+GLOSSY = SceneConfig(gloss=1.0, views=9, width=24, height=18, points=50)
+
+
+@pytest.fixture(scope="module")
+def matt(tmp_path_factory):
+    return write_scene(MATT, tmp_path_factory.mktemp("scenes") / "matt")
+
+
+@pytest.fixture(scope="module")
+def glossy(tmp_path_factory):
+    return write_scene(GLOSSY, tmp_path_factory.mktemp("scenes") / "glossy")
+
+
+def load(folder):
+    """transforms.json, images by path as floats [H, W, 3] in [0, 1], points [P, 3], colours [P, 3] in [0, 1]."""
+    transforms = json.loads((folder / "transforms.json").read_text())
+    images = {f["file_path"]: np.asarray(Image.open(folder / f["file_path"])) / 255.0 for f in transforms["frames"]}
+    vertex = PlyData.read(str(folder / "sparse.ply"))["vertex"]
+    points = np.stack([vertex[name] for name in ("x", "y", "z")], axis=1).astype(np.float64)
+    colours = np.stack([vertex[name] for name in ("red", "green", "blue")], axis=1) / 255.0
+    return transforms, images, points, colours
+
+
+def bilinear(image, x, y):
+    """Colours [N, 3] at image positions whose first pixel centre is (0.5, 0.5)."""
+    x, y = x - 0.5, y - 0.5
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    fx, fy = (x - column)[:, None], (y - row)[:, None]
+    top = image[row, column] * (1 - fx) + image[row, column + 1] * fx
+    bottom = image[row + 1, column] * (1 - fx) + image[row + 1, column + 1] * fx
+    return top * (1 - fy) + bottom * fy
+
+
+def colour_errors(folder, config, shift=(0.0, 0.0)):
+    """|image at the projected point - colour of the point|, over all views and the points that they see: errors [N].
+
+    Also the contrast [N] of the image around each: the largest range of a channel over the 3 x 3 nearest pixels.
+    The projection is written out from the file's own numbers: OpenGL camera-to-world, x right, y up, looking along -z,
+    pixel = (cx + fl_x x / -z, cy - fl_y y / -z).
+    """
+    transforms, images, points, colours = load(folder)
+    scene = build_scene(config)
+    errors, contrasts = [], []
+    for frame in transforms["frames"]:
+        world_to_camera = np.linalg.inv(np.array(frame["transform_matrix"]))
+        x, y, z = (points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]).T
+        u = transforms["cx"] + transforms["fl_x"] * x / -z + shift[0]
+        v = transforms["cy"] - transforms["fl_y"] * y / -z + shift[1]
+        position = np.array(frame["transform_matrix"])[:3, 3]
+        towards = points - position
+        hits, _ = scene.first_hit(np.broadcast_to(position, points.shape), towards)
+        seen = (np.linalg.norm(hits - points, axis=1) < 1e-3) & (z < 0)
+        seen &= (u > 2) & (u < transforms["w"] - 2) & (v > 2) & (v < transforms["h"] - 2)
+        image = images[frame["file_path"]]
+        errors.append(np.abs(bilinear(image, u[seen], v[seen]) - colours[seen]).mean(axis=1))
+        column, row = u[seen].astype(int), v[seen].astype(int)
+        around = [image[row + j, column + i] for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        contrasts.append(np.ptp(around, axis=0).max(axis=1))
+    return np.concatenate(errors), np.concatenate(contrasts)
+
+
+def test_points_project_onto_their_colours(matt):
+    """Without gloss a point has its colour in every view. Any slip of a convention breaks this, to half a pixel."""
+    errors, contrasts = colour_errors(matt, MATT)
+    assert len(errors) > 5000
+    # Where the picture is even to 3/255, the point differs from it by no more than that and two roundings to 8 bits.
+    even = contrasts < 3.5 / 255
+    assert even.sum() > 100
+    assert errors[even].max() < 4.5 / 255
+    # Elsewhere a pixel is a blur of what the point is; but nowhere does the picture fit better than in the right place.
+    # Half a pixel raises the mean error by about a third and more.
+    for shift in [(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]:
+        assert colour_errors(matt, MATT, shift)[0].mean() > 1.2 * errors.mean()
+
+
+def test_transforms_hold_the_cameras(matt):
+    transforms, images, _, _ = load(matt)
+    np.testing.assert_array_equal([f["transform_matrix"] for f in transforms["frames"]], dome_cameras(MATT))
+    names = [f["file_path"] for f in transforms["frames"]]
+    assert names == sorted(names) and len(names) == MATT.views
+    assert {image.shape for image in images.values()} == {(72, 96, 3)}
+    assert transforms["camera_model"] == "OPENCV"
+    assert [transforms[key] for key in ("w", "h", "cx", "cy", "k1", "k2", "p1", "p2")] == [96, 72, 48, 36, 0, 0, 0, 0]
+
+
+def test_every_eighth_image_is_for_test_and_validation(matt):
+    transforms, _, _, _ = load(matt)
+    names = [f["file_path"] for f in transforms["frames"]]
+    assert transforms["test_filenames"] == transforms["val_filenames"] == [names[0], names[8]]
+    assert transforms["train_filenames"] == names[1:8] + names[9:]
+    train, test = split_names(SceneConfig(views=48, test_every=5))
+    assert len(test) == 10 and len(train) == 38 and not set(train) & set(test)
+
+
+def test_cameras_are_rigid_upright_and_look_at_the_scene():
+    for matrix in dome_cameras(SceneConfig()):
+        rotation, position = matrix[:3, :3], matrix[:3, 3]
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1.0)
+        assert rotation[2, 0] == pytest.approx(0.0) and rotation[2, 1] > 0.5  # x level, y up
+        assert 3.8 < np.linalg.norm(position) < 5.2 and position[2] > 1.0
+        assert -rotation[:, 2] @ -position / np.linalg.norm(position) > 0.98
+
+
+def test_test_views_surround_the_scene():
+    config = SceneConfig()
+    positions = dome_cameras(config)[:: config.test_every, :2, 3]
+    azimuths = np.sort(np.arctan2(positions[:, 1], positions[:, 0]))
+    gaps = np.diff(np.append(azimuths, azimuths[0] + 2 * np.pi))
+    assert gaps.max() < np.radians(150)  # six views evenly spread leave gaps of 60 degrees
+
+
+def test_project_undoes_camera_rays():
+    config, camera = SceneConfig(), dome_cameras(SceneConfig())[7]
+    pixels = np.random.default_rng(0).uniform((0, 0), (config.width, config.height), size=(100, 2))
+    origins, directions = (a.astype(np.float64) for a in camera_rays(config, camera, pixels))
+    again, depth = project(config, camera, origins + 2.5 * directions)
+    # Rays are float32: 5 x 6e-8 of position, at depth 2.5 and focal length 214: 3e-5 pixels, and as much of direction.
+    np.testing.assert_allclose(again, pixels, atol=2e-4)
+    np.testing.assert_allclose(depth, 2.5, atol=1e-5)
+
+
+def test_a_pixel_is_the_mean_of_its_samples():
+    scene = build_scene(GLOSSY)
+    camera = dome_cameras(GLOSSY)[4]
+    offsets = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
+    samples = tone_curve(scene.radiance(*camera_rays(GLOSSY, camera, np.array([13.0, 11.0]) + offsets)))
+    # Means of float32 in another order: 2 eps. The same ray may differ in the last bits when traced in other company.
+    np.testing.assert_allclose(render(scene, camera)[11, 13], samples.mean(axis=0), atol=1e-5)
+
+
+def test_sparse_points_cover_all_surfaces_and_mean_colours_follow_the_views(matt, glossy):
+    _, _, points, colours = load(matt)
+    assert points.shape == (1500, 3) and colours.std(axis=0).min() > 0.05
+    centres = [item.solid.middle for item in build_scene(MATT).objects]
+    near_object = [np.linalg.norm(points - c, axis=1).min() < 0.75 for c in centres]
+    assert all(near_object)
+    radii = np.linalg.norm(points, axis=1)
+    on_sky, on_ground = np.abs(radii - 10.0) < 1e-4, np.abs(points[:, 2]) < 1e-5
+    assert on_sky.mean() > 0.005 and on_ground.mean() > 0.3
+    assert radii.max() < 10.001
+    _, _, glossy_points, glossy_colours = load(glossy)
+    assert len(glossy_points) == 50 and np.isfinite(glossy_colours).all()
+
+
+def test_sparse_points_come_from_training_views_alone(glossy):
+    _, _, points, colours = load(glossy)
+    training = np.delete(dome_cameras(GLOSSY), [0, 8], axis=0)
+    expected_points, expected_colours = sparse_points(build_scene(GLOSSY), training)
+    np.testing.assert_array_equal(points, expected_points)
+    np.testing.assert_array_equal(np.rint(255.0 * colours), np.rint(255.0 * expected_colours))
+
+
+def test_rerun_is_identical_to_the_byte(glossy, tmp_path):
+    again = write_scene(GLOSSY, tmp_path / "deep" / "again")
+    first = {p.relative_to(glossy): p.read_bytes() for p in sorted(glossy.rglob("*")) if p.is_file()}
+    second = {p.relative_to(again): p.read_bytes() for p in sorted(again.rglob("*")) if p.is_file()}
+    assert first == second
+    assert len(first) == GLOSSY.views + 3
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["again"]  # nothing of the staging is left
+
+
+def test_same_scene_is_reused_even_beside_other_files(glossy):
+    (glossy / "outputs").mkdir(exist_ok=True)
+    before = (glossy / "images" / "view_000.png").stat().st_mtime_ns
+    calls = []
+    assert write_scene(GLOSSY, glossy, lambda done, total: calls.append(done)) == glossy
+    assert calls == [] and (glossy / "images" / "view_000.png").stat().st_mtime_ns == before
+    (glossy / "outputs").rmdir()
+
+
+def test_another_scene_is_refused_by_name(glossy):
+    other = SceneConfig(**{**GLOSSY.__dict__, "gloss": 0.5})
+    with pytest.raises(FileExistsError, match=r"glossy holds a procedural scene with another gloss\. Choose another"):
+        write_scene(other, glossy)
+
+
+def test_other_content_and_damage_are_refused(tmp_path):
+    tiny = SceneConfig(views=2, width=4, height=3, samples=1, points=5)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "holiday.jpg").touch()
+    with pytest.raises(FileExistsError, match="photos exists and is not a procedural scene.*delete this one"):
+        write_scene(tiny, photos)
+    with pytest.raises(FileExistsError, match="holiday.jpg exists"):
+        write_scene(tiny, photos / "holiday.jpg")
+    (photos / "scene.json").write_text("[1, 2]")
+    with pytest.raises(FileExistsError, match="not a procedural scene"):
+        write_scene(tiny, photos)
+
+    (tmp_path / "empty").mkdir()
+    done = write_scene(tiny, tmp_path / "empty")
+    (done / "images" / "view_001.png").unlink()
+    with pytest.raises(FileExistsError, match="images/view_001.png is missing or was changed"):
+        write_scene(tiny, done)
+
+
+def test_progress_counts_and_an_interruption_leaves_nothing(tmp_path):
+    tiny = SceneConfig(views=3, width=4, height=3, samples=1, points=5)
+    calls = []
+
+    def stop_at_two(done, total):
+        calls.append((done, total))
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_scene(tiny, tmp_path / "scene", stop_at_two)
+    assert calls == [(1, 3), (2, 3)]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scene_json_tells_how_to_write_it_again(glossy):
+    record = json.loads((glossy / "scene.json").read_text())
+    assert SceneConfig(**record["config"]) == GLOSSY
+    assert [item["name"] for item in record["description"]["objects"]][0] == "chrome"
+    assert len(record["description"]["objects"]) == len(build_scene(GLOSSY).objects)
+    assert FIRST_SOLID == 2
+
+
+def test_nerfstudio_reads_it_as_we_meant_it(matt):
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    keep = dict(orientation_method="none", center_method="none", auto_scale_poses=False, load_3D_points=False)
+    parser = NerfstudioDataParserConfig(data=matt, **keep).setup()
+    train, test = (parser.get_dataparser_outputs(split) for split in ("train", "test"))
+    train_names, test_names = split_names(MATT)
+    assert [p.relative_to(matt).as_posix() for p in train.image_filenames] == train_names
+    assert [p.relative_to(matt).as_posix() for p in test.image_filenames] == test_names
+
+    # The host's own rays are ours: same origins, same directions through every pixel centre.
+    rays = test.cameras.generate_rays(camera_indices=1)
+    xs, ys = np.meshgrid(np.arange(96) + 0.5, np.arange(72) + 0.5)
+    origins, directions = camera_rays(MATT, dome_cameras(MATT)[8], np.stack([xs, ys], axis=-1).reshape(-1, 2))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    np.testing.assert_allclose(rays.origins.reshape(-1, 3).numpy(), origins, atol=1e-5)
+    np.testing.assert_allclose(rays.directions.reshape(-1, 3).numpy(), directions, atol=1e-5)

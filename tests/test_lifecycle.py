@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train, evaluate, render, resume, refuse: nerfstudio's own commands on a tiny scene, with CUDA out of reach."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from nerfstudio.scripts.render import DatasetRender
+from nerfstudio.utils.eval_utils import eval_setup
+from torch.testing import assert_close
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.studies.run import evaluate, parse, train
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+BUSY = {
+    "--pipeline.model.warmup-length": 2,
+    "--pipeline.model.refine-every": 4,
+    "--pipeline.model.reset-alpha-every": 6,
+    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.resolution-schedule": 10,
+    "--pipeline.model.num-downscales": 1,
+    "--pipeline.model.stop-split-at": 100,
+}
+"""Densify every 4th step, reset opacity every 24th. 8 training views hold refinement back for 12 steps after a reset."""
+
+
+def options(scene: Path, out: Path, method: str = "nrfgs", steps: int = 20, **more) -> list[str]:
+    """A command line for ns-train; `more` maps options, written with underscores for dashes and dots kept."""
+    chosen = {
+        "--data": scene,
+        "--output-dir": out,
+        "--max-num-iterations": steps,
+        "--vis": "tensorboard",
+        "--steps-per-eval-image": 1000,
+        "--steps-per-eval-all-images": 1000,
+        "--logging.local-writer.enable": False,
+        "--logging.profiler": "none",
+        **BUSY,
+        **more,
+    }
+    return [method, *(str(word) for option in chosen.items() for word in option)]
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_scene, tmp_path_factory):
+    """config.yml of a finished 20-step training of each method."""
+    done = {}
+
+    def config_of(method: str) -> Path:
+        if method not in done:
+            record = train(options(tiny_scene, tmp_path_factory.mktemp(method), method))
+            done[method] = Path(record.config_path)
+        return done[method]
+
+    return config_of
+
+
+def checkpoint(config: Path) -> dict:
+    (path,) = (config.parent / "nerfstudio_models").glob("*.ckpt")
+    return torch.load(path, weights_only=True)
+
+
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+def test_train_eval_render(method, trained, tmp_path, tiny_scene):
+    config = trained(method)
+    results = evaluate(config, tmp_path / "eval.json")
+    images = results["per_image"]
+    assert len(images) == 2
+    assert results["psnr"] == pytest.approx(sum(image["psnr"] for image in images) / 2)
+    assert 8 < results["psnr"] < 40 and 0 < results["ssim"] < 1 and 0 < results["l1"] < 1
+    # 48 x 36 is too small for MS-SSIM's five scales, and LPIPS has no weights here: no number, and no crash.
+    assert results["ms_ssim"] is None and results["lpips"] is None
+    _, pipeline, path, step = eval_setup(config)
+    assert step == 19
+    assert results["splats"] == pipeline.model.num_points
+    assert results["parameter_bytes"] == pipeline.model.parameter_bytes
+    if method == "nrfgs":
+        assert results["parameter_bytes"] == 4 * (pipeline.model.num_points * (3 + 3 + 4 + 1 + 3 + 32) + 6664)
+    else:
+        assert results["parameter_bytes"] == 4 * pipeline.model.num_points * (3 + 3 + 4 + 1 + 48)
+
+    DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
+    names = json.loads((tiny_scene / "transforms.json").read_text())["test_filenames"]
+    for output in ("rgb", "depth", "accumulation", "gt-rgb"):
+        folder = tmp_path / "renders" / "test" / output
+        assert sorted(file.stem for file in folder.rglob("*.png")) == sorted(Path(name).stem for name in names)
+
+
+def test_training_changes_everything_and_densifies(trained, tiny_scene):
+    _, pipeline, _, _ = eval_setup(trained("nrfgs"))
+    model = pipeline.model
+    points = json.loads((tiny_scene / "scene.json").read_text())["config"]["points"]
+    assert model.num_points != points
+    assert {len(value) for value in model.gauss_params.values()} == {model.num_points}
+    # A field that had not learnt would still have zero output layers.
+    assert model.head.low[-1].weight.abs().max() > 0 and model.head.high[-1].weight.abs().max() > 0
+
+
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+def test_resumed_training_is_the_unbroken_one(method, tiny_scene, tmp_path):
+    """40 steps at once, against 20 and 20 more from the checkpoint.
+
+    In both halves splats are split (with random samples), pruned and their Adam state carried along; step 24 resets
+    opacities. The same machine adds the same numbers in the same order, so that only a lost state can differ.
+    """
+    whole = Path(train(options(tiny_scene, tmp_path / "whole", method, steps=40)).config_path)
+    half = Path(train(options(tiny_scene, tmp_path / "half", method, steps=20)).config_path)
+    rest = options(
+        tiny_scene, tmp_path / "rest", method, steps=20, **{"--load-dir": half.parent / "nerfstudio_models"}
+    )
+    resumed = Path(train(rest).config_path)
+    a, b = checkpoint(whole), checkpoint(resumed)
+    assert a["step"] == b["step"] == 39
+    counts = [len(checkpoint(run)["pipeline"]["_model.gauss_params.means"]) for run in (half, whole)]
+    assert counts[0] != counts[1], "nothing was densified in the second half: the test would prove nothing"
+    for part in ("pipeline", "optimizers"):
+        assert_close(tensors(a[part]), tensors(b[part]), rtol=1e-5, atol=1e-7)
+
+
+def tensors(tree, prefix="") -> dict:
+    """The tensors of a checkpoint's part, by path."""
+    if isinstance(tree, torch.Tensor):
+        return {prefix: tree}
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, (list, tuple)) else ()
+    return {path: leaf for key, value in items for path, leaf in tensors(value, f"{prefix}/{key}").items()}
+
+
+def test_optimisers_hold_the_loaded_parameters(trained, tiny_scene, tmp_path):
+    """The host's way, replacing parameters on load, would leave the optimisers with orphans."""
+    models = trained("nrfgs").parent / "nerfstudio_models"
+    config = parse(options(tiny_scene, tmp_path, **{"--load-dir": models}))
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    for name, parameter in trainer.pipeline.model.gauss_params.items():
+        (held,) = trainer.optimizers.optimizers[name].param_groups[0]["params"]
+        assert held is parameter
+        assert trainer.optimizers.optimizers[name].state[held]["exp_avg"].shape == parameter.shape
+
+
+@pytest.mark.parametrize(
+    "method, more, says",
+    [
+        ("nrfgs-sh", {}, "written by the 'nrf' head"),
+        ("nrfgs", {"--pipeline.model.appearance.latent-dim": 8}, "latents"),
+        ("nrfgs", {"--pipeline.model.appearance.hidden-width": 32}, "head.low"),
+        ("nrfgs", {"--pipeline.model.appearance.split-bands": False}, "head."),
+    ],
+)
+def test_checkpoint_of_another_head_is_refused(method, more, says, trained, tiny_scene, tmp_path):
+    models = trained("nrfgs").parent / "nerfstudio_models"
+    config = parse(options(tiny_scene, tmp_path, method, **{"--load-dir": models}, **more))
+    trainer = config.setup(local_rank=0, world_size=1)
+    with pytest.raises(InputError, match=says) as error:
+        trainer.setup()
+    assert "--load-config" in str(error.value)
+
+
+def test_unknown_head_is_refused_before_training(tiny_scene, tmp_path):
+    config = parse(options(tiny_scene, tmp_path))
+    config.pipeline.model.appearance = "sparkle"
+    with pytest.raises(InputError, match="sparkle"):
+        config.setup(local_rank=0, world_size=1).setup()
+
+
+def test_impossible_setting_is_refused_before_training(tiny_scene, tmp_path):
+    config = parse(options(tiny_scene, tmp_path, **{"--pipeline.model.appearance.num-bands": 0}))
+    with pytest.raises(ValueError, match="num_bands is 0"):
+        config.setup(local_rank=0, world_size=1).setup()
+
+
+def test_saved_config_is_the_run(trained):
+    config = yaml.load(trained("nrfgs").read_text(), Loader=yaml.Loader)
+    assert config.pipeline.model.appearance.latent_dim == 32
+    assert config.machine.device_type == "cpu" or torch.cuda.is_available()
+    assert config.pipeline.model.refine_every == BUSY["--pipeline.model.refine-every"]
+
+
+def test_checkpoint_is_written_aside_and_moved(tiny_scene, tmp_path, monkeypatch):
+    """A save that is cut short leaves the older checkpoint, and nothing that --load-dir would take for a newer one."""
+    config = parse(options(tiny_scene, tmp_path, steps=1))
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.train()
+    folder = trainer.checkpoint_dir
+    before = sorted(folder.iterdir())
+
+    def torn(state, path):
+        Path(path).write_bytes(b"half a check")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(torch, "save", torn)
+    with pytest.raises(OSError, match="disk full"):
+        trainer.save_checkpoint(5)
+    assert sorted(folder.iterdir()) == before

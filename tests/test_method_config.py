@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The menu: registered, light to import, and splatfacto's to the number."""
+
+import subprocess
+import sys
+from dataclasses import fields
+
+import pytest
+import torch
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods, method_configs
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+
+from nrfgs_ns.appearance.nrf import NeuralResidualField
+from nrfgs_ns.appearance.sh import SphericalHarmonics
+from nrfgs_ns.method_config import nrfgs, nrfgs_sh
+
+METHODS = {"nrfgs": nrfgs, "nrfgs-sh": nrfgs_sh}
+OWN_GROUPS = {"nrfgs": {"latents", "field"}, "nrfgs-sh": set()}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_nerfstudio_finds_the_method(name):
+    assert all_methods[name].method_name == name
+    assert tyro.cli(AnnotatedBaseConfigUnion, args=[name, "--data", "x"]).method_name == name
+
+
+@pytest.mark.parametrize("name, head", [("nrfgs", NeuralResidualField), ("nrfgs-sh", SphericalHarmonics)])
+def test_each_method_has_its_head(name, head):
+    assert isinstance(METHODS[name].config.pipeline.model.appearance.setup(), head)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_everything_else_is_splatfactos(name):
+    ours, host = METHODS[name].config, method_configs["splatfacto"]
+    for field in fields(SplatfactoModelConfig):
+        if field.name != "_target":
+            assert getattr(ours.pipeline.model, field.name) == getattr(host.pipeline.model, field.name), field.name
+    for group, parts in ours.optimizers.items():
+        if group not in OWN_GROUPS[name]:
+            for part in ("optimizer", "scheduler"):
+                assert parts[part] == host.optimizers[group][part], (group, part)
+    assert set(host.optimizers) - set(ours.optimizers) <= {"features_rest"}
+    for field in ("max_num_iterations", "mixed_precision", "use_grad_scaler", "gradient_accumulation_steps", "vis"):
+        assert getattr(ours, field) == getattr(host, field), field
+    datamanager, host_datamanager = ours.pipeline.datamanager, host.pipeline.datamanager
+    for field in ("cache_images", "cache_images_type", "camera_res_scale_factor", "train_cameras_sampling_strategy"):
+        assert getattr(datamanager, field) == getattr(host_datamanager, field), field
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_device_is_what_is_there(name):
+    assert METHODS[name].config.machine.device_type == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def test_every_option_of_the_head_is_reachable_and_explained():
+    args = ["nrfgs", "--pipeline.model.appearance.latent-dim", "16", "--pipeline.model.appearance.split-bands", "False"]
+    appearance = tyro.cli(AnnotatedBaseConfigUnion, args=args).pipeline.model.appearance
+    assert (appearance.latent_dim, appearance.split_bands) == (16, False)
+    help_text = subprocess.run(
+        [sys.executable, "-c", "from nerfstudio.scripts.train import entrypoint; entrypoint()", "nrfgs", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    plain = " ".join(help_text.replace("│", " ").split())
+    for field in fields(METHODS["nrfgs"].config.pipeline.model.appearance):
+        if not field.name.startswith("_"):
+            assert f"--pipeline.model.appearance.{field.name.replace('_', '-')}" in plain
+    assert "numbers in a splat's latent" in plain
+    assert "--pipeline.model.sh-degree" not in plain, "the head's degree, and splatfacto's that does nothing"
+
+
+def test_registering_pulls_in_no_gpu_code_and_no_training_tools():
+    """An entry point that fails to import, or is slow, spoils every ns command."""
+    code = (
+        "import sys, nerfstudio.configs.method_configs, nrfgs_ns.method_config;"
+        "print([m for m in ('gsplat.cuda._backend', 'open3d', 'sklearn', 'nrfgs_ns.studies') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip().endswith("[]")
