@@ -178,7 +178,7 @@ def build_scene(config: SceneConfig) -> Scene:
             "gold",
             Sphere((-1.05, -0.50, 0.42), 0.42),
             Paint((0.66, 0.34, 0.05), (0.95, 0.66, 0.18), (3.0, 3.0, 0.0)),
-            Finish((0.97, 0.49, 0.13), roughness=0.26, mirror=0.7),
+            Finish((0.97, 0.58, 0.19), roughness=0.26, mirror=0.7),
         ),
         Object(
             "lacquer",
