@@ -71,12 +71,12 @@ def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
     nameless = [f"frames[{i}]" for i, frame in enumerate(frames) if not _is_name(frame.get("file_path"))]
     if nameless:
         raise InputError(f"{source}: {some(nameless)} without a file_path. Name the image, or remove the frame.")
-    for field in ("mask_path", "depth_file_path"):
+    for field, hint in (("mask_path", " (an all-white mask keeps the whole image)"), ("depth_file_path", "")):
         without = [frame["file_path"] for frame in frames if not _is_name(frame.get(field))]
         if without and any(field in frame for frame in frames):
             raise InputError(
                 f"{source}: {field} is given for some frames but not for {some(without)}. "
-                "Give one for every frame (an all-white mask keeps the whole image), or for none."
+                f"Give one for every frame{hint}, or for none."
             )
 
 
@@ -117,14 +117,12 @@ def check_intrinsics(meta: dict[str, Any], source: Path) -> None:
     for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
         for where, holder in _holders(meta, key):
             if key not in holder:
-                raise InputError(
-                    f"{source}: {key} is missing, at the top and in {where}. Add it, in pixels (from a field of view: "
-                    "fl_x = w / (2 tan(camera_angle_x / 2)), and the same for fl_y)."
-                )
+                hint = " (from a field of view: w / (2 tan(camera_angle_x / 2)))" if key in ("fl_x", "fl_y") else ""
+                raise InputError(f"{source}: {key} is missing, at the top and in {where}. Add it, in pixels{hint}.")
             value = _number(holder[key])
             possible = {"fl_x": value > 0, "fl_y": value > 0, "w": value >= 1, "h": value >= 1}.get(key, True)
             if not (possible and np.isfinite(value)):
-                raise InputError(f"{source}: {key} of {where} is {holder[key]!r}. Give it in pixels.")
+                raise InputError(f"{source}: {key} of {where} is {holder[key]!r}. Give a number of pixels, above 0.")
     for key in ("k1", "k2", "k3", "k4", "p1", "p2", "distortion_params"):
         for where, holder in _holders(meta, key):
             value = holder.get(key, 0.0)
@@ -147,12 +145,14 @@ def check_exist(paths: Sequence[Path], source: Path, what: str) -> None:
     if missing:
         raise InputError(
             f"{source}: {len(missing)} of {len(paths)} {what} are missing: {some(missing)}. Restore them, or correct "
-            "file_path (relative to the JSON file, with its extension) or --downscale-factor."
+            "their paths (relative to the JSON file, with the extension) or --downscale-factor."
         )
 
 
-def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what: str) -> list[str]:
+def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what: str, mend: str) -> list[str]:
     """Every file is an image of the size (width, height) that its camera has; only headers are read.
+
+    `what` says what the files are, and `mend` what to do if their size is another.
 
     Returns:
         The PIL modes of the files.
@@ -166,7 +166,7 @@ def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what:
     if wrong:
         raise InputError(
             f"{len(wrong)} {what} do not match the size w x h of their cameras (divided by the downscale factor): "
-            f"{some(wrong)}. Use the images that the poses were computed from, or scale w, h, fl_x, fl_y, cx, cy alike."
+            f"{some(wrong)}. {mend}"
         )
     return [mode for _, mode in found]
 

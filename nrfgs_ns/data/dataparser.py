@@ -79,7 +79,6 @@ class NrfgsDataParser(Nerfstudio):
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         """Parses one split; the first call checks the whole data set."""
         if self._meta is None:
-            self._images_needed = self.downscale_factor is None
             meta, self._source = read_transforms(self.config.data)
             self._check(meta)
             self._meta = meta
@@ -152,7 +151,10 @@ class NrfgsDataParser(Nerfstudio):
                 check_exist(paths, source, f"files of {key}")
         self._counts = self._count_splits(meta, images)
         if not self._counts["train"]:
-            raise InputError(f"{source}: no image is left for training. Correct train_filenames, or --eval-mode.")
+            raise InputError(
+                f"{source}: no image is left for training. Correct train_filenames if it is there, else --eval-mode, "
+                "--eval-interval or --train-split-fraction."
+            )
 
     def _count_splits(self, meta: dict[str, Any], images: list[Path]) -> dict[str, int]:
         """How many images each split has."""
@@ -206,15 +208,21 @@ class NrfgsDataParser(Nerfstudio):
         if not self._images_needed:
             return
         sizes = list(zip(cameras.width.flatten().tolist(), cameras.height.flatten().tolist(), strict=True))
-        check_headers(outputs.image_filenames, sizes, "images")
+        mend = "Use the images that the poses were computed from, or scale w, h, fl_x, fl_y, cx and cy alike."
+        check_headers(outputs.image_filenames, sizes, "images", mend)
         if outputs.mask_filenames is not None:
-            modes = check_headers(outputs.mask_filenames, sizes, "masks")
+            modes = check_headers(outputs.mask_filenames, sizes, "masks", "Make them as large as the images.")
             bad = [path for path, mode in zip(outputs.mask_filenames, modes, strict=True) if mode not in MASK_MODES]
             if bad:
                 raise InputError(
                     f"{some(bad)}: a mask must have one grey channel (0 outside, anything else inside), not colours "
                     "or a palette. Save it as 8-bit grey."
                 )
+
+    @cached_property
+    def _images_needed(self) -> bool:
+        """Whether nerfstudio asks for images. First read before the parsing, which sets the factor itself."""
+        return self.downscale_factor is None
 
     # Points.
 

@@ -85,7 +85,10 @@ META = {  # what is done to the data set -> what the message must say
         "test_filenames x.png no frame",
     ),
     "split not a list": (lambda c: c.meta.update(train_filenames=LAST), "train_filenames list"),
-    "split names twice": (lambda c: c.meta.update(train_filenames=[LAST, LAST]), "train_filenames 000.png more than once"),
+    "split names twice": (
+        lambda c: c.meta.update(train_filenames=[LAST, LAST]),
+        "train_filenames 000.png more than once",
+    ),
     "one mask lacking": (
         with_masks(lambda c: c.meta["frames"][4].pop("mask_path")),
         "mask_path images/005.png all-white for none",

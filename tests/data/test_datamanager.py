@@ -120,7 +120,7 @@ def test_unusable_mask_is_named(capture, mode, size):
     data = manager(capture)
     path = capture.folder / "masks/003.png"
     if mode is None:
-        path.write_bytes(path.read_bytes()[:-20])
+        path.write_bytes(path.read_bytes()[:50])  # the header is whole, the pixels are not
     else:
         Image.new(mode, size).save(path)
     with pytest.raises(InputError, match=r"masks/003.png cannot be used as the mask of .*images/003.png"):
@@ -131,7 +131,8 @@ def test_mask_colour_on_bytes_is_that_on_floats(capture):
     capture.add_masks()
     colour = (1.0, 0.4, 0.0)
     as_bytes, as_floats = (
-        manager(capture, {"mask_color": colour}, cache_images_type=kind).cached_train[2] for kind in ("uint8", "float32")
+        manager(capture, {"mask_color": colour}, cache_images_type=kind).cached_train[2]
+        for kind in ("uint8", "float32")
     )
     assert as_bytes["image"].dtype == torch.uint8
     torch.testing.assert_close(as_bytes["image"].float(), as_floats["image"] * 255, atol=1e-3, rtol=0)
@@ -173,17 +174,19 @@ def through_a_checkpoint(state: dict) -> dict:
 @pytest.mark.parametrize("strategy", ["random", "fps"])
 @pytest.mark.parametrize("steps", [0, 3, 7, 8, 20])  # 8 cameras: before, at and after the end of a round
 def test_order_continues_after_a_restore(capture, strategy, steps):
-    first = manager(capture, train_cameras_sampling_strategy=strategy)
+    # Rounds of 3 for fps, so that cameras miss whole rounds, which it remembers; random goes round all 8.
+    options = {"train_cameras_sampling_strategy": strategy, "fps_reset_every": 3}
+    first = manager(capture, **options)
     next_cameras(first, steps)
     state = through_a_checkpoint(first.sampling_state())
     expected = next_cameras(first, 30)
 
-    second = manager(capture, train_cameras_sampling_strategy=strategy)
+    second = manager(capture, **options)
     next_cameras(second, 5)
     np.random.rand(3)
     second.load_sampling_state(state)
     assert next_cameras(second, 30) == expected
-    assert sorted(expected[-30:][:8]) != expected[:8] or strategy == "fps"  # shuffled at all
+    assert len(set(expected)) > 3
 
 
 def test_a_state_is_not_changed_by_what_happens_later(capture):

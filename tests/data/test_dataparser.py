@@ -173,6 +173,10 @@ def drop_z(path):
     path.write_bytes(path.read_bytes().replace(b"float z", b"float w"))
 
 
+def empty(path):
+    path.write_bytes(b"")
+
+
 def claim_more(path):
     path.write_bytes(path.read_bytes().replace(b"vertex 20", b"vertex 20000000000"))
 
@@ -180,8 +184,8 @@ def claim_more(path):
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize(
     "spoil",
-    [truncate, drop_vertices, drop_z, claim_more, Path.unlink, lambda p: p.write_bytes(b""), lambda p: p.write_bytes(b"ply?")],
-    ids=["truncated", "no vertices", "no z", "too few", "missing", "empty file", "no ply"],
+    [truncate, drop_vertices, drop_z, claim_more, Path.unlink, empty, lambda p: p.write_bytes(b"ply?")],
+    ids=["truncated", "no vertices", "no z", "too few", "missing", "emptied", "no ply"],
 )  # fmt: skip
 def test_unusable_ply(capture, spoil, text):
     spoil(capture.add_ply(*cloud(), text))
@@ -210,7 +214,9 @@ def test_without_points_one_warning(capture, printed, points):
 
 @pytest.mark.parametrize("applied", [None, [[0, 0, 1, 3], [1, 0, 0, 4], [0, 1, 0, 5]]])
 @pytest.mark.parametrize("as_file", [False, True])
-@pytest.mark.parametrize("write, name", [(write_points3D_binary, "points3D.bin"), (write_points3D_text, "points3D.txt")])
+@pytest.mark.parametrize(
+    "write, name", [(write_points3D_binary, "points3D.bin"), (write_points3D_text, "points3D.txt")]
+)
 def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, as_file, applied):
     """They land where nerfstudio's own conversion to a .ply puts them: moved into the world of the poses first."""
     monkeypatch.setattr("rich.prompt.Confirm.ask", lambda *_, **__: pytest.fail("asked a question"))
@@ -218,7 +224,9 @@ def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, 
     folder = capture.folder / "colmap" / "sparse" / "0"
     folder.mkdir(parents=True)
     nothing = np.empty(0, dtype=int)
-    points = {i: Point3D(i, p.astype(float), c, 0.5, nothing, nothing) for i, (p, c) in enumerate(zip(xyz, rgb, strict=True))}
+    points = {
+        i: Point3D(i, p.astype(float), c, 0.5, nothing, nothing) for i, (p, c) in enumerate(zip(xyz, rgb, strict=True))
+    }
     write(points, folder / name)
     if applied is not None:
         capture.meta["applied_transform"] = applied
@@ -273,7 +281,8 @@ def test_plugin():
 @pytest.mark.parametrize("first", ["nrfgs_ns.data.dataparser", "nerfstudio.configs.dataparser_configs"])
 def test_nerfstudio_finds_the_plugin_whichever_is_imported_first(first):
     """nerfstudio loads plugins while it imports itself: a circle of imports would show in one of the two orders."""
-    code = f"import {first}; from nerfstudio.configs.dataparser_configs import all_dataparsers as a; print(a['nrfgs-data'])"
+    found = "from nerfstudio.configs.dataparser_configs import all_dataparsers as a; print(a['nrfgs-data'])"
+    code = f"import {first}; {found}"
     plugin = "nrfgs-data=nrfgs_ns.data.dataparser:nrfgs_dataparser"
     environment = {**os.environ, "NERFSTUDIO_DATAPARSER_CONFIGS": plugin, "PYTHONPATH": os.pathsep.join(sys.path)}
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
