@@ -31,7 +31,7 @@ def tiny_scene(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def no_cuda(monkeypatch):
-    """Make anything that needs CUDA fail: gsplat's compiled kernels, `.cuda()`, and torch's idea that there is a GPU."""
+    """Make anything that needs CUDA fail: gsplat's compiled kernels, `.cuda()`; and hide a GPU that is there."""
     import sys
 
     import torch

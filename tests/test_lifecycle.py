@@ -25,7 +25,7 @@ BUSY = {
     "--pipeline.model.num-downscales": 1,
     "--pipeline.model.stop-split-at": 100,
 }
-"""Densify every 4th step, reset opacity every 24th. 8 training views hold refinement back for 12 steps after a reset."""
+"""Densify every 4th step, reset opacity every 24th. 8 training views hold densification back for 12 steps after it."""
 
 
 def options(scene: Path, out: Path, method: str = "nrfgs", steps: int = 20, **more) -> list[str]:
@@ -109,9 +109,7 @@ def test_resumed_training_is_the_unbroken_one(method, tiny_scene, tmp_path):
     """
     whole = Path(train(options(tiny_scene, tmp_path / "whole", method, steps=40)).config_path)
     half = Path(train(options(tiny_scene, tmp_path / "half", method, steps=20)).config_path)
-    rest = options(
-        tiny_scene, tmp_path / "rest", method, steps=20, **{"--load-dir": half.parent / "nerfstudio_models"}
-    )
+    rest = options(tiny_scene, tmp_path / "rest", method, steps=20, **{"--load-dir": half.parent / "nerfstudio_models"})
     resumed = Path(train(rest).config_path)
     a, b = checkpoint(whole), checkpoint(resumed)
     assert a["step"] == b["step"] == 39
