@@ -2,6 +2,7 @@
 """NRF-GS for nerfstudio: what this project adds beside ns-train, ns-eval, ns-viewer and ns-render."""
 
 import sys
+import warnings
 
 import tyro
 
@@ -11,10 +12,13 @@ from nrfgs_ns.errors import InputError
 
 def entrypoint() -> None:
     """The console script `nrfgs VERB`."""
+    # Deprecations inside nerfstudio, and a loss that it logs undetached: not the reader's business.
+    warnings.simplefilter("ignore", FutureWarning)
+    warnings.filterwarnings("ignore", "Converting a tensor with requires_grad=True to a scalar")
     verb = tyro.extras.subcommand_cli_from_dict({"demo": Demo}, description=__doc__)
     try:
         verb.main()
-    except InputError as error:
+    except (InputError, FileExistsError) as error:
         sys.exit(f"nrfgs: {error}")
 
 

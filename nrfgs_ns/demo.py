@@ -51,7 +51,7 @@ class Demo:
         columns = TextColumn("{task.description:<24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=screen) as progress:
             with _bar(progress, "make the scene", scene.views) as advance:
-                data = write_scene(scene, self.out / f"scene-{self.name}", progress=lambda *_: advance())
+                data = write_scene(scene, self.out / self.scene_folder, progress=lambda *_: advance())
             for method, label in METHODS.items():
                 args = self.train_args(method, data, steps)
                 progress.console.print(f"[dim]$ ns-train {shlex.join(args)}", highlight=False, soft_wrap=True)
@@ -72,9 +72,9 @@ class Demo:
         screen.print(f"  ns-viewer --load-config {results['nrfgs']['train']['config_path']}", soft_wrap=True)
 
     @property
-    def name(self) -> str:
-        """What distinguishes one demo's scene from another's."""
-        return f"gloss{self.gloss:g}-seed{self.seed}" + ("-quick" if self.quick else "")
+    def scene_folder(self) -> str:
+        """Folder of the data set inside `out`; its name tells one demo's scene from another's."""
+        return f"scene-gloss{self.gloss:g}-seed{self.seed}" + ("-quick" if self.quick else "")
 
     def scene(self) -> SceneConfig:
         """The scene's configuration."""

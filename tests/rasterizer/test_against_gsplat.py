@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The CPU rasterizer, gsplat's recorded results and the float64 twin: any two agree up to rounding."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from agreement import assert_agrees, judge
+from make_gsplat_fixtures import CASES, evaluate, load
+from nrfgs_ns.rasterizer import rasterization
+
+FOLDER = Path(__file__).resolve().parents[1] / "fixtures" / "gsplat"
+
+
+@pytest.fixture(scope="module", params=sorted(CASES))
+def recorded(request):
+    path = FOLDER / f"{request.param}.npz"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not recorded; run tests/fixtures/make_gsplat_fixtures.py on a CUDA machine")
+    case, grads, gsplat = load(path)
+    return case, grads, gsplat, judge(case, grads)
+
+
+def test_gsplat_agrees_with_the_twin(recorded):
+    """The twin is the definition that the CPU rasterizer is tested by everywhere else: gsplat itself must satisfy it."""
+    _, _, gsplat, verdict = recorded
+    assert_agrees(verdict, gsplat)
+
+
+def test_cpu_agrees_with_gsplat(recorded):
+    """Both lie within the twin's tolerance, so they are within twice of each other."""
+    case, grads, gsplat, verdict = recorded
+    ours = evaluate(rasterization, case, grads, "cpu", packed=False)
+    assert_agrees(verdict, ours)
+    for name, tolerance in verdict.tolerances.items():
+        difference = (ours[name].double() - gsplat[name].double()).abs()
+        seen = verdict.visible if name in ("means2d", "depths", "conics") else ...
+        assert (difference <= 2 * tolerance)[seen].all(), name
+    seen = verdict.visible
+    assert (ours["radii"] - gsplat["radii"]).abs()[seen].le(1).all()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_gpu_back_end_agrees_with_the_twin(name):
+    from make_gsplat_fixtures import upstream
+
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    case = CASES[name]()
+    grads = upstream(case)
+    assert_agrees(judge(case, grads), evaluate(rasterization, case, grads, "cuda", packed=False))

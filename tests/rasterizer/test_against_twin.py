@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fast path against the float64 twin: values, gradients, absgrad, over the hard cases and over random scenes."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from agreement import FLOAT32, FLOAT64, assert_agrees, judge
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from make_gsplat_fixtures import CASES, Case, _camera, evaluate, upstream
+from nrfgs_ns.rasterizer import rasterization
+from nrfgs_ns.rasterizer.torch_cpu import compositing
+
+
+def in_precision(case: Case, dtype: torch.dtype) -> Case:
+    options = {k: v.to(dtype) if isinstance(v, torch.Tensor) else v for k, v in case.options.items()}
+    tensors = {k: v.to(dtype) for k, v in vars(case).items() if isinstance(v, torch.Tensor)}
+    return replace(case, **tensors, options=options)
+
+
+def check(case: Case, dtype: torch.dtype = torch.float32) -> None:
+    unit = {torch.float32: FLOAT32, torch.float64: FLOAT64}[dtype]
+    case = in_precision(case, dtype)
+    grads = upstream(case)
+    ours = evaluate(rasterization, case, tuple(g.to(dtype) for g in grads), "cpu", packed=False)
+    assert_agrees(judge(case, grads, unit), ours, unit)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_hard_cases(name):
+    check(CASES[name]())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_hard_cases_in_float64(name):
+    """The same formulas with 29 bits more: what still differs would be a wrong formula, not rounding."""
+    check(CASES[name](), torch.float64)
+
+
+@pytest.mark.parametrize("name", ["ordinary", "opaque_layers", "several_cameras"])
+def test_any_partition_of_the_work_gives_the_same_result(name, monkeypatch):
+    """Slabs of 5, batches of a few tiles and blocks of 100 pairs: every loop is taken, every state handed over."""
+    monkeypatch.setattr(compositing, "SLAB", 5)
+    monkeypatch.setattr(compositing, "BATCH_ELEMENTS", 64 * 13)
+    monkeypatch.setattr(compositing, "BLOCK_PAIRS", 100)
+    check(CASES[name]())
+
+
+@pytest.mark.parametrize("tile_size", [4, 10, 16, 24, 32])
+def test_tile_sizes(tile_size):
+    """The tile size is visible in the image (it cuts tails off), also where it is no multiple of the sub-tile."""
+    case = CASES["ordinary"]()
+    case.options["tile_size"] = tile_size
+    check(case)
+
+
+@st.composite
+def scenes(draw) -> Case:
+    """Clouds from opaque to transparent, from dust to planets, round to needle-like, near and far, one or two cameras."""
+    g = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
+    n = draw(st.integers(0, 40))
+    width, height = draw(st.integers(1, 40)), draw(st.integers(1, 40))
+    log_size = draw(st.floats(-5, 1.5))
+    spread = draw(st.floats(0, 2))
+    cameras = draw(st.integers(1, 2))
+    depth = draw(st.floats(0.3, 5)) + 3 * torch.rand(n, generator=g)
+    pose = torch.eye(4).repeat(cameras, 1, 1)
+    pose[:, :3, 3] += 0.2 * torch.randn(cameras, 3, generator=g)
+    fov, centre = draw(st.floats(20, 140)), (draw(st.floats(-0.3, 1.3)), draw(st.floats(-0.3, 1.3)))
+    options = {
+        "render_mode": draw(st.sampled_from(["RGB", "D", "ED", "RGB+D", "RGB+ED"])),
+        "rasterize_mode": draw(st.sampled_from(["classic", "antialiased"])),
+        "eps2d": draw(st.sampled_from([0.3, 0.1, 1.0])),
+        "radius_clip": draw(st.sampled_from([0.0, 3.0])),
+    }
+    return Case(
+        means=torch.cat([1.5 * torch.randn(n, 2, generator=g), depth[:, None]], 1),
+        quats=torch.randn(n, 4, generator=g) * draw(st.floats(0.1, 10)),
+        scales=torch.exp(log_size + spread * torch.randn(n, 3, generator=g)),
+        opacities=torch.rand(n, generator=g) ** draw(st.floats(0.05, 3)),
+        colors=torch.randn(n, draw(st.integers(1, 5)), generator=g),
+        viewmats=pose,
+        Ks=_camera(width, height, fov, centre).repeat(cameras, 1, 1),
+        width=width,
+        height=height,
+        options=options,
+    )
+
+
+@settings(max_examples=40)
+@given(scenes())
+def test_random_scenes(case):
+    check(case)
+
+
+@settings(max_examples=15)
+@given(scenes())
+def test_random_scenes_in_float64(case):
+    check(case, torch.float64)
+
+
+def test_finite_differences():
+    """dL/dparameter by central differences in float64, on a scene without cut-offs.
+
+    One splat-filled tile with alphas in (1/255, 0.999) everywhere: wide splats of opacity 0.1 to 0.3, so L is smooth. With step h the
+    truncation error is about L''' h^2 / 6 and the rounding error 1e-16 |L| / h; h = 1e-5 leaves both near 1e-9 relative.
+    """
+    g = torch.Generator().manual_seed(0)
+    n = 6
+    means = torch.cat([0.2 * torch.randn(n, 2, generator=g), 3 + torch.rand(n, 1, generator=g)], 1)
+    inputs = [
+        means.double(),
+        torch.randn(n, 4, generator=g).double(),
+        (1.0 + torch.rand(n, 3, generator=g)).double(),
+        (0.1 + 0.2 * torch.rand(n, generator=g)).double(),
+        torch.rand(n, 2, generator=g).double(),
+        torch.eye(4).double()[None],
+    ]
+    K = _camera(8, 8).double()[None]
+    probe = torch.randn(1, 8, 8, 3, generator=g).double()
+
+    def loss(*tensors):
+        render, alphas, _ = rasterization(*tensors, K, 8, 8, render_mode="RGB+ED", rasterize_mode="antialiased")
+        return (render * probe).sum() + alphas.sum()
+
+    leaves = [t.clone().requires_grad_() for t in inputs]
+    loss(*leaves).backward()
+    for i, leaf in enumerate(leaves):
+        direction = torch.randn(leaf.shape, generator=g).double()
+        if i == 5:
+            direction[:, 3] = 0  # the last row of a view matrix is constant
+        h = 1e-5
+        moved = [[t + s * h * direction if j == i else t for j, t in enumerate(inputs)] for s in (1, -1)]
+        numeric = (loss(*moved[0]) - loss(*moved[1])) / (2 * h)
+        assert torch.isclose((leaf.grad * direction).sum(), numeric, rtol=1e-6, atol=1e-7), i

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projection: which splats are visible, at the limits, and an independent implementation to compare with.
+
+Values and gradients are held against the float64 twin in test_against_twin.py.
+"""
+
+import pytest
+import torch
+from make_gsplat_fixtures import CASES, _camera
+from nrfgs_ns.rasterizer import project
+
+W, H = 40, 28
+
+
+def one(z=2.0, x=0.0, y=0.0, scale=0.1, **options):
+    splat = [torch.tensor([[x, y, z]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), scale)]
+    return project(*splat, torch.eye(4)[None], _camera(W, H)[None], W, H, **options)
+
+
+@pytest.mark.parametrize(
+    ("z", "seen"),
+    [(-1.0, False), (0.0, False), (0.25 - 2**-26, False), (0.25, True), (4.0, True), (4.0 + 2**-21, False)],
+)
+def test_near_and_far_planes_are_inclusive(z, seen):
+    assert len(one(z, near_plane=0.25, far_plane=4.0).radii) == seen
+
+
+def test_radius_clip_is_exclusive():
+    radius = int(one().radii[0])
+    assert len(one(radius_clip=float(radius)).radii) == 0
+    assert len(one(radius_clip=radius - 0.5).radii) == 1
+
+
+def test_square_must_overlap_the_image():
+    """A point has radius 3. Its centre is at x = 20 + f / 2 times its offset at depth 2; it is seen if x + 3 > 0."""
+    edge = -23 * 2 / float(_camera(W, H)[0, 0])
+    assert len(one(x=edge * 1.001, scale=1e-6).radii) == 0
+    assert one(x=edge * 0.999, scale=1e-6).radii.tolist() == [3]
+
+
+def test_radius_of_a_point_comes_from_the_blur():
+    """cov = 0.3 I: b^2 - det = 0 is floored at 0.1, so r = ceil(3 sqrt(0.3 + sqrt 0.1)) = ceil(2.355) = 3."""
+    assert int(one(scale=1e-6).radii[0]) == 3
+
+
+@pytest.mark.parametrize("field", ["means", "quats", "scales"])
+def test_invisible_and_invalid_splats_send_no_nan_back(field):
+    """Centres at and behind the camera, zero quaternions, infinite and NaN scales: invisible, with gradient exactly 0."""
+    means = torch.tensor(
+        [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 2.0], [0.0, 0.0, 2.0]]
+    )
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(6, 1)
+    scales = torch.full((6, 3), 0.1)
+    quats[3], scales[4], scales[5] = 0.0, float("inf"), float("nan")
+    tensors = {"means": means, "quats": quats, "scales": scales}
+    leaf = tensors[field].requires_grad_()
+    p = project(
+        **tensors, viewmats=torch.eye(4)[None], Ks=_camera(W, H)[None], width=W, height=H, rasterize_mode="antialiased"
+    )
+    assert p.gaussian_ids.tolist() == [0]
+    (p.means2d.sum() + p.conics.sum() + p.depths.sum() + p.compensations.sum()).backward()
+    assert torch.isfinite(leaf.grad).all() and (leaf.grad[1:] == 0).all()
+
+
+def test_flat_splat_has_finite_gradients():
+    """Seen edge on, a disc of thickness 0 has det = 0 and compensation 0: sqrt would send an infinity back."""
+    scales = torch.tensor([[0.0, 0.1, 0.1]], requires_grad=True)
+    p = project(
+        torch.tensor([[0.0, 0.0, 2.0]]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales,
+        torch.eye(4)[None],
+        _camera(W, H)[None],
+        W,
+        H,
+        rasterize_mode="antialiased",
+    )
+    p.compensations.sum().backward()
+    assert p.compensations.item() == 0 and torch.isfinite(scales.grad).all()
+
+
+def test_long_needles_keep_a_definite_conic():
+    """Ten thousand pixels long, a third of a pixel wide: the covariance's determinant is 1e-9 of its products."""
+    p = one(z=1.0, scale=1e-6)
+    needle = project(
+        torch.tensor([[0.0, 0.0, 1.0]]),
+        torch.tensor([[0.924, 0.0, 0.0, 0.383]]),
+        torch.tensor([[300.0, 1e-3, 1e-3]]),
+        torch.eye(4)[None],
+        _camera(W, H)[None],
+        W,
+        H,
+    )
+    a, b, c = needle.conics[0].double()
+    # Across the needle only the blur is left: the conic's trace is 1 / 0.3 up to float32's 1e-7.
+    assert abs(float(a + c) * (0.3 + (34.64e-3) ** 2) - 1) < 1e-4
+    assert len(p.radii) == 1
+
+
+def test_agrees_with_gsplats_torch_projection():
+    """gsplat's own plain-torch projection, an independent program. Its radius formula differs from its kernel's (0.01
+    for 0.1 under the root) and its fov limit is symmetric, so those are left to the recorded GPU results. float64: 1e-9."""
+    torch_impl = pytest.importorskip("gsplat.cuda._torch_impl")
+    case = CASES["ordinary"]()
+    tensors = [t.double() for t in (case.means, case.quats, case.scales, case.viewmats, case.Ks)]
+    covars, _ = torch_impl._quat_scale_to_covar_preci(
+        tensors[1] / tensors[1].norm(dim=-1, keepdim=True), tensors[2], True, False
+    )
+    size = (case.width, case.height)
+    _, means2d, depths, conics, compensations = torch_impl._fully_fused_projection(
+        tensors[0], covars, *tensors[3:], *size, calc_compensations=True
+    )
+    p = project(*tensors, *size, rasterize_mode="antialiased")
+    for ours, theirs in (
+        (p.means2d, means2d),
+        (p.depths, depths),
+        (p.conics, conics),
+        (p.compensations, compensations),
+    ):
+        torch.testing.assert_close(ours, theirs[0, p.gaussian_ids], rtol=1e-9, atol=1e-12)
+
+
+def test_rows_are_ordered_by_camera_then_splat():
+    case = CASES["several_cameras"]()
+    p = project(case.means, case.quats, case.scales, case.viewmats, case.Ks, case.width, case.height)
+    key = p.camera_ids * len(case.means) + p.gaussian_ids
+    assert torch.equal(key, key.sort().values) and len(key.unique()) == len(key)
+    assert p.camera_ids.dtype == p.gaussian_ids.dtype == torch.int64 and p.radii.dtype == torch.int32

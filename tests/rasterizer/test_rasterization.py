@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The call: arguments, layouts, errors, and what gsplat's strategies need of `info`."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from make_gsplat_fixtures import CASES
+from nrfgs_ns.rasterizer import composite, project, rasterization
+from nrfgs_ns.rasterizer.torch_cpu import compositing
+
+
+def test_two_stages_are_the_whole_call():
+    case = CASES["color_and_expected_depth"]()
+    whole = rasterization(*case.arguments(), **case.options)
+    p = project(
+        case.means,
+        case.quats,
+        case.scales,
+        case.viewmats,
+        case.Ks,
+        case.width,
+        case.height,
+        rasterize_mode="antialiased",
+    )
+    parts = composite(p, case.colors[p.gaussian_ids], case.opacities[p.gaussian_ids], render_mode="RGB+ED")
+    assert torch.equal(whole[0], parts[0]) and torch.equal(whole[1], parts[1])
+
+
+@pytest.mark.parametrize("name", ["ordinary", "several_cameras"])
+def test_packed_and_dense_layouts_hold_the_same(name):
+    case = CASES[name]()
+    leaves, infos, images = [], [], []
+    for packed in (True, False):
+        arguments = list(case.arguments())
+        arguments[0] = arguments[0].clone().requires_grad_()
+        render, alphas, info = rasterization(*arguments, **case.options, packed=packed, absgrad=True)
+        info["means2d"].retain_grad()
+        (render.square().sum() + alphas.sum()).backward()
+        leaves.append(arguments[0].grad)
+        infos.append(info)
+        images.append(render)
+    packed, dense = infos
+    cells = (packed["camera_ids"], packed["gaussian_ids"])
+    assert dense["camera_ids"] is None and dense["gaussian_ids"] is None
+    for key in ("radii", "means2d", "depths", "conics", "opacities"):
+        assert torch.equal(dense[key][cells], packed[key]), key
+    assert torch.equal((dense["radii"] > 0).nonzero(), torch.stack(cells, 1))
+    assert torch.equal(dense["means2d"].grad[cells], packed["means2d"].grad)
+    assert torch.equal(dense["means2d"].absgrad[cells], packed["means2d"].absgrad)
+    assert (dense["means2d"].absgrad >= dense["means2d"].grad.abs() * (1 - 1e-5) - 1e-9).all()  # triangle inequality
+    assert torch.equal(leaves[0], leaves[1]) and torch.equal(images[0], images[1])
+
+
+def test_info_has_gsplats_keys():
+    case = CASES["ordinary"]()
+    _, _, info = rasterization(*case.arguments())
+    assert set(info) == {
+        *("camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "opacities"),
+        *("tile_width", "tile_height", "width", "height", "tile_size", "n_cameras"),
+    }
+    assert (info["tile_width"], info["tile_height"], info["n_cameras"]) == (4, 3, 1)  # 60 x 44 in tiles of 16
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("packed", [False, True])
+def test_gsplats_default_strategy_runs_unchanged(packed, absgrad):
+    """Densification and pruning on our `info`, as splatfacto drives it."""
+    strategy_module = pytest.importorskip("gsplat.strategy")
+    case = CASES["ordinary"]()
+    params = torch.nn.ParameterDict(
+        {
+            "means": case.means,
+            "quats": case.quats,
+            "scales": case.scales.log(),
+            "opacities": torch.logit(case.opacities),
+            "colors": case.colors,
+        }
+    )
+    optimizers = {name: torch.optim.Adam([p], lr=1e-3) for name, p in params.items()}
+    strategy = strategy_module.DefaultStrategy(
+        absgrad=absgrad, grow_grad2d=1e-6, refine_start_iter=0, refine_every=1, refine_stop_iter=10, reset_every=5
+    )
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state()
+    before = len(params["means"])
+    for step in range(1, 3):
+        render, _, info = rasterization(
+            params["means"],
+            params["quats"],
+            params["scales"].exp(),
+            params["opacities"].sigmoid(),
+            params["colors"],
+            *case.arguments()[5:],
+            packed=packed,
+            absgrad=absgrad,
+        )
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        render.square().mean().backward()
+        strategy.step_post_backward(params, optimizers, state, step, info, packed=packed)
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+    assert len(params["means"]) > before
+
+
+def test_absgrad_is_left_alone_unless_asked_for():
+    case = CASES["one_splat"]()
+    _, _, info = rasterization(case.means.requires_grad_(), *case.arguments()[1:])
+    info["means2d"].sum().backward()
+    assert not hasattr(info["means2d"], "absgrad")
+
+
+def test_background_shines_through_and_has_a_gradient():
+    case = CASES["ordinary"]()
+    background = torch.tensor([[0.3, 0.6, 0.9]], requires_grad=True)
+    black, alphas, _ = rasterization(*case.arguments())
+    render, _, _ = rasterization(*case.arguments(), backgrounds=background)
+    torch.testing.assert_close(render, black + (1 - alphas) * background[:, None, None])
+    render.sum().backward()
+    torch.testing.assert_close(background.grad, (1 - alphas).sum((1, 2)).expand(1, 3))
+
+
+def test_no_splats_at_all():
+    case = CASES["ordinary"]()
+    empty = [t[:0].clone().requires_grad_() for t in (case.means, case.quats, case.scales, case.opacities, case.colors)]
+    render, alphas, info = rasterization(*empty, *case.arguments()[5:], backgrounds=torch.ones(1, 3), absgrad=True)
+    (render.sum() + alphas.sum()).backward()
+    assert (render == 1).all() and (alphas == 0).all() and info["means2d"].shape == (0, 2)
+    assert all(t.grad is not None and t.grad.shape == t.shape for t in empty)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"sh_degree": 3}, ValueError, "sh_degree must be None"),
+        ({"distributed": True}, NotImplementedError, "not supported: distributed"),
+        ({"sparse_grad": True}, NotImplementedError, "not supported: sparse_grad"),
+        ({"covars": torch.eye(3)}, NotImplementedError, "not supported: covars"),
+        ({"camera_model": "fisheye"}, NotImplementedError, "not supported: camera_model='fisheye'"),
+        ({"render_mode": "RGBD"}, ValueError, "render_mode must be one of"),
+        ({"rasterize_mode": "mip"}, ValueError, "rasterize_mode must be one of"),
+        ({"backgrounds": torch.ones(3)}, ValueError, r"backgrounds must have shape \[1, 3\], got \[3\]"),
+    ],
+)
+def test_errors_say_what_is_wrong(options, error, message):
+    with pytest.raises(error, match=message):
+        rasterization(*CASES["one_splat"]().arguments(), **options)
+
+
+@pytest.mark.parametrize(
+    ("field", "shape"),
+    [("means", (1, 2)), ("quats", (2, 4)), ("opacities", (1, 1)), ("colors", (2, 3)), ("Ks", (3, 3))],
+)
+def test_wrong_shapes_are_named(field, shape):
+    case = replace(CASES["one_splat"](), **{field: torch.ones(shape)})
+    with pytest.raises(ValueError, match=f"{field} must have shape"):
+        rasterization(*case.arguments())
+
+
+def test_other_devices_are_refused():
+    case = CASES["one_splat"]()
+    with pytest.raises(NotImplementedError, match="device meta"):
+        rasterization(*(t.to("meta") for t in case.arguments()[:7]), case.width, case.height)
+
+
+def test_cpu_path_imports_no_gsplat():
+    """Importing gsplat's kernels compiles them where nvcc exists; the CPU path must work without gsplat altogether."""
+    program = (
+        "import sys; sys.modules['gsplat'] = None\n"
+        "import torch; from nrfgs_ns.rasterizer import rasterization\n"
+        "x = [torch.ones(2, n) for n in (3, 4, 3)]\n"
+        "image = rasterization(*x, torch.ones(2), torch.ones(2, 3), torch.eye(4)[None], torch.eye(3)[None], 8, 8)[0]\n"
+        "assert image.shape == (1, 8, 8, 3) and image.sum() > 0"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+def test_autocast_does_not_reach_the_arithmetic():
+    case = CASES["ordinary"]()
+    expected = rasterization(*case.arguments())[0]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(rasterization(*case.arguments())[0], expected)
+
+
+def test_low_matmul_precision_does_not_reach_the_arithmetic():
+    """`set_float32_matmul_precision("medium")`, popular in training scripts, turns CPU matrix products into bfloat16."""
+    case = CASES["ordinary"]()
+    expected = rasterization(*case.arguments())[0]
+    before = torch.get_float32_matmul_precision()
+    try:
+        torch.set_float32_matmul_precision("medium")
+        assert torch.equal(rasterization(*case.arguments())[0], expected)
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def test_one_very_long_tile():
+    """Twenty thousand splats over one 8 x 8 tile, faint enough that light is left: the sum has a closed form.
+
+    All splats are flat over the tile (sigma ~ 0), so alpha = o for each and T = (1 - o)^n up to n roundings: 20,000 x 2^-24 = 1e-3.
+    """
+    n, o = 20_000, 0.004
+    means = torch.cat([torch.zeros(n, 2), torch.linspace(1, 2, n)[:, None]], 1)
+    K = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
+    opacities = torch.full((n,), o, requires_grad=True)
+    scales, quats = torch.full((n, 3), 1e4), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1)
+    _, alphas, _ = rasterization(means, quats, scales, opacities, torch.ones(n, 1), torch.eye(4)[None], K, 8, 8)
+    drawn = int(
+        torch.floor(torch.log(torch.tensor(1e-4)) / torch.log1p(torch.tensor(-o)))
+    )  # T falls to 1e-4 after these
+    torch.testing.assert_close(1 - alphas, torch.full_like(alphas, (1 - o) ** drawn), rtol=5e-3, atol=0)
+    alphas.sum().backward()
+    assert (opacities.grad[:drawn] > 0).all() and (opacities.grad[drawn + 1 :] == 0).all()
+
+
+def test_hidden_splats_cost_nothing(monkeypatch):
+    """Behind an opaque wall of 20 layers, 5000 more splats are never looked at: two slabs of 64 instead of 79."""
+    calls = []
+    blend = compositing._blend
+    monkeypatch.setattr(compositing, "_blend", lambda *a: calls.append(a[2].first) or blend(*a))
+    n = 5020
+    means = torch.cat([torch.zeros(n, 2), torch.linspace(1, 2, n)[:, None]], 1)
+    K = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
+    shape = [torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1), torch.full((n, 3), 10.0)]
+    rasterization(means, *shape, torch.full((n,), 0.9), torch.ones(n, 1), torch.eye(4)[None], K, 8, 8)
+    assert max(calls) == 0

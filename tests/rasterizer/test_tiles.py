@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lists against their definition: every splat that reaches a pixel is listed there, in order, and hardly anything else."""
+
+import pytest
+import torch
+from make_gsplat_fixtures import CASES
+from nrfgs_ns.rasterizer import project
+from nrfgs_ns.rasterizer.torch_cpu.tiles import MIN_ALPHA, Block, footprints, list_tiles, split_into_blocks
+
+TILE = 16
+
+
+def brute_force(projection, opacities):
+    """alpha of every (row, pixel) within gsplat's tiles, 0 elsewhere; float64. [M, C, H, W]"""
+    y, x = torch.meshgrid(torch.arange(projection.height), torch.arange(projection.width), indexing="ij")
+    dx = (x + 0.5) - projection.means2d[:, 0, None, None].double()
+    dy = (y + 0.5) - projection.means2d[:, 1, None, None].double()
+    a, b, c = (projection.conics[:, i, None, None].double() for i in range(3))
+    alpha = opacities[:, None, None].double() * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    within = torch.ones_like(alpha, dtype=torch.bool)
+    for pixel, centre in ((x, projection.means2d[:, 0]), (y, projection.means2d[:, 1])):
+        first = ((centre - projection.radii) / TILE).floor()[:, None, None]
+        end = ((centre + projection.radii) / TILE).ceil()[:, None, None]
+        within &= (pixel // TILE >= first) & (pixel // TILE < end)
+    camera = torch.arange(projection.n_cameras)[None, :, None, None] == projection.camera_ids[:, None, None, None]
+    return torch.where(within, alpha, 0.0)[:, None] * camera
+
+
+def setup(name):
+    case = CASES[name]()
+    with torch.no_grad():
+        projection = project(case.means, case.quats, case.scales, case.viewmats, case.Ks, case.width, case.height)
+    opacities = case.opacities[projection.gaussian_ids]
+    return projection, opacities, footprints(projection, opacities, TILE)
+
+
+def tile_maxima(alpha, prints):
+    """Largest alpha of each row in each sub-tile. [M, C * tiles]"""
+    edge = prints.edge
+    pad = (0, prints.tiles_x * edge - alpha.shape[-1], 0, prints.tiles_y * edge - alpha.shape[-2])
+    return torch.nn.functional.max_pool2d(torch.nn.functional.pad(alpha, pad), edge).flatten(1)
+
+
+def listed(lists, prints, shape):
+    table = torch.zeros(shape, dtype=torch.bool)
+    table[prints.rows[lists.splat], lists.tiles.repeat_interleave(lists.count)] = True
+    return table
+
+
+@pytest.mark.parametrize("name", [n for n in CASES if n not in ("nothing_visible", "near_plane")])
+def test_lists_are_complete_ordered_and_tight(name):
+    projection, opacities, prints = setup(name)
+    lists = list_tiles(prints, prints.whole)
+    maxima = tile_maxima(brute_force(projection, opacities), prints)
+    table = listed(lists, prints, maxima.shape)
+    assert len(lists.splat) == table.sum(), "a pair is listed twice"
+    assert table[maxima >= MIN_ALPHA * (1 + 1e-6)].all(), "a splat that can be seen is missing"
+    # The ellipse can pass between pixel centres of a tile that it enters, so some pairs turn out empty. Never most of them
+    # for splats wider than a pixel; a bounding box would list three times too many for the needles.
+    assert table.sum() <= 1.5 * (maxima >= MIN_ALPHA).sum() + 20
+
+    depth = projection.depths[prints.rows[lists.splat]]
+    rows = prints.rows[lists.splat]
+    for start, count in zip(lists.start.tolist(), lists.count.tolist(), strict=True):
+        keys = [
+            (float(d), int(r)) for d, r in zip(depth[start : start + count], rows[start : start + count], strict=True)
+        ]
+        assert keys == sorted(keys)
+
+
+def test_slots_put_the_pairs_of_a_splat_side_by_side():
+    _, _, prints = setup("ordinary")
+    lists = list_tiles(prints, prints.whole)
+    by_slot = torch.empty_like(lists.splat)
+    by_slot[lists.slot] = lists.splat
+    counts = torch.diff(torch.cat([lists.splat_start, torch.tensor([len(by_slot)])]))
+    assert torch.equal(by_slot, torch.arange(len(prints.rows)).repeat_interleave(counts))
+
+
+@pytest.mark.parametrize("name", ["ordinary", "larger_than_image", "several_cameras", "needles"])
+def test_blocks_partition_the_lists(name):
+    _, _, prints = setup(name)
+    whole = list_tiles(prints, prints.whole)
+    blocks = split_into_blocks(prints, 50)
+    assert len(blocks) > 1
+    parts = [list_tiles(prints, block) for block in blocks]
+    pairs = {(int(t), int(s)) for p in parts for t, s in zip(p.tiles.repeat_interleave(p.count), p.splat, strict=True)}
+    assert sum(len(p.splat) for p in parts) == len(whole.splat) == len(pairs)
+    expected = zip(whole.tiles.repeat_interleave(whole.count), whole.splat, strict=True)
+    assert pairs == {(int(t), int(s)) for t, s in expected}
+
+
+def test_blocks_respect_their_bound_down_to_single_tiles():
+    _, _, prints = setup("larger_than_image")
+    for block in split_into_blocks(prints, 100):
+        single = block.row1 - block.row0 == 1 and block.col1 - block.col0 == 1
+        assert single or len(list_tiles(prints, block).splat) <= 100
+
+
+def test_nothing_to_list():
+    _, _, prints = setup("nothing_visible")
+    assert prints.whole == Block(0, 0, 0, prints.tiles_x)
+    assert split_into_blocks(prints, 100) == []
+
+
+def test_faint_splats_are_not_listed():
+    """Below 1/255 nothing is drawn, whatever the pixel."""
+    projection, _, _ = setup("ordinary")
+    m = len(projection.radii)
+    assert len(footprints(projection, torch.full((m,), 0.0039), TILE).rows) == 0
+    assert len(footprints(projection, torch.full((m,), 0.5), TILE).rows) > 0.9 * m

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real trainings: minutes, not seconds. Run with `pytest -m slow`."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from nrfgs_ns.scenes import SceneConfig, write_scene
+from nrfgs_ns.studies.run import evaluate, train
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def psnr(method: str, data: Path, out: Path, steps: int, *options: str) -> float:
+    args = [method, "--data", str(data), "--output-dir", str(out), "--max-num-iterations", str(steps)]
+    args += ["--vis", "tensorboard", "--steps-per-eval-image", "100000", "--steps-per-eval-all-images", "100000"]
+    args += ["--logging.local-writer.enable", "False", "--pipeline.model.num-downscales", "0", *options]
+    return evaluate(Path(train(args).config_path), out / f"{method}.json")["psnr"]
+
+
+def test_the_field_pays_where_there_is_gloss(tmp_path):
+    """On mirror-like balls NRF beats its own base colour, and SH of degree 0, after the same 500 steps."""
+    data = write_scene(SceneConfig(gloss=1.0, views=24, width=100, height=76, points=2000), tmp_path / "scene")
+    matte = psnr("nrfgs-sh", data, tmp_path, 500, "--pipeline.model.appearance.degree", "0")
+    field = psnr("nrfgs", data, tmp_path, 500)
+    # Seeds move either by about 0.1 dB.
+    assert field > matte + 0.3
+
+
+@pytest.mark.parametrize("scene", ["fox", "kitchen"])
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+def test_real_photographs_train(scene, method, captures, tmp_path):
+    scale = ["--pipeline.datamanager.camera-res-scale-factor", "0.125"]
+    assert psnr(method, captures / scene, tmp_path, 300, *scale) > 17
+
+
+def test_compare_runs_resumes_and_reports_failures(tiny_scene, tmp_path):
+    """benchmarks/compare.py: a finished run is kept, a missing one is made, a crashed one is listed as failed."""
+    script = [sys.executable, str(ROOT / "benchmarks" / "compare.py"), "--scenes", str(tiny_scene), "--steps", "5"]
+    script += ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work"), "--methods", "nrfgs-sh"]
+    subprocess.run([*script, "nrfgs:broken=--pipeline.model.appearance.num-bands 0"], check=True)
+    record = tmp_path / "out" / "runs" / f"nrfgs-sh-{tiny_scene.name}-42.json"
+    first = record.stat().st_mtime_ns
+    summary = {row["method"]: row for row in json.loads((tmp_path / "out" / "summary.json").read_text())}
+    assert summary["nrfgs:broken"]["failed"] == 1 and summary["nrfgs-sh"]["failed"] == 0
+    subprocess.run([*script, "nrfgs"], check=True)
+    assert record.stat().st_mtime_ns == first
+    table = (tmp_path / "out" / "table.md").read_text()
+    assert f"| {tiny_scene.name} | nrfgs | 1 |" in table
+
+
+def test_killed_training_goes_on_from_its_checkpoint(tiny_scene, tmp_path):
+    """SIGKILL in the middle of `ns-train`; what is left on disk continues."""
+    args = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "100000"]
+    args += ["--vis", "tensorboard", "--steps-per-save", "20", "--steps-per-eval-image", "1000000"]
+    args += ["--steps-per-eval-all-images", "1000000"]
+    code = "from nerfstudio.scripts.train import entrypoint; entrypoint()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *args], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    deadline = time.time() + 120
+    while time.time() < deadline and not list(tmp_path.rglob("step-0000001*.ckpt")):
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    checkpoint = max(tmp_path.rglob("nerfstudio_models/*.ckpt"))
+    reached = int(checkpoint.stem.split("-")[1])
+    assert reached >= 100
+    args[args.index("--max-num-iterations") + 1] = "3"
+    record = train([*args, "--load-dir", str(checkpoint.parent)])
+    assert record.splats[-1][0] == reached + 3
