@@ -5,9 +5,10 @@
     python benchmarks/rasterizer_cpu.py --checkpoint path/to/step.ckpt    # and a trained nerfstudio scene
     python benchmarks/rasterizer_cpu.py --sizes 20000x256x256 --no-loop --repeats 5
 
-The loop is what one would write first: gsplat's lists of 16-pixel tiles, then for each tile alpha, cumulative product and sum
-in plain torch, differentiated by autograd. Both compute the same image, which is checked before anything is timed. Figures are
-medians over the repeats in milliseconds; projection is included. Peak memory is measured in a process of its own per size.
+The loop is what one would write first: gsplat's lists of 16-pixel tiles, then for each tile alpha, cumulative product
+and sum in plain torch, differentiated by autograd. Both compute the same image, which is checked before anything is
+timed. Figures are medians over the repeats in milliseconds; projection is included. Peak memory is measured in a
+process of its own per size.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import argparse
 import json
 import math
 import platform
-import resource
 import statistics
 import subprocess
 import sys
@@ -66,7 +66,9 @@ def cloud(n: int, width: int, height: int, opaque: bool = False) -> Scene:
 
 
 def trained(path: Path, width: int, height: int) -> Scene:
-    """The splats of a nerfstudio checkpoint, base colours only, seen from outside along the mean viewing axis of its cloud."""
+    """The splats of a nerfstudio checkpoint, base colours only, seen from outside along the mean viewing axis of its
+    cloud.
+    """
     state = torch.load(path, map_location="cpu", weights_only=True)["pipeline"]
     splats = {key.rsplit(".", 1)[-1]: t.float() for key, t in state.items() if ".gauss_params." in key}
     base = splats.get("features_dc", splats.get("colors"))
@@ -85,7 +87,15 @@ def trained(path: Path, width: int, height: int) -> Scene:
 
 
 def plain_loop(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, w: int, h: int
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    w: int,
+    h: int,
 ) -> tuple[Tensor, Tensor]:
     """The baseline: one camera, 16-pixel tiles one after the other, gradients by autograd."""
     p: Projection = project(means, quats, scales, viewmats, Ks, w, h)
@@ -143,13 +153,19 @@ def agree(scene: Scene) -> float:
 
 
 def peak_memory(n: int, width: int, height: int) -> float:
-    """MiB by which the peak of one forward and backward exceeds what the process holds before, inputs included. Linux."""
+    """MiB by which the peak of one forward and backward exceeds what the process held before. Linux only."""
     scene = cloud(n, width, height)
     # A first small image loads libraries and starts threads.
     timed(rasterization, cloud(100, 32, 32), 0)
-    resident = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    before = memory_kib("VmRSS")
     timed(rasterization, scene, 0)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - resident / 2**20
+    return (memory_kib("VmHWM") - before) / 1024
+
+
+def memory_kib(field: str) -> int:
+    """A line of Linux's account of this process: VmRSS is what it holds now, VmHWM the most it ever held."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(field))
 
 
 def main() -> None:
@@ -195,9 +211,15 @@ def main() -> None:
         print(line, flush=True)
         rows[name] = row
 
-    machine = {"cpu": platform.processor() or platform.machine(), "threads": arguments.threads, "torch": torch.__version__}
+    machine = {
+        "cpu": platform.processor() or platform.machine(),
+        "threads": arguments.threads,
+        "torch": torch.__version__,
+    }
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps({"machine": machine, "repeats": arguments.repeats, "results": rows}, indent=2) + "\n")
+    arguments.out.write_text(
+        json.dumps({"machine": machine, "repeats": arguments.repeats, "results": rows}, indent=2) + "\n"
+    )
 
 
 if __name__ == "__main__":

@@ -7,8 +7,8 @@ Two stages, because colours and opacities come from an appearance head that shou
     colors, opacities = head(projection.gaussian_ids, ...)                       # one row per visible splat
     render, alphas, info = composite(projection, colors, opacities)              # the image
 
-`rasterization` is both at once, with the signature of `gsplat.rasterization`. The device of the means picks the back end:
-gsplat's kernels on CUDA, `torch_cpu` (plain torch, no compiler) elsewhere on the CPU.
+`rasterization` is both at once, with the signature of `gsplat.rasterization`. The device of the means picks the back
+end: gsplat's kernels on CUDA, `torch_cpu` (plain torch, no compiler) elsewhere on the CPU.
 """
 
 from __future__ import annotations
@@ -62,6 +62,7 @@ def project(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     rasterize_mode: RasterizeMode = "classic",
+    packed: bool = True,
 ) -> Projection:
     """Find the splats that each camera sees and project them. Differentiable in all tensors but Ks.
 
@@ -76,6 +77,8 @@ def project(
         radius_clip: splats whose radius is at most this many pixels are skipped.
         eps2d: blur added to the 2D covariances, in square pixels.
         rasterize_mode: "antialiased" also computes the opacity factor that compensates for the blur.
+        packed: which of gsplat's projection kernels to follow. The rows come packed either way, but the two kernels
+            put different floors into the radius formula, so a small round splat has radius 3 (packed) or 2 (not).
 
     Raises:
         ValueError: a tensor has the wrong shape, or the mode is unknown.
@@ -105,6 +108,7 @@ def project(
         radius_clip=radius_clip,
         eps2d=eps2d,
         rasterize_mode=rasterize_mode,
+        packed=packed,
     )
 
 
@@ -124,6 +128,7 @@ def composite(
         projection: the result of `project`, M rows.
         colors: any number of channels D per row; ignored by the modes "D" and "ED". [M, D]
         opacities: opacity per row, before antialiasing compensation. Below 1/255 nothing is drawn. [M]
+            Both are brought to the precision of the projection: under autocast a head answers in half precision.
         backgrounds: colour behind the splats; depth is always composited over 0. [C, D]
         render_mode: channels of the render: colours, accumulated depth sum(w z) ("D"), expected depth sum(w z) / sum(w)
             ("ED"), or colours followed by one of the depths.
@@ -131,9 +136,10 @@ def composite(
         absgrad: leave sum |dL/dmean2d| over pixels in `projection.means2d.absgrad` when going backward. [M, 2]
 
     Returns:
-        render [C, H, W, X], alphas [C, H, W, 1], and gsplat's `info`: camera_ids, gaussian_ids, radii, means2d, depths, conics,
-        opacities (compensated), width, height, tile_size, tile_width, tile_height, n_cameras; on CUDA also tiles_per_gauss,
-        isect_ids, flatten_ids and isect_offsets, which index gsplat's own lists and have no counterpart on the CPU.
+        render [C, H, W, X], alphas [C, H, W, 1], and gsplat's `info`: camera_ids, gaussian_ids, radii, means2d,
+        depths, conics, opacities (compensated), width, height, tile_size, tile_width, tile_height, n_cameras; on CUDA
+        also tiles_per_gauss, isect_ids, flatten_ids and isect_offsets, which index gsplat's own lists and have no
+        counterpart on the CPU.
 
     Raises:
         ValueError: a tensor has the wrong shape, or the mode is unknown.
@@ -146,6 +152,7 @@ def composite(
     if backgrounds is not None:
         _check_shape("backgrounds", backgrounds, c, colors.shape[-1])
 
+    colors, opacities = colors.to(projection.depths.dtype), opacities.to(projection.depths.dtype)
     if projection.compensations is not None:
         opacities = opacities * projection.compensations
     depths = projection.depths[:, None]
@@ -212,19 +219,21 @@ def rasterization(
     Args:
         opacities: one per splat. [N]
         colors: one per splat, or per camera and splat. [N, D] or [C, N, D]
-        packed: False gives `info` gsplat's dense layout: radii, means2d, depths, conics and opacities with leading dimensions
-            [C, N] and zeros where a splat is not visible; camera_ids and gaussian_ids are None.
+        packed: False gives `info` gsplat's dense layout: radii, means2d, depths, conics and opacities with leading
+            dimensions [C, N] and zeros where a splat is not visible; camera_ids and gaussian_ids are None.
         channel_chunk: accepted for the signature's sake; any number of channels is composited at once.
 
         The others: see `project` and `composite`.
 
     Raises:
-        ValueError: a tensor has the wrong shape, a mode is unknown, or spherical harmonics were asked for: colours are the
-            business of an appearance head.
+        ValueError: a tensor has the wrong shape, a mode is unknown, or spherical harmonics were asked for: colours are
+            the business of an appearance head.
         NotImplementedError: distributed, sparse_grad, covars, or a camera that is not a pinhole.
     """
     if sh_degree is not None:
-        raise ValueError("sh_degree must be None: evaluate colours first (see nrfgs_ns.appearance) and pass them as `colors`")
+        raise ValueError(
+            "sh_degree must be None: evaluate colours first (see nrfgs_ns.appearance) and pass them as `colors`"
+        )
     unsupported = {
         "distributed": distributed,
         "sparse_grad": sparse_grad,
@@ -250,6 +259,7 @@ def rasterization(
         radius_clip=radius_clip,
         eps2d=eps2d,
         rasterize_mode=rasterize_mode,
+        packed=packed,
     )
     cell = (projection.camera_ids, projection.gaussian_ids)
     if not packed:

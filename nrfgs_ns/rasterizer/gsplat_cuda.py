@@ -26,6 +26,7 @@ def project(
     radius_clip: float,
     eps2d: float,
     rasterize_mode: str,
+    packed: bool,
 ) -> Projection:
     """See `nrfgs_ns.rasterizer.project`."""
     rows = fully_fused_projection(
@@ -38,12 +39,16 @@ def project(
         width,
         height,
         eps2d=eps2d,
-        packed=True,
+        packed=packed,
         near_plane=near_plane,
         far_plane=far_plane,
         radius_clip=radius_clip,
         calc_compensations=rasterize_mode == "antialiased",
     )
+    if not packed:
+        camera_ids, gaussian_ids = (rows[0] > 0).nonzero(as_tuple=True)
+        seen = (None if dense is None else dense[camera_ids, gaussian_ids] for dense in rows)
+        rows = (camera_ids, gaussian_ids, *seen)
     return Projection(*rows, width=width, height=height, n_cameras=viewmats.shape[0])
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from agreement import assert_agrees, judge
 from make_gsplat_fixtures import CASES, evaluate, load
+
 from nrfgs_ns.rasterizer import rasterization
 
 FOLDER = Path(__file__).resolve().parents[1] / "fixtures" / "gsplat"
@@ -22,7 +23,7 @@ def recorded(request):
 
 
 def test_gsplat_agrees_with_the_twin(recorded):
-    """The twin is the definition that the CPU rasterizer is tested by everywhere else: gsplat itself must satisfy it."""
+    """The twin is what the CPU rasterizer is tested by everywhere else: gsplat itself must satisfy it."""
     _, _, gsplat, verdict = recorded
     assert_agrees(verdict, gsplat)
 

@@ -9,8 +9,9 @@ from agreement import FLOAT32, FLOAT64, assert_agrees, judge
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from make_gsplat_fixtures import CASES, Case, _camera, evaluate, upstream
+
 from nrfgs_ns.rasterizer import rasterization
-from nrfgs_ns.rasterizer.torch_cpu import compositing
+from nrfgs_ns.rasterizer.torch_cpu import batches, compositing
 
 
 def in_precision(case: Case, dtype: torch.dtype) -> Case:
@@ -41,8 +42,8 @@ def test_hard_cases_in_float64(name):
 @pytest.mark.parametrize("name", ["ordinary", "opaque_layers", "several_cameras"])
 def test_any_partition_of_the_work_gives_the_same_result(name, monkeypatch):
     """Slabs of 5, batches of a few tiles and blocks of 100 pairs: every loop is taken, every state handed over."""
-    monkeypatch.setattr(compositing, "SLAB", 5)
-    monkeypatch.setattr(compositing, "BATCH_ELEMENTS", 64 * 13)
+    monkeypatch.setattr(batches, "SLAB", 5)
+    monkeypatch.setattr(batches, "BATCH_ELEMENTS", 64 * 13)
     monkeypatch.setattr(compositing, "BLOCK_PAIRS", 100)
     check(CASES[name]())
 
@@ -57,10 +58,15 @@ def test_tile_sizes(tile_size):
 
 @st.composite
 def scenes(draw) -> Case:
-    """Clouds from opaque to transparent, from dust to planets, round to needle-like, near and far, one or two cameras."""
+    """Clouds from opaque to transparent, from dust to planets, round to needle-like, near and far, one or two cameras.
+
+    Images have at least 6 x 6 pixels: in smaller ones all of a splat's gradient may come from one pixel at its very
+    centre, where d^2 is below the rounding of the tile's coordinates and the judge's relative noise no longer
+    describes it.
+    """
     g = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
     n = draw(st.integers(0, 40))
-    width, height = draw(st.integers(1, 40)), draw(st.integers(1, 40))
+    width, height = draw(st.integers(6, 40)), draw(st.integers(6, 40))
     log_size = draw(st.floats(-5, 1.5))
     spread = draw(st.floats(0, 2))
     cameras = draw(st.integers(1, 2))
@@ -88,23 +94,32 @@ def scenes(draw) -> Case:
     )
 
 
-@settings(max_examples=40)
+@settings(max_examples=40, derandomize=True)
 @given(scenes())
 def test_random_scenes(case):
     check(case)
 
 
-@settings(max_examples=15)
+@settings(max_examples=20, derandomize=True)
 @given(scenes())
 def test_random_scenes_in_float64(case):
     check(case, torch.float64)
 
 
+@pytest.mark.slow
+@settings(max_examples=1000)
+@given(scenes(), st.sampled_from([torch.float32, torch.float64]))
+def test_many_random_scenes(case, dtype):
+    """New scenes every time: the search, where the two above are the regression test."""
+    check(case, dtype)
+
+
 def test_finite_differences():
     """dL/dparameter by central differences in float64, on a scene without cut-offs.
 
-    One splat-filled tile with alphas in (1/255, 0.999) everywhere: wide splats of opacity 0.1 to 0.3, so L is smooth. With step h the
-    truncation error is about L''' h^2 / 6 and the rounding error 1e-16 |L| / h; h = 1e-5 leaves both near 1e-9 relative.
+    One splat-filled tile with alphas in (1/255, 0.999) everywhere: wide splats of opacity 0.1 to 0.3, so L is smooth.
+    With step h the truncation error is about L''' h^2 / 6 and the rounding error 1e-16 |L| / h; h = 1e-5 leaves both
+    near 1e-9 relative.
     """
     g = torch.Generator().manual_seed(0)
     n = 6

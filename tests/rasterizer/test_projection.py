@@ -7,6 +7,7 @@ Values and gradients are held against the float64 twin in test_against_twin.py.
 import pytest
 import torch
 from make_gsplat_fixtures import CASES, _camera
+
 from nrfgs_ns.rasterizer import project
 
 W, H = 40, 28
@@ -39,13 +40,17 @@ def test_square_must_overlap_the_image():
 
 
 def test_radius_of_a_point_comes_from_the_blur():
-    """cov = 0.3 I: b^2 - det = 0 is floored at 0.1, so r = ceil(3 sqrt(0.3 + sqrt 0.1)) = ceil(2.355) = 3."""
+    """cov = 0.3 I: b^2 - det = 0 is floored at 0.1 by gsplat's packed kernel and at 0.01 by the other one.
+
+    r = ceil(3 sqrt(0.3 + sqrt 0.1)) = ceil(2.355) = 3, or ceil(3 sqrt(0.3 + sqrt 0.01)) = ceil(1.897) = 2.
+    """
     assert int(one(scale=1e-6).radii[0]) == 3
+    assert int(one(scale=1e-6, packed=False).radii[0]) == 2
 
 
 @pytest.mark.parametrize("field", ["means", "quats", "scales"])
 def test_invisible_and_invalid_splats_send_no_nan_back(field):
-    """Centres at and behind the camera, zero quaternions, infinite and NaN scales: invisible, with gradient exactly 0."""
+    """Centres at and behind the camera, zero quaternions, infinite and NaN scales: invisible, gradient exactly 0."""
     means = torch.tensor(
         [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 2.0], [0.0, 0.0, 2.0]]
     )
@@ -98,14 +103,16 @@ def test_long_needles_keep_a_definite_conic():
 
 
 def test_agrees_with_gsplats_torch_projection():
-    """gsplat's own plain-torch projection, an independent program. Its radius formula differs from its kernel's (0.01
-    for 0.1 under the root) and its fov limit is symmetric, so those are left to the recorded GPU results. float64: 1e-9."""
+    """gsplat's own plain-torch projection, an independent program, in float64.
+
+    Its radius formula differs from its kernel's (0.01 for 0.1 under the root) and its fov limit is symmetric: those are
+    left to the recorded GPU results.
+    """
     torch_impl = pytest.importorskip("gsplat.cuda._torch_impl")
     case = CASES["ordinary"]()
     tensors = [t.double() for t in (case.means, case.quats, case.scales, case.viewmats, case.Ks)]
-    covars, _ = torch_impl._quat_scale_to_covar_preci(
-        tensors[1] / tensors[1].norm(dim=-1, keepdim=True), tensors[2], True, False
-    )
+    quats = tensors[1] / tensors[1].norm(dim=-1, keepdim=True)
+    covars, _ = torch_impl._quat_scale_to_covar_preci(quats, tensors[2], True, False)
     size = (case.width, case.height)
     _, means2d, depths, conics, compensations = torch_impl._fully_fused_projection(
         tensors[0], covars, *tensors[3:], *size, calc_compensations=True

@@ -4,12 +4,14 @@
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from make_gsplat_fixtures import CASES
+
 from nrfgs_ns.rasterizer import composite, project, rasterization
-from nrfgs_ns.rasterizer.torch_cpu import compositing
+from nrfgs_ns.rasterizer.torch_cpu import compositing, projection
 
 
 def test_two_stages_are_the_whole_call():
@@ -30,7 +32,8 @@ def test_two_stages_are_the_whole_call():
 
 
 @pytest.mark.parametrize("name", ["ordinary", "several_cameras"])
-def test_packed_and_dense_layouts_hold_the_same(name):
+def test_packed_and_dense_layouts_hold_the_same(name, monkeypatch):
+    monkeypatch.setattr(projection, "MIN_DISCRIMINANT_DENSE", projection.MIN_DISCRIMINANT_PACKED)  # all else is equal
     case = CASES[name]()
     leaves, infos, images = [], [], []
     for packed in (True, False):
@@ -123,6 +126,21 @@ def test_background_shines_through_and_has_a_gradient():
     torch.testing.assert_close(background.grad, (1 - alphas).sum((1, 2)).expand(1, 3))
 
 
+def test_alpha_is_capped_without_gradient_to_the_shape():
+    """A splat much wider than the image has alpha = o everywhere: 0.999 at most, and then only colour has gradients."""
+    case = replace(CASES["one_splat"](), scales=torch.full((1, 3), 1e3), opacities=torch.tensor([1.0]))
+    leaves = [t.clone().requires_grad_() for t in case.arguments()[:5]]
+    render, alphas, _ = rasterization(*leaves, *case.arguments()[5:])
+    torch.testing.assert_close(alphas, torch.full_like(alphas, 0.999))
+    render.sum().backward()
+    assert all((leaf.grad == 0).all() for leaf in leaves[:4])
+    torch.testing.assert_close(leaves[4].grad, torch.full((1, 3), 0.999 * case.width * case.height))
+    # Just below the cap, the gradient is there.
+    below = torch.tensor([0.9985], requires_grad=True)
+    rasterization(*case.arguments()[:3], below, *case.arguments()[4:])[1].sum().backward()
+    torch.testing.assert_close(below.grad, torch.full((1,), 1.0 * case.width * case.height))
+
+
 def test_no_splats_at_all():
     case = CASES["ordinary"]()
     empty = [t[:0].clone().requires_grad_() for t in (case.means, case.quats, case.scales, case.opacities, case.colors)]
@@ -186,7 +204,7 @@ def test_autocast_does_not_reach_the_arithmetic():
 
 
 def test_low_matmul_precision_does_not_reach_the_arithmetic():
-    """`set_float32_matmul_precision("medium")`, popular in training scripts, turns CPU matrix products into bfloat16."""
+    """`set_float32_matmul_precision("medium")`, popular in training scripts, makes CPU products bfloat16."""
     case = CASES["ordinary"]()
     expected = rasterization(*case.arguments())[0]
     before = torch.get_float32_matmul_precision()
@@ -201,7 +219,8 @@ def test_low_matmul_precision_does_not_reach_the_arithmetic():
 def test_one_very_long_tile():
     """Twenty thousand splats over one 8 x 8 tile, faint enough that light is left: the sum has a closed form.
 
-    All splats are flat over the tile (sigma ~ 0), so alpha = o for each and T = (1 - o)^n up to n roundings: 20,000 x 2^-24 = 1e-3.
+    All splats are flat over the tile (sigma ~ 0), so alpha = o for each and T = (1 - o)^n up to n roundings: 20,000 x
+    2^-24 = 1e-3.
     """
     n, o = 20_000, 0.004
     means = torch.cat([torch.zeros(n, 2), torch.linspace(1, 2, n)[:, None]], 1)
@@ -218,13 +237,43 @@ def test_one_very_long_tile():
 
 
 def test_hidden_splats_cost_nothing(monkeypatch):
-    """Behind an opaque wall of 20 layers, 5000 more splats are never looked at: two slabs of 64 instead of 79."""
-    calls = []
-    blend = compositing._blend
-    monkeypatch.setattr(compositing, "_blend", lambda *a: calls.append(a[2].first) or blend(*a))
+    """Behind an opaque wall of 20 layers, 5000 more splats are never looked at: one slab of 32 instead of 157."""
+    slabs = []
+    batch = compositing.Batch
+    monkeypatch.setattr(compositing, "Batch", lambda *a: slabs.append(a[1]) or batch(*a))
     n = 5020
     means = torch.cat([torch.zeros(n, 2), torch.linspace(1, 2, n)[:, None]], 1)
     K = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
     shape = [torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1), torch.full((n, 3), 10.0)]
     rasterization(means, *shape, torch.full((n,), 0.9), torch.ones(n, 1), torch.eye(4)[None], K, 8, 8)
-    assert max(calls) == 0
+    assert slabs == [0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["200000x1600x1200", "200000x800x600"])
+def test_peak_memory_is_bounded(size):
+    """Forward and backward of 200,000 splats stay within 1 GiB above their inputs; in a fresh process, for its peak is
+    one's own.
+    """
+    script = Path(__file__).resolve().parents[2] / "benchmarks" / "rasterizer_cpu.py"
+    done = subprocess.run([sys.executable, script, "--peak-memory", size], check=True, capture_output=True, text=True)
+    assert float(done.stdout) < 1024
+
+
+@pytest.mark.slow
+def test_a_tile_of_a_hundred_thousand_splats():
+    """All over the same 8 x 8 pixels and nearly transparent to the last one: 3,125 slabs, a handful of arrays of 2,048
+    each.
+    """
+    n = 100_000
+    means = torch.cat([torch.zeros(n, 2), torch.linspace(1, 2, n)[:, None]], 1)
+    K = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
+    opacities = torch.zeros(n)
+    opacities[::200] = 0.0045  # 500 visible ones: T = 0.9955^500 = 0.105
+    opacities.requires_grad_()
+    scales, quats = torch.full((n, 3), 1e4), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1)
+    everyone = torch.full((n,), 0.0045)
+    _, some, _ = rasterization(means, quats, scales, opacities, torch.ones(n, 1), torch.eye(4)[None], K, 8, 8)
+    torch.testing.assert_close(1 - some, torch.full_like(some, 0.9955**500), rtol=1e-4, atol=0)
+    _, every, _ = rasterization(means, quats, scales, everyone, torch.ones(n, 1), torch.eye(4)[None], K, 8, 8)
+    assert ((1 - every > 1e-4) & (1 - every < 1e-4 / 0.9955 * 1.01)).all()

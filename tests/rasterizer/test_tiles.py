@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lists against their definition: every splat that reaches a pixel is listed there, in order, and hardly anything else."""
+"""The lists against their definition: every splat that reaches a pixel is listed there, in order, and hardly anything
+else.
+"""
 
 import pytest
 import torch
 from make_gsplat_fixtures import CASES
-from nrfgs_ns.rasterizer import project
+
+from nrfgs_ns.rasterizer import project, rasterization
+from nrfgs_ns.rasterizer.torch_cpu import compositing
 from nrfgs_ns.rasterizer.torch_cpu.tiles import MIN_ALPHA, Block, footprints, list_tiles, split_into_blocks
 
 TILE = 16
@@ -55,8 +59,8 @@ def test_lists_are_complete_ordered_and_tight(name):
     table = listed(lists, prints, maxima.shape)
     assert len(lists.splat) == table.sum(), "a pair is listed twice"
     assert table[maxima >= MIN_ALPHA * (1 + 1e-6)].all(), "a splat that can be seen is missing"
-    # The ellipse can pass between pixel centres of a tile that it enters, so some pairs turn out empty. Never most of them
-    # for splats wider than a pixel; a bounding box would list three times too many for the needles.
+    # The ellipse can pass between pixel centres of a tile that it enters, so some pairs turn out empty. Never most of
+    # them for splats wider than a pixel; a bounding box would list three times too many for the needles.
     assert table.sum() <= 1.5 * (maxima >= MIN_ALPHA).sum() + 20
 
     depth = projection.depths[prints.rows[lists.splat]]
@@ -109,3 +113,20 @@ def test_faint_splats_are_not_listed():
     m = len(projection.radii)
     assert len(footprints(projection, torch.full((m,), 0.0039), TILE).rows) == 0
     assert len(footprints(projection, torch.full((m,), 0.5), TILE).rows) > 0.9 * m
+
+
+def test_blocks_without_a_pair(monkeypatch):
+    """A diagonal needle misses most blocks of its bounding box: single sub-tiles, listed with nothing in them."""
+    K = torch.tensor([[[60.0, 0.0, 50.0], [0.0, 60.0, 50.0], [0.0, 0.0, 1.0]]])
+    needle = [
+        torch.tensor([[0.0, 0.0, 2.0]]),
+        torch.tensor([[0.924, 0.0, 0.0, 0.383]]),
+        torch.tensor([[2.0, 1e-3, 1e-3]]),
+    ]
+    arguments = (*needle, torch.tensor([0.9]), torch.ones(1, 3, requires_grad=True), torch.eye(4)[None], K, 100, 100)
+    whole, _, _ = rasterization(*arguments)
+    monkeypatch.setattr(compositing, "BLOCK_PAIRS", 1)
+    parts, _, _ = rasterization(*arguments)
+    torch.testing.assert_close(parts, whole)
+    parts.sum().backward()
+    torch.testing.assert_close(arguments[4].grad.sum(), whole.sum().detach())

@@ -5,42 +5,45 @@ Forward. Splat k (nearest first) covers a pixel centre x with
 
     alpha_k = min(0.999, exp(l_k)),    l_k = ln o_k - sigma_k,    sigma_k = (x - m_k)^T Q_k (x - m_k) / 2,
 
-counted as 0 below 1/255. What is left of the light behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat that would
-push T_k to 1e-4 or below ends the pixel: it and all behind it are not drawn. With the odds r_k = alpha_k / (1 - alpha_k)
+counted as 0 below 1/255. What is left of the light behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat
+that would push T_k to 1e-4 or below ends the pixel: it and all behind it are not drawn, as if their alpha were 0. Then
 
-    C = sum_k w_k c_k,    A = 1 - T_n,    w_k = alpha_k T_{k-1} = r_k T_k                     (n: last drawn splat).
+    C = sum_k w_k c_k,    A = 1 - T_n,    w_k = alpha_k T_{k-1}.
 
 Written around the centre of the pixel's tile, with x the offset from it and m_k = (mx, my) the splat's,
 
     l_k(x) = [ln o - s] + gx x + gy y - (a/2) x^2 - b xy - (c/2) y^2,     (gx, gy) = Q_k m_k,    s = m_k . (gx, gy) / 2,
 
-which is linear in (1, x, y, x^2, xy, y^2). Those six numbers are the same for every tile, so the l of all splats at all 64
-pixels is one matrix product. The six coefficients are formed in float64: they are where a needle far from its tile cancels.
+which is linear in (1, x, y, x^2, xy, y^2). Those six numbers are the same for every tile, so the l of all splats at
+all 64 pixels is one matrix product. The six coefficients are formed in float64: they are where a needle far from its
+tile cancels.
 
-Backward. Let e_k = c_k . dL/dC and b = -dL/dA, and let S_k be the part of the loss that is seen through splat k:
+Backward. The derivative of the loss L with respect to the light that arrives behind splat k is
 
-    S_k = T_n b + sum_{j > k} w_j e_j            (T_n b because A = 1 - T_n).
+    U_k = dL/dT_k,      U_n = dL/dT_n = -dL/dA,
 
-Splat k adds w_k e_k = alpha_k T_{k-1} e_k and dims all of S_k by (1 - alpha_k), so
+and splat k splits the light that reaches it: alpha_k of it meets the colour c_k, which is worth e_k = c_k . dL/dC, the
+rest goes on and is worth U_k. So, from back to front,
 
-    dL/dalpha_k = T_{k-1} e_k - S_k / (1 - alpha_k),
-    dL/dl_k     = alpha_k dL/dalpha_k = w_k e_k - r_k S_k,        S_{k-1} = S_k + w_k e_k,
+    U_{k-1}     = (1 - alpha_k) U_k + alpha_k e_k,
+    dL/dalpha_k = T_{k-1} (e_k - U_k),
+    dL/dl_k     = alpha_k dL/dalpha_k = w_k (e_k - U_k),        dL/dc_k = sum over pixels of w_k dL/dC.
 
-run from back to front. It vanishes by itself where alpha is 0, and is set to 0 where alpha is capped; dL/dc_k = sum_x w_k dL/dC.
-With v = dL/dl_k at each pixel, d = x - m, and sums over the tile's pixels, which six moments of v deliver,
+Nothing is divided and nothing large cancels. dL/dl_k is 0 by itself where splat k is not drawn, and is set to 0 where
+alpha is capped. With v = dL/dl_k at each pixel, d = x - m, and sums over the tile's pixels, which six moments of v
+deliver,
 
     dL/dln o = sum v,    dL/dm = sum v Q d,    dL/d(a, b, c) = -sum v (dx^2 / 2, dx dy, dy^2 / 2),
 
 and absgrad is sum |v Q d|, the only one that needs a pass of its own.
 
-Order of work. Tiles advance together in *slabs* of 64 splats of depth. After each slab the tiles that have run out of splats
-or of light leave, so hidden splats cost nothing. A slab is cut into batches of tiles with similar counts whose
-arrays [B, n, 64] stay within `BATCH_ELEMENTS`, the memory knob of the arithmetic; `BLOCK_PAIRS` in turn bounds
-the lists. Nothing per pixel is stored for the backward pass but T at the start of each slab.
+How the work is cut up is the business of `batches`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -48,109 +51,76 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ..contract import Projection
-from .tiles import MIN_ALPHA, Footprints, TileLists, footprints, list_tiles, split_into_blocks
+from . import batches
+from .batches import LN_2, Batch, Numbers, Sheet, gather, pair_rows, similar_tiles
+from .tiles import MIN_ALPHA, TileLists, footprints, list_tiles, split_into_blocks
 
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4  # a pixel ends before T falls to this
-SLAB = 64  # splats of depth between two looks at which tiles are finished
-BATCH_ELEMENTS = 2**20  # pixels x splats in flight; about five float arrays of this size exist at a time
-BLOCK_PAIRS = 2**22  # (tile, splat) pairs listed at a time; about 100 bytes each
-NOTHING = -1e5  # exp(NOTHING) = 0: the log-alpha of padding
+BLOCK_PAIRS = 2**21  # (tile, splat) pairs listed at a time; about 200 bytes each, forward and backward
+
+
+@contextmanager
+def full_precision() -> Iterator[None]:
+    """Keep matrix products in the precision of their operands, whatever autocast or the matmul precision ask for.
+
+    log-alpha reaches tens and is then exponentiated: bfloat16 would be wrong by whole factors. Both settings reach CPU
+    products (the second through oneDNN), so both are suspended here.
+    """
+    enabled = torch.backends.mkldnn.enabled
+    torch.backends.mkldnn.enabled = False
+    try:
+        with torch.autocast("cpu", enabled=False):
+            yield
+    finally:
+        torch.backends.mkldnn.enabled = enabled
 
 
 @dataclass
-class _Batch:
-    """Tiles that are composited together over one slab: B tiles, n splats each, P pixels per tile."""
+class _Blend:
+    """A batch, composited."""
 
-    tiles: Tensor  # [B] positions in TileLists.tiles
-    first: int  # depth of the slab's first splat
-    depth: int  # n
-    transmittance: Tensor  # T where the slab begins; 0 in finished pixels. [B, P]
-
-
-class _Sheet:
-    """The constant part of the work: splats in depth order, the tile grid and its pixel basis."""
-
-    def __init__(self, prints: Footprints, colors: Tensor, n_cameras: int, width: int, height: int) -> None:
-        self.prints = prints
-        self.colors = colors  # [F, D]
-        self.n_tiles = n_cameras * prints.tiles_y * prints.tiles_x
-        edge, dtype = prints.edge, colors.dtype
-        offsets = torch.arange(edge, dtype=dtype) - (edge - 1) / 2
-        y, x = (grid.flatten() for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
-        self.basis = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])  # [6, P]
-
-        inside_x = (torch.arange(prints.tiles_x * edge) < width).view(1, 1, prints.tiles_x, 1, edge)
-        inside_y = (torch.arange(prints.tiles_y * edge) < height).view(1, prints.tiles_y, 1, edge, 1)
-        inside = (inside_x & inside_y).expand(n_cameras, -1, -1, -1, -1)
-        self.inside = inside.reshape(self.n_tiles, edge * edge).to(dtype)  # 1 in pixels of the image. [C * tiles, P]
-
-    def centres(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixel coordinates of the centres of tiles. [B] each, float64"""
-        edge, tiles_x, tiles_y = self.prints.edge, self.prints.tiles_x, self.prints.tiles_y
-        x, y = tiles % tiles_x, tiles // tiles_x % tiles_y
-        return (x.double() + 0.5) * edge, (y.double() + 0.5) * edge
-
-    def image(self, values: Tensor, n_cameras: int, width: int, height: int) -> Tensor:
-        """Put tiles back into images. [C * tiles, D, P] -> [C, H, W, D]"""
-        edge, tiles_x, tiles_y = self.prints.edge, self.prints.tiles_x, self.prints.tiles_y
-        values = values.view(n_cameras, tiles_y, tiles_x, -1, edge, edge).permute(0, 1, 4, 2, 5, 3)
-        return values.reshape(n_cameras, tiles_y * edge, tiles_x * edge, -1)[:, :height, :width].contiguous()
-
-    def tiled(self, images: Tensor) -> Tensor:
-        """Inverse of `image`, 0 outside the images. [C, H, W, D] -> [C * tiles, D, P]"""
-        edge, tiles_x, tiles_y = self.prints.edge, self.prints.tiles_x, self.prints.tiles_y
-        n_cameras, height, width, channels = images.shape
-        images = F.pad(images, (0, 0, 0, tiles_x * edge - width, 0, tiles_y * edge - height))
-        images = images.view(n_cameras, tiles_y, edge, tiles_x, edge, channels).permute(0, 1, 3, 5, 2, 4)
-        return images.reshape(self.n_tiles, channels, edge * edge)
+    alpha: Tensor  # 0 where splat k is not drawn. [B, n, P]
+    alphas: tuple[Tensor, ...]  # its n slices. [B, P] each
+    weights: Tensor  # w_k = alpha_k T_{k-1}. [B, n, P]
+    last: Tensor  # T behind the slab, 0 in pixels that have ended. [B, P]
+    final: Tensor  # T behind the last drawn splat; meaningless in pixels that had ended before. [B, P]
+    capped: tuple[Tensor, Tensor] | None  # rows (of B * n) that can exceed 0.999, and their pixels that do
 
 
-class _Slice:
-    """The splats of a batch with their coefficients of l; rows are (tile, splat), B * n of them."""
+def _blend(sheet: Sheet, numbers: Numbers, start: Tensor) -> _Blend:
+    """The forward equations of the module docstring for one batch, from T in front of it [B, P].
 
-    def __init__(self, sheet: _Sheet, lists: TileLists, batch: _Batch) -> None:
-        depth = torch.arange(batch.first, batch.first + batch.depth)
-        pair = lists.start.index_select(0, batch.tiles)[:, None] + depth
-        self.listed = depth < lists.count.index_select(0, batch.tiles)[:, None]  # [B, n]
-        self.pair = pair.clamp_(max=lists.splat.numel() - 1)
-        self.splat = lists.splat.index_select(0, self.pair.flatten())  # [B * n]
-        tile_x, tile_y = sheet.centres(lists.tiles.index_select(0, batch.tiles))
-
-        shape = sheet.prints.shape.index_select(0, self.splat).view(*pair.shape, 6)
-        x, y, a, b, c, log_opacity = shape.unbind(-1)
-        mx, my = x - tile_x[:, None], y - tile_y[:, None]
-        gx, gy = a * mx + b * my, b * mx + c * my
-        peak = torch.where(self.listed, log_opacity - 0.5 * (mx * gx + my * gy), NOTHING)
-        dtype = sheet.colors.dtype
-        self.centre = torch.stack([mx, my], dim=-1).to(dtype)  # [B, n, 2]
-        self.coefficients = torch.stack([peak, gx, gy, -0.5 * a, -b, -0.5 * c], dim=-1).to(dtype)  # [B, n, 6]
-        self.colors = sheet.colors.index_select(0, self.splat).view(*pair.shape, -1)  # [B, n, D]
-        self.may_cap = bool(log_opacity.max() > -1e-3)  # ln 0.999 = -1.0005e-3
-
-
-def _blend(sheet: _Sheet, piece: _Slice, batch: _Batch) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
-    """Odds r_k (0 where splat k is not drawn) and T_k of a batch. [B, n, P] each
-
-    Also where alpha is capped and where the pixel has ended, [B, n, P], or None where that happens nowhere.
+    Arithmetic with zeros stands in for masks: filling by a mask costs as much as the exponential.
     """
-    n_tiles, n = piece.listed.shape
-    alpha = (piece.coefficients.view(-1, 6) @ sheet.basis).view(n_tiles, n, -1).exp_()
-    F.threshold_(alpha, _just_below(MIN_ALPHA, alpha.dtype), 0.0)
+    n_tiles, n = numbers.colors.shape[:2]
+    pixels = start.shape[1]
+    alpha, alphas = sheet.buffer("alpha", n_tiles, n, pixels)
+    flat = alpha.view(-1, pixels)
+    torch.mm(numbers.coefficients.flatten(0, 1), sheet.basis, out=flat).exp2_()
+    F.threshold_(flat, _just_below(MIN_ALPHA, flat.dtype), 0.0)
     capped = None
-    if piece.may_cap:
-        capped = alpha > MAX_ALPHA
-        alpha.clamp_(max=MAX_ALPHA)
-    transmittance = 1 - alpha
-    odds = alpha.div_(transmittance)
-    before = batch.transmittance
-    for through in transmittance.unbind(1):
-        before = torch.mul(through, before, out=through)
-    ended = None
-    if before.min() <= MIN_TRANSMITTANCE:
-        ended = transmittance <= MIN_TRANSMITTANCE
-        odds.masked_fill_(ended, 0.0)
-    return odds, transmittance, capped, ended
+    if numbers.strong.numel() > 0:
+        strong = flat.index_select(0, numbers.strong)
+        capped = numbers.strong, strong > MAX_ALPHA
+        flat.index_copy_(0, numbers.strong, strong.clamp_(max=MAX_ALPHA))
+
+    through, steps = sheet.buffer("through", n_tiles, n + 1, pixels)  # T_0 ... T_n
+    steps[0].copy_(start)
+    for before, own, after in zip(steps, alphas, steps[1:], strict=False):
+        torch.addcmul(before, own, before, value=-1, out=after)  # T_k = T_{k-1} - alpha_k T_{k-1}
+    weights = torch.mul(alpha, through[:, :-1], out=sheet.buffer("weights", n_tiles, n, pixels)[0])
+
+    last = final = steps[-1].clone()
+    if last.min() <= MIN_TRANSMITTANCE:
+        # T never rises, so the last value above the threshold is the smallest.
+        spare, _ = sheet.buffer("spare", *through.shape)
+        final = torch.threshold(through, MIN_TRANSMITTANCE, 2.0, out=spare).amin(1)
+        drawn = through.gt_(MIN_TRANSMITTANCE)  # 1 or 0
+        last = last * drawn[:, -1]
+        weights *= drawn[:, 1:]
+        alpha *= drawn[:, 1:]
+    return _Blend(alpha, alphas, weights, last, final, capped)
 
 
 def _just_below(value: float, dtype: torch.dtype) -> float:
@@ -159,24 +129,11 @@ def _just_below(value: float, dtype: torch.dtype) -> float:
     return float(torch.nextafter(value, torch.zeros_like(value)))
 
 
-def _batches(remaining: Tensor, tiles: Tensor, pixels: int) -> list[Tensor]:
-    """Cut tiles, sorted by falling number of splats, into groups of similar numbers within BATCH_ELEMENTS."""
-    counts = remaining.tolist()
-    groups, begin = [], 0
-    while begin < len(counts):
-        end = min(len(counts), begin + max(1, BATCH_ELEMENTS // (counts[begin] * pixels)))
-        enough = 0.75 * counts[begin] - 4  # bounds the padding to a quarter, or four splats
-        while counts[end - 1] < enough:
-            end -= 1
-        groups.append(tiles[begin:end])
-        begin = end
-    return groups
-
-
-def _sweep(sheet: _Sheet, lists: TileLists, final: Tensor, render: Tensor | None) -> list[_Batch]:
+def _sweep(sheet: Sheet, lists: TileLists, rows: Tensor, final: Tensor, render: Tensor | None) -> list[Batch]:
     """Composite one block front to back.
 
     Args:
+        rows: see `pair_rows`. [K, 9 + D]
         final: transmittance behind the last drawn splat, updated in place. [C * tiles, P]
         render: colours, added in place; None repeats a sweep for its transmittances only. [C * tiles, D, P]
 
@@ -188,123 +145,131 @@ def _sweep(sheet: _Sheet, lists: TileLists, final: Tensor, render: Tensor | None
     active = torch.arange(lists.tiles.numel())
     first = 0
     while active.numel() > 0:
-        remaining = (lists.count.index_select(0, active) - first).clamp(max=SLAB)
+        remaining = (lists.count.index_select(0, active) - first).clamp(max=batches.SLAB)
         remaining, by_count = torch.sort(remaining, descending=True)
         active = active.index_select(0, by_count)
-        for tiles in _batches(remaining, active, live.shape[1]):
-            depth = min(SLAB, int(lists.count[tiles[0]]) - first)
-            batch = _Batch(tiles, first, depth, live.index_select(0, tiles))
+        for tiles in similar_tiles(remaining, active, live.shape[1]):
+            n = min(batches.SLAB, int(lists.count[tiles[0]]) - first)
+            batch = Batch(tiles, first, n, live.index_select(0, tiles))
             record.append(batch)
-            piece = _Slice(sheet, lists, batch)
-            odds, transmittance, _, ended = _blend(sheet, piece, batch)
-            weights = odds.mul_(transmittance)
+            numbers = gather(rows, *batch.pairs(lists))
+            blend = _blend(sheet, numbers, batch.transmittance)
             where = lists.tiles.index_select(0, tiles)
+            live.index_copy_(0, tiles, blend.last)
+            final.index_copy_(0, where, blend.final.minimum(final.index_select(0, where)))
             if render is not None:
-                render[where] += torch.bmm(piece.colors.transpose(1, 2), weights)
-            after = transmittance[:, -1]
-            if ended is not None:
-                after = transmittance.masked_fill_(ended, 2.0).amin(1).minimum(final.index_select(0, where))
-            final[where] = after
-            live[tiles] = after if ended is None else after.masked_fill(ended[:, -1], 0.0)
-        first += SLAB
+                so_far = render.index_select(0, where)
+                render.index_copy_(0, where, so_far.baddbmm_(numbers.colors.transpose(1, 2), blend.weights))
+        first += batches.SLAB
         unfinished = (lists.count.index_select(0, active) > first) & (live.index_select(0, active) > 0).any(1)
         active = active[unfinished]
     return record
 
 
 def _backward_batch(
-    sheet: _Sheet, lists: TileLists, batch: _Batch, grad: Tensor, behind: Tensor, absgrad: bool
-) -> tuple[Tensor, Tensor]:
-    """Gradients of one batch with respect to its splats.
+    sheet: Sheet, numbers: Numbers, start: Tensor, grad: Tensor, behind: Tensor, absgrad: bool
+) -> Tensor:
+    """Gradients of one batch with respect to its splats: the backward equations of the module docstring.
 
     Args:
+        start: T in front of the batch. [B, P]
         grad: dL/dC of its tiles. [B, D, P]
-        behind: S of the last splat; becomes S before the first, in place. [B, P]
+        behind: U of the last splat; becomes U in front of the first, in place. [B, P]
 
     Returns:
-        The slots [R] and rows [R, 6 + D (+ 2)] of the listed (tile, splat) pairs: gradients of centre x, y, conic a, b, c, ln o,
-        colours, and absolute gradients of the centre.
+        Gradients of centre x, y, conic a, b, c, ln o, colours, then absgrad. [B, n, 6 + D (+ 2)]
     """
-    piece = _Slice(sheet, lists, batch)
-    odds, transmittance, capped, _ = _blend(sheet, piece, batch)
-    weights = transmittance.mul_(odds)
-    grad_colors = torch.bmm(weights, grad.transpose(1, 2))  # [B, n, D]
-    seen = torch.bmm(piece.colors, grad).mul_(weights)  # w_k e_k
-    for own, r in zip(reversed(seen.unbind(1)), reversed(odds.unbind(1)), strict=True):
-        torch.addcmul(own, r, behind, value=-1, out=r)
-        behind += own
-    v = odds  # dL/dl
-    if capped is not None:
-        v.masked_fill_(capped, 0.0)
+    blend = _blend(sheet, numbers, start)
+    n_tiles, n, pixels = blend.alpha.shape
+    worth, each_worth = sheet.buffer("spare", n_tiles, n, pixels)
+    torch.bmm(numbers.colors, grad, out=worth)  # e_k
+    beyond, steps = sheet.buffer("through", n_tiles, n + 1, pixels)  # U_0 ... U_n
+    steps[-1].copy_(behind)
+    for k in range(n - 1, -1, -1):
+        torch.lerp(steps[k + 1], each_worth[k], blend.alphas[k], out=steps[k])
+    behind.copy_(steps[0])
+    v = worth.sub_(beyond[:, 1:]).mul_(blend.weights)  # dL/dl
+    if blend.capped is not None:
+        where, pixels_capped = blend.capped
+        v.view(-1, pixels)[where] *= ~pixels_capped
 
-    n_tiles, n = piece.listed.shape
-    moments = (v.view(n_tiles * n, -1) @ sheet.basis.t()).view(n_tiles, n, 6)
-    v0, vx, vy, vxx, vxy, vyy = moments.unbind(-1)
-    mx, my = piece.centre.unbind(-1)
-    _, gx, gy, half_a, b, half_c = piece.coefficients.unbind(-1)  # gx, gy, -a / 2, -b, -c / 2
-    columns = [
-        -2 * half_a * vx - b * vy - gx * v0,
-        -b * vx - 2 * half_c * vy - gy * v0,
-        -0.5 * (vxx - 2 * mx * vx + mx * mx * v0),
-        -(vxy - mx * vy - my * vx + mx * my * v0),
-        -0.5 * (vyy - 2 * my * vy + my * my * v0),
-        v0,
-    ]
+    channels = numbers.colors.shape[-1]
+    gradients = v.new_empty(n_tiles, n, 6 + channels + 2 * absgrad)
+    v0, vx, vy, vxx, vxy, vyy = (v.view(-1, pixels) @ sheet.basis.t()).view(n_tiles, n, 6).unbind(-1)
+    mx, my = numbers.centres.unbind(-1)
+    _, gx, gy, half_a, b, half_c = numbers.coefficients.unbind(-1)  # peak, gx, gy, -a / 2, -b, -c / 2, all over ln 2
+    a, c = 2 * half_a, 2 * half_c
+    dx, dy = vx - mx * v0, vy - my * v0  # sums of v dx, v dy
+    gradients[..., 0] = -LN_2 * (a * vx + b * vy + gx * v0)
+    gradients[..., 1] = -LN_2 * (b * vx + c * vy + gy * v0)
+    gradients[..., 2] = -0.5 * (vxx - mx * (vx + dx))
+    gradients[..., 3] = my * vx + mx * dy - vxy
+    gradients[..., 4] = -0.5 * (vyy - my * (vy + dy))
+    gradients[..., 5] = v0
+    gradients[..., 6 : 6 + channels] = torch.bmm(blend.weights, grad.transpose(1, 2))
     if absgrad:
-        v = v.abs_()
-        for pull in ([gx, 2 * half_a, b], [gy, b, 2 * half_c]):  # -(Q d) as a function of the pixel
-            pull = (torch.stack(pull, dim=-1).view(-1, 3) @ sheet.basis[:3]).view_as(v)
-            columns.append(pull.abs_().mul_(v).sum(-1))
-    rows = torch.cat([torch.stack(columns[:6], dim=-1), grad_colors, *(c[..., None] for c in columns[6:])], dim=-1)
-    slots = lists.slot.index_select(0, piece.pair.flatten())
-    listed = piece.listed.flatten()
-    if bool(listed.all()):
-        return slots, rows.flatten(0, 1)
-    return slots[listed], rows.flatten(0, 1)[listed]
+        size = v.abs_()
+        for axis, pull in enumerate(([gx, a, b], [gy, b, c])):  # -Q d is linear in the pixel
+            pulls, _ = sheet.buffer("through", n_tiles, n, pixels)
+            torch.mm(torch.stack(pull, dim=-1).view(-1, 3), sheet.basis[:3], out=pulls.view(-1, pixels))
+            gradients[..., 6 + channels + axis] = LN_2 * pulls.abs_().mul_(size).sum(-1)
+    return gradients
 
 
 class _Composite(torch.autograd.Function):
     """(means2d, conics, opacities, colors) -> (render [C, H, W, D], transmittance [C, H, W, 1])."""
 
     @staticmethod
+    @full_precision()
     def forward(ctx, means2d, conics, opacities, colors, projection: Projection, tile_size: int, absgrad: bool):
         prints = footprints(projection, opacities, tile_size)
         size = (projection.n_cameras, projection.width, projection.height)
-        sheet = _Sheet(prints, colors.index_select(0, prints.rows), *size)
+        sheet = Sheet(prints, colors.index_select(0, prints.rows), *size)
         final = torch.ones_like(sheet.inside)
         render = final.new_zeros(sheet.n_tiles, colors.shape[1], final.shape[1])
         blocks = split_into_blocks(prints, BLOCK_PAIRS)
         records = []
         for block in blocks:
             lists = list_tiles(prints, block)
-            batches = _sweep(sheet, lists, final, render)
+            rows = pair_rows(sheet, lists)
+            work = _sweep(sheet, lists, rows, final, render)
             # With several blocks, keeping the record of each would undo the bound on memory: they are swept again.
-            records.append((lists, batches) if len(blocks) == 1 else None)
+            records.append((lists, rows, work) if len(blocks) == 1 else None)
         ctx.save_for_backward(means2d, conics, opacities, colors)
-        ctx.sheet, ctx.final, ctx.blocks, ctx.records, ctx.absgrad = sheet, final, blocks, records, absgrad
+        ctx.sheet, ctx.blocks, ctx.records, ctx.absgrad = sheet, blocks, records, absgrad
         return sheet.image(render, *size), sheet.image(final[:, None], *size)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
+    @full_precision()
     def backward(ctx, grad_render: Tensor, grad_transmittance: Tensor):
         means2d, conics, opacities, colors = ctx.saved_tensors
-        sheet, final = ctx.sheet, ctx.final
+        sheet = ctx.sheet
         grad = sheet.tiled(grad_render)
-        behind = final * sheet.tiled(grad_transmittance).squeeze(1)  # S behind the last drawn splat: T_n dL/dT_n
+        behind = sheet.tiled(grad_transmittance).squeeze(1).clone()  # U behind the last drawn splat
         channels = colors.shape[1]
         n_columns = 6 + channels + (2 if ctx.absgrad else 0)
-        total = final.new_zeros(means2d.shape[0], n_columns)
+        total = grad.new_zeros(means2d.shape[0], n_columns)
         for block, record in zip(ctx.blocks, ctx.records, strict=True):
             if record is None:
                 lists = list_tiles(sheet.prints, block)
-                record = lists, _sweep(sheet, lists, torch.ones_like(final), None)
-            lists, batches = record
-            per_pair = final.new_zeros(lists.splat.numel(), n_columns)
-            for batch in reversed(batches):
+                rows = pair_rows(sheet, lists)
+                record = lists, rows, _sweep(sheet, lists, rows, torch.ones_like(sheet.inside), None)
+            lists, rows, work = record
+            per_pair = grad.new_zeros(lists.splat.numel(), n_columns)
+            for batch in reversed(work):
                 where = lists.tiles.index_select(0, batch.tiles)
                 state = behind.index_select(0, where)
-                slots, rows = _backward_batch(sheet, lists, batch, grad.index_select(0, where), state, ctx.absgrad)
-                per_pair[slots] = rows
+                pairs, listed = batch.pairs(lists)
+                numbers = gather(rows, pairs, listed)
+                gradients = _backward_batch(
+                    sheet, numbers, batch.transmittance, grad.index_select(0, where), state, ctx.absgrad
+                )
+                slots, gradients = lists.slot.index_select(0, pairs.flatten()), gradients.flatten(0, 1)
+                if not listed[-1, -1]:  # the last tile of a batch has the fewest splats
+                    listed = listed.flatten().nonzero().squeeze(1)
+                    slots, gradients = slots.index_select(0, listed), gradients.index_select(0, listed)
+                per_pair.index_copy_(0, slots, gradients)
                 behind[where] = state
             # Pairs of a splat lie in consecutive slots: one segmented sum, many times faster than a scatter.
             summed = F.embedding_bag(torch.arange(len(per_pair)), per_pair, lists.splat_start, mode="sum")
@@ -320,8 +285,4 @@ def composite(
     projection: Projection, colors: Tensor, opacities: Tensor, *, tile_size: int, absgrad: bool
 ) -> tuple[Tensor, Tensor]:
     """Blend colours front to back. Colours [M, D], opacities [M] -> render [C, H, W, D], transmittance [C, H, W, 1]."""
-    # Half-precision arithmetic, which autocast would choose, cannot hold log-alpha.
-    with torch.autocast("cpu", enabled=False):
-        return _Composite.apply(
-            projection.means2d, projection.conics, opacities, colors, projection, tile_size, absgrad
-        )
+    return _Composite.apply(projection.means2d, projection.conics, opacities, colors, projection, tile_size, absgrad)

@@ -33,7 +33,8 @@ from ..contract import Projection
 
 FOV_MARGIN = 0.3  # how far beyond the image edge J may be evaluated, in units of tan(fov / 2)
 RADIUS_SIGMAS = 3.0  # a splat ends at this many standard deviations
-MIN_DISCRIMINANT = 0.1  # floor under the square root of the eigenvalue formula, in pixel^4
+# Floor under the square root of the eigenvalue formula, in pixel^4. gsplat's two projection kernels differ in it.
+MIN_DISCRIMINANT_PACKED, MIN_DISCRIMINANT_DENSE = 0.1, 0.01
 COMPENSATION_EPS = 1e-6  # bounds the slope of sqrt at 0 in the backward pass
 MAX_RADIUS = float(2**30)  # in pixels: representable in int32 and far beyond every image
 
@@ -74,14 +75,19 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(rows).view(3, 3, -1)
 
 
+def _rotate(W: Tensor, rows: Tensor) -> list[Tensor]:
+    """W times three rows of any shape. Not a call to BLAS, whose precision autocast and global settings lower."""
+    return [W[i, 0] * rows[0] + W[i, 1] * rows[1] + W[i, 2] * rows[2] for i in range(3)]
+
+
 def _to_screen(
     means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, eps2d: float
 ) -> _Screen:
     """The equations of the module docstring for one camera: means [n, 3], quats [n, 4], scales [n, 3]."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    W, t = viewmat[:3, :3], viewmat[:3, 3:]
+    W, t = viewmat[:3, :3], viewmat[:3, 3]
 
-    px, py, pz = W @ means.t() + t  # each [n]
+    px, py, pz = (p + shift for p, shift in zip(_rotate(W, means.t().contiguous()), t, strict=True))  # each [n]
     u, v = px / pz, py / pz
     means2d = torch.stack([fx * u + cx, fy * v + cy])
 
@@ -89,9 +95,9 @@ def _to_screen(
     u = u.clamp(-(cx / fx + margin_x), (width - cx) / fx + margin_x)
     v = v.clamp(-(cy / fy + margin_y), (height - cy) / fy + margin_y)
 
-    axes = (W @ rotation_matrices(quats).flatten(1)).view(3, 3, -1) * scales.t()  # W R_q diag(s): [row, axis, n]
-    a0 = (fx / pz) * (axes[0] - u * axes[2])  # [3, n]
-    a1 = (fy / pz) * (axes[1] - v * axes[2])
+    right, down, forward = _rotate(W, rotation_matrices(quats) * scales.t())  # rows of W R_q diag(s), [3, n] each
+    a0 = (fx / pz) * (right - u * forward)
+    a1 = (fy / pz) * (down - v * forward)
 
     xx, xy, yy = (a0 * a0).sum(0), (a0 * a1).sum(0), (a1 * a1).sum(0)
     det = torch.linalg.cross(a0, a1, dim=0).square().sum(0)
@@ -99,11 +105,11 @@ def _to_screen(
     return _Screen(means2d, pz, (xx + eps2d, xy, yy + eps2d), det, det_blurred)
 
 
-def _radii(screen: _Screen) -> Tensor:
+def _radii(screen: _Screen, min_discriminant: float) -> Tensor:
     """Three standard deviations along the longer axis, rounded up: ceil(3 sqrt(lambda_max)). [n]"""
     xx, xy, yy = screen.blurred
     discriminant = (0.5 * (xx - yy)).square() + xy.square()
-    longest = 0.5 * (xx + yy) + discriminant.clamp(min=MIN_DISCRIMINANT).sqrt()
+    longest = 0.5 * (xx + yy) + discriminant.clamp(min=min_discriminant).sqrt()
     return (RADIUS_SIGMAS * longest.sqrt()).ceil()
 
 
@@ -121,19 +127,21 @@ def project(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     rasterize_mode: str = "classic",
+    packed: bool = True,
 ) -> Projection:
     """Find the visible splats of each camera and project them; see `nrfgs_ns.rasterizer.project`.
 
     Visibility is decided first, without gradients, for all splats; the differentiable pass then runs on the visible
-    ones only, so that a culled splat can never send a NaN back. A splat is visible when near <= depth <= far, its radius
-    exceeds `radius_clip`, and its square touches the image. A splat whose projection is not finite (a zero quaternion, an
-    infinite scale) fails these comparisons and is invisible.
+    ones only, so that a culled splat can never send a NaN back. A splat is visible when near <= depth <= far, its
+    radius exceeds `radius_clip`, and its square touches the image. A splat whose projection is not finite (a zero
+    quaternion, an infinite scale) fails these comparisons and is invisible.
     """
+    min_discriminant = MIN_DISCRIMINANT_PACKED if packed else MIN_DISCRIMINANT_DENSE
     per_camera = []
     for camera, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
         with torch.no_grad():
             screen = _to_screen(means, quats, scales, viewmat, K, width, height, eps2d)
-            radii = _radii(screen)
+            radii = _radii(screen, min_discriminant)
             x, y = screen.means2d
             visible = (screen.depths >= near_plane) & (screen.depths <= far_plane)
             visible &= (screen.det_blurred > 0) & (radii > radius_clip)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The slow twin: the same image from dense float64 arithmetic, every splat against every pixel, gradients by autograd.
 
-Written to be checked by eye against the definition and sharing no code with the fast path. Arrays are [N, H, W] for one camera, so
-this is for small images. It also says how sure its decisions are: a cut-off (1/255, 1e-4, 0.999, the radius and its tiles) is a step,
-float32 may fall on its other side, and a comparison must know at which pixels that can happen, and how far it can go.
+Written to be checked by eye against the definition and sharing no code with the fast path. Arrays are [N, H, W] for
+one camera, so this is for small images. It also says how sure its decisions are: a cut-off (1/255, 1e-4, 0.999, the
+radius and its tiles) is a step, float32 may fall on its other side, and a comparison must know at which pixels that
+can happen, and how far it can go.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ class Screen:
     """Inverse of the blurred covariance. [N, 2, 2]"""
     compensations: Tensor
     """sqrt(det / det_blurred). [N]"""
+    condition: Tensor
+    """(a c / det) of the covariance before the blur: by how much a difference of products amplifies rounding in det.
+    [N]
+    """
     sigma3: Tensor
     """The radius before it is rounded up. [N]"""
     visible: Tensor
@@ -68,6 +73,7 @@ def project(
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
+    packed: bool = True,
 ) -> Screen:
     """Project N splats into one camera: cov2d = J W Sigma W^T J^T + eps2d I. Everything in float64."""
     means, quats, scales, viewmat, K = (t.double() for t in (means, quats, scales, viewmat, K))
@@ -99,17 +105,22 @@ def project(
 
     cov2d = J @ W @ sigma_world @ W.T @ J.mT
     blurred = cov2d + eps2d * torch.eye(2, dtype=torch.float64)
-    ratio = torch.linalg.det(cov2d) / torch.linalg.det(blurred)
+    ratio = (torch.linalg.det(cov2d) / torch.linalg.det(blurred)).clamp(min=0)
+    # sqrt(ratio) with the slope that gsplat gives it, 1 / (2 (sqrt + 1e-6)): finite at 0.
+    root = ratio.detach().sqrt()
+    compensations = root + (ratio - ratio.detach()) / (2 * (root + 1e-6))
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
 
+    condition = (cov2d[:, 0, 0] * cov2d[:, 1, 1] / torch.linalg.det(cov2d).clamp(min=1e-300)).detach()
+
     half_trace = 0.5 * (blurred[:, 0, 0] + blurred[:, 1, 1])
-    longest = half_trace + (half_trace**2 - torch.linalg.det(blurred)).clamp(min=0.1).sqrt()
+    longest = half_trace + (half_trace**2 - torch.linalg.det(blurred)).clamp(min=0.1 if packed else 0.01).sqrt()
     sigma3 = 3 * longest.sqrt()
     radius = sigma3.ceil()
     size = torch.tensor([width, height])
     on_image = ((means2d + radius[:, None] > 0) & (means2d - radius[:, None] < size)).all(-1)
     visible = in_range & on_image & (radius > radius_clip)
-    return Screen(means2d, depths, torch.linalg.inv(blurred), ratio.clamp(min=0).sqrt(), sigma3, visible)
+    return Screen(means2d, depths, torch.linalg.inv(blurred), compensations, condition, sigma3, visible)
 
 
 def _covered(centre: Tensor, radius: Tensor, n_pixels: int, tile_size: int) -> Tensor:
@@ -130,6 +141,8 @@ def composite(
     background: Tensor | None = None,
     tile_size: int = 16,
     unit: float = 2.0**-24,
+    opacity_error: Tensor | float = 0.0,
+    order: Tensor | None = None,
 ) -> Image:
     """Blend N splats into one image.
 
@@ -137,11 +150,15 @@ def composite(
         colors: [N, D]
         opacities: as composited, compensation included. [N]
         background: [D]
-        unit: rounding unit of the arithmetic that will be compared (float32 by default); it shapes `rounding`, `undecided`
-            and `jump` only, never the image.
+        unit: rounding unit of the arithmetic that will be compared (float32 by default); it shapes `rounding`,
+            `undecided` and `jump` only, never the image.
+        opacity_error: relative error of the opacities beyond rounding, in the same role. [N]
+        order: visible splats from front to back, where noise in the depths must not break ties; by default, sorted. [n]
     """
-    order = torch.argsort(screen.depths.detach(), stable=True)
-    order = order[screen.visible[order]]
+    if order is None:
+        order = torch.argsort(screen.depths.detach(), stable=True)
+        order = order[screen.visible[order]]
+    opacity_error = torch.as_tensor(opacity_error).expand_as(screen.depths)[order, None, None]
     means2d, conics, sigma3 = screen.means2d[order], screen.conics[order], screen.sigma3[order].detach()
     opacities, colors = opacities.double()[order, None, None], colors.double()[order]
 
@@ -178,7 +195,7 @@ def composite(
         cancelled = (conics[:, 0, 0] * conics[:, 1, 1] / torch.linalg.det(conics))[:, None, None]
         slope = torch.einsum("nij,nhwj->nhwi", conics, d).abs().sum(-1)
         where = means2d.abs().amax(-1)[:, None, None] + max(width, height)
-        error = 8 * unit * (1 + terms + cancelled * sigma + slope * where)
+        error = 8 * unit * (1 + terms + cancelled * sigma + slope * where) + opacity_error
         rounding = 2 * (weights * error).sum(0) + 8 * unit
         lost = torch.cumsum(torch.where(counts, alpha / (1 - alpha) * error, 0.0), 0) + 8 * unit  # relative error of T
 
@@ -213,14 +230,17 @@ def rasterization(
     tile_size: int = 16,
     unit: float = 2.0**-24,
     perturb: Callable[[Tensor], Tensor] = lambda t: t,
+    orders: list[Tensor] | None = None,
     **limits: float,
 ) -> tuple[Tensor, Tensor, list[Screen], list[Image]]:
     """The twin of `nrfgs_ns.rasterizer.rasterization`, camera by camera.
 
     Args:
-        perturb: applied to the projected means, depths, conics and compensations; with noise of a few rounding units it
-            shows what rounding does to the image and to its gradients.
-        limits: near_plane, far_plane, radius_clip, eps2d.
+        perturb: applied to the projected means, depths, conics and compensations, and to the transmittance that
+            expected depth is divided by; with noise of a few rounding units it shows what rounding does to the image
+            and to its gradients.
+        orders: see `composite`; one per camera.
+        limits: near_plane, far_plane, radius_clip, eps2d, packed.
 
     Returns:
         render [C, H, W, X], alphas [C, H, W, 1], and the screens and images of the C cameras.
@@ -228,8 +248,9 @@ def rasterization(
     renders, screens, images = [], [], []
     for camera, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
         screen = project(means, quats, scales, viewmat, K, width, height, **limits)
-        noisy = {name: perturb(getattr(screen, name)) for name in ("means2d", "depths", "conics", "compensations")}
-        screen = replace(screen, **noisy)
+        noisy = {name: perturb(getattr(screen, name)) for name in ("means2d", "depths", "conics")}
+        noise = (perturb(screen.compensations) - screen.compensations) * (1 + screen.condition)
+        screen = replace(screen, **noisy, compensations=screen.compensations + noise)
         color = (colors[camera] if colors.dim() == 3 else colors).double()
         background = None if backgrounds is None else backgrounds[camera].double()
         depths = screen.depths[:, None]
@@ -238,11 +259,26 @@ def rasterization(
         elif render_mode in ("RGB+D", "RGB+ED"):
             color = torch.cat([color, depths], -1)
             background = None if background is None else torch.cat([background, background.new_zeros(1)])
-        opacity = opacities.double() * screen.compensations if rasterize_mode == "antialiased" else opacities
-        image = composite(screen, color, opacity, width, height, background=background, tile_size=tile_size, unit=unit)
+        opacity, opacity_error = opacities, 0.0
+        if rasterize_mode == "antialiased":
+            opacity, opacity_error = opacities.double() * screen.compensations, 8 * unit * screen.condition
+        order = None if orders is None else orders[camera]
+        image = composite(
+            screen,
+            color,
+            opacity,
+            width,
+            height,
+            background=background,
+            tile_size=tile_size,
+            unit=unit,
+            opacity_error=opacity_error,
+            order=order,
+        )
         render = image.render
         if render_mode in ("ED", "RGB+ED"):
-            render = torch.cat([render[..., :-1], render[..., -1:] / image.alphas.clamp(min=1e-10)], -1)
+            alphas = 1 - perturb(1 - image.alphas)
+            render = torch.cat([render[..., :-1], render[..., -1:] / alphas.clamp(min=1e-10)], -1)
         renders.append(render)
         screens.append(screen)
         images.append(image)

@@ -2,8 +2,8 @@
 """Tiles: which splats can touch which pixels, sorted front to back.
 
 gsplat lets a splat touch exactly the `tile_size` tiles that its radius square meets. That rule is part of its image (it
-truncates tails at tile borders), so it is kept. Inside these tiles the splats are listed per *sub-tile* of 8 x 8 pixels, and
-only where they can matter: alpha = o exp(-sigma) >= 1/255 holds inside the ellipse
+truncates tails at tile borders), so it is kept. Inside these tiles the splats are listed per *sub-tile* of 8 x 8
+pixels, and only where they can matter: alpha = o exp(-sigma) >= 1/255 holds inside the ellipse
 
     sigma(d) = (a dx^2 + 2 b dx dy + c dy^2) / 2 <= s,        s = ln(255 o),
 
@@ -11,12 +11,13 @@ and nowhere else. On the horizontal line dy the ellipse spans
 
     dx = (-b dy -+ sqrt(2 a s - (a c - b^2) dy^2)) / a,
 
-and its extreme points lie at dx = -+ sqrt(2 s c / (a c - b^2)), dy = +- (b / c) times that. Within a row of sub-tiles the
-leftmost point is therefore the one on the line nearest to the leftmost extreme, and likewise on the right: each (splat, row)
-yields one exact interval of columns, so a long diagonal needle is listed along its length and not over its bounding box.
+and its extreme points lie at dx = -+ sqrt(2 s c / (a c - b^2)), dy = +- (b / c) times that. Within a row of sub-tiles
+the leftmost point is therefore the one on the line nearest to the leftmost extreme, and likewise on the right: each
+(splat, row) yields one exact interval of columns, so a long diagonal needle is listed along its length and not over
+its bounding box.
 
-Sorting: splats are put in depth order once (stable, so equal depths keep their index order, as in gsplat), expanded into
-pairs in that order, and the pairs are stably sorted by tile. Both sorts are radix sorts on integers.
+Sorting: splats are put in depth order once (stable, so equal depths keep their index order, as in gsplat), expanded
+    into pairs in that order, and the pairs are stably sorted by tile. Both sorts are radix sorts on integers.
 """
 
 from __future__ import annotations
@@ -57,9 +58,13 @@ class Footprints:
     rows: Tensor
     """Row of the projection. [F], int64"""
     shape: Tensor
-    """Columns: centre x, centre y, conic a, b, c, ln(opacity). [F, 6], float64"""
+    """Rows: centre x, centre y, conic a, b, c, ln(opacity). [6, F], float64
+
+    The images of all cameras are stacked, so y counts from the top of the first one."""
     spans: Tensor
-    """Bounding box in sub-tiles: first row, end row, first column, end column; rows of all cameras stacked. [4, F], int64"""
+    """Bounding box in sub-tiles: first row, end row, first column, end column; rows of all cameras stacked. [4, F],
+    int64
+    """
 
     @property
     def whole(self) -> Block:
@@ -123,21 +128,23 @@ def footprints(projection: Projection, opacities: Tensor, tile_size: int) -> Foo
     limit = (a * c).sqrt() * (1 - 2.0**-22)
     b = torch.maximum(torch.minimum(b, limit), -limit)
     log_opacity = opacities.index_select(0, order).double().log()
-    shape = torch.stack([x.double(), y.double(), a, b, c, log_opacity], dim=-1)
+    shape = torch.stack([x.double(), y.double(), a, b, c, log_opacity])
 
     det = a * c - b * b
     reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
     half_x, half_y = (reach * c / det).sqrt(), (reach * a / det).sqrt()
-    col0, col1 = _inclusive_range(shape[:, 0] - half_x, shape[:, 0] + half_x, edge)
-    row0, row1 = _inclusive_range(shape[:, 1] - half_y, shape[:, 1] + half_y, edge)
+    col0, col1 = _inclusive_range(shape[0] - half_x, shape[0] + half_x, edge)
+    row0, row1 = _inclusive_range(shape[1] - half_y, shape[1] + half_y, edge)
     col0, col1 = col0.maximum(x0 * per_tile), col1.minimum((x1 * per_tile).clamp(max=tiles_x))
     row0, row1 = row0.maximum(y0 * per_tile), row1.minimum((y1 * per_tile).clamp(max=tiles_y))
 
     kept = ((col0 < col1) & (row0 < row1)).nonzero().squeeze(1)
     spans = torch.stack([row0, row1, col0, col1]).index_select(1, kept).long()
-    order = order.index_select(0, kept)
-    spans[:2] += projection.camera_ids.index_select(0, order) * tiles_y
-    return Footprints(edge, tiles_x, tiles_y, order, shape.index_select(0, kept), spans)
+    order, shape = order.index_select(0, kept), shape.index_select(1, kept)
+    images_above = projection.camera_ids.index_select(0, order)
+    spans[:2] += images_above * tiles_y
+    shape[1] += images_above * (tiles_y * edge)
+    return Footprints(edge, tiles_x, tiles_y, order, shape, spans)
 
 
 def _clip(spans: Tensor, block: Block) -> Tensor:
@@ -149,7 +156,7 @@ def _clip(spans: Tensor, block: Block) -> Tensor:
 
 
 def split_into_blocks(prints: Footprints, max_pairs: int) -> list[Block]:
-    """Cut the sub-tiles into blocks of at most `max_pairs` bounding-box pairs (or a single sub-tile): bounded memory."""
+    """Cut the sub-tiles into blocks of at most `max_pairs` pairs (by bounding boxes), or of one sub-tile."""
 
     def split(block: Block) -> list[Block]:
         row0, row1, col0, col1 = block
@@ -181,10 +188,10 @@ def list_tiles(prints: Footprints, block: Block) -> TileLists:
     row = torch.arange(total) + (row0 - row_end + n_rows).index_select(0, splat)
 
     # The interval of columns that the ellipse covers on the pixel rows [y0, y1] of each.
-    x, y, a, b, c, log_opacity = prints.shape.index_select(0, splat).t().contiguous()
+    x, y, a, b, c, log_opacity = (row.index_select(0, splat) for row in prints.shape)
     det = a * c - b * b
     reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
-    y0 = (row % prints.tiles_y * edge + 0.5) - y
+    y0 = (row * edge + 0.5) - y
     y1 = y0 + (edge - 1)
     rightmost = -(b / c) * (reach * c / det).sqrt()
     ends = []
