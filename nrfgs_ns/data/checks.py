@@ -54,7 +54,7 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
     if not source.is_file():
         raise InputError(
             f"{source} is missing. Point --data at a folder that holds one, or make one from photos with "
-            "`nrfgs prepare` or `ns-process-data`."
+            "`ns-process-data`."
         )
     try:
         meta = json.loads(source.read_text(encoding="utf-8"))
