@@ -5,7 +5,7 @@
 
 Each run is a process of its own (`python -m nrfgs_ns.studies.run`) that leaves OUT/runs/METHOD-SCENE-SEED.json; a run
 whose file is there is not repeated. Several runs may share a GPU where wall-clock is not what is measured: with
---jobs 1 the seconds can be compared, otherwise they are left out of the table. A run that fails is listed as failed.
+--jobs 1 the seconds can be compared, otherwise they are left out of the table. A run that failed is listed as missing.
 A method may carry options: "nrfgs:zero=--pipeline.model.appearance.output-init zero" is reported as "nrfgs:zero".
 """
 
@@ -48,8 +48,8 @@ class Compare:
     """folder for checkpoints and logs"""
     options: str = ""
     """further options of ns-train for every run"""
-    deadline: float = 0.0
-    """seconds after which no further run starts and running ones are stopped, to be resumed by hand; 0 for none"""
+    report_only: bool = False
+    """run nothing: make the table from the runs that are there"""
     pending: list[tuple[str, list[str], Path]] = field(init=False, default_factory=list)
 
     def command(self, method: str, scene: Path, seed: int, record: Path) -> list[str]:
@@ -76,7 +76,7 @@ class Compare:
                 for method in self.methods:
                     label = method.partition("=")[0]
                     record = runs / f"{label.replace(':', '_')}-{scene.name}-{seed}.json"
-                    if not record.exists():
+                    if not record.exists() and not self.report_only:
                         self.pending.append((record.stem, self.command(method, scene, seed, record), record))
         self.run_all()
         self.report(runs)
@@ -85,14 +85,12 @@ class Compare:
         """Run what is pending, `jobs` at once on each GPU."""
         slots = [gpu for _ in range(self.jobs) for gpu in range(self.gpus)]
         running: dict[int, tuple[str, subprocess.Popen]] = {}
-        start = time.time()
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
         with Progress(*columns, console=Console(stderr=True)) as progress:
             task = progress.add_task("runs", total=len(self.pending))
             while self.pending or running:
-                late = self.deadline and time.time() - start > self.deadline
                 for slot, gpu in enumerate(slots):
-                    if slot not in running and self.pending and not late:
+                    if slot not in running and self.pending:
                         name, command, _ = self.pending.pop(0)
                         log = (self.work / f"{name}.log").open("w")
                         environment = {**os.environ, "CUDA_VISIBLE_DEVICES": str(gpu)}
@@ -102,11 +100,6 @@ class Compare:
                         name, process = running.pop(slot)
                         progress.console.print(f"{name}: {'done' if process.returncode == 0 else 'FAILED'}")
                         progress.advance(task)
-                if late:
-                    for name, process in running.values():
-                        progress.console.print(f"{name}: stopped at the deadline")
-                        process.terminate()
-                    return
                 time.sleep(0.2)
 
     def report(self, runs: Path) -> None:
@@ -118,9 +111,9 @@ class Compare:
                 files = [runs / f"{label.replace(':', '_')}-{scene.name}-{seed}.json" for seed in self.seeds]
                 records = [json.loads(file.read_text()) for file in files if file.exists()]
                 row: dict[str, object] = {"scene": scene.name, "method": label, "seeds": len(records)}
-                row["failed"] = len(files) - len(records)
-                for column, (part, key) in COLUMNS.items():
-                    values = [record[part].get(key) for record in records]
+                row["missing"] = len(files) - len(records)
+                for column, value_of in COLUMNS.items():
+                    values = [value_of(record) for record in records]
                     values = [value for value in values if value is not None]
                     if values:
                         deviation = statistics.stdev(values) if len(values) > 1 else None
@@ -134,16 +127,16 @@ class Compare:
 
 
 COLUMNS = {
-    "PSNR": ("eval", "psnr"),
-    "SSIM": ("eval", "ssim"),
-    "MS-SSIM": ("eval", "ms_ssim"),
-    "L1": ("eval", "l1"),
-    "splats": ("eval", "splats"),
-    "MB": ("eval", "parameter_bytes"),
-    "train s": ("train", "seconds"),
-    "peak MB": ("train", "peak_memory_bytes"),
+    "PSNR": lambda run: run["eval"]["psnr"],
+    "SSIM": lambda run: run["eval"]["ssim"],
+    "MS-SSIM": lambda run: run["eval"].get("ms_ssim"),
+    "L1": lambda run: run["eval"].get("l1"),
+    "splats": lambda run: run["train"]["splats"][-1][1],
+    "MB": lambda run: run["eval"].get("parameter_bytes"),
+    "train s": lambda run: run["train"]["seconds"],
+    "peak MB": lambda run: run["train"]["peak_memory_bytes"],
 }
-"""Column -> where a run's record has it."""
+"""Column -> its value in a run's record; None where the method does not report it."""
 
 FORMATS = {"PSNR": "{:.2f}", "SSIM": "{:.4f}", "MS-SSIM": "{:.4f}", "L1": "{:.4f}", "splats": "{:,.0f}"}
 UNITS = {"MB": 1e6, "peak MB": 1e6}
@@ -163,7 +156,7 @@ def markdown(summary: list[dict], with_seconds: bool) -> str:
             form, unit = FORMATS.get(column, "{:.1f}"), UNITS.get(column, 1.0)
             spread = f" ± {form.format(deviation / unit)}" if deviation is not None else ""
             cells.append(form.format(mean / unit) + spread)
-        seeds = f"{row['seeds']}" + (f" ({row['failed']} failed)" if row["failed"] else "")
+        seeds = f"{row['seeds']}" + (f" ({row['missing']} missing)" if row["missing"] else "")
         lines.append(f"| {row['scene']} | {row['method']} | {seeds} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
