@@ -29,7 +29,7 @@ from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, Splat
 
 @dataclass
 class NrfConfig(AppearanceHeadConfig):
-    """Neural residual field. The defaults are the paper's, but for the two choices that name a measurement."""
+    """Neural residual field. The defaults are the paper's, but for zero outputs and the straight-through bound."""
 
     _target: type = field(default_factory=lambda: NeuralResidualField)
     """the head class that this configuration builds"""
@@ -56,9 +56,9 @@ class NrfConfig(AppearanceHeadConfig):
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: the residual is exactly nothing. default: torch's uniform, as in the paper, to
     be quieted by the warm-up."""
-    opacity_bound: Literal["clamp", "straight-through"] = "clamp"
+    opacity_bound: Literal["clamp", "straight-through"] = "straight-through"
     """how base + residual is brought back into [0, 1]. clamp: no gradient beyond the ends. straight-through: the
-    gradient ignores the clamp."""
+    gradient ignores the clamp, so that a splat can come back (measured in docs/measurements.md)."""
 
     def validate(self) -> None:
         self.require(self.latent_dim >= 1, "latent_dim", "at least 1")

@@ -115,7 +115,7 @@ def test_zero_scales_add_nothing():
     assert torch.equal(head(splats, visible, centers).colors, head.base_appearance(splats, visible).colors)
 
 
-@pytest.mark.parametrize("config", [{}, {"split_bands": False}, {"opacity_bound": "straight-through"}])
+@pytest.mark.parametrize("config", [{}, {"split_bands": False}, {"opacity_bound": "clamp"}])
 def test_gradients_agree_with_finite_differences(config):
     """To means, base colours, latents, opacities, camera centres and every shared weight."""
     head = awake(latent_dim=3, hidden_width=5, num_bands=2, **config)
