@@ -71,7 +71,7 @@ class NrfgsPipeline(VanillaPipeline):
         per_image: list[dict[str, Any]] = []
         columns = TextColumn("Evaluating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=CONSOLE, transient=True) as progress:
-            for name, (camera, batch) in progress.track(list(zip(names, images, strict=True))):
+            for index, (name, (camera, batch)) in enumerate(progress.track(list(zip(names, images, strict=True)))):
                 start = perf_counter()
                 outputs = self.model.get_outputs_for_camera(camera=camera)
                 if outputs["rgb"].is_cuda:
@@ -81,7 +81,8 @@ class NrfgsPipeline(VanillaPipeline):
                 per_image.append({"image": name, **metrics, "seconds_per_image": seconds})
                 if output_path is not None:
                     for key, picture in pictures.items():
-                        save_image(picture.permute(2, 0, 1).cpu(), output_path / f"eval_{key}_{Path(name).stem}.png")
+                        file = output_path / f"eval_{key}_{index:04d}_{Path(name).stem}.png"
+                        save_image(picture.permute(2, 0, 1).cpu(), file)
         self.train()
 
         result: dict[str, Any] = {}

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
 from torch.testing import assert_close
@@ -83,6 +84,8 @@ def test_train_eval_render(method, trained, tmp_path, tiny_scene):
     else:
         assert results["parameter_bytes"] == 4 * pipeline.model.num_points * (3 + 3 + 4 + 1 + 48)
 
+    ComputePSNR(config, tmp_path / "again.json", render_output_path=tmp_path / "pairs").main()
+    assert [file.name[:13] for file in sorted((tmp_path / "pairs").iterdir())] == ["eval_img_0000", "eval_img_0001"]
     DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
     names = json.loads((tiny_scene / "transforms.json").read_text())["test_filenames"]
     for output in ("rgb", "depth", "accumulation", "gt-rgb"):
