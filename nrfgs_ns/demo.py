@@ -33,7 +33,7 @@ class Demo:
     """folder for the data set, the trainings, results.json and contact_sheet.png"""
     gloss: float = 1.0
     """0: everything is diffuse. 1: glossy and mirror-like."""
-    steps: int = 1500
+    steps: int = 1000
     """training steps of each method"""
     quick: bool = False
     """a smaller scene and fewer steps: a minute, to see that everything works"""
