@@ -10,6 +10,8 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
 
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.studies.run import evaluate, train
@@ -26,13 +28,20 @@ def psnr(method: str, data: Path, out: Path, steps: int, *options: str) -> float
     return evaluate(Path(train(args).config_path), out / f"{method}.json")["psnr"]
 
 
-def test_the_field_pays_where_there_is_gloss(tmp_path):
-    """On mirror-like balls NRF beats its own base colour, and SH of degree 0, after the same 500 steps."""
+def test_the_field_carries_what_depends_on_the_view(tmp_path):
+    """On mirror-like balls, taking the field away from a trained model must cost more than rounding to 8 bits could."""
     data = write_scene(SceneConfig(gloss=1.0, views=24, width=100, height=76, points=2000), tmp_path / "scene")
-    matte = psnr("nrfgs-sh", data, tmp_path, 500, "--pipeline.model.appearance.degree", "0")
-    field = psnr("nrfgs", data, tmp_path, 500)
-    # Seeds move either by about 0.1 dB.
-    assert field > matte + 0.3
+    psnr("nrfgs", data, tmp_path, 500)
+    (config,) = tmp_path.rglob("config.yml")
+    _, pipeline, _, _ = eval_setup(config)
+    errors = {"whole": [], "base": []}
+    for camera, batch in pipeline.datamanager.fixed_indices_eval_dataloader:
+        truth = pipeline.model.get_gt_img(batch["image"])
+        errors["whole"].append((pipeline.model.get_outputs_for_camera(camera)["rgb"] - truth).square().mean())
+        errors["base"].append((pipeline.model.get_base_color(camera) - truth).square().mean())
+    whole, base = (torch.stack(errors[which]).mean() for which in ("whole", "base"))
+    # At this error (PSNR near 25 dB, 0.056 root mean square) half an 8-bit step in every pixel is 0.001 dB.
+    assert 10 * torch.log10(base / whole) > 0.1
 
 
 @pytest.mark.parametrize("scene", ["fox", "kitchen"])
