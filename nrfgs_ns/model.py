@@ -158,10 +158,8 @@ class NrfgsModel(SplatfactoModel):
     @property
     def features_rest(self) -> Tensor:
         """Coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any."""
-        return self.gauss_params["features_rest"] if "features_rest" in self.gauss_params else self._no_harmonics
-
-    @property
-    def _no_harmonics(self) -> Tensor:
+        if "features_rest" in self.gauss_params:
+            return self.gauss_params["features_rest"]
         return self.features_dc.new_zeros(self.num_points, 0, 3)
 
     @property
