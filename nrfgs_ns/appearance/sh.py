@@ -53,14 +53,12 @@ class SphericalHarmonics(AppearanceHead):
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         directions = splats["means"].index_select(0, visible) - camera_centers
-        coefficients = torch.cat(
-            [
-                splats["features_dc"].index_select(0, visible)[:, None],
-                splats["features_rest"].index_select(0, visible),
-            ],
-            dim=1,
-        )
         return SplatAppearance(
-            colors=(eval_sh(self.active_degree, directions, coefficients) + 0.5).clamp_min(0.0),
+            colors=(eval_sh(self.active_degree, directions, self.coefficients(splats, visible)) + 0.5).clamp_min(0.0),
             opacities=torch.sigmoid(splats["opacities"].index_select(0, visible)).squeeze(-1),
         )
+
+    def coefficients(self, splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:
+        """All coefficients of the visible splats, [M, (degree + 1)^2, 3]."""
+        constant = splats["features_dc"].index_select(0, visible)[:, None]
+        return torch.cat([constant, splats["features_rest"].index_select(0, visible)], dim=1)

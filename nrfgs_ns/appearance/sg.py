@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Spherical Gaussians: a base colour and a few lobes of light, each about an axis of its own.
+
+Seen from the direction d from camera to splat, splat i with base colour c and L = 3 lobes has
+
+    colour = max(0, c + sum_{j <= L} a_j exp(|s_j| (d . mu_j - 1))),
+
+with amplitude a_j (3 numbers, any sign), sharpness |s_j| (1 number) and unit axis mu_j (3 numbers, stored at any
+length). Opacity does not depend on the view. Sources: the papers "SG-Splatting" (three lobes about the fixed axes x,
+y, z, from step 2,000) and "MEGS2" (free axes, |s|), which this follows.
+
+A splat stores 3 + 7 L = 24 colour numbers, half of what harmonics of degree 3 take; nothing is shared.
+
+Axes start at x, y, z: at right angles the lobes can follow a gradient of colour in every direction equally well.
+Amplitudes start at zero, so that switching the lobes on changes nothing. Sharpness starts at 2: a lobe has 56 % of its
+height halfway to the next axis, so that neighbours overlap, and 2 % opposite its own axis, so that each has directions
+to itself.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from nrfgs_ns.appearance.directions import unit_vectors
+from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_colors
+
+SHORTEST_AXIS = 1e-3
+"""Stored axes shorter than this are divided by it instead of their length: they start at 1, and the bound is for the
+gradient of one that training leads through zero."""
+
+
+@dataclass
+class SgConfig(AppearanceHeadConfig):
+    """Spherical Gaussians with free axes."""
+
+    _target: type = field(default_factory=lambda: SphericalGaussians)
+    """the head class that this configuration builds"""
+    lobes: int = 3
+    """L: lobes of each splat, 1 to 6. They start about x, y, z, -x, -y, -z, in this order."""
+    start_step: int = 2000
+    """training step from which there are lobes; before it only the base colour is trained."""
+    initial_sharpness: float = 2.0
+    """s at the start."""
+    distance_eps: float = 0.01
+    """smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
+
+    def validate(self) -> None:
+        # Two lobes that started alike would get the same gradients and stay alike.
+        self.require(1 <= self.lobes <= 6, "lobes", "1 to 6, so that no two lobes start about the same axis")
+        self.require(self.start_step >= 0, "start_step", "zero or positive")
+        self.require(self.initial_sharpness > 0, "initial_sharpness", "positive")
+        self.require(self.distance_eps > 0, "distance_eps", "positive")
+
+
+class SphericalGaussians(AppearanceHead):
+    """Colours from base and lobes, opacities from the base."""
+
+    name = "sg"
+
+    def __init__(self, config: SgConfig):
+        super().__init__()
+        self.config = config
+        self.active = True
+        """whether there are lobes yet."""
+
+    def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
+        """Base colours and lobes.
+
+        "features_dc" [N, 3]; "sg_axes" [N, L, 3], of any length but zero; "sg_sharpness" [N, L], of any sign;
+        "sg_colors" [N, L, 3], amplitudes in units of white.
+        """
+        count, lobes = len(rgb), self.config.lobes
+        axes = torch.eye(3, device=rgb.device)
+        return {
+            **super().splat_params(rgb),
+            "sg_axes": torch.cat([axes, -axes])[:lobes].repeat(count, 1, 1),
+            "sg_sharpness": torch.full((count, lobes), float(self.config.initial_sharpness), device=rgb.device),
+            "sg_colors": torch.zeros(count, lobes, 3, device=rgb.device),
+        }
+
+    def set_step(self, step: int) -> None:
+        self.active = step >= self.config.start_step
+
+    def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
+        colors = base_colors(splats["features_dc"].index_select(0, visible))
+        if self.active:
+            colors = colors + self._lobes(splats, visible, camera_centers)
+        return SplatAppearance(
+            colors=colors.clamp_min(0.0),
+            opacities=torch.sigmoid(splats["opacities"].index_select(0, visible)).squeeze(-1),
+        )
+
+    def _lobes(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor:
+        """What the lobes add to the visible splats' colours, [M, 3]."""
+        means = splats["means"].index_select(0, visible)
+        directions = unit_vectors(means - camera_centers, self.config.distance_eps)
+        axes = unit_vectors(splats["sg_axes"].index_select(0, visible), SHORTEST_AXIS)
+        sharpness = splats["sg_sharpness"].index_select(0, visible).abs()
+        heights = torch.exp(sharpness * ((axes * directions[:, None]).sum(dim=-1) - 1.0))  # [M, L]
+        return (heights[..., None] * splats["sg_colors"].index_select(0, visible)).sum(dim=1)

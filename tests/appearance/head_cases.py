@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splats and weights for the tests of appearance heads, none of them at a start where a term would be zero."""
+
+import torch
+
+from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig
+
+
+def awake(config: AppearanceHeadConfig, dtype: torch.dtype = torch.float64) -> AppearanceHead:
+    """A head fully switched on, with shared weights large enough to be felt."""
+    torch.manual_seed(1)
+    head = config.setup().to(dtype)
+    for weights in head.parameters():
+        weights.data += 0.3 * torch.randn_like(weights)
+    return head
+
+
+def scene(head: AppearanceHead, count: int = 11, dtype: torch.dtype = torch.float64, seed: int = 0):
+    """A table of random splats within [-2, 2]^3, two thirds of which are visible, out of order, from a camera each."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator, dtype=dtype)
+
+    torch.manual_seed(seed)
+    stored = {name: value.to(dtype) for name, value in head.splat_params(rand(count, 3)).items()}
+    splats = {"means": 4 * rand(count, 3) - 2, "opacities": 2 * rand(count, 1) - 1}
+    splats |= {name: value + 0.5 * rand(*value.shape) - 0.25 for name, value in stored.items()}
+    visible = torch.randperm(count, generator=generator)[: 2 * count // 3]
+    return splats, visible, 6 * rand(len(visible), 3) - 3
+
+
+def numbers_per_splat(head: AppearanceHead) -> int:
+    """Numbers that a splat stores for its colour."""
+    return sum(value[0].numel() for value in head.splat_params(torch.rand(2, 3)).values())
+
+
+def shared_weights(module: torch.nn.Module) -> int:
+    return sum(weights.numel() for weights in module.parameters())

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import pytest
+import torch
+from gsplat.cuda._torch_impl import _eval_sh_bases_fast
+from head_cases import awake, numbers_per_splat, scene, shared_weights
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.gsnb import GsnbConfig
+from nrfgs_ns.appearance.sh import ShConfig
+
+
+def by_hand(head, splats, visible, centers, ramp):
+    """The formulas, one splat at a time, with nothing shared with the implementation but the weights."""
+    first, _, second, _, third, _ = head.basis
+    colors = []
+    for row, center in zip(visible.tolist(), centers, strict=True):
+        x = splats["means"][row]
+        d = (x - center) / (x - center).norm()
+        waves = [[torch.sin(2**k * math.pi * d), torch.cos(2**k * math.pi * d)] for k in range(6)]
+        h = torch.cat([d, *sum(waves, [])])
+        for layer in (first, second):
+            h = layer.weight @ h + layer.bias
+            h = torch.where(h > 0, h, 0.01 * h)
+        phi = torch.tanh(third.weight @ h + third.bias)
+        k = torch.cat([splats["features_dc"][row][None], splats["features_rest"][row]])
+        color = 0.5 + sum((_eval_sh_bases_fast(16, d)[j] + ramp * phi[j]) * k[j] for j in range(16))
+        colors.append(color.clamp_min(0))
+    return torch.stack(colors)
+
+
+def test_sizes():
+    head = GsnbConfig().setup()
+    assert shared_weights(head) == (39 * 64 + 64) + (64 * 64 + 64) + (64 * 16 + 16) == 7760
+    assert numbers_per_splat(head) == 48
+
+
+@pytest.mark.parametrize("step, ramp", [(3000, 0.6), (5000, 1.0), (30_000, 1.0)])
+def test_matches_the_formulas(step, ramp):
+    head = awake(GsnbConfig())
+    head.set_step(step)
+    splats, visible, centers = scene(head)
+    colors, opacities = head(splats, visible, centers)
+    assert_close(colors, by_hand(head, splats, visible, centers, ramp), rtol=0, atol=1e-12)
+    assert_close(opacities, torch.sigmoid(splats["opacities"][visible, 0]))
+
+
+def test_the_basis_is_faded_in_from_nothing():
+    head, plain = awake(GsnbConfig()), ShConfig().setup()
+    splats, visible, centers = scene(head)
+    changes = []
+    for step in (0, 1250, 2500, 5000):
+        for each in (head, plain):
+            each.set_step(step)
+            each.active_degree = 3
+        assert head.ramp == step / 5000
+        changes.append((head(splats, visible, centers).colors - plain(splats, visible, centers).colors).abs().max())
+    # Directions are normalised once more on the way: a few units of float64.
+    assert changes[0] < 1e-14 < changes[1] < changes[2] < changes[3]
+
+
+def test_before_a_step_is_known_all_of_it_counts():
+    assert GsnbConfig().setup().ramp == 1.0
+
+
+def test_learnt_functions_use_the_coefficients_of_degrees_that_are_still_off():
+    head = awake(GsnbConfig())
+    head.set_step(500)
+    assert head.active_degree == 0
+    splats, visible, centers = scene(head)
+    splats["features_rest"].requires_grad_()
+    head(splats, visible, centers).colors.sum().backward()
+    assert (splats["features_rest"].grad[visible] != 0).any(dim=0).all()
+
+
+def test_opposite_directions_along_an_axis_are_told_apart():
+    """sin(pi d) and cos(pi d) and all higher bands agree at d = +x and d = -x."""
+    head = awake(GsnbConfig(degree=0))
+    splats, visible, _ = scene(head, count=3)
+    splats["means"].zero_()
+    x = torch.tensor([2.0, 0, 0], dtype=torch.double)
+    assert not torch.allclose(head(splats, visible, x).colors, head(splats, visible, -x).colors)
+
+
+@pytest.mark.parametrize(
+    "field, value",
+    [("num_bands", 0), ("hidden_width", 0), ("ramp_steps", 0), ("distance_eps", -0.01), ("degree", -1)],
+)
+def test_impossible_settings_are_named(field, value):
+    with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):
+        GsnbConfig(**{field: value}).setup()

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every head owes the model, whatever its formulas."""
+
+import pytest
+import torch
+from head_cases import awake, scene
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.gsnb import GsnbConfig
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.sg import SgConfig
+from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.appearance.vdgs import VdgsConfig
+
+CONFIGS = {
+    "nrf": NrfConfig(),
+    "sh": ShConfig(),
+    "vdgs": VdgsConfig(),
+    "vdgs-sh": VdgsConfig(mode="sh"),
+    "vdgs-both": VdgsConfig(mode="both"),
+    "gsnb": GsnbConfig(),
+    "sg": SgConfig(),
+}
+TINY_GRID = {"grid_levels": 2, "grid_features": 2, "grid_log2_table_size": 4, "grid_base_resolution": 1}
+SMALL = {
+    "nrf": NrfConfig(latent_dim=3, hidden_width=5),
+    "sh": ShConfig(degree=2),
+    "vdgs": VdgsConfig(degree=1, hidden_width=4, grid_per_level_scale=2, **TINY_GRID),
+    "vdgs-both": VdgsConfig(mode="both", degree=1, hidden_width=4, grid_per_level_scale=2, **TINY_GRID),
+    "gsnb": GsnbConfig(degree=1, num_bands=2, hidden_width=4),
+    "sg": SgConfig(lobes=2),
+}
+"""Few enough numbers for finite differences; the tiny grid has a numbered level and a hashed one."""
+
+
+@pytest.fixture(params=CONFIGS)
+def config(request):
+    return CONFIGS[request.param]
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_gradients_agree_with_finite_differences(name):
+    """To every stored number, the cameras and every shared weight."""
+    head = awake(SMALL[name])
+    splats, visible, centers = scene(head, count=5)
+    weights = dict(head.named_parameters())
+
+    def f(centers, *tensors):
+        table = dict(zip(splats, tensors, strict=False))
+        shared = dict(zip(weights, tensors[len(splats) :], strict=True))
+        return torch.func.functional_call(head, shared, (table, visible, centers))
+
+    inputs = [centers, *splats.values(), *(weight.detach().clone() for weight in weights.values())]
+    assert torch.autograd.gradcheck(f, [x.requires_grad_() for x in inputs])
+
+
+def test_float32_is_float64_up_to_rounding(config):
+    """How far rounding can go is measured: in float64, every number that goes in is off by a random 8 units (2^-24).
+
+    8 is about how many operations deep each stage is. The tolerance is 8 times the largest change in 6 such runs, and
+    64 units of 1 for the sums over up to 64 terms.
+    """
+    head = awake(config)
+    splats, visible, centers = scene(head)
+    exact = head(splats, visible, centers)
+    unit = 2.0**-24
+
+    def off(value):
+        return value * (1 + 8 * unit * torch.empty_like(value).uniform_(-1, 1))
+
+    changes = []
+    for seed in range(6):
+        torch.manual_seed(seed)
+        weights = {name: off(weight.detach()) for name, weight in head.named_parameters()}
+        table = {name: off(value) for name, value in splats.items()}
+        moved = torch.func.functional_call(head, weights, (table, visible, off(centers)))
+        changes.append([(a - b).abs().max().item() for a, b in zip(moved, exact, strict=True)])
+    head.float()
+    single = head({name: value.float() for name, value in splats.items()}, visible, centers.float())
+    for value, expected, change in zip(single, exact, torch.tensor(changes).max(dim=0).values.tolist(), strict=True):
+        assert value.dtype == torch.float32
+        assert_close(value.double(), expected, rtol=0, atol=8 * change + 64 * unit)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("offset", [0.0, 1e-20, 1e-6])
+def test_a_camera_on_the_splat_gives_finite_values_and_gradients(config, dtype, offset):
+    head = awake(config, dtype)
+    splats, visible, _ = scene(head, dtype=dtype)
+    splats = {name: value.requires_grad_() for name, value in splats.items()}
+    splats["means"].data[visible[0]] = 0.0  # where 1e-20 is not lost in the sum
+    centers = splats["means"].detach()[visible] + offset
+    colors, opacities = head(splats, visible, centers)
+    (colors.sum() + opacities.sum()).backward()
+    for value in (colors, opacities, *(splat.grad for splat in splats.values()), *(w.grad for w in head.parameters())):
+        assert torch.isfinite(value).all()
+
+
+def test_values_are_bounded_and_every_stored_number_is_felt(config):
+    head = awake(config)
+    splats, visible, centers = scene(head, count=60)
+    splats = {name: value.requires_grad_() for name, value in splats.items()}
+    colors, opacities = head(splats, visible, centers)
+    assert colors.shape == (40, 3) and opacities.shape == (40,)
+    assert (colors >= 0).all() and (opacities >= 0).all() and (opacities <= 1).all()
+    (colors.sum() + opacities.sum()).backward()
+    hidden = torch.ones(60, dtype=torch.bool)
+    hidden[visible] = False
+    for name, value in splats.items():
+        assert (value.grad[hidden] == 0).all(), name
+        assert (value.grad[visible] != 0).any(dim=0).all(), name
+
+
+def test_nothing_visible(config):
+    head = awake(config)
+    splats, _, _ = scene(head)
+    for centers in (torch.zeros(3).double(), torch.zeros(0, 3).double()):
+        colors, opacities = head(splats, torch.zeros(0, dtype=torch.int64), centers)
+        assert colors.shape == (0, 3) and opacities.shape == (0,)
+
+
+def test_one_camera_is_as_good_as_one_for_each_splat(config):
+    head = awake(config)
+    splats, visible, centers = scene(head)
+    one = head(splats, visible, centers[0])
+    each = head(splats, visible, centers[:1].expand(len(visible), 3))
+    assert torch.equal(one.colors, each.colors) and torch.equal(one.opacities, each.opacities)
+
+
+def test_only_the_neural_residual_field_is_warmed_up(config):
+    head = awake(config)
+    assert (head.neutral_loss(*scene(head)) is not None) == isinstance(config, NrfConfig)
+
+
+def test_heads_are_told_apart_in_checkpoints():
+    names = ["nrf", "sh", "vdgs", "gsnb", "sg"]
+    assert [CONFIGS[name].setup().name for name in names] == names

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import pytest
+import torch
+from gsplat.cuda._torch_impl import _eval_sh_bases_fast
+from head_cases import awake, numbers_per_splat, scene, shared_weights
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.hash_grid import HashGrid
+from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.appearance.vdgs import VdgsConfig
+
+
+def grid_by_hand(table, x):
+    """The paper's four levels at one position, corner by corner, the hash in unsigned 32-bit integers."""
+    features = []
+    for level, resolution in enumerate((16, 24, 36, 54)):
+        scaled = [float(coordinate) * resolution for coordinate in x]
+        total = torch.zeros(4, dtype=torch.float64)
+        for corner in range(8):
+            weight, point = 1.0, []
+            for axis in range(3):
+                upper = corner >> axis & 1
+                below = math.floor(scaled[axis])
+                weight *= scaled[axis] - below if upper else 1 - (scaled[axis] - below)
+                point.append(below + upper)
+            i, j, k = point
+            if level == 0:  # 32 points per side fill the table
+                row = i % 32 + 32 * (j % 32) + 1024 * (k % 32)
+            else:
+                u, v, w = (c * p % 2**32 for c, p in zip(point, (1, 2654435761, 805459861), strict=True))
+                row = (u ^ v ^ w) % 2**15
+            total = total + weight * table[level * 2**15 + row]
+        features.append(total)
+    return torch.cat(features)
+
+
+def by_hand(head, splats, visible, centers):
+    """The formulas, one splat at a time, with nothing shared with the implementation but the weights."""
+    first, _, second, _, third = head.network
+    mode = head.config.mode
+    colors, opacities = [], []
+    for row, center in zip(visible.tolist(), centers, strict=True):
+        x = splats["means"][row]
+        d = (x - center) / (x - center).norm()
+        h = torch.cat([d, grid_by_hand(head.grid.table, x)])
+        for layer in (first, second):
+            h = layer.weight @ h + layer.bias
+            h = torch.where(h > 0, h, 0.01 * h)
+        f = 1 / (1 + torch.exp(-(third.weight @ h + third.bias)))
+        k = torch.cat([splats["features_dc"][row][None], splats["features_rest"][row]])
+        alpha = 1 / (1 + torch.exp(-splats["opacities"][row, 0]))
+        if mode in ("opacity", "both"):
+            alpha = alpha * f[0]
+        if mode in ("sh", "both"):
+            k = k * f[1 if mode == "both" else 0 :].reshape(16, 3)
+        colors.append((0.5 + _eval_sh_bases_fast(16, d) @ k).clamp_min(0))
+        opacities.append(alpha)
+    return torch.stack(colors), torch.stack(opacities)
+
+
+@pytest.mark.parametrize("mode, network", [("opacity", 1729), ("sh", 3280), ("both", 3313)])
+def test_sizes(mode, network):
+    head = VdgsConfig(mode=mode).setup()
+    assert shared_weights(head.network) == network
+    assert shared_weights(head.grid) == 4 * 2**15 * 4 == 524_288
+    assert shared_weights(head) == 524_288 + network
+    assert numbers_per_splat(head) == 48
+
+
+@pytest.mark.parametrize("mode", ["opacity", "sh", "both"])
+def test_matches_the_formulas(mode):
+    head = awake(VdgsConfig(mode=mode))
+    splats, visible, centers = scene(head, count=18)
+    assert (splats["means"][visible].abs() > 1).any() and (splats["means"][visible] < 0).any()
+    colors, opacities = head(splats, visible, centers)
+    expected_colors, expected_opacities = by_hand(head, splats, visible, centers)
+    assert_close(colors, expected_colors, rtol=0, atol=1e-12)
+    assert_close(opacities, expected_opacities, rtol=0, atol=1e-12)
+
+
+def test_opacity_mode_leaves_colours_alone_and_only_turns_opacity_down():
+    head, plain = awake(VdgsConfig()), ShConfig().setup()
+    splats, visible, centers = scene(head)
+    ours, theirs = head(splats, visible, centers), plain(splats, visible, centers)
+    # Directions are normalised once more on the way: a few units of float64.
+    assert_close(ours.colors, theirs.colors, rtol=0, atol=1e-14)
+    assert (ours.opacities < theirs.opacities).all() and (ours.opacities > 0).all()
+    assert not torch.allclose(ours.opacities, head(splats, visible, -centers).opacities)
+
+
+def test_sh_mode_leaves_opacity_alone():
+    head, plain = awake(VdgsConfig(mode="sh")), ShConfig().setup()
+    ours, theirs = head(*scene(head)), plain(*scene(plain))
+    assert torch.equal(ours.opacities, theirs.opacities)
+    assert not torch.allclose(ours.colors, theirs.colors)
+
+
+def test_the_degree_grows_as_for_harmonics():
+    head = VdgsConfig(degree_interval=10).setup()
+    head.set_step(25)
+    assert head.active_degree == 2
+
+
+def grid(**options):
+    torch.manual_seed(0)
+    defaults = {"levels": 4, "features": 4, "log2_table_size": 15, "base_resolution": 16, "per_level_scale": 1.5}
+    made = HashGrid(**{**defaults, **options}).double()
+    made.table.data.normal_()
+    return made
+
+
+def test_grid_starts_next_to_nothing():
+    torch.manual_seed(0)
+    table = VdgsConfig().setup().grid.table
+    assert 0.99e-4 < table.abs().max() <= 1e-4
+
+
+def test_numbered_level_has_one_row_for_each_lattice_point_of_the_cube():
+    """Features at lattice points are the table's rows: 32^3 points from -1 to 31/32, all rows, each once."""
+    level = grid(levels=1, features=1)
+    level.table.data[:, 0] = torch.arange(2**15)
+    side = torch.arange(-16, 16, dtype=torch.double) / 16
+    rows = level(torch.cartesian_prod(side, side, side))[:, 0]
+    assert torch.equal(rows.sort().values, torch.arange(2**15).double())
+
+
+def test_numbered_level_repeats_itself_beyond_the_cube_and_hashed_levels_do_not():
+    made = grid()
+    x = torch.rand(50, 3, dtype=torch.double) * 2 - 1
+    for shift in ([2.0, 0, 0], [0, -2.0, 0], [0, 4.0, -6.0]):
+        here, there = made(x), made(x + torch.tensor(shift).double())
+        # The shift rounds x by 2^-50, times 16 steps, times differences of a few between features.
+        assert_close(here[:, :4], there[:, :4], rtol=0, atol=1e-12)
+        assert ((here - there)[:, 4:].abs().amax(dim=1) > 0.1).all()
+
+
+def test_lattice_without_numbered_levels():
+    made = grid(log2_table_size=8)
+    assert len(made.sides) == 0
+    assert made(torch.rand(5, 3).double()).shape == (5, 16)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_features_are_continuous_across_cells_zero_and_the_cube(axis):
+    made = grid()
+    x = torch.rand(40, 3, dtype=torch.double) * 2 - 1
+    x[:, axis] = torch.arange(-20, 20) / 16  # faces of cells on level 0, of some on the others
+    before, after = x.clone(), x.clone()
+    before[:, axis] -= 1e-9
+    after[:, axis] += 1e-9
+    # A feature changes by at most 54 steps per unit times the largest difference of two normal numbers among 2^19.
+    assert (made(after) - made(before)).abs().max() < 2e-9 * 54 * 10
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_far_splats_find_rows_too(dtype):
+    made = grid().to(dtype)
+    far = torch.tensor([[1e6, -1e6, 1e6], [-1e9, 1e9, 0.1], [1e30, -1e30, 0.0]], dtype=dtype)
+    features = made(far)
+    assert torch.isfinite(features).all() and (features != 0).any(dim=1).all()
+
+
+@pytest.mark.parametrize(
+    "field, value",
+    [
+        ("mode", "color"),
+        ("hidden_width", 0),
+        ("grid_levels", 0),
+        ("grid_features", 0),
+        ("grid_log2_table_size", 0),
+        ("grid_log2_table_size", 25),
+        ("grid_base_resolution", 0),
+        ("grid_per_level_scale", 0.5),
+        ("distance_eps", 0.0),
+        ("degree", 4),
+    ],
+)
+def test_impossible_settings_are_named(field, value):
+    with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):
+        VdgsConfig(**{field: value}).setup()
