@@ -11,6 +11,8 @@ import math
 import torch
 from torch import Tensor
 
+FARTHEST = 1e18
+"""Coordinates of v are held within this, without gradient beyond: their squares must stay below float32's 3e38."""
 LOW_DIM = 9
 """Numbers in the low bands: the raw direction (3), sin and cos of band 0 (6)."""
 
@@ -26,7 +28,7 @@ def view_geometry(means: Tensor, camera_centers: Tensor, eps: float) -> tuple[Te
     Returns:
         directions [M, 3] with norm <= 1 (1 wherever |v| >= eps), and log distances [M, 1] >= log eps.
     """
-    v = camera_centers - means
+    v = (camera_centers - means).clamp(-FARTHEST, FARTHEST)
     r = v.square().sum(dim=-1, keepdim=True).clamp_min(eps * eps).sqrt()
     return v / r, r.log()
 

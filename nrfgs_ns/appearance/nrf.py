@@ -14,6 +14,8 @@ The low branch carries what changes slowly with direction; the high branch's det
 opens only where detail pays. Both are one hidden layer of ReLUs: 46 -> 64 -> 4 and 48 -> 64 -> 4, 6,664 weights in
 all at the default sizes. Without the split there is one branch of twice the width that sees everything
 (58 -> 128 -> 4, 8,068 weights) and no gate.
+
+`opacity_bound.py` has the ways in which opacity is kept in [0, 1]. `fused/` computes the same in two GPU kernels.
 """
 
 from collections.abc import Mapping
@@ -24,7 +26,9 @@ import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.encoding import LOW_DIM, fourier_bands, high_dim, view_geometry
+from nrfgs_ns.appearance.fused import FusedField
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_colors
+from nrfgs_ns.appearance.opacity_bound import OPACITY_BOUNDS, OpacityBound, bounded_opacity
 
 
 @dataclass
@@ -56,9 +60,18 @@ class NrfConfig(AppearanceHeadConfig):
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: the residual is exactly nothing. default: torch's uniform, as in the paper, to
     be quieted by the warm-up."""
-    opacity_bound: Literal["clamp", "straight-through"] = "straight-through"
+    opacity_bound: OpacityBound = "straight-through"
     """how base + residual is brought back into [0, 1]. clamp: no gradient beyond the ends. straight-through: the
-    gradient ignores the clamp, so that a splat can come back (measured in docs/measurements.md)."""
+    gradient ignores the clamp, so that a splat can come back (measured in docs/measurements.md). logit: the residual
+    is added to the logit. smooth: a clamp with round corners."""
+    geometry_gradient: bool = True
+    """let direction and distance send gradients to the means and the camera."""
+    implementation: Literal["auto", "torch", "fused"] = "auto"
+    """auto: the fused Triton kernels on CUDA, where they can run, and PyTorch elsewhere. fused: an error instead of
+    PyTorch."""
+    precision: Literal["fp32", "tf32", "bf16", "fp16"] = "fp32"
+    """what the fused kernels round the factors of matrix products to; sums are always float32. PyTorch's path ignores
+    it."""
 
     def validate(self) -> None:
         self.require(self.latent_dim >= 1, "latent_dim", "at least 1")
@@ -69,9 +82,12 @@ class NrfConfig(AppearanceHeadConfig):
         self.require(self.distance_eps > 0, "distance_eps", "positive")
         self.require(self.latent_std >= 0, "latent_std", "zero or positive")
         self.require(self.output_init in ("zero", "default"), "output_init", "'zero' or 'default'")
-        self.require(
-            self.opacity_bound in ("clamp", "straight-through"), "opacity_bound", "'clamp' or 'straight-through'"
-        )
+        for name, choices in (
+            ("opacity_bound", OPACITY_BOUNDS),
+            ("implementation", ("auto", "torch", "fused")),
+            ("precision", ("fp32", "tf32", "bf16", "fp16")),
+        ):
+            self.require(getattr(self, name) in choices, name, "one of " + ", ".join(map(repr, choices)))
 
 
 class NeuralResidualField(AppearanceHead):
@@ -96,6 +112,7 @@ class NeuralResidualField(AppearanceHead):
             for branch in filter(None, (self.low, self.high)):
                 nn.init.zeros_(branch[-1].weight)
                 nn.init.zeros_(branch[-1].bias)
+        self.fused = FusedField(config, self.low, self.high)
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Base colours and latents: "features_dc" [N, 3], "latents" [N, D] ~ N(0, latent_std^2)."""
@@ -103,49 +120,48 @@ class NeuralResidualField(AppearanceHead):
         return {**super().splat_params(rgb), "latents": latents}
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        color, alpha = self._base(splats, visible)
-        d_color, d_alpha = self._residual(splats, visible, camera_centers, color, alpha)
+        if self.fused.takes(splats, camera_centers):
+            return SplatAppearance(*self.fused(splats, visible, camera_centers))
+        color, logit = self._base(splats, visible)
+        d_color, d_alpha = self._residual(splats, visible, camera_centers, color, logit)
+        if d_alpha is None:
+            opacity = torch.sigmoid(logit)
+        else:
+            opacity = bounded_opacity(logit, d_alpha, self.config.opacity_scale, self.config.opacity_bound)
         return SplatAppearance(
-            colors=(color + d_color).clamp_min(0.0),
-            opacities=self._bounded(alpha if d_alpha is None else alpha + d_alpha).squeeze(-1),
+            colors=(color + self.config.color_scale * d_color).clamp_min(0.0), opacities=opacity.squeeze(-1)
         )
 
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor:
         """Mean square of the colour and opacity residuals."""
         d_color, d_alpha = self._residual(splats, visible, camera_centers, *self._base(splats, visible))
-        loss = d_color.square().mean()
-        return loss if d_alpha is None else loss + d_alpha.square().mean()
+        loss = (self.config.color_scale * d_color).square().mean()
+        return loss if d_alpha is None else loss + (self.config.opacity_scale * d_alpha).square().mean()
 
     def _base(self, splats: Mapping[str, Tensor], visible: Tensor) -> tuple[Tensor, Tensor]:
-        """Base colours [M, 3], not clamped, and base opacities [M, 1]."""
+        """Base colours [M, 3], not clamped, and base opacities' logits [M, 1]."""
         color = base_colors(splats["features_dc"].index_select(0, visible))
-        return color, torch.sigmoid(splats["opacities"].index_select(0, visible))
+        return color, splats["opacities"].index_select(0, visible)
 
     def _residual(
-        self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, color: Tensor, alpha: Tensor
+        self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, color: Tensor, logit: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """Colour residual [M, 3] in +-s_c; opacity residual [M, 1] in +-s_alpha, or None if it is switched off."""
+        """What the scales multiply, in [-1, 1]: colour's [M, 3]; opacity's [M, 1], or None if it is switched off."""
         means = splats["means"].index_select(0, visible)
         latents = splats["latents"].index_select(0, visible)
         directions, log_distance = view_geometry(means, camera_centers, self.config.distance_eps)
+        if not self.config.geometry_gradient:
+            directions, log_distance = directions.detach(), log_distance.detach()
         low, high = fourier_bands(directions, self.config.num_bands)
 
         shared = [latents, color] + ([log_distance] if self.config.use_distance else [])
-        inputs = [*shared, alpha, low] if self.config.split_bands else [*shared, alpha, low, high]
-        out = self.low(torch.cat(inputs, dim=-1))
+        inputs = [*shared, torch.sigmoid(logit), low]
+        out = self.low(torch.cat(inputs if self.config.split_bands else [*inputs, high], dim=-1))
         d_color = out[:, :3]
         if self.high is not None:
             detail = self.high(torch.cat([*shared, high], dim=-1))
             d_color = d_color + torch.sigmoid(detail[:, 3:]) * detail[:, :3]
-        d_alpha = self.config.opacity_scale * torch.tanh(out[:, 3:]) if self.config.opacity_residual else None
-        return self.config.color_scale * torch.tanh(d_color), d_alpha
-
-    def _bounded(self, opacity: Tensor) -> Tensor:
-        """Bring opacities back into [0, 1]."""
-        clamped = opacity.clamp(0.0, 1.0)
-        if self.config.opacity_bound == "straight-through":
-            return opacity + (clamped - opacity).detach()
-        return clamped
+        return torch.tanh(d_color), torch.tanh(out[:, 3:]) if self.config.opacity_residual else None
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.opacity_bound import OPACITY_BOUNDS, SHARPNESS, bounded_opacity
 
 
 def weights(head) -> int:
@@ -115,7 +116,10 @@ def test_zero_scales_add_nothing():
     assert torch.equal(head(splats, visible, centers).colors, head.base_appearance(splats, visible).colors)
 
 
-@pytest.mark.parametrize("config", [{}, {"split_bands": False}, {"opacity_bound": "clamp"}])
+@pytest.mark.parametrize(
+    "config",
+    [{}, {"split_bands": False}, {"opacity_bound": "clamp"}, {"opacity_bound": "logit"}, {"opacity_bound": "smooth"}],
+)
 def test_gradients_agree_with_finite_differences(config):
     """To means, base colours, latents, opacities, camera centres and every shared weight."""
     head = awake(latent_dim=3, hidden_width=5, num_bands=2, **config)
@@ -138,14 +142,52 @@ def test_gradients_agree_with_finite_differences(config):
     assert torch.autograd.gradcheck(f, [x.requires_grad_() for x in inputs])
 
 
-def test_opacity_bounds_differ_only_in_the_gradient():
-    for bound, slope in (("clamp", 0.0), ("straight-through", 1.0)):
-        head = awake(opacity_bound=bound)
-        opacity = torch.tensor([[-0.1], [0.5], [1.1]], dtype=torch.double, requires_grad=True)
-        bounded = head._bounded(opacity)
-        assert_close(bounded.detach().squeeze(), torch.tensor([0.0, 0.5, 1.0], dtype=torch.double))
-        bounded.sum().backward()
-        assert opacity.grad.squeeze().tolist() == [slope, 1.0, slope]
+def test_clamp_and_straight_through_differ_only_in_the_gradient():
+    logit = torch.tensor([[-3.0], [0.0], [3.0]], dtype=torch.double)
+    for bound, slope in (("clamp", 0.0), ("straight-through", 0.2)):
+        residual = torch.tensor([[-1.0], [0.5], [1.0]], dtype=torch.double, requires_grad=True)
+        opacity = bounded_opacity(logit, residual, 0.2, bound)
+        assert_close(opacity.detach().squeeze(), torch.tensor([0.0, 0.6, 1.0], dtype=torch.double))
+        opacity.sum().backward()
+        assert residual.grad.squeeze().tolist() == [slope, 0.2, slope]
+
+
+@given(st.floats(-1e4, 1e4), st.floats(-1, 1), st.floats(0, 1), st.sampled_from(OPACITY_BOUNDS))
+def test_every_bound_stays_within_0_and_1_and_keeps_gradients_finite(logit, residual, scale, bound):
+    logit = torch.tensor([[logit]], dtype=torch.float32, requires_grad=True)
+    residual = torch.tensor([[residual]], dtype=torch.float32, requires_grad=True)
+    opacity = bounded_opacity(logit, residual, scale, bound)
+    assert 0 <= opacity.item() <= 1
+    opacity.sum().backward()
+    assert torch.isfinite(logit.grad).all() and torch.isfinite(residual.grad).all() and residual.grad.item() >= 0
+
+
+def test_logit_bound_is_the_residual_at_half_opacity():
+    residual = torch.tensor([[1e-4]], dtype=torch.double)
+    opacity = bounded_opacity(torch.zeros(1, 1, dtype=torch.double), residual, 0.2, "logit")
+    # The sigmoid has no second derivative at 0; the third leaves (4 * 0.2e-4)^3 / 48.
+    assert_close(opacity.item() - 0.5, 0.2e-4, rtol=0, atol=2e-14)
+
+
+def test_smooth_bound_is_the_clamp_away_from_its_corners():
+    x = torch.linspace(-0.5, 1.5, 401, dtype=torch.double)[:, None]
+    smooth = bounded_opacity(torch.full_like(x, -1e9), x, 1.0, "smooth")  # alpha = 0, so that the residual is x
+    off = (smooth - x.clamp(0, 1)).abs().squeeze()
+    assert off.max() <= math.log(2) / SHARPNESS
+    corner = torch.minimum(x.abs(), (x - 1).abs()).squeeze()
+    # PyTorch's softplus is taken for straight beyond 20, where it is e^-20 off.
+    assert (off <= (torch.exp(-SHARPNESS * corner) + math.exp(-20)) / SHARPNESS).all()
+
+
+def test_geometry_without_gradient():
+    for geometry_gradient in (True, False):
+        head = awake(geometry_gradient=geometry_gradient)
+        splats, visible, centers = scene(head)
+        splats = {name: value.requires_grad_() for name, value in splats.items()}
+        colors, opacities = head(splats, visible, centers.requires_grad_())
+        (colors.sum() + opacities.sum()).backward()
+        assert (splats["means"].grad is not None) == (centers.grad is not None) == geometry_gradient
+        assert splats["latents"].grad is not None
 
 
 @settings(max_examples=40, deadline=None)
@@ -182,6 +224,8 @@ def test_float32_stays_finite_bounded_and_near_float64(seed, log_size, color, lo
         ("latent_std", -1.0),
         ("output_init", "ones"),
         ("opacity_bound", "none"),
+        ("implementation", "cuda"),
+        ("precision", "fp8"),
     ],
 )
 def test_impossible_settings_are_named(field, value):

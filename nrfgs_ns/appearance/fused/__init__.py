@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The field in two Triton kernels, one forward and one backward; PyTorch's twin is `nrf.py`.
+
+`packing.py` says how weights and features lie, `kernels.py` computes, `launch.py` makes a differentiable function of
+it, and this file decides whether it can run. Triton is imported only when it is about to: it is missing on machines
+without CUDA. With TRITON_INTERPRET=1 set before Triton is imported, the same kernels run in Triton's interpreter on
+the CPU: slowly, for tests.
+"""
+
+import importlib.util
+import logging
+import os
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from nrfgs_ns.appearance.fused.packing import Packing, pack
+from nrfgs_ns.errors import InputError
+
+MAX_WIDTH = 64
+"""Largest P (packing.py): latents, or features, rounded up to a power of two."""
+MAX_WEIGHTS = 128 * 128
+"""Most numbers in the first layer, padded. Their gradients are kept in registers, and the layer in shared memory."""
+
+logger = logging.getLogger(__name__)
+
+
+class FusedField:
+    """The fused twin of one field: shares its weights, and has no state of its own but index maps.
+
+    Args:
+        config: the field's NrfConfig.
+        low: its low branch, or only one.
+        high: its high branch, or None.
+    """
+
+    def __init__(self, config, low: nn.Sequential, high: nn.Sequential | None):
+        self.config = config
+        self.branches = [branch for branch in (low, high) if branch is not None]
+        self.on_cpu = pack(config.latent_dim, config.num_bands, config.use_distance, low, high)
+        self.ready: dict[tuple[torch.device, str], Packing | str] = {}  # by device and precision
+
+    def takes(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> bool:
+        """Whether the kernels are to compute this call.
+
+        Raises:
+            InputError: the configuration demands them, and they cannot.
+        """
+        if self.config.implementation == "torch":
+            return False
+        reason = self._why_not(splats, camera_centers)
+        if reason is not None and self.config.implementation == "fused":
+            raise InputError(
+                f"pipeline.model.appearance.implementation is 'fused', but {reason}. "
+                "Set --pipeline.model.appearance.implementation auto or torch."
+            )
+        return reason is None
+
+    def __call__(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours [M, 3] and opacities [M]: see AppearanceHead.forward, after `takes` said yes."""
+        from nrfgs_ns.appearance.fused.launch import FusedFunction
+
+        weights = [weight for branch in self.branches for weight in branch.parameters()]
+        tables = [splats[name] for name in ("means", "latents", "features_dc", "opacities")]
+        packing = self._packing_on(visible.device)
+        return FusedFunction.apply(packing, self._options(), *tables, visible, camera_centers, *weights)
+
+    def _why_not(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> str | None:
+        """What keeps the kernels from computing this call, or None."""
+        device = splats["means"].device
+        interpreted = os.environ.get("TRITON_INTERPRET") == "1"
+        demanded = self.config.implementation == "fused"
+        if device.type != "cuda" and not (interpreted and demanded):
+            return f"the splats are on {device.type}, and the kernels run on CUDA"
+        weight = self.branches[0][0].weight
+        for name, tensor in (*splats.items(), ("camera_centers", camera_centers), ("shared weights", weight)):
+            if tensor.dtype != torch.float32:
+                return f"{name} is {str(tensor.dtype).removeprefix('torch.')}, and the kernels take float32"
+            if tensor.device != device:
+                return f"{name} is on {tensor.device}, and means on {device}"
+        ready = self._packing_on(device)
+        return ready if isinstance(ready, str) else None
+
+    def _packing_on(self, device: torch.device) -> Packing | str:
+        """The index maps on `device`, or why the kernels cannot run there: found out once, and said once."""
+        key = device, self.config.precision
+        if key not in self.ready:
+            self.ready[key] = self._prepare(device)
+            if isinstance(self.ready[key], str) and self.config.implementation == "auto":
+                logger.warning("The field runs in plain PyTorch on %s: %s.", device, self.ready[key])
+        return self.ready[key]
+
+    def _prepare(self, device: torch.device) -> Packing | str:
+        """The index maps on `device`, or why the kernels cannot run there."""
+        if importlib.util.find_spec("triton") is None:
+            return "Triton is not installed"
+        width, hidden = self.on_cpu.width, self.on_cpu.hidden
+        if width > MAX_WIDTH or 2 * width * hidden > MAX_WEIGHTS:
+            return (
+                f"its sizes are beyond the kernels': padded to powers of two, {width} latents or features (at most "
+                f"{MAX_WIDTH}) and {2 * width} x {hidden} weights of the first layer (at most {MAX_WEIGHTS})"
+            )
+        packing = self.on_cpu.to(device)
+        try:
+            from nrfgs_ns.appearance.fused.launch import probe
+
+            probe(packing, self._options())
+        except Exception as error:  # whatever stops Triton on this machine, PyTorch computes the same
+            first_line = next(iter(str(error).splitlines()), "")
+            return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
+        return packing
+
+    def _options(self):
+        """The configuration as the launcher wants it."""
+        from nrfgs_ns.appearance.fused.launch import FieldOptions
+
+        config = self.config
+        return FieldOptions(
+            color_scale=config.color_scale,
+            opacity_scale=config.opacity_scale,
+            distance_eps=config.distance_eps,
+            bound=config.opacity_bound if config.opacity_residual else "none",
+            geometry_gradient=config.geometry_gradient,
+            precision=config.precision,
+        )

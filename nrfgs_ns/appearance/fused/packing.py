@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the field's weights and features lie in the fused kernels: two index maps, built once.
+
+Kernels' names: D numbers in a latent; R rows of four features, P = 4 R columns of features and of latents, the same
+power of two for both; H hidden units of both branches side by side, rounded up to a power of two.
+
+- Features, four lanes in a row: row 0 is the direction and the constant 1, whose row of W1 is the first layer's bias;
+  rows 1 + 2k and 2 + 2k are the sines and cosines of band k; row R - 1 is (c, alpha). Lane 3 of row 1 is log r. What
+  is left over has no weights.
+- Inputs X [., 2P]: latent i in column 2i, feature j in column 2j + 1, so that the kernels join two tiles [., P] without
+  moving anything between threads.
+- W1 [2P, H]: zero where a branch does not see an input.
+- W2 [H, 16] and b2 [16]: output j of the low branch in column 4j, of the high branch in column 4j + 2. So column 12 is
+  d_alpha, column 14 the gate's logit w, and odd columns are padding: a tensor core sums over 16 at once.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+OUTPUT_COLUMNS = 16
+CENTER_SLOTS = 4
+"""Numbers kept behind the weights' partial gradients for the camera centre's, 3 and a filler."""
+
+
+@dataclass(frozen=True)
+class Packing:
+    """Where everything lies. Tensors are on the CPU until `to`."""
+
+    latent_dim: int
+    width: int
+    """P: columns of the latents' tile and of the features' tile."""
+    hidden: int
+    """H: hidden units, a power of two >= 16."""
+    gather: Tensor
+    """[2 P H + 16 H + 16], int64: packed weights = flat[gather], flat being all parameters in a row and then one 0."""
+    scatter: Tensor
+    """[number of weights], int64: gradient of the flat parameters = gradient of the packed ones [scatter]."""
+    shapes: tuple[torch.Size, ...]
+    """Shapes of the parameters, in the order in which they are laid in a row."""
+
+    @property
+    def size(self) -> int:
+        """Packed numbers."""
+        return len(self.gather)
+
+    def to(self, device: torch.device) -> "Packing":
+        """The same with its tensors on `device`."""
+        moved = {name: getattr(self, name).to(device) for name in ("gather", "scatter")}
+        return Packing(self.latent_dim, self.width, self.hidden, shapes=self.shapes, **moved)
+
+
+def pack(
+    latent_dim: int, num_bands: int, use_distance: bool, low: nn.Sequential, high: nn.Sequential | None
+) -> Packing:
+    """Lay out a field.
+
+    Args:
+        latent_dim: D.
+        num_bands: K.
+        use_distance: whether the log distance is among the inputs.
+        low: the low branch or the only one, Linear - ReLU - Linear.
+        high: the high branch, or None if there is none.
+    """
+    width = max(16, _power_of_two(latent_dim), 4 * _power_of_two(2 * num_bands + 2))
+    columns = _feature_columns(num_bands, width // 4)
+    hidden_units = [branch[0].out_features for branch in (low, high) if branch is not None]
+    hidden = max(16, _power_of_two(sum(hidden_units)))
+
+    latents = [2 * i for i in range(latent_dim)]
+    color = [columns[name] for name in ("c0", "c1", "c2")]
+    shared = latents + color + ([columns["log_r"]] if use_distance else [])
+    low_bands = [columns[name] for name in ("dx", "dy", "dz", *_band(0))]
+    high_bands = [columns[name] for k in range(1, num_bands) for name in _band(k)]
+    low_inputs = [*shared, columns["alpha"], *low_bands]
+    if high is None and low[0].in_features > len(low_inputs):
+        low_inputs += high_bands  # the single branch sees everything
+
+    parameters = [p for branch in (low, high) if branch is not None for p in branch.parameters()]
+    shapes = tuple(parameter.shape for parameter in parameters)
+    zero = sum(shape.numel() for shape in shapes)
+    first = torch.full((2 * width, hidden), zero)
+    second = torch.full((hidden, OUTPUT_COLUMNS), zero)
+    bias = torch.full((OUTPUT_COLUMNS,), zero)
+    positions = [p.view(shape) for p, shape in zip(_ranges(shapes), shapes, strict=True)]
+    unit = 0
+    branches = [(low_inputs, positions[:4], 0)]
+    if high is not None:
+        branches.append((shared + high_bands, positions[4:], 2))
+    for inputs, (w1, b1, w2, b2), offset in branches:
+        units = torch.arange(unit, unit + len(b1))
+        unit += len(b1)
+        outputs = 4 * torch.arange(len(b2)) + offset
+        first[torch.tensor(inputs)[:, None], units] = w1.T
+        first[columns["one"], units] = b1
+        second[units[:, None], outputs] = w2.T
+        bias[outputs] = b2
+    gather = torch.cat([first.flatten(), second.flatten(), bias])
+    scatter = torch.empty(zero + 1, dtype=torch.int64)
+    scatter[gather] = torch.arange(len(gather))
+    return Packing(latent_dim, width, hidden, gather, scatter[:zero].clone(), shapes)
+
+
+def _feature_columns(num_bands: int, rows: int) -> dict[str, int]:
+    """Each feature's column in X."""
+    lanes = {(0, 3): "one", (1, 3): "log_r"}
+    for lane, name in enumerate(("dx", "dy", "dz")):
+        lanes[0, lane] = name
+    for lane, name in enumerate(("c0", "c1", "c2", "alpha")):
+        lanes[rows - 1, lane] = name
+    for k in range(num_bands):
+        for i, name in enumerate(_band(k)):
+            lanes[1 + 2 * k + i // 3, i % 3] = name
+    return {name: 2 * (4 * row + lane) + 1 for (row, lane), name in lanes.items()}
+
+
+def _band(k: int) -> list[str]:
+    """Names of band k's six features, in the encoding's order."""
+    return [f"{wave}{k}{axis}" for wave in ("sin", "cos") for axis in "xyz"]
+
+
+def _ranges(shapes: tuple[torch.Size, ...]) -> list[Tensor]:
+    """Positions of each parameter's numbers when all are laid in a row."""
+    sizes = [shape.numel() for shape in shapes]
+    return list(torch.arange(sum(sizes)).split(sizes))
+
+
+def _power_of_two(n: int) -> int:
+    """The smallest power of two >= n, n >= 1."""
+    return 1 << (n - 1).bit_length()

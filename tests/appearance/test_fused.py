@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fused field: its kernels (fused_interpreted.py, in a process of its own), and when it is chosen."""
+
+import importlib.util
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from fused_cases import heads, scene
+
+from nrfgs_ns.appearance.fused.packing import pack
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.errors import InputError
+
+INTERPRETED = Path(__file__).with_name("fused_interpreted.py")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
+def test_kernels_in_the_interpreter():
+    """Every test of fused_interpreted.py; a failure shows that process's report."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(INTERPRETED)]
+    environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=INTERPRETED.parents[2])
+    assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-2000:]
+
+
+@pytest.fixture
+def no_interpreter(monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+
+
+def test_cpu_takes_torch(no_interpreter):
+    head = NrfConfig(output_init="default").setup()
+    splats, visible, centers = scene(head, 20, 15)
+    assert not head.fused.takes(splats, centers)
+    head.config.implementation = "torch"
+    expected = head(splats, visible, centers)
+    head.config.implementation = "auto"
+    assert torch.equal(head(splats, visible, centers).colors, expected.colors)
+
+
+def test_demanding_the_impossible_names_the_reason(no_interpreter):
+    head, _ = heads()
+    with pytest.raises(InputError, match="implementation is 'fused', but the splats are on cpu.*auto or torch"):
+        head(*scene(head, 20, 15))
+
+
+def test_float64_is_named(monkeypatch):
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    head, _ = heads()
+    splats, visible, centers = scene(head, 20, 15)
+    with pytest.raises(InputError, match="latents is float64, and the kernels take float32"):
+        head({**splats, "latents": splats["latents"].double()}, visible, centers)
+
+
+@pytest.mark.parametrize("sizes", [{"latent_dim": 65}, {"hidden_width": 129}, {"hidden_width": 65, "num_bands": 5}])
+def test_sizes_beyond_the_kernels_are_named(sizes, monkeypatch):
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    head, _ = heads(**sizes)
+    with pytest.raises(InputError, match="its sizes are beyond the kernels'"):
+        head(*scene(head, 20, 15))
+
+
+def test_falling_back_is_logged_once(caplog):
+    head = NrfConfig(latent_dim=65).setup()
+    device = torch.device("cuda")
+    # As `takes` would on a GPU, which this machine need not have: sizes are refused before anything is moved there.
+    caplog.set_level(logging.WARNING)
+    reasons = [head.fused._packing_on(device) for _ in range(2)]
+    assert reasons[0] == reasons[1]
+    assert len(caplog.records) == 1 and "beyond the kernels'" in caplog.text
+
+
+def test_state_dict_is_the_modules():
+    assert set(NrfConfig().setup().state_dict()) == {
+        f"{branch}.{layer}.{kind}" for branch in ("low", "high") for layer in (0, 2) for kind in ("weight", "bias")
+    }
+
+
+@pytest.mark.parametrize("config", [{}, {"split_bands": False}, {"num_bands": 1}, {"num_bands": 5, "latent_dim": 7}])
+def test_packing_places_every_weight_once(config):
+    head = NrfConfig(**config).setup()
+    layout = pack(head.config.latent_dim, head.config.num_bands, head.config.use_distance, head.low, head.high)
+    weights = sum(parameter.numel() for parameter in head.parameters())
+    positions, counts = layout.gather.unique(return_counts=True)
+    assert torch.equal(positions[:weights], torch.arange(weights)) and (counts[:weights] == 1).all()
+    assert torch.equal(layout.gather[layout.scatter], torch.arange(weights))

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fused field on a CUDA device against PyTorch's in float64. `pytest -m gpu tests/test_gpu_fused.py`."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parent / "appearance"))
+from fused_cases import assert_near, evaluate, float32_tolerance, heads, rounding, scene  # noqa: E402
+
+from nrfgs_ns.appearance.nrf import NrfConfig  # noqa: E402
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+]
+
+# The card's own exp, log, sqrt and division are good to 2 ULP or so each, and its three tf32 products leave 2^-21 of a
+# product instead of 2^-24: eight times the float32 that the interpreter computes.
+DEVICE_FLOAT32 = 8.0
+
+
+def compare(head, twin, case, tolerance) -> None:
+    assert_near(evaluate(head, *case), evaluate(twin, *case, dtype=torch.float64), tolerance)
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+@pytest.mark.parametrize("opacity_bound", ["clamp", "straight-through", "logit", "smooth"])
+@pytest.mark.parametrize("visible", [0, 1, 65, 5000])
+def test_values_and_gradients(opacity_bound, visible, repeated):
+    head, twin = heads("cuda", opacity_bound=opacity_bound)
+    compare(head, twin, scene(head, 6000, visible, repeated), DEVICE_FLOAT32 * float32_tolerance())
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"split_bands": False},
+        {"opacity_residual": False},
+        {"use_distance": False},
+        {"geometry_gradient": False},
+        {"num_bands": 1},
+        {"num_bands": 2, "latent_dim": 7, "hidden_width": 20},
+        {"latent_dim": 16, "hidden_width": 8},
+    ],
+)
+def test_every_switch(config):
+    head, twin = heads("cuda", **config)
+    compare(head, twin, scene(head, 3000, 2000), DEVICE_FLOAT32 * float32_tolerance(config.get("num_bands", 3)))
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+@pytest.mark.parametrize("precision", ["tf32", "bf16", "fp16"])
+def test_rounded_products(precision, repeated):
+    """Derivation in fused_interpreted.py; the card's float32 is coarser, so that four times as many factors differ."""
+    from nrfgs_ns.appearance.fused.launch import KINDS
+
+    head, twin = heads("cuda", precision=precision)
+    compare(head, rounding(twin, KINDS[precision]), scene(head, 120_000, 100_000, repeated), 2.0**-12)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "tf32", "bf16", "fp16"])
+def test_extremes_stay_finite(precision):
+    head, _ = heads("cuda", precision=precision, scale=100.0)
+    splats, visible, centers = scene(head, 1000, 900)
+    splats["latents"] *= 1e4
+    splats["opacities"] = 1e4 * splats["opacities"].sign()
+    centers.copy_(splats["means"][visible[0]])
+    found = evaluate(head, splats, visible, centers)
+    assert all(torch.isfinite(value).all() for value in found.values())
+    assert ((found["opacities"] >= 0) & (found["opacities"] <= 1)).all() and (found["colors"] >= 0).all()
+
+
+def test_twice_is_the_same():
+    head, _ = heads("cuda")
+    case = scene(head, 120_000, 100_000)
+    first, second = evaluate(head, *case), evaluate(head, *case)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_auto_takes_the_kernels_and_falls_back():
+    for config, taken in (({}, True), ({"latent_dim": 65}, False)):
+        head = NrfConfig(output_init="default", **config).setup().cuda()
+        splats, visible, centers = scene(head, 100, 80)
+        assert head.fused.takes(splats, centers) == taken
+        head(splats, visible, centers)
+
+
+def test_rows_beyond_32_bit_offsets():
+    """The last rows of a table of more than 2^31 latents: 9 GB, and as much again for the gradient."""
+    count = 2**26 + 5
+    if torch.cuda.mem_get_info()[0] < 30 * 2**30:
+        pytest.skip("needs 30 GB of GPU memory")
+    head, _ = heads("cuda")
+    small, _, center = scene(head, 3, 3)
+    rows = torch.arange(3, device="cuda")
+    near = evaluate(head, small, rows, center)
+    large = {name: torch.zeros(count, value.shape[1], device="cuda") for name, value in small.items()}
+    for name, table in large.items():
+        table[count - 3 :] = small[name]
+        table.requires_grad_()
+    colors, opacities = head(large, rows + count - 3, center)
+    assert torch.equal(colors, near["colors"]) and torch.equal(opacities, near["opacities"])
+    (colors.sum() + opacities.sum()).backward()
+    assert all((table.grad[count - 3 :] != 0).any() for table in large.values())
+    assert all((table.grad[: count - 3] == 0).all() for table in large.values())
