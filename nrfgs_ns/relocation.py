@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The moves of 3DGS-MCMC (Kheradmand et al. 2024), on a table of splats, in plain torch.
+
+A live splat of opacity o that is replaced by n copies of itself at the same place looks the same from everywhere if
+each copy has (equation 9 of the paper)
+
+    o' = 1 - (1 - o)^(1/n),
+    s' = s o / sum_{i=1..n} sum_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1).
+
+gsplat 1.4 has these moves too, but two of its steps exist as CUDA kernels only. Here is the same mathematics for every
+device; the inner sum over i is done in closed form, sum_{i=1..n} binom(i-1, k) = binom(n, k+1).
+"""
+
+import math
+from collections.abc import Mapping, MutableMapping
+
+import torch
+import torch.nn.functional as F
+from gsplat.strategy.ops import _update_param_with_optimizer
+from gsplat.utils import normalized_quat_to_rotmat
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
+
+MAX_COPIES = 51
+"""n is cut off here, as in gsplat: the alternating sum loses its digits as n grows."""
+NOISE_SHARPNESS = 100.0
+"""The noise's sigmoid falls from 1 to 0 around opacity 0.005 with this slope: live splats hold still."""
+NOISE_OPACITY = 0.005
+"""Opacity at which the noise is half as large as that of an invisible splat."""
+
+Splats = MutableMapping[str, Parameter]
+Optimizers = Mapping[str, Optimizer]
+
+
+def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity and scales of each of n copies that together look like the one splat (equation 9).
+
+    Args:
+        opacities: [M] in (0, 1).
+        scales: standard deviations [M, 3].
+        copies: n, int64 [M], cut off at 51.
+
+    Returns:
+        o' [M] and s' [M, 3].
+    """
+    n = copies.clamp(1, MAX_COPIES)
+    # float64, and o short of 1: the terms alternate, and for n = 51 they are up to 1e5 times as large as their sum.
+    o = opacities.double().clamp_max(1.0 - torch.finfo(torch.float32).eps)
+    each = -torch.expm1(torch.log1p(-o) / n)
+    k = torch.arange(MAX_COPIES, device=o.device)
+    signs = (1.0 - 2.0 * (k % 2)) / (k + 1.0).sqrt()
+    terms = _BINOMIALS.to(o.device)[n] * signs * each[:, None] ** (k + 1)  # [M, 51]
+    factor = o / terms.sum(dim=-1)
+    return each.to(opacities.dtype), (factor[:, None] * scales).to(scales.dtype)
+
+
+_BINOMIALS = torch.tensor(
+    [[math.comb(n, k + 1) for k in range(MAX_COPIES)] for n in range(MAX_COPIES + 1)], dtype=torch.float64
+)
+"""binom(n, k + 1), [52, 51]."""
+
+
+@torch.no_grad()
+def relocate(splats: Splats, optimizers: Optimizers, dead: Tensor, min_opacity: float) -> int:
+    """Move dead splats onto live ones, drawn in proportion to their opacity; each place is then shared evenly.
+
+    As in gsplat, the drawn splats' moments are set to zero, and those of the dead stay what they were.
+
+    Args:
+        splats: the table; entries are replaced.
+        optimizers: of each entry, by its name.
+        dead: bool [N].
+        min_opacity: no splat ends below it.
+
+    Returns:
+        The number of splats that moved; 0 if none is alive.
+    """
+    dead_rows, live_rows = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
+    if len(dead_rows) == 0 or len(live_rows) == 0:
+        return 0
+    chosen, opacities, scales = _shared_places(splats, live_rows, len(dead_rows), min_opacity)
+
+    def moved(name: str, old: Tensor) -> Parameter:
+        new = old.detach().clone()
+        if name in ("opacities", "scales"):
+            new[chosen] = opacities if name == "opacities" else scales
+        new[dead_rows] = new[chosen]
+        return Parameter(new)
+
+    def moments(_: str, old: Tensor) -> Tensor:
+        return old.index_fill(0, chosen, 0.0)
+
+    _update_param_with_optimizer(moved, moments, splats, optimizers)
+    return len(dead_rows)
+
+
+@torch.no_grad()
+def add_samples(splats: Splats, optimizers: Optimizers, count: int, min_opacity: float) -> None:
+    """Add `count` splats onto existing ones, drawn in proportion to their opacity; each place is then shared evenly.
+
+    Args: see `relocate`. The new rows come last, with zero moments; the drawn splats keep theirs, as in gsplat.
+    """
+    if count <= 0:
+        return
+    rows = torch.arange(len(splats["means"]), device=splats["means"].device)
+    chosen, opacities, scales = _shared_places(splats, rows, count, min_opacity)
+
+    def grown(name: str, old: Tensor) -> Parameter:
+        new = old.detach().clone()
+        if name in ("opacities", "scales"):
+            new[chosen] = opacities if name == "opacities" else scales
+        return Parameter(torch.cat([new, new[chosen]]))
+
+    def moments(_: str, old: Tensor) -> Tensor:
+        return torch.cat([old, old.new_zeros(count, *old.shape[1:])])
+
+    _update_param_with_optimizer(grown, moments, splats, optimizers)
+
+
+def _shared_places(splats: Splats, rows: Tensor, count: int, min_opacity: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw `count` of `rows`, and what each drawn splat and its copies become.
+
+    Returns:
+        drawn rows, int64 [count], with repetitions; their new logits [count, 1] and log scales [count, 3].
+    """
+    opacities = torch.sigmoid(splats["opacities"]).flatten()
+    chosen = rows[torch.multinomial(opacities[rows], count, replacement=True)]
+    copies = torch.bincount(chosen, minlength=len(opacities))[chosen] + 1  # the drawn splat stays as one of them
+    each, scales = split_evenly(opacities[chosen], splats["scales"][chosen].exp(), copies)
+    each = each.clamp(min_opacity, 1.0 - torch.finfo(each.dtype).eps)
+    return chosen, torch.logit(each)[:, None], scales.log()
+
+
+@torch.no_grad()
+def diffuse(splats: Splats, size: float) -> None:
+    """Add noise to the means, along each splat's own shape: covariance @ N(0, 1) * size * gate(opacity).
+
+    The gate, 1 / (1 + exp(100 (opacity - 0.005))), lets only splats explore that cannot be seen.
+
+    Args:
+        splats: the table; `means` changes in place.
+        size: learning rate of the means times the noise's own.
+    """
+    opacities = torch.sigmoid(splats["opacities"]).flatten()
+    gate = torch.sigmoid(-NOISE_SHARPNESS * (opacities - NOISE_OPACITY))
+    noise = torch.randn_like(splats["means"]) * (gate * size)[:, None]
+    axes = normalized_quat_to_rotmat(F.normalize(splats["quats"], dim=-1))
+    variances = (2.0 * splats["scales"]).exp()
+    along = torch.einsum("nij,ni->nj", axes, noise) * variances
+    splats["means"].add_(torch.einsum("nij,nj->ni", axes, along))
