@@ -31,7 +31,7 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
         state: the checkpoint's state of the model. Tensors under "gauss_params." may have any number of rows.
 
     Raises:
-        InputError: naming the first tensor that is missing, unknown or of another shape, and the mend.
+        InputError: naming the first tensor that is missing, unknown, of another shape or not finite, and the mend.
     """
     written_by = state.get("_extra_state", {}).get("head", "another method")
     same = f"Both have the '{written_by}' head, but of another size or with other switches."
@@ -55,3 +55,10 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
     for name in given:
         if name not in expected:
             raise InputError(f"The checkpoint has '{name}', which this model does not know. {mend}")
+    for name, value in given.items():
+        if value.numel() > 0 and not torch.isfinite(value).all():
+            rows = (~torch.isfinite(value)).reshape(len(value), -1).any(dim=1).nonzero().flatten().tolist()
+            raise InputError(
+                f"The checkpoint's '{name}' is not finite in {len(rows)} of {len(value)} rows, first row {rows[0]}. "
+                "Load an older checkpoint (--load-step)."
+            )

@@ -63,6 +63,7 @@ def project(
     eps2d: float = 0.3,
     rasterize_mode: RasterizeMode = "classic",
     packed: bool = True,
+    assume_finite: bool = False,
 ) -> Projection:
     """Find the splats that each camera sees and project them. Differentiable in all tensors but Ks.
 
@@ -73,12 +74,15 @@ def project(
         viewmats: world-to-camera transforms, x right, y down, z forward. [C, 4, 4]
         Ks: pinhole intrinsics in pixels, without skew. [C, 3, 3]
         width, height: image size in pixels.
-        near_plane, far_plane: depths, inclusive, between which splats are visible.
+        near_plane, far_plane: depths, inclusive, between which splats are visible. A splat whose projection is not
+            finite (NaN or infinity in its mean or scale, a zero quaternion) is not visible either.
         radius_clip: splats whose radius is at most this many pixels are skipped.
         eps2d: blur added to the 2D covariances, in square pixels.
         rasterize_mode: "antialiased" also computes the opacity factor that compensates for the blur.
         packed: which of gsplat's projection kernels to follow. The rows come packed either way, but the two kernels
             put different floors into the radius formula, so a small round splat has radius 3 (packed) or 2 (not).
+        assume_finite: do not look for splats that are not finite, which costs a GPU a wait. A training need not: its
+            guard stops at the first such number.
 
     Raises:
         ValueError: a tensor has the wrong shape, or the mode is unknown.
@@ -109,6 +113,7 @@ def project(
         eps2d=eps2d,
         rasterize_mode=rasterize_mode,
         packed=packed,
+        assume_finite=assume_finite,
     )
 
 
@@ -121,19 +126,22 @@ def composite(
     render_mode: RenderMode = "RGB",
     tile_size: int = 16,
     absgrad: bool = False,
+    assume_finite: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Blend the projected splats into images.
 
     Args:
         projection: the result of `project`, M rows.
         colors: any number of channels D per row; ignored by the modes "D" and "ED". [M, D]
-        opacities: opacity per row, before antialiasing compensation. Below 1/255 nothing is drawn. [M]
+        opacities: opacity per row, before antialiasing compensation. Below 1/255 nothing is drawn, nor is a row whose
+            colour or opacity is not finite. [M]
             Both are brought to the precision of the projection: under autocast a head answers in half precision.
         backgrounds: colour behind the splats; depth is always composited over 0. [C, D]
         render_mode: channels of the render: colours, accumulated depth sum(w z) ("D"), expected depth sum(w z) / sum(w)
             ("ED"), or colours followed by one of the depths.
         tile_size: side in pixels of the tiles that cut a splat off beyond its radius, as in gsplat.
         absgrad: leave sum |dL/dmean2d| over pixels in `projection.means2d.absgrad` when going backward. [M, 2]
+        assume_finite: as in `project`.
 
     Returns:
         render [C, H, W, X], alphas [C, H, W, 1], and gsplat's `info`: camera_ids, gaussian_ids, radii, means2d,
@@ -153,6 +161,10 @@ def composite(
         _check_shape("backgrounds", backgrounds, c, colors.shape[-1])
 
     colors, opacities = colors.to(projection.depths.dtype), opacities.to(projection.depths.dtype)
+    if not assume_finite:
+        # One such row would spread over every pixel that it covers, and from there into the gradients of all splats.
+        drawable = torch.isfinite(colors.detach().sum(-1) + opacities.detach())
+        colors, opacities = colors.where(drawable[:, None], 0.0), opacities.where(drawable, 0.0)
     if projection.compensations is not None:
         opacities = opacities * projection.compensations
     depths = projection.depths[:, None]

@@ -27,8 +27,45 @@ def project(
     eps2d: float,
     rasterize_mode: str,
     packed: bool,
+    assume_finite: bool,
 ) -> Projection:
-    """See `nrfgs_ns.rasterizer.project`."""
+    """See `nrfgs_ns.rasterizer.project`.
+
+    gsplat lets NaN pass its tests for visibility: such a splat comes out as a row, which an appearance head would
+    turn into NaN gradients of its shared weights. Where that happens the projection is repeated without those splats;
+    to find out costs three sums and one wait, right after gsplat's own wait for the number of rows.
+    """
+    settings = dict(
+        eps2d=eps2d,
+        packed=packed,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        radius_clip=radius_clip,
+        calc_compensations=rasterize_mode == "antialiased",
+    )
+    geometry = (means, quats, scales)
+    rows = _visible_rows(*geometry, viewmats, Ks, width, height, **settings)
+    if not (assume_finite or _finite(rows)):
+        camera_ids, gaussian_ids, _, means2d, depths, conics, _ = rows
+        bad = ~torch.isfinite(torch.cat([means2d, depths[:, None], conics], dim=1)).all(dim=1)
+        keep = torch.ones(len(means), dtype=torch.bool, device=means.device)
+        keep[gaussian_ids[bad]] = False
+        kept = keep.nonzero().squeeze(1)
+        geometry = (table.index_select(0, kept) for table in geometry)
+        camera_ids, gaussian_ids, *seen = _visible_rows(*geometry, viewmats, Ks, width, height, **settings)
+        rows = (camera_ids, kept.index_select(0, gaussian_ids), *seen)
+    return Projection(*rows, width=width, height=height, n_cameras=viewmats.shape[0])
+
+
+def _finite(rows: tuple) -> bool:
+    """Whether the projected numbers are finite; False also if only their sum is not."""
+    _, _, _, means2d, depths, conics, compensations = rows
+    total = means2d.detach().sum() + depths.detach().sum() + conics.detach().sum()
+    return bool(torch.isfinite(total))
+
+
+def _visible_rows(means, quats, scales, viewmats, Ks, width, height, *, packed: bool, **settings) -> tuple:
+    """gsplat's projection as packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations."""
     rows = fully_fused_projection(
         means,
         None,
@@ -38,18 +75,14 @@ def project(
         Ks,
         width,
         height,
-        eps2d=eps2d,
         packed=packed,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        calc_compensations=rasterize_mode == "antialiased",
+        **settings,
     )
     if not packed:
         camera_ids, gaussian_ids = (rows[0] > 0).nonzero(as_tuple=True)
         seen = (None if dense is None else dense[camera_ids, gaussian_ids] for dense in rows)
         rows = (camera_ids, gaussian_ids, *seen)
-    return Projection(*rows, width=width, height=height, n_cameras=viewmats.shape[0])
+    return rows
 
 
 def composite(

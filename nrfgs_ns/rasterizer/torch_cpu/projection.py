@@ -24,6 +24,7 @@ All arrays hold one row per coordinate and one column per splat: each line below
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -37,6 +38,8 @@ RADIUS_SIGMAS = 3.0  # a splat ends at this many standard deviations
 MIN_DISCRIMINANT_PACKED, MIN_DISCRIMINANT_DENSE = 0.1, 0.01
 COMPENSATION_EPS = 1e-6  # bounds the slope of sqrt at 0 in the backward pass
 MAX_RADIUS = float(2**30)  # in pixels: representable in int32 and far beyond every image
+LARGEST_RADIUS = float(2**63)  # in pixels: products of two lengths on the image plane stay below float32's 2^128
+MIN_QUATERNION = 1e-15  # the derivative of normalising goes through 1 / |q|^2, which must stay far below 2^128
 
 
 class _Screen(NamedTuple):
@@ -65,8 +68,14 @@ class _BoundedSlopeSqrt(torch.autograd.Function):
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices of quaternions (w, x, y, z) of any length but zero. [N, 4] -> [3, 3, N]"""
-    w, x, y, z = (quats * quats.square().sum(-1, keepdim=True).rsqrt()).t().contiguous()
+    """Rotation matrices of quaternions (w, x, y, z). [N, 4] -> [3, 3, N]
+
+    NaN for a quaternion shorter than MIN_QUATERNION, or so long that its square overflows: it has no direction.
+    """
+    squared = quats.square().sum(-1, keepdim=True)
+    squared = squared.masked_fill((squared < MIN_QUATERNION**2) | squared.isinf(), math.nan)
+    # Not rsqrt, whose derivative is its third power: infinite for a quaternion of length 1e-13 already.
+    w, x, y, z = (quats / squared.sqrt()).t().contiguous()
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -108,8 +117,8 @@ def _to_screen(
 def _radii(screen: _Screen, min_discriminant: float) -> Tensor:
     """Three standard deviations along the longer axis, rounded up: ceil(3 sqrt(lambda_max)). [n]"""
     xx, xy, yy = screen.blurred
-    discriminant = (0.5 * (xx - yy)).square() + xy.square()
-    longest = 0.5 * (xx + yy) + discriminant.clamp(min=min_discriminant).sqrt()
+    spread = torch.hypot(0.5 * (xx - yy), xy)  # no square, which would overflow from 4e9 pixels
+    longest = 0.5 * (xx + yy) + spread.clamp(min=math.sqrt(min_discriminant))
     return (RADIUS_SIGMAS * longest.sqrt()).ceil()
 
 
@@ -128,13 +137,15 @@ def project(
     eps2d: float = 0.3,
     rasterize_mode: str = "classic",
     packed: bool = True,
+    assume_finite: bool = False,
 ) -> Projection:
     """Find the visible splats of each camera and project them; see `nrfgs_ns.rasterizer.project`.
 
     Visibility is decided first, without gradients, for all splats; the differentiable pass then runs on the visible
     ones only, so that a culled splat can never send a NaN back. A splat is visible when near <= depth <= far, its
     radius exceeds `radius_clip`, and its square touches the image. A splat whose projection is not finite (a zero
-    quaternion, an infinite scale) fails these comparisons and is invisible.
+    quaternion, an infinite scale, a NaN anywhere) fails these comparisons and is invisible, for nothing: here
+    `assume_finite` saves no work and changes nothing.
     """
     min_discriminant = MIN_DISCRIMINANT_PACKED if packed else MIN_DISCRIMINANT_DENSE
     per_camera = []
@@ -144,7 +155,7 @@ def project(
             radii = _radii(screen, min_discriminant)
             x, y = screen.means2d
             visible = (screen.depths >= near_plane) & (screen.depths <= far_plane)
-            visible &= (screen.det_blurred > 0) & (radii > radius_clip)
+            visible &= (screen.det_blurred > 0) & (radii > radius_clip) & (radii < LARGEST_RADIUS)
             visible &= (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
             ids = visible.nonzero().squeeze(1)
 
@@ -161,7 +172,9 @@ def project(
             conics,
         ]
         if rasterize_mode == "antialiased":
-            rows.append(_BoundedSlopeSqrt.apply(screen.det / screen.det_blurred))
+            # Both overflow for a splat of 1e10 pixels, of which the blur is no part: the factor is 1.
+            det, det_blurred = (d.clamp(max=torch.finfo(d.dtype).max) for d in (screen.det, screen.det_blurred))
+            rows.append(_BoundedSlopeSqrt.apply(det / det_blurred))
         per_camera.append(rows)
 
     columns = [torch.cat(column) for column in zip(*per_camera, strict=True)]

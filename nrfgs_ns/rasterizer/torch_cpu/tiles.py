@@ -33,6 +33,7 @@ from ..contract import Projection
 
 SUB_TILE = 8  # pixels; smaller wastes work on lists, larger on pixels that a splat does not reach
 MIN_ALPHA = 1.0 / 255.0
+FLATTEST = 1e-30  # conic entries of a splat so large that they underflow; keeps its ellipse finite
 REACH_SLACK = 1e-3  # added to s: covers the rounding of sigma in float32 (below 1e-4), so that no pair is lost
 
 
@@ -124,6 +125,7 @@ def footprints(projection: Projection, opacities: Tensor, tile_size: int) -> Foo
     y0, y1 = _square_range(y, radii, tile_size, -(-height // tile_size))
 
     a, b, c = projection.conics.index_select(0, order).double().t()
+    a, c = a.clamp(min=FLATTEST), c.clamp(min=FLATTEST)
     # Rounding can make the stored conic of an extreme needle indefinite; an ulp off b makes it definite again.
     limit = (a * c).sqrt() * (1 - 2.0**-22)
     b = torch.maximum(torch.minimum(b, limit), -limit)

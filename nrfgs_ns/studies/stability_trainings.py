@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hard trainings: each must end with finite numbers, and the unit of length must not decide how well.
+
+    python -m nrfgs_ns.studies.stability_trainings --out docs/results/stability --work FOLDER
+
+trains on small procedural scenes: in millimetres and in kilometres with nerfstudio's scaling on and off, at ten times
+the learning rates, under many opacity resets, on black, white and single images. It writes `trainings.json` (one entry
+per run) and `trainings.md`, the table. A run that is in the JSON already is not repeated.
+"""
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+from plyfile import PlyData
+from rich.progress import track
+
+import nrfgs_ns.appearance.nrf as nrf_module
+import nrfgs_ns.model as model_module
+from nrfgs_ns.method_config import nrfgs
+from nrfgs_ns.scenes import SceneConfig, write_scene
+from nrfgs_ns.studies.run import evaluate, machine, train
+
+SCENE = SceneConfig(views=16, width=48, height=36, points=600, samples=2)
+"""Small enough for a run a minute on one core."""
+RESETS = {"--pipeline.model.refine-every": 25, "--pipeline.model.reset-alpha-every": 2}
+"""Reset all opacities every 50th step; splatfacto then neither adds nor deletes splats for longer than that."""
+
+
+@dataclass
+class HardTraining:
+    """One training that a user's capture could be."""
+
+    name: str
+    """row of the table, and key of the record"""
+    edit: Callable[[Path], None] = lambda folder: None
+    """what is done to the data set before the training"""
+    options: dict[str, Any] = field(default_factory=dict)
+    """options of ns-train"""
+    auto_scale: bool = True
+    """nerfstudio's scaling of poses into a unit cube"""
+    method: str = "nrfgs"
+    """what is trained"""
+    unit: float = 1.0
+    """what near plane, camera distance and distance_eps are multiples of: a trial of what the package does not do"""
+    seeds: tuple[int, ...] = (42,)
+    """one training for each"""
+
+
+def rescale(folder: Path, factor: float) -> None:
+    """Measure the scene in another unit: every length in poses and points times `factor`."""
+    path = folder / "transforms.json"
+    meta = json.loads(path.read_text())
+    for frame in meta["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] *= factor
+        frame["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(meta))
+    points = PlyData.read(str(folder / meta["ply_file_path"]), mmap=False)
+    for axis in "xyz":
+        points["vertex"][axis] *= factor
+    points.write(str(folder / meta["ply_file_path"]))
+
+
+def paint(folder: Path, value: int) -> None:
+    """Every image in one grey, 0 to 255."""
+    for path in (folder / "images").glob("*.png"):
+        Image.fromarray(np.full_like(np.array(Image.open(path)), value)).save(path)
+
+
+def keep(folder: Path, count: int, identical: bool = False) -> None:
+    """Keep the first `count` training frames, all with the first one's image and pose if `identical`."""
+    path = folder / "transforms.json"
+    meta = json.loads(path.read_text())
+    by_name = {frame["file_path"]: frame for frame in meta["frames"]}
+    names = meta["train_filenames"][:count]
+    for split in ("train", "val", "test"):
+        meta[f"{split}_filenames"] = names if split == "train" else []
+    if identical:
+        for name in names[1:]:
+            shutil.copy(folder / names[0], folder / name)
+            by_name[name]["transform_matrix"] = by_name[names[0]]["transform_matrix"]
+    meta["frames"] = [by_name[name] for name in names]
+    path.write_text(json.dumps(meta))
+
+
+def in_unit(factor: float) -> dict[str, Any]:
+    """Splatfacto's own lengths, in a unit `factor` times smaller: what a user would have to set by hand."""
+    return {
+        "--optimizers.means.optimizer.lr": 1.6e-4 * factor,
+        "--optimizers.means.scheduler.lr-final": 1.6e-6 * factor,
+        "--pipeline.model.densify-size-thresh": 0.01 * factor,
+        "--pipeline.model.cull-scale-thresh": 0.5 * factor,
+    }
+
+
+def ten_times_faster() -> dict[str, Any]:
+    """Every learning rate times 10."""
+    groups = nrfgs.config.optimizers.items()
+    return {f"--optimizers.{name}.optimizer.lr": 10 * group["optimizer"].lr for name, group in groups}
+
+
+def hard_trainings() -> list[HardTraining]:
+    """All rows of the table."""
+    seeds = (42, 43, 44)
+    rows = []
+    for method in ("nrfgs", "nrfgs-sh"):
+        for auto_scale in (True, False):
+            for factor in (1.0, 1e-3, 1e3):
+                name = f"{method}, unit x {factor:g}, auto-scaling {'on' if auto_scale else 'off'}"
+                edit = partial(rescale, factor=factor)
+                rows.append(HardTraining(name, edit, auto_scale=auto_scale, method=method, seeds=seeds))
+    for factor in (1e-3, 1e3):
+        name = f"nrfgs, unit x {factor:g}, auto-scaling off, splatfacto's lengths by hand"
+        base = HardTraining(name, partial(rescale, factor=factor), in_unit(factor), auto_scale=False, seeds=seeds)
+        no_distance = {**in_unit(factor), "--pipeline.model.appearance.use-distance": False}
+        rows.append(replace(base, name=f"{name}, near plane and distance in that unit", unit=factor))
+        if factor > 1:  # in the smaller unit, the near plane alone decides
+            rows += [base, replace(base, name=f"{name}, no distance", options=no_distance)]
+    return [
+        *rows,
+        HardTraining("learning rates x 10", options=ten_times_faster()),
+        HardTraining("opacity reset every 50 steps", options=RESETS),
+        HardTraining("black images", partial(paint, value=0)),
+        HardTraining("white images", partial(paint, value=255)),
+        HardTraining("one image", partial(keep, count=1)),
+        # With auto-scaling, cameras at one place are refused: they have no extent to scale by.
+        HardTraining("two identical images", partial(keep, count=2, identical=True), auto_scale=False),
+    ]
+
+
+@contextmanager
+def measured_in(unit: float) -> Iterator[None]:
+    """Let near plane, camera distance and distance_eps be multiples of `unit` for a while.
+
+    Stands in for a scene unit that model and field would be told; nothing is touched at unit 1.
+    """
+    if unit == 1.0:
+        yield
+        return
+    before = model_module.project, nrf_module.view_geometry
+
+    def project(*args, **kwargs):
+        return before[0](*args, near_plane=0.01 * unit, far_plane=1e10 * unit, **kwargs)
+
+    def view_geometry(means, camera_centers, eps):
+        return before[1](means / unit, camera_centers / unit, eps)
+
+    model_module.project, nrf_module.view_geometry = project, view_geometry
+    try:
+        yield
+    finally:
+        model_module.project, nrf_module.view_geometry = before
+
+
+def run(training: HardTraining, seed: int, steps: int, work: Path) -> dict[str, Any]:
+    """Train, evaluate, and look at every number that a user could get to see.
+
+    Args:
+        steps: training steps.
+        work: folder for the data set and the outputs; emptied.
+
+    Returns:
+        "psnr" and "l1" of the test images, "splats", and "finite": every tensor of the checkpoint and every number of
+        the evaluation.
+    """
+    shutil.rmtree(work, ignore_errors=True)
+    data = write_scene(SCENE, work / "scene")
+    training.edit(data)
+    chosen = {
+        "--data": data,
+        "--output-dir": work / "outputs",
+        "--max-num-iterations": steps,
+        "--machine.seed": seed,
+        "--vis": "tensorboard",
+        "--steps-per-eval-image": 10**6,
+        "--steps-per-eval-all-images": 10**6,
+        "--logging.local-writer.enable": False,
+        "--logging.profiler": "none",
+        "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.warmup-length": 100,
+        **training.options,
+    }
+    args = [training.method, *(str(word) for option in chosen.items() for word in option)]
+    args += ["nrfgs-data", "--auto-scale-poses", str(training.auto_scale)]
+    with measured_in(training.unit):
+        record = train(args)
+        results = evaluate(Path(record.config_path), work / "eval.json")
+    _, pipeline, _, _ = eval_setup(Path(record.config_path))
+    tensors = all(bool(torch.isfinite(value).all()) for value in pipeline.model.parameters())
+    numbers = [results[name] for name in ("psnr", "ssim", "l1")]
+    return {
+        "psnr": results["psnr"],
+        "l1": results["l1"],
+        "splats": results["splats"],
+        "finite": tensors and all(number is not None and not math.isnan(number) for number in numbers),
+    }
+
+
+def table(runs: dict[str, dict[str, dict[str, Any]]]) -> str:
+    """The records as a Markdown table: means over seeds, and the PSNR's sample deviation."""
+    lines = ["| training | seeds | PSNR | L1 | splats | all finite |", "|---|---|---|---|---|---|"]
+    for name, by_seed in runs.items():
+        records = list(by_seed.values())
+        psnr, l1, splats = (np.array([record[key] for record in records]) for key in ("psnr", "l1", "splats"))
+        spread = f" ± {psnr.std(ddof=1):.2f}" if len(psnr) > 1 else ""
+        finite = "yes" if all(record["finite"] for record in records) else "NO"
+        cells = f"{len(records)} | {psnr.mean():.2f}{spread} | {l1.mean():.4f} | {splats.mean():,.0f} | {finite}"
+        lines.append(f"| {name} | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
+def main(out: Path, work: Path, steps: int = 400) -> None:
+    """Run all hard trainings and write their table.
+
+    Args:
+        out: folder for trainings.json and trainings.md.
+        work: folder for data sets and checkpoints.
+        steps: steps of each training.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / "trainings.json"
+    record = json.loads(file.read_text()) if file.exists() else {"machine": machine(), "steps": steps, "runs": {}}
+    todo = [(training, seed) for training in hard_trainings() for seed in training.seeds]
+    for index, (training, seed) in enumerate(track(todo, "Hard trainings")):
+        done = record["runs"].setdefault(training.name, {})
+        if str(seed) in done:
+            continue
+        # A folder each: tensorboard's writers outlive their training.
+        done[str(seed)] = run(training, seed, steps, work / f"run-{index}")
+        file.write_text(json.dumps(record, indent=1) + "\n")
+        (out / "trainings.md").write_text(table(record["runs"]))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The catalogue of extremes: its checks hold, its tests exist, and the page shows it as it is."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from nrfgs_ns.scenes import write_scene
+from nrfgs_ns.studies.stability import CATALOGUE, markdown
+from nrfgs_ns.studies.stability_trainings import SCENE, hard_trainings, run, table
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.parametrize("quantity", CATALOGUE, ids=lambda quantity: quantity.name)
+def test_check_holds(quantity):
+    assert quantity.check() is True
+
+
+def test_every_test_that_is_named_exists():
+    for file, name in {tuple(test.split("::")) for quantity in CATALOGUE for test in quantity.tests}:
+        tree = ast.parse((ROOT / file).read_text())
+        assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, f"{file}::{name}"
+
+
+def test_the_page_shows_the_catalogue():
+    assert markdown() in (ROOT / "docs" / "stability.md").read_text()
+
+
+def test_the_page_shows_the_trainings():
+    shown = (ROOT / "docs" / "results" / "stability" / "trainings.md").read_text()
+    assert shown in (ROOT / "docs" / "stability.md").read_text()
+    rows = {line.split("|")[1].strip() for line in shown.splitlines()[2:]}
+    assert rows == {training.name for training in hard_trainings()}
+
+
+def test_table_of_trainings():
+    records = {str(seed): {"psnr": 20.0 + seed, "l1": 0.1, "splats": 1000, "finite": True} for seed in (0, 2)}
+    assert table({"a": records}).splitlines()[-1] == "| a | 2 | 21.00 ± 1.41 | 0.1000 | 1,000 | yes |"
+    records["2"]["finite"] = False
+    assert "NO" in table({"a": records})
+
+
+def test_data_sets_of_the_hard_trainings_differ_as_they_say(tmp_path):
+    import json
+
+    import numpy as np
+    from PIL import Image
+    from plyfile import PlyData
+
+    edits = {training.name: training.edit for training in hard_trainings()}
+    scene = write_scene(SCENE, tmp_path / "plain")
+    plain = json.loads((scene / "transforms.json").read_text())
+
+    def edited(name):
+        folder = write_scene(SCENE, tmp_path / name.replace(" ", "_"))
+        edits[name](folder)
+        return folder, json.loads((folder / "transforms.json").read_text())
+
+    folder, meta = edited("nrfgs, unit x 1000, auto-scaling on")
+    poses = [np.array([f["transform_matrix"] for f in m["frames"]]) for m in (plain, meta)]
+    assert np.allclose(poses[1][:, :3, 3], 1000 * poses[0][:, :3, 3]) and np.allclose(
+        poses[1][:, :3, :3], poses[0][:, :3, :3]
+    )
+    points = [PlyData.read(str(f / "sparse.ply"))["vertex"]["x"] for f in (scene, folder)]
+    assert np.allclose(points[1], 1000 * points[0], rtol=1e-6)
+    folder, _ = edited("white images")
+    assert all((np.array(Image.open(path)) == 255).all() for path in (folder / "images").glob("*.png"))
+    _, meta = edited("one image")
+    assert len(meta["frames"]) == len(meta["train_filenames"]) == 1
+    folder, meta = edited("two identical images")
+    first, second = meta["frames"]
+    assert first["transform_matrix"] == second["transform_matrix"]
+    assert (folder / first["file_path"]).read_bytes() == (folder / second["file_path"]).read_bytes()
+
+
+HARD = [training for training in hard_trainings() if training.method == "nrfgs"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("training", HARD, ids=lambda training: training.name)
+def test_hard_trainings_end_finite(training, tmp_path):
+    assert run(training, training.seeds[0], 200, tmp_path)["finite"]
