@@ -8,6 +8,8 @@ import tyro
 
 from nrfgs_ns.demo import Demo
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.studies.bench import Bench
+from nrfgs_ns.studies.express.study import Express
 
 
 def entrypoint() -> None:
@@ -15,7 +17,7 @@ def entrypoint() -> None:
     # Deprecations inside nerfstudio, and a loss that it logs undetached: not the reader's business.
     warnings.simplefilter("ignore", FutureWarning)
     warnings.filterwarnings("ignore", "Converting a tensor with requires_grad=True to a scalar")
-    verb = tyro.extras.subcommand_cli_from_dict({"demo": Demo}, description=__doc__)
+    verb = tyro.extras.subcommand_cli_from_dict({"demo": Demo, "bench": Bench, "express": Express}, description=__doc__)
     try:
         verb.main()
     except (InputError, FileExistsError) as error:

@@ -28,6 +28,7 @@ from nerfstudio.utils import profiler
 from torch import nn
 
 from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.studies.files import write_whole
 
 
 @dataclass
@@ -46,6 +47,10 @@ class TrainRecord:
     """most GPU memory in tensors; None on a CPU"""
     splats: list[list[int]] = field(default_factory=list)
     """pairs (step, number of splats), every hundredth step and the last"""
+    saved: list[list[float]] = field(default_factory=list)
+    """pairs (step, seconds until then) of the checkpoints"""
+    parts: int = 1
+    """processes that it took: more than one if it was interrupted and went on from a checkpoint"""
 
 
 def parse(args: list[str]) -> TrainerConfig:
@@ -57,12 +62,19 @@ def parse(args: list[str]) -> TrainerConfig:
     return config
 
 
-def train(args: list[str], on_step: Callable[[int], None] | None = None) -> TrainRecord:
+def train(
+    args: list[str],
+    on_step: Callable[[int], None] | None = None,
+    on_save: Callable[[TrainRecord], None] | None = None,
+    earlier: TrainRecord | None = None,
+) -> TrainRecord:
     """Run `ns-train ARGS` in this process.
 
     Args:
         args: the command line after `ns-train`.
         on_step: called after each step with its number, for progress bars.
+        on_save: called before each checkpoint is written, with the record of the training until then.
+        earlier: the record until the checkpoint that `args` continue from; the result is that of the whole training.
     """
     config = parse(args)
     config.save_config()
@@ -71,40 +83,74 @@ def train(args: list[str], on_step: Callable[[int], None] | None = None) -> Trai
     trainer.setup()
     model = trainer.pipeline.model
     record = TrainRecord(args, str(config.get_base_dir() / "config.yml"))
-    start = 0.0
+    if earlier is not None:
+        record.steps, record.seconds, record.parts = earlier.steps, earlier.seconds, earlier.parts + 1
+        record.splats, record.saved = list(earlier.splats), list(earlier.saved)
+        record.peak_memory_bytes = earlier.peak_memory_bytes
+    last_step = record.steps + config.max_num_iterations
+    clock = _Clock(record)
 
     def before(step: int) -> None:
-        nonlocal start
-        if record.steps == 0:
-            _synchronize()
-            start = perf_counter()
+        clock.start()
 
     def after(step: int) -> None:
         record.steps += 1
-        last = record.steps == config.max_num_iterations
+        last = record.steps == last_step
         if last:
-            _synchronize()
-            record.seconds = perf_counter() - start
+            clock.stop()
         if last or step % 100 == 0:
             record.splats.append([step, int(model.num_points)])
         if on_step is not None:
             on_step(step)
 
+    save = trainer.save_checkpoint
+
+    def save_off_the_clock(step: int) -> None:
+        clock.stop()
+        record.saved.append([step, record.seconds])
+        if torch.cuda.is_available():
+            record.peak_memory_bytes = max(record.peak_memory_bytes or 0, torch.cuda.max_memory_allocated())
+        if on_save is not None:
+            on_save(record)
+        save(step)
+
     # Ahead of the model's own callbacks and behind them: its warm-up and its densification are on the clock.
     trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before))
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after))
+    trainer.save_checkpoint = save_off_the_clock
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
     trainer.train()
     profiler.flush_profiler(config.logging)
-    if torch.cuda.is_available():
-        record.peak_memory_bytes = torch.cuda.max_memory_allocated()
     return record
 
 
-def evaluate(config_path: Path, output_path: Path) -> dict[str, Any]:
-    """Run `ns-eval --load-config CONFIG_PATH --output-path OUTPUT_PATH` in this process; returns its results."""
-    ComputePSNR(load_config=Path(config_path), output_path=Path(output_path)).main()
+class _Clock:
+    """Adds to `record.seconds` from each start to the next stop, when the GPU has finished; twice is once."""
+
+    def __init__(self, record: TrainRecord):
+        self.record = record
+        self.started: float | None = None
+
+    def start(self) -> None:
+        if self.started is None:
+            _synchronize()
+            self.started = perf_counter()
+
+    def stop(self) -> None:
+        if self.started is not None:
+            _synchronize()
+            self.record.seconds += perf_counter() - self.started
+            self.started = None
+
+
+def evaluate(config_path: Path, output_path: Path, pictures: Path | None = None) -> dict[str, Any]:
+    """Run `ns-eval --load-config CONFIG_PATH --output-path OUTPUT_PATH` in this process; returns its results.
+
+    Args:
+        pictures: folder for its pictures of the test views, if they are wanted (--render-output-path).
+    """
+    ComputePSNR(Path(config_path), Path(output_path), pictures).main()
     results = json.loads(Path(output_path).read_text())["results"]
     return {name: None if value != value else value for name, value in results.items()}  # NaN is no number: null
 
@@ -114,12 +160,13 @@ def host_without_downloads(method: str) -> Iterator[None]:
     """Let nerfstudio's own methods run offline, for comparisons.
 
     They build LPIPS, and download its weights, with the model. For the time of a run it is replaced by one that gives
-    NaN. Their checkpoints need torch's leave to be read. This project's methods need no such thing.
+    NaN, unless the weights are on disk. Their checkpoints need torch's leave to be read. This project's methods need no
+    such thing.
     """
-    if method.startswith("nrfgs"):
+    allow_nerfstudio_checkpoints()
+    if method.startswith("nrfgs") or _lpips_weights_are_here():
         yield
         return
-    allow_nerfstudio_checkpoints()
     import torchmetrics.image.lpip as lpip
 
     class NoLpips(nn.Module):
@@ -134,6 +181,12 @@ def host_without_downloads(method: str) -> Iterator[None]:
         yield
     finally:
         lpip.LearnedPerceptualImagePatchSimilarity = original
+
+
+def _lpips_weights_are_here() -> bool:
+    from torchvision.models import AlexNet_Weights
+
+    return (Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.DEFAULT.url).name).is_file()
 
 
 def machine() -> dict[str, str]:
@@ -158,9 +211,8 @@ def main() -> None:
         record = train(args)
         results = evaluate(Path(record.config_path), record_path.with_suffix(".eval.json"))
     record_path.with_suffix(".eval.json").unlink()
-    record_path.write_text(
-        json.dumps({"method": args[0], "machine": machine(), "train": asdict(record), "eval": results}, indent=1)
-    )
+    content = {"method": args[0], "machine": machine(), "train": asdict(record), "eval": results}
+    write_whole(record_path, json.dumps(content, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs bench`: methods x protocols x scenes x seeds, one table, one figure, one sheet of crops for each scene.
+
+Each training is a process of its own (`bench_run.py`) that leaves OUT/runs/NAME.json when it is finished. What is there
+is not repeated, what was cut off goes on from its checkpoint, what failed is tried again at the next call and listed
+as FAILED until then. A record that was made with other arguments is never mixed in: the benchmark stops and names it.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.studies.files import write_whole
+
+CHILD = (sys.executable, "-m", "nrfgs_ns.studies.bench_run")
+"""The command that does a job; the file that describes the job is appended."""
+POLL_SECONDS = 0.2
+
+
+@dataclass
+class Running:
+    """A child at work."""
+
+    name: str
+    process: subprocess.Popen
+    log: IO
+    work: Path
+    record: Path
+    identity: dict
+
+    def steps(self) -> int:
+        """How far its training is, as far as it said."""
+        try:
+            return int(json.loads((self.work / "progress.json").read_text(encoding="utf-8"))["step"])
+        except (OSError, ValueError, KeyError):
+            return 0
+
+
+@dataclass
+class Bench:
+    """Compare methods: train each under each protocol on each scene with each seed, and report. See docs/bench.md."""
+
+    spec: Annotated[Path | None, tyro.conf.Positional] = None
+    """YAML file with runs, protocols, scenes, seeds, ...; what is given as an option here has precedence"""
+    scenes: Path = Path(".")
+    """folder in which the data sets lie"""
+    out: Path = Path("bench")
+    """folder for runs/*.json and the report"""
+    work: Path = Path("outputs/bench")
+    """folder for checkpoints, pictures and logs"""
+    data: tuple[str, ...] = ()
+    """data sets: folders below --scenes"""
+    runs: tuple[str, ...] = ()
+    """methods, each METHOD or "NAME=METHOD OPTIONS" """
+    protocols: tuple[str, ...] = ()
+    """densification: splatfacto, original, mcmc, mcmc@BUDGET, own"""
+    seeds: tuple[int, ...] = ()
+    """--machine.seed of each repetition"""
+    steps: int | None = None
+    """training steps"""
+    options: str | None = None
+    """options of ns-train for every run"""
+    train_views: int | None = None
+    """training images that are evaluated beside the test images"""
+    jobs: int | None = None
+    """runs at once on each GPU, or on the CPU; times are reported only with 1"""
+    gpus: int | None = None
+    """GPUs to spread the runs over"""
+    report_only: bool = False
+    """run nothing: report what is there"""
+    redo_stale: bool = False
+    """put records that were made with other arguments aside, and make them anew"""
+
+    def main(self) -> None:
+        from nrfgs_ns.studies.bench_report import report  # matplotlib takes a second; `nrfgs --help` should not
+
+        plan = self.plan()
+        parsers = None if self.report_only else self.parsers(plan)
+        stale = self.stale(plan, parsers)
+        if stale and not self.report_only:
+            if not self.redo_stale:
+                name, difference = next(iter(stale.items()))
+                raise InputError(
+                    f"{len(stale)} of the records in {self.out / 'runs'} were made with other arguments; {name} had "
+                    f"{difference}. Give --redo-stale to put them aside and run them again, or another --out."
+                )
+            for name in stale:
+                os.replace(self.record(name), self.record(name).with_suffix(".stale"))
+            stale = {}
+        jobs = self.jobs_of(plan, parsers) if parsers else {}
+        pending = {name: job for name, job in jobs.items() if not self.record(name).exists()}
+        if pending:
+            # A terminated benchmark must not leave its children behind; an exception reaches the `finally` below.
+            signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+            self.run_all(pending, plan)
+        report(plan, self.out, self.work, stale)
+
+    def plan(self):
+        """The `Spec`: the file, with this command's options over it."""
+        from nrfgs_ns.studies.bench_spec import load_spec, make_spec
+
+        content = load_spec(self.spec) if self.spec else {}
+        if self.runs:
+            content["runs"] = dict(_named_run(run) for run in self.runs)
+        given = {"scenes": self.data, "protocols": self.protocols, "seeds": self.seeds, "steps": self.steps}
+        given |= {"options": self.options, "train_views": self.train_views, "jobs": self.jobs, "gpus": self.gpus}
+        content |= {key: value for key, value in given.items() if value not in (None, ())}
+        return make_spec(content, str(self.spec or "nrfgs bench"))
+
+    def record(self, name: str) -> Path:
+        """The file that a finished run leaves."""
+        return self.out / "runs" / f"{name}.json"
+
+    def parsers(self, plan) -> dict:
+        """Scene -> the data parser and its options. A data set that cannot be read fails now."""
+        from nrfgs_ns.studies.bench_data import parser_options
+
+        return {scene: parser_options(self.scenes, scene, self.work / "scenes") for scene in plan.scenes}
+
+    def jobs_of(self, plan, parsers: dict) -> dict:
+        """Name -> `Job` of every training."""
+        from nrfgs_ns.studies.bench_spec import Job, cells_of, command, identity
+
+        return {
+            cell.name: Job(
+                args=command(plan, cell, parsers[cell.scene], self.work / cell.name),
+                identity=identity(plan, cell, parsers[cell.scene]),
+                steps=plan.steps,
+                record=str(self.record(cell.name)),
+                work=str(self.work / cell.name),
+                train_views=plan.train_views,
+                jobs=plan.jobs,
+            )
+            for cell in cells_of(plan)
+        }
+
+    def stale(self, plan, parsers: dict | None) -> dict[str, str]:
+        """Name -> difference, of the records whose arguments are not those of the plan."""
+        from nrfgs_ns.studies.bench_spec import cells_of, differences, identity
+
+        result = {}
+        for cell in cells_of(plan):
+            if self.record(cell.name).exists():
+                made_with = json.loads(self.record(cell.name).read_text(encoding="utf-8"))["identity"]
+                wanted = identity(plan, cell, parsers[cell.scene] if parsers else None)
+                if difference := differences(made_with, wanted):
+                    result[cell.name] = difference
+        return result
+
+    def run_all(self, pending: dict, plan) -> None:
+        """Run the jobs, `plan.jobs` at once on each GPU, with the time that is left."""
+        for folder in (self.out / "runs", self.work):
+            folder.mkdir(parents=True, exist_ok=True)
+        waiting, running, finished = list(pending.items()), {}, 0
+        slots = [gpu for _ in range(plan.jobs) for gpu in gpu_names(plan.gpus)]
+        columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
+        with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
+            bar = progress.add_task("", total=len(pending) * plan.steps)
+            try:
+                while waiting or running:
+                    for slot, gpu in enumerate(slots):
+                        if slot in running and running[slot].process.poll() is not None:
+                            done = running.pop(slot)
+                            done.log.close()
+                            finished += 1
+                            good = done.process.returncode == 0 and done.record.exists()
+                            progress.console.print(f"{done.name}: {'done' if good else 'FAILED'}", highlight=False)
+                            if not good:
+                                note = {"returncode": done.process.returncode, "identity": done.identity}
+                                write_whole(failure(done.record), json.dumps(note, indent=1) + "\n")
+                                progress.console.print(f"  see {done.log.name}", highlight=False, soft_wrap=True)
+                        if slot not in running and waiting:
+                            running[slot] = self.start(*waiting.pop(0), gpu)
+                    steps = finished * plan.steps + sum(child.steps() for child in running.values())
+                    label = f"{finished} of {len(pending)} runs"
+                    progress.update(bar, completed=steps, description=label)
+                    time.sleep(POLL_SECONDS)
+            finally:
+                for child in running.values():
+                    child.process.terminate()
+                for child in running.values():
+                    child.process.wait()
+                    child.log.close()
+
+    def start(self, name: str, job, gpu: str) -> Running:
+        """Start one job on a GPU."""
+        failure(self.record(name)).unlink(missing_ok=True)
+        file = self.work / f"{name}.job.json"
+        write_whole(file, json.dumps(asdict(job), indent=1))
+        log = (self.work / f"{name}.log").open("a")
+        environment = {**os.environ, "CUDA_VISIBLE_DEVICES": gpu}
+        process = subprocess.Popen([*CHILD, str(file)], stdout=log, stderr=subprocess.STDOUT, env=environment)
+        return Running(name, process, log, Path(job.work), self.record(name), job.identity)
+
+
+def failure(record: Path) -> Path:
+    """The note that a run's last attempt failed."""
+    return record.with_suffix(".failed")
+
+
+def gpu_names(count: int) -> list[str]:
+    """Values of CUDA_VISIBLE_DEVICES for `count` GPUs, out of those that this process may see.
+
+    Raises:
+        InputError: it may see fewer.
+    """
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    names = visible.split(",") if visible else [str(index) for index in range(count)]
+    if len(names) < count:
+        raise InputError(f"gpus is {count}, but CUDA_VISIBLE_DEVICES shows {visible}. Ask for at most {len(names)}.")
+    return names[:count]
+
+
+def _named_run(text: str) -> tuple[str, dict]:
+    """A run as the command line gives it: METHOD or NAME=METHOD OPTIONS."""
+    name, equals, rest = text.partition("=")
+    if not equals or " " in name:
+        name, rest = text, text
+    method, _, options = rest.strip().partition(" ")
+    return name.strip(), {"method": method, "options": options}

@@ -1,0 +1,313 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a benchmark consists of: runs x protocols x scenes x seeds, from a YAML file, and the command of each.
+
+    runs:                                   # name -> method of ns-train, or method and options
+      SH: nrfgs-sh
+      NRF-16: {method: nrfgs, options: --pipeline.model.appearance.latent-dim 16}
+      splatfacto: {method: splatfacto, protocols: [own]}
+    protocols: [original, mcmc@200000]      # densification, and the budget of mcmc; `own`: the method's, no option
+    scenes: [bonsai, {path: garden, downscale: 4}]
+    seeds: [42, 43]
+    steps: 30000
+
+All keys of a file are fields of `Spec`.
+"""
+
+import re
+import shlex
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from nrfgs_ns.errors import InputError
+
+QUIET = (
+    "--vis tensorboard --steps-per-eval-image 1000000 --steps-per-eval-all-images 1000000 "
+    "--logging.local-writer.enable False --logging.profiler none"
+).split()
+"""Options that keep evaluation, the viewer and the terminal table out of the timing."""
+OWN = "own"
+"""The protocol of a method that is run as it is."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the table: a method of ns-train, and options."""
+
+    name: str
+    method: str
+    options: tuple[str, ...] = ()
+    protocols: tuple[str, ...] | None = None
+    """instead of the benchmark's; a method that is not of this project has `own` only, unless it says otherwise"""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A data set: a folder below the root, and how it is read."""
+
+    name: str
+    downscale: int | None = None
+    """use the images of images_N; None: nerfstudio's layout decides by size, COLMAP's takes the full size"""
+    options: tuple[str, ...] = ()
+    """options of the data parser"""
+
+    @property
+    def short_name(self) -> str:
+        """Last part of the path, which tables show."""
+        return Path(self.name).name
+
+
+@dataclass
+class Spec:
+    """A benchmark."""
+
+    runs: list[Method]
+    """methods with options, each under a name"""
+    scenes: list[Scene]
+    """data sets"""
+    protocols: list[str] = field(default_factory=lambda: [OWN])
+    """densification: splatfacto, original, mcmc, mcmc@BUDGET, or own for no option at all"""
+    seeds: list[int] = field(default_factory=lambda: [42])
+    """--machine.seed of each repetition"""
+    steps: int = 30_000
+    """training steps"""
+    options: tuple[str, ...] = ()
+    """options of ns-train for every run"""
+    train_views: int = 16
+    """training images, evenly spaced, that are evaluated beside the test images"""
+    checkpoint_every: int = 5_000
+    """steps between checkpoints, from which an interrupted run goes on"""
+    jobs: int = 1
+    """runs at once on each GPU, or on the CPU"""
+    gpus: int = 1
+    """GPUs to spread the runs over"""
+    crops: dict[str, list[int]] = field(default_factory=dict)
+    """scene -> numbers of the test views to compare in pictures, from 0; where methods differ most if left out"""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training of a benchmark."""
+
+    run: Method
+    protocol: str
+    scene: Scene
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Name of its files."""
+        text = f"{self.run.name}-{self.protocol}-{self.scene.name}-{self.seed}"
+        return re.sub(r"[^A-Za-z0-9_.@-]", "_", text)
+
+
+@dataclass
+class Job:
+    """What the benchmark asks of a run."""
+
+    args: list[str]
+    """command line of ns-train"""
+    identity: dict[str, Any]
+    """what decides the result, without paths: a record is compared with it"""
+    steps: int
+    """training steps in all"""
+    record: str
+    """file to write"""
+    work: str
+    """folder for everything else; pictures of the test views lie in its `pictures`"""
+    train_views: int
+    """training images to evaluate"""
+    jobs: int
+    """runs that share the GPU: times mean something only if it is 1"""
+
+
+def load_spec(path: Path) -> dict[str, Any]:
+    """The content of a YAML file: a mapping, as `make_spec` takes it.
+
+    Raises:
+        InputError: the file cannot be read, or is no mapping.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md for an example.")
+    return content
+
+
+def make_spec(content: dict[str, Any], where: str) -> Spec:
+    """Check and complete the content of a file.
+
+    Args:
+        content: keys and values as in the module's docstring.
+        where: what error messages call it.
+
+    Raises:
+        InputError: naming the key and the mend.
+    """
+    known = [one.name for one in fields(Spec)]
+    for key in content:
+        _require(key in known, f"{where}: unknown key {key!r}. Known are {', '.join(known)}.")
+    for key in ("runs", "scenes"):
+        _require(bool(content.get(key)), f"{where}: {key} is missing or empty. Name at least one.")
+    _require(isinstance(content["runs"], dict), f"{where}: runs must map names to methods.")
+    spec = Spec(
+        **{
+            **content,
+            "runs": [_method(name, value, where) for name, value in content["runs"].items()],
+            "scenes": [_scene(value, where) for value in _list(content["scenes"])],
+            "protocols": [str(value) for value in _list(content.get("protocols", [OWN]))],
+            "seeds": _list(content.get("seeds", [42])),
+            "options": _words(content.get("options", ()), f"{where}: options"),
+        }
+    )
+    for key, least in (("steps", 1), ("jobs", 1), ("gpus", 1), ("train_views", 0), ("checkpoint_every", 1)):
+        _whole(getattr(spec, key), least, f"{where}: {key}")
+    views = isinstance(spec.crops, dict) and all(isinstance(chosen, list) for chosen in spec.crops.values())
+    _require(views, f"{where}: crops must map scenes to lists of numbers of test views, such as {{bonsai: [0, 5]}}.")
+    for seed in spec.seeds:
+        _whole(seed, 0, f"{where}: seeds")
+    for run in spec.runs:
+        for protocol in run.protocols or spec.protocols:
+            options = protocol_options(protocol)
+            _require(
+                not (run.protocols and options) or run.method.startswith("nrfgs"),
+                f"{where}: runs: {run.name}: {run.method} knows no protocol {protocol!r}; only this project's methods "
+                "do. Use own, and the method's options.",
+            )
+    cells = cells_of(spec)
+    names = [cell.name for cell in cells]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    _require(not twice, f"{where}: {', '.join(twice[:3])} would be trained twice. Give runs and scenes distinct names.")
+    return spec
+
+
+def cells_of(spec: Spec) -> list[Cell]:
+    """All trainings, the first seed of everything before the second."""
+    return [
+        Cell(run, protocol, scene, seed)
+        for seed in spec.seeds
+        for scene in spec.scenes
+        for protocol, run in rows_of(spec)
+    ]
+
+
+def rows_of(spec: Spec) -> list[tuple[str, Method]]:
+    """Pairs (protocol, run): the rows of the table for each scene, protocol by protocol."""
+
+    def protocols(run: Method) -> list[str]:
+        return list(run.protocols or (spec.protocols if run.method.startswith("nrfgs") else [OWN]))
+
+    order = list(dict.fromkeys([*spec.protocols, *(name for run in spec.runs for name in protocols(run))]))
+    return [(protocol, run) for protocol in order for run in spec.runs if protocol in protocols(run)]
+
+
+def protocol_options(protocol: str) -> list[str]:
+    """Options of ns-train for a protocol of densification.
+
+    Raises:
+        InputError: there is no such protocol.
+    """
+    name, at, budget = protocol.partition("@")
+    if protocol == OWN:
+        return []
+    good = name in ("splatfacto", "original", "mcmc") and (not at or (name == "mcmc" and budget.isdigit()))
+    _require(good, f"protocol {protocol!r} is unknown; use splatfacto, original, mcmc, mcmc@BUDGET or own.")
+    return ["--pipeline.model.densification", name, *(["--pipeline.model.splat-budget", budget] if at else [])]
+
+
+def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
+    """The command line of ns-train for one training.
+
+    Args:
+        parser: the data parser and its options (see `bench_data`).
+        work: folder for checkpoints.
+    """
+    # Only this project's methods go on from a checkpoint.
+    every = spec.checkpoint_every if cell.run.method.startswith("nrfgs") else spec.steps
+    return [
+        cell.run.method,
+        *("--output-dir", str(work), "--experiment-name", cell.scene.short_name),
+        *("--max-num-iterations", str(spec.steps), "--steps-per-save", str(min(every, spec.steps))),
+        *("--machine.seed", str(cell.seed)),
+        *QUIET,
+        *spec.options,
+        *protocol_options(cell.protocol),
+        *cell.run.options,
+        *parser,
+    ]
+
+
+def identity(spec: Spec, cell: Cell, parser: list[str] | None) -> dict[str, Any]:
+    """A record's fingerprint: what decides the result, without paths, which differ between machines.
+
+    Args:
+        parser: as for `command`; None if the data are not there, and how they are read is not to be compared.
+    """
+    drop = ("--output-dir", "--steps-per-save")
+    args = command(spec, cell, [], Path())
+    kept = [word for before, word in zip(["", *args], args, strict=False) if word not in drop and before not in drop]
+    result = {"options": kept, "scene": cell.scene.name, "train_views": spec.train_views}
+    if parser is not None:
+        at = parser.index("--data")
+        result["parser"] = [*parser[:at], *parser[at + 2 :]]
+    return result
+
+
+def differences(made_with: dict[str, Any], wanted: dict[str, Any]) -> str:
+    """In which words a record's fingerprint differs from the wanted one; empty if it does not."""
+    words = []
+    for key, value in wanted.items():
+        had = made_with.get(key)
+        if had == value:
+            continue
+        odd = [word for word in had if word not in value] if isinstance(had, list) else [str(had)]
+        words.append(f"{key}: {' '.join(odd) or 'fewer words'}")
+    return "; ".join(words)
+
+
+def _method(name: str, value: Any, where: str) -> Method:
+    value = {"method": value} if isinstance(value, str) else value
+    where = f"{where}: runs: {name}"
+    _require(isinstance(value, dict) and isinstance(value.get("method"), str), f"{where} names no method.")
+    unknown = sorted(set(value) - {"method", "options", "protocols"})
+    _require(not unknown, f"{where}: unknown key {unknown}. Known are method, options, protocols.")
+    protocols = tuple(str(one) for one in _list(value["protocols"])) if "protocols" in value else None
+    return Method(str(name), value["method"], _words(value.get("options", ()), f"{where}: options"), protocols)
+
+
+def _scene(value: Any, where: str) -> Scene:
+    value = {"path": value} if isinstance(value, (str, Path)) else value
+    _require(isinstance(value, dict) and "path" in value, f"{where}: scenes: {value!r} is neither a path nor has one.")
+    unknown = sorted(set(value) - {"path", "downscale", "options"})
+    _require(not unknown, f"{where}: scenes: unknown key {unknown}. Known are path, downscale, options.")
+    downscale = value.get("downscale")
+    if downscale is not None:
+        _whole(downscale, 1, f"{where}: scenes: downscale")
+    name = Path(value["path"]).as_posix()
+    return Scene(name, downscale, _words(value.get("options", ()), f"{where}: scenes: options"))
+
+
+def _list(value: Any) -> list:
+    return list(value) if isinstance(value, (list, tuple)) else [value]
+
+
+def _words(value: Any, where: str) -> tuple[str, ...]:
+    """Options given as one string, as in a shell, or as a list of words."""
+    try:
+        return tuple(shlex.split(value)) if isinstance(value, str) else tuple(str(word) for word in value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where} must be a string or a list of words ({error}).") from error
+
+
+def _whole(value: Any, least: int, where: str) -> None:
+    good = isinstance(value, int) and not isinstance(value, bool) and value >= least
+    _require(good, f"{where} is {value!r}; give a whole number of at least {least}.")
+
+
+def _require(holds: bool, message: str) -> None:
+    if not holds:
+        raise InputError(message)

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of a benchmark: means and deviations over seeds, per scene and over scenes, as Markdown, CSV and LaTeX."""
+
+import csv
+import io
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+AVERAGE = "average"
+"""What stands for the scene in the rows of averages over scenes."""
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One measured quantity."""
+
+    name: str
+    value: Callable[[Record], float | None]
+    """its value in a run's record, None where there is none"""
+    form: str
+    """how it is written"""
+    unit: float = 1.0
+    """values are divided by this"""
+    better: int = 0
+    """1: more is better, -1: less is better, 0: no ranking"""
+    is_time: bool = False
+    """means something only for a run that had its GPU to itself"""
+
+
+def _measured(part: str, key: str) -> Callable[[Record], float | None]:
+    return lambda record: (record["measured"][part] or {}).get(key)
+
+
+def _gap(record: Record) -> float | None:
+    train, test = _measured("train", "psnr")(record), _measured("test", "psnr")(record)
+    return None if train is None or test is None else train - test
+
+
+COLUMNS = (
+    Column("splats", lambda record: record["measured"]["splats"], "{:,.0f}", better=-1),
+    Column("time s", lambda record: record["train"]["seconds"], "{:.1f}", better=-1, is_time=True),
+    Column("SSIM", _measured("test", "ssim"), "{:.4f}", better=1),
+    Column("MS-SSIM", _measured("test", "ms_ssim"), "{:.4f}", better=1),
+    Column("LPIPS", _measured("test", "lpips"), "{:.4f}", better=-1),
+    Column("L1", _measured("test", "l1"), "{:.4f}", better=-1),
+    Column("PSNR", _measured("test", "psnr"), "{:.2f}", better=1),
+    Column("FPS", lambda record: record["measured"]["fps"], "{:.1f}", better=1, is_time=True),
+    Column("MB", lambda record: record["measured"]["parameter_bytes"], "{:.2f}", 1e6, better=-1),
+    Column("ckpt MB", lambda record: record["measured"]["checkpoint_bytes"], "{:.2f}", 1e6, better=-1),
+    Column("peak MB", lambda record: record["train"].get("peak_memory_bytes"), "{:.1f}", 1e6, better=-1),
+    Column("train PSNR", _measured("train", "psnr"), "{:.2f}"),
+    Column("gap", _gap, "{:.2f}"),
+)
+
+
+@dataclass
+class Row:
+    """One run under one protocol on one scene, or on the average of all."""
+
+    scene: str
+    run: str
+    protocol: str
+    records: dict[int, Record] = field(default_factory=dict)
+    """seed -> record"""
+    absent: dict[int, str] = field(default_factory=dict)
+    """seed -> why there is no record: FAILED, missing or stale"""
+    values: dict[str, dict[int, float]] = field(default_factory=dict)
+    """column -> seed -> value"""
+
+    def fill(self) -> "Row":
+        """Read the columns' values from the records."""
+        for column in COLUMNS:
+            values = {}
+            for seed, record in self.records.items():
+                value = column.value(record)
+                if value is not None and not (column.is_time and record["jobs"] != 1):
+                    values[seed] = value / column.unit
+            self.values[column.name] = values
+        return self
+
+    def mean(self, column: Column) -> float | None:
+        values = self.values[column.name].values()
+        return statistics.fmean(values) if values else None
+
+    def deviation(self, column: Column) -> float | None:
+        """Sample deviation over seeds."""
+        values = self.values[column.name].values()
+        return statistics.stdev(values) if len(values) > 1 else None
+
+    @property
+    def seeds(self) -> str:
+        """How many seeds the row rests on, and what became of the others."""
+        reasons = [f"{list(self.absent.values()).count(why)} {why}" for why in dict.fromkeys(self.absent.values())]
+        return f"{len(self.records)}" + (f" ({', '.join(reasons)})" if reasons else "")
+
+    def text(self, column: Column) -> str:
+        """The cell without emphasis."""
+        mean, deviation = self.mean(column), self.deviation(column)
+        if mean is None:
+            return "-"
+        return column.form.format(mean) + (f" ± {column.form.format(deviation)}" if deviation is not None else "")
+
+
+def average(rows: list[Row]) -> Row:
+    """The row of means over scenes: seed by seed, of the seeds and columns that every scene has."""
+    result = Row(AVERAGE, rows[0].run, rows[0].protocol)
+    seeds = [seed for seed in rows[0].records if all(seed in row.records for row in rows)]
+    result.records = {seed: {} for seed in seeds}
+    for row in rows:
+        result.absent |= row.absent
+    for column in COLUMNS:
+        shared = [seed for seed in seeds if all(seed in row.values[column.name] for row in rows)]
+        result.values[column.name] = {
+            seed: statistics.fmean(row.values[column.name][seed] for row in rows) for seed in shared
+        }
+    return result
+
+
+def with_averages(rows: list[Row]) -> list[Row]:
+    """The rows, and behind them one average for each run and protocol if there is more than one scene."""
+    kinds = list(dict.fromkeys((row.protocol, row.run) for row in rows))
+    if len({row.scene for row in rows}) < 2:
+        return rows
+    return rows + [average([row for row in rows if (row.protocol, row.run) == kind]) for kind in kinds]
+
+
+def ranks(rows: list[Row], column: Column) -> dict[int, int]:
+    """Row number -> 1 (best) or 2 (second) among the rows of one scene; equal as written is equal."""
+    if column.better == 0:
+        return {}
+    shown = {
+        number: column.form.format(row.mean(column)) for number, row in enumerate(rows) if row.mean(column) is not None
+    }
+    order = sorted(shown, key=lambda number: -column.better * rows[number].mean(column))
+    distinct = list(dict.fromkeys(shown[number] for number in order))
+    if len(distinct) < 2:
+        return {}
+    return {number: distinct.index(text) + 1 for number, text in shown.items() if text in distinct[:2]}
+
+
+def cells(rows: list[Row], best: Callable[[str], str], second: Callable[[str], str]) -> list[list[str]]:
+    """The table's body as text; best and second of each scene are marked."""
+    body: list[list[str]] = []
+    for scene in dict.fromkeys(row.scene for row in rows):
+        group = [row for row in rows if row.scene == scene]
+        ranked = {column.name: ranks(group, column) for column in COLUMNS}
+        for number, row in enumerate(group):
+            line = [row.scene, row.run, row.protocol, row.seeds]
+            for column in COLUMNS:
+                mark = {1: best, 2: second}.get(ranked[column.name].get(number), str)
+                line.append(mark(row.text(column)))
+            body.append(line)
+    return body
+
+
+HEAD = ["scene", "run", "protocol", "seeds"]
+
+
+def notes(rows: list[Row]) -> list[str]:
+    """Sentences that must stand below the table."""
+    records = [record for row in rows if row.scene != AVERAGE for record in row.records.values()]
+    result = []
+    if any(record["jobs"] != 1 for record in records):
+        result.append("Time and FPS are left out (-) of runs that shared their GPU with others.")
+    if any(record["train"]["parts"] > 1 for record in records):
+        result.append("Some runs were interrupted and went on from a checkpoint; their times are sums.")
+    if any(row.absent for row in rows):
+        result.append(
+            "Runs that failed, are missing or were made with other arguments (stale) are counted under seeds."
+        )
+    machines = dict.fromkeys(f"{record['machine']['device']}, torch {record['machine']['torch']}" for record in records)
+    if machines:
+        result.append(f"Made on: {'; '.join(machines)}.")
+    return result
+
+
+def markdown(rows: list[Row]) -> str:
+    """The table in Markdown: best bold, second in italics."""
+    head = HEAD + [column.name for column in COLUMNS]
+    body = cells(rows, lambda text: f"**{text}**", lambda text: f"_{text}_")
+    lines = [head, ["---"] * len(HEAD) + ["---:"] * len(COLUMNS), *body]
+    text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    return text + "".join(f"\n{note}\n" for note in notes(rows))
+
+
+def latex(rows: list[Row]) -> str:
+    """The table as a LaTeX tabular: best bold, second underlined, a line between scenes."""
+    body = cells(rows, lambda text: f"\\textbf{{{text}}}", lambda text: f"\\underline{{{text}}}")
+    lines = [f"\\begin{{tabular}}{{{'l' * len(HEAD)}{'r' * len(COLUMNS)}}}", "\\hline"]
+    lines.append(" & ".join([*HEAD, *(column.name for column in COLUMNS)]) + r" \\")
+    scene = None
+    for line in body:
+        if line[0] != scene:
+            lines.append("\\hline")
+        scene = line[0]
+        escaped = [_escaped(word) for word in line[: len(HEAD)]]
+        lines.append(" & ".join([*escaped, *(word.replace("±", r"$\pm$") for word in line[len(HEAD) :])]) + r" \\")
+    return "\n".join([*lines, "\\hline", "\\end{tabular}"]) + "\n"
+
+
+def _escaped(text: str) -> str:
+    return "".join(f"\\{letter}" if letter in "_&%#$" else letter for letter in text)
+
+
+def as_csv(rows: list[Row]) -> str:
+    """Means and deviations as plain numbers, empty where there is none."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    titles = [title for column in COLUMNS for title in (column.name, f"{column.name} deviation")]
+    writer.writerow([*HEAD, *titles])
+    for row in rows:
+        numbers = [number for column in COLUMNS for number in (row.mean(column), row.deviation(column))]
+        writer.writerow([row.scene, row.run, row.protocol, row.seeds, *("" if n is None else n for n in numbers)])
+    return file.getvalue()

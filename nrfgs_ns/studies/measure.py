@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a trained model is worth, measured alike for every method: on test views, on training views, in time and bytes.
+
+`ns-eval` reports what a method chooses to report; nerfstudio's own splatfacto has neither L1 nor MS-SSIM, ignores masks
+and takes its frames per second without waiting for the GPU. Here one piece of code looks at the renderings of all.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+
+from nrfgs_ns.metrics import METRIC_NAMES, ImageMetrics
+
+TIMED_CAMERAS = 20
+"""Test cameras, evenly spaced, whose rendering is timed."""
+TIMED_SECONDS = 1.0
+"""They are rendered in turn for at least this long."""
+
+
+@torch.no_grad()
+def measure(config_path: Path, train_views: int) -> dict[str, Any]:
+    """Load the last checkpoint of a training and measure it at full resolution.
+
+    Args:
+        config_path: the config.yml that the training saved.
+        train_views: of how many training images, evenly spaced among all; 0 leaves them out.
+
+    Returns:
+        "test" and "train" (null without views), each with the means of psnr, ssim, ms_ssim, l1, lpips (null where it
+        cannot be had) and "per_image"; "fps"; "splats"; "parameter_bytes" (splats and head in memory);
+        "checkpoint_bytes" (the file, with the optimisers' moments).
+    """
+    _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
+    model, data = pipeline.model, pipeline.datamanager
+    model.eval()
+    metrics = ImageMetrics()
+    test = data.fixed_indices_eval_dataloader
+    names = [Path(name).name for name in data.eval_dataset.image_filenames]
+    result: dict[str, Any] = {"test": _views(model, metrics, zip(names, test, strict=True)), "train": None}
+    if train_views > 0:
+        images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
+        cameras = data.train_dataset.cameras
+        chosen = evenly_spaced(len(images), train_views)
+        views = ((cameras[i : i + 1].to(model.device), images[i]) for i in chosen)
+        names = [Path(data.train_dataset.image_filenames[i]).name for i in chosen]
+        result["train"] = _views(model, metrics, zip(names, views, strict=True))
+    stored = [*model.gauss_params.values(), *(model.head.parameters() if hasattr(model, "head") else ())]
+    return {
+        **result,
+        "fps": frames_per_second(model, [camera for camera, _ in test]),
+        "splats": int(model.num_points),
+        "parameter_bytes": sum(parameter.numel() * parameter.element_size() for parameter in stored),
+        "checkpoint_bytes": Path(checkpoint).stat().st_size,
+    }
+
+
+def evenly_spaced(total: int, wanted: int) -> list[int]:
+    """At most `wanted` of 0..total-1, evenly spaced, the first among them."""
+    count = min(total, wanted)
+    return [i * total // count for i in range(count)]
+
+
+def _views(model, metrics: ImageMetrics, views: Iterable) -> dict[str, Any]:
+    """Means and each image's values over (name, (camera, batch))."""
+    per_image = []
+    for name, (camera, batch) in views:
+        outputs = model.get_outputs_for_camera(camera)
+        truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
+        mask = batch["mask"].to(model.device).float() >= 0.5 if "mask" in batch else None
+        per_image.append({"image": name, **metrics(outputs["rgb"], truth, mask)})
+    means = {}
+    for metric in METRIC_NAMES:
+        values = [image[metric] for image in per_image if image[metric] is not None]
+        means[metric] = sum(values) / len(values) if values else None
+    return {**means, "per_image": per_image}
+
+
+def frames_per_second(model, cameras: list) -> float:
+    """Renderings per second of wall-clock, one after the other, after one of each that is not timed."""
+    chosen = [cameras[i].to(model.device) for i in evenly_spaced(len(cameras), TIMED_CAMERAS)]
+    rendered, seconds = 0, 0.0
+    for timed in (False, True):
+        _synchronize()
+        start = perf_counter()
+        while True:
+            for camera in chosen:
+                model.get_outputs_for_camera(camera)
+            _synchronize()
+            if not timed:
+                break
+            rendered, seconds = rendered + len(chosen), perf_counter() - start
+            if seconds >= TIMED_SECONDS:
+                break
+    return rendered / seconds
+
+
+def _synchronize() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()

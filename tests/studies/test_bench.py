@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmark's scheduling with children that only pretend: resume, failures, stale records, GPUs, kills."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.studies import bench, bench_run
+from nrfgs_ns.studies.bench import Bench, gpu_names
+from nrfgs_ns.studies.bench_run import forget_other_arguments, last_checkpoint, record_until, train_or_continue
+from nrfgs_ns.studies.bench_spec import Job
+from nrfgs_ns.studies.files import write_whole
+from nrfgs_ns.studies.run import TrainRecord
+
+FAKE = """
+import json, os, sys, time
+from pathlib import Path
+
+job = json.loads(Path(sys.argv[1]).read_text())
+name = Path(job["record"]).stem
+behaviour = json.loads((Path(__file__).parent / "behaviour.json").read_text()).get(name, "good")
+start = time.time()
+Path(job["work"]).mkdir(parents=True, exist_ok=True)
+if behaviour == "fails":
+    sys.exit(3)
+if behaviour == "hangs":
+    (Path(job["work"]) / "pid").write_text(str(os.getpid()))
+    time.sleep(600)
+time.sleep(0.3)
+seed = int(job["args"][job["args"].index("--machine.seed") + 1])
+metrics = {"psnr": 20.0 + seed, "ssim": 0.9, "ms_ssim": None, "l1": 0.1, "lpips": None}
+record = {
+    "identity": job["identity"], "machine": {"device": "fake", "torch": "0"}, "jobs": job["jobs"], "wall_seconds": 1.0,
+    "train": {"seconds": 10.0, "parts": 1, "splats": [[0, 10], [100, 20]]},
+    "measured": {"test": metrics, "train": None, "fps": 5.0, "splats": 20, "parameter_bytes": 1, "checkpoint_bytes": 2},
+}
+if behaviour != "silent":
+    Path(job["record"]).write_text(json.dumps(record))
+with (Path(__file__).parent / "ran.txt").open("a") as file:
+    file.write(f"{name} {os.environ.get('CUDA_VISIBLE_DEVICES')} {start} {time.time()}\\n")
+"""
+
+
+@pytest.fixture
+def fake(tmp_path, monkeypatch):
+    """A benchmark of two methods on one scene whose children are the script above; its folder."""
+    (tmp_path / "child.py").write_text(FAKE)
+    (tmp_path / "behaviour.json").write_text("{}")
+    (tmp_path / "data" / "scene").mkdir(parents=True)
+    (tmp_path / "data" / "scene" / "transforms.json").write_text("{}")
+    monkeypatch.setattr(bench, "CHILD", (sys.executable, str(tmp_path / "child.py")))
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    handler = signal.getsignal(signal.SIGTERM)
+    yield tmp_path
+    signal.signal(signal.SIGTERM, handler)
+
+
+def bench_in(folder: Path, **more) -> Bench:
+    options = {"data": ("scene",), "runs": ("SH=nrfgs-sh", "NRF=nrfgs"), "seeds": (1, 2), "steps": 100, **more}
+    return Bench(scenes=folder / "data", out=folder / "out", work=folder / "work", **options)
+
+
+def ran(folder: Path) -> list[list[str]]:
+    """name, GPU, start, end of each child that came to its end."""
+    file = folder / "ran.txt"
+    return [line.split() for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def behave(folder: Path, **behaviours: str) -> None:
+    (folder / "behaviour.json").write_text(json.dumps(behaviours))
+
+
+ALL = {"SH-own-scene-1", "NRF-own-scene-1", "SH-own-scene-2", "NRF-own-scene-2"}
+
+
+def test_everything_is_run_once_and_reported(fake, capsys):
+    bench_in(fake).main()
+    assert [name for name, *_ in ran(fake)] == [
+        "SH-own-scene-1",
+        "NRF-own-scene-1",
+        "SH-own-scene-2",
+        "NRF-own-scene-2",
+    ]
+    intervals = sorted((float(start), float(end)) for _, _, start, end in ran(fake))
+    assert all(end <= start for (_, end), (start, _) in zip(intervals, intervals[1:], strict=False))
+    table = (fake / "out" / "table.md").read_text()
+    assert table in capsys.readouterr().out
+    assert "| scene | NRF | own | 2 |" in table and "21.50 ± 0.71" in table
+    for file in ("table.csv", "table.tex", "summary.json", "splats.png", "splats.svg"):
+        assert (fake / "out" / file).stat().st_size > 0
+    bench_in(fake).main()
+    assert len(ran(fake)) == 4, "a finished run was repeated"
+
+
+def test_failures_are_listed_and_tried_again(fake):
+    behave(fake, **{"NRF-own-scene-1": "fails", "NRF-own-scene-2": "silent"})
+    bench_in(fake).main()
+    assert "| scene | NRF | own | 0 (2 FAILED) |" in (fake / "out" / "table.md").read_text()
+    assert json.loads((fake / "out/runs/NRF-own-scene-1.failed").read_text())["returncode"] == 3
+    behave(fake)
+    bench_in(fake).main()
+    assert "| scene | NRF | own | 2 |" in (fake / "out" / "table.md").read_text()
+    assert sorted(name for name, *_ in ran(fake)).count("SH-own-scene-1") == 1
+    assert not list((fake / "out" / "runs").glob("*.failed"))
+
+
+def test_report_only_runs_nothing_and_needs_no_data(fake):
+    bench_in(fake, seeds=(1,)).main()
+    (fake / "data" / "scene" / "transforms.json").unlink()
+    bench_in(fake, report_only=True).main()
+    assert len(ran(fake)) == 2
+    assert "| scene | SH | own | 1 (1 missing) |" in (fake / "out" / "table.md").read_text()
+
+
+def test_records_of_other_arguments_are_refused_named_and_redone(fake, capsys):
+    bench_in(fake, seeds=(1,)).main()
+    with pytest.raises(InputError, match="2 of the records.*SH-own-scene-1 had options: 100.*--redo-stale"):
+        bench_in(fake, seeds=(1,), steps=50).main()
+    assert len(ran(fake)) == 2
+    bench_in(fake, seeds=(1,), steps=50, report_only=True).main()
+    assert "| scene | NRF | own | 0 (1 stale) |" in (fake / "out" / "table.md").read_text()
+    assert "SH-own-scene-1 is stale" in capsys.readouterr().out
+    bench_in(fake, seeds=(1,), steps=50, redo_stale=True).main()
+    assert len(ran(fake)) == 4
+    assert len(list((fake / "out" / "runs").glob("*.stale"))) == 2
+    bench_in(fake, seeds=(1,), steps=50).main()
+    assert len(ran(fake)) == 4
+
+
+def test_runs_share_gpus_as_they_are_told(fake, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7,9")
+    bench_in(fake, jobs=2, gpus=2).main()
+    assert sorted(gpu for _, gpu, *_ in ran(fake)) == ["5", "5", "7", "7"]
+    starts, ends = [float(line[2]) for line in ran(fake)], [float(line[3]) for line in ran(fake)]
+    assert max(starts) < min(ends), "they did not run at once"
+    table = (fake / "out" / "table.md").read_text()
+    assert "10.0" not in table and "Time and FPS are left out" in table
+
+
+def test_more_gpus_than_there_are_is_refused(monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    assert gpu_names(1) == ["3"]
+    with pytest.raises(InputError, match="at most 1"):
+        gpu_names(2)
+
+
+def test_a_terminated_benchmark_takes_its_children_along(fake):
+    behave(fake, **{"NRF-own-scene-1": "hangs"})
+    script = textwrap.dedent(
+        f"""
+        import sys
+        from pathlib import Path
+        from nrfgs_ns.studies import bench
+        bench.CHILD = (sys.executable, {str(fake / "child.py")!r})
+        folder = Path({str(fake)!r})
+        bench.Bench(scenes=folder / "data", out=folder / "out", work=folder / "work", data=("scene",),
+                    runs=("SH=nrfgs-sh", "NRF=nrfgs"), seeds=(1,), steps=100).main()
+        """
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
+    pid = fake / "work" / "NRF-own-scene-1" / "pid"
+    deadline = time.time() + 120
+    while not (pid.exists() and pid.read_text()) and time.time() < deadline:
+        time.sleep(0.05)
+    child = int(pid.read_text())
+    process.terminate()
+    process.wait(timeout=30)
+    with pytest.raises(ProcessLookupError):
+        os.kill(child, 0)
+    assert (fake / "out" / "runs" / "SH-own-scene-1.json").exists()
+    behave(fake)
+    bench_in(fake, seeds=(1,)).main()
+    assert [name for name, *_ in ran(fake)] == ["SH-own-scene-1", "NRF-own-scene-1"]
+
+
+def test_flags_have_precedence_over_the_file(fake):
+    (fake / "spec.yaml").write_text("runs: {A: nrfgs}\nscenes: [other]\nsteps: 5\nseeds: [9]\njobs: 3\n")
+    plan = Bench(spec=fake / "spec.yaml", data=("scene",), steps=7, runs=("B=nrfgs-sh --x 1",)).plan()
+    assert (plan.steps, plan.seeds, plan.jobs) == (7, [9], 3)
+    assert [scene.name for scene in plan.scenes] == ["scene"]
+    assert [(run.name, run.method, run.options) for run in plan.runs] == [("B", "nrfgs-sh", ("--x", "1"))]
+    assert [run.name for run in Bench(runs=("nrfgs", "nrfgs-sh"), data=("x",)).plan().runs] == ["nrfgs", "nrfgs-sh"]
+    with pytest.raises(InputError, match="runs is missing"):
+        Bench().plan()
+
+
+# One run.
+
+
+def job_in(folder: Path, method="nrfgs", steps=100) -> Job:
+    args = [method, "--output-dir", str(folder), "--max-num-iterations", str(steps), "nrfgs-data", "--data", "x"]
+    return Job(args, {"options": args[:1]}, steps, str(folder / "record.json"), str(folder), 0, 1)
+
+
+def interrupted(folder: Path, *checkpoints: int, reached: int) -> None:
+    """The work folder of a training that was killed after step `reached`."""
+    models = folder / "scene" / "nrfgs" / "2000-01-01" / "nerfstudio_models"
+    models.mkdir(parents=True)
+    for step in checkpoints:
+        (models / f"step-{step:09d}.ckpt").write_bytes(b"")
+    splats = [[step, 10 + step] for step in range(0, reached + 1, 10)]
+    record = TrainRecord(
+        ["nrfgs"], "lost", steps=reached + 1, seconds=99.0, splats=splats, saved=[[20, 2.0], [40, 4.0]]
+    )
+    write_whole(folder / "train.json", json.dumps(record.__dict__))
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Calls of a train() that does nothing."""
+    calls = []
+    monkeypatch.setattr(
+        bench_run, "train", lambda args, stepped, saved, earlier: calls.append((args, earlier)) or TrainRecord(args, "")
+    )
+    return calls
+
+
+def test_a_training_goes_on_from_its_last_checkpoint(tmp_path, trained):
+    interrupted(tmp_path, 20, 40, reached=60)
+    train_or_continue(job_in(tmp_path), tmp_path)
+    ((args, earlier),) = trained
+    models = tmp_path / "scene/nrfgs/2000-01-01/nerfstudio_models"
+    assert args[:3] == ["nrfgs", "--load-dir", str(models)]
+    assert args[args.index("--max-num-iterations") + 1] == "59"
+    assert (earlier.steps, earlier.seconds) == (41, 4.0)
+    assert earlier.splats[-1] == [40, 50] and earlier.saved == [[20, 2.0], [40, 4.0]]
+
+
+def test_the_record_fits_the_checkpoint_that_is_there(tmp_path):
+    """The kill came after the note about a checkpoint and before the checkpoint."""
+    interrupted(tmp_path, 20, reached=40)
+    earlier = record_until(tmp_path / "train.json", last_checkpoint(tmp_path))
+    assert (earlier.steps, earlier.seconds, earlier.splats[-1]) == (21, 2.0, [20, 30])
+    assert earlier.saved == [[20, 2.0]]
+
+
+def test_a_finished_training_is_only_evaluated(tmp_path, trained):
+    interrupted(tmp_path, 20, 40, reached=60)
+    record = train_or_continue(job_in(tmp_path, steps=41), tmp_path)
+    assert not trained and record.steps == 41
+    assert record.config_path == str(tmp_path / "scene/nrfgs/2000-01-01/config.yml")
+
+
+@pytest.mark.parametrize("method, checkpoints", [("nrfgs", []), ("splatfacto", [20, 40]), ("nrfgs", [33])])
+def test_what_cannot_be_continued_starts_anew(method, checkpoints, tmp_path, trained):
+    """No checkpoint; a method that cannot resume; a checkpoint of which nothing is noted."""
+    interrupted(tmp_path, *checkpoints, reached=60)
+    job = job_in(tmp_path, method)
+    train_or_continue(job, tmp_path)
+    assert trained == [(job.args, None)]
+
+
+def test_checkpoints_of_other_arguments_are_cleared(tmp_path):
+    forget_other_arguments(tmp_path, {"options": ["a"]})
+    interrupted(tmp_path, 20, reached=20)
+    forget_other_arguments(tmp_path, {"options": ["a"]})
+    assert last_checkpoint(tmp_path) is not None
+    forget_other_arguments(tmp_path, {"options": ["b"]})
+    assert last_checkpoint(tmp_path) is None and not (tmp_path / "train.json").exists()
+
+
+def test_two_children_do_not_share_a_folder(tmp_path):
+    """A lock belongs to an open file: another one waits, in this process as in any other."""
+    events = []
+
+    def first() -> None:
+        with bench_run.only_one(tmp_path / "lock"):
+            events.append("first in")
+            time.sleep(0.5)
+            events.append("first out")
+
+    thread = threading.Thread(target=first)
+    thread.start()
+    while not events:
+        time.sleep(0.01)
+    with bench_run.only_one(tmp_path / "lock"):
+        events.append("second in")
+    thread.join()
+    assert events == ["first in", "first out", "second in"]
+
+
+def test_a_finished_run_is_not_repeated_by_a_late_child(tmp_path, trained):
+    job = job_in(tmp_path)
+    Path(job.record).write_text("{}")
+    bench_run.run(job)
+    assert not trained and Path(job.record).read_text() == "{}"

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One real run of a benchmark, in this process: interrupted while training and before its evaluation, then measured."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from nrfgs_ns.studies import bench_run
+from nrfgs_ns.studies.bench_spec import Job, cells_of, command, identity, make_spec
+from nrfgs_ns.studies.measure import evenly_spaced
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+
+class Killed(BaseException):
+    """Stands for a signal."""
+
+
+def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monkeypatch):
+    content = {"runs": {"NRF": "nrfgs"}, "scenes": ["tiny"], "protocols": ["mcmc@310"], "steps": 8}
+    content |= {"checkpoint_every": 2, "train_views": 3, "options": "--pipeline.model.warmup-length 1"}
+    spec = make_spec(content, "test")
+    (cell,) = cells_of(spec)
+    parser = ["nrfgs-data", "--data", str(tiny_scene)]
+    args = command(spec, cell, parser, tmp_path / "work")
+    job = Job(args, identity(spec, cell, parser), 8, str(tmp_path / "record.json"), str(tmp_path / "work"), 3, 1)
+
+    train, evaluate = bench_run.train, bench_run.evaluate
+
+    def killed_at_5(args, on_step, on_save, earlier):
+        def step(number: int) -> None:
+            if number == 5:
+                raise Killed
+
+        return train(args, step, on_save, earlier)
+
+    def killed(*_):
+        raise Killed
+
+    monkeypatch.setattr(bench_run, "train", killed_at_5)
+    with pytest.raises(Killed):
+        bench_run.run(job)
+    assert bench_run.last_checkpoint(tmp_path / "work").name == "step-000000004.ckpt"
+    monkeypatch.setattr(bench_run, "train", train)
+    monkeypatch.setattr(bench_run, "evaluate", killed)
+    with pytest.raises(Killed):
+        bench_run.run(job)
+    assert not Path(job.record).exists()
+    monkeypatch.setattr(bench_run, "train", killed)  # what is trained is not trained again
+    monkeypatch.setattr(bench_run, "evaluate", evaluate)
+    bench_run.run(job)
+
+    record = json.loads(Path(job.record).read_text())
+    measured, trained = record["measured"], record["train"]
+    assert record["identity"] == job.identity and str(tmp_path) not in json.dumps(record)
+    assert trained["parts"] == 2 and trained["steps"] == 8 and trained["seconds"] > 0
+    assert [step for step, _ in trained["splats"]] == [0, 7]
+    assert [step for step, _ in trained["saved"]] == [2, 4, 6, 7]
+    # One and the same code took both; the renderings are the same to rounding.
+    for metric in ("psnr", "ssim", "l1"):
+        assert measured["test"][metric] == pytest.approx(record["eval"][metric], rel=1e-5)
+    assert measured["test"]["lpips"] is None
+    assert [image["image"] for image in measured["train"]["per_image"]] == [
+        "view_001.png",
+        "view_003.png",
+        "view_006.png",
+    ]
+    mean = sum(image["psnr"] for image in measured["train"]["per_image"]) / 3
+    assert measured["train"]["psnr"] == pytest.approx(mean)
+    assert measured["parameter_bytes"] == record["eval"]["parameter_bytes"] == 4 * (measured["splats"] * 46 + 6664)
+    assert measured["fps"] > 0 and measured["checkpoint_bytes"] > measured["parameter_bytes"]
+    assert len(list((tmp_path / "work" / "pictures").glob("eval_img_*.png"))) == 2
+
+
+@pytest.mark.parametrize(
+    "total, wanted, chosen", [(10, 4, [0, 2, 5, 7]), (3, 5, [0, 1, 2]), (5, 5, [0, 1, 2, 3, 4]), (5, 0, [])]
+)
+def test_evenly_spaced(total, wanted, chosen):
+    assert evenly_spaced(total, wanted) == chosen
