@@ -12,9 +12,12 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from nrfgs_ns.appearance.gsnb import GsnbConfig
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.model import NrfgsModelConfig
 from nrfgs_ns.pipeline import NrfgsPipelineConfig
 from nrfgs_ns.trainer import NrfgsTrainerConfig
@@ -70,7 +73,7 @@ nrfgs = method(
     NrfConfig(),
     "Gaussian splatting with a neural residual field for view-dependent colour and opacity.",
     latents=adam(0.0025),
-    field=adam(1e-3, lr_final=1e-4),
+    field=adam(5e-3, lr_final=5e-4),
 )
 
 nrfgs_sh = method(
@@ -78,4 +81,30 @@ nrfgs_sh = method(
     ShConfig(),
     "The same model with spherical harmonics: 3DGS as in splatfacto, for comparison.",
     features_rest=adam(0.0025 / 20),
+)
+
+nrfgs_vdgs = method(
+    "nrfgs-vdgs",
+    VdgsConfig(),
+    "The same model with VDGS's head: spherical harmonics, and opacity that depends on the view; for comparison.",
+    features_rest=adam(0.0025 / 20),
+    field=adam(1e-3),
+)
+
+nrfgs_gsnb = method(
+    "nrfgs-gsnb",
+    GsnbConfig(),
+    "The same model with GSNB's head: spherical harmonics, and a learnt basis beside them; for comparison.",
+    features_rest=adam(0.0025 / 20),
+    # AdamW as its reference has it, with torch's own eps and decay.
+    field={"optimizer": AdamOptimizerConfig(_target=torch.optim.AdamW, lr=1e-3, weight_decay=0.01), "scheduler": None},
+)
+
+nrfgs_sg = method(
+    "nrfgs-sg",
+    SgConfig(),
+    "The same model with three spherical Gaussians on each splat's base colour, for comparison.",
+    sg_axes=adam(0.0025),
+    sg_sharpness=adam(0.0025),
+    sg_colors=adam(0.0025),
 )

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splatfacto with an appearance head: geometry -> head -> rasterizer -> image.
 
-Loss, densification, pruning, opacity reset, schedules and crop are nerfstudio's. What differs: colours and opacities
-come from the head, for the splats that the camera sees only; nothing needs CUDA; metrics respect masks; and loading a
-checkpoint keeps the parameter objects that the optimisers hold, so that an interrupted training can go on.
+Loss, schedules and crop are nerfstudio's, and so is densification unless another protocol is asked for
+(`densification.py`). What differs: colours and opacities come from the head, for the splats that the camera sees only;
+nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the parameter objects that the optimisers
+hold, so that an interrupted training can go on.
 """
 
 from dataclasses import dataclass, field
@@ -11,22 +12,29 @@ from typing import Any, NamedTuple
 
 import torch
 import tyro
-from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.model_components.lib_bilagrid import BilateralGrid
+from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
 from nerfstudio.utils.colors import get_color
-from pytorch_msssim import SSIM
 from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.checkpoint import check_compatible
+from nrfgs_ns.densification import (
+    McmcDensification,
+    OpacitySeen,
+    OriginalDensification,
+    Protocol,
+    build_densification,
+)
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.metrics import ImageMetrics
+from nrfgs_ns.pinhole import Pinhole, pinhole
 from nrfgs_ns.rasterizer import Projection, composite, project
+from nrfgs_ns.ssim import photometric_loss
 from nrfgs_ns.warmup import warm_up
 
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
@@ -46,6 +54,18 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     A head that adds nothing from the start skips them."""
     warmup_lr: float = 1e-3
     """learning rate of the warm-up's Adam"""
+    densification: Protocol = "splatfacto"
+    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
+    splat_budget"""
+    splat_budget: int = 1_000_000
+    """mcmc: the number of splats that it grows to and keeps"""
+    opacity_seen_by_densification: OpacitySeen = "base"
+    """which opacity makes a splat die when it depends on the view. base: the stored one. peak: the largest that any
+    view has shown since the last refinement"""
+    original: OriginalDensification = field(default_factory=OriginalDensification)
+    """thresholds of the densification 'original'"""
+    mcmc: McmcDensification = field(default_factory=McmcDensification)
+    """constants of the densification 'mcmc'"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -91,33 +111,16 @@ class NrfgsModel(SplatfactoModel):
         if self.config.use_bilateral_grid:
             self.bil_grids = BilateralGrid(self.num_train_data, *self.config.grid_shape)
 
-        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.image_metrics = ImageMetrics()
         self.step = 0
         self.crop_box = None
+        self._pinholes: dict[tuple[int, int], Pinhole] = {}
         self.background_color = (
             torch.tensor(VISER_BACKGROUND)
             if self.config.background_color == "random"
             else get_color(self.config.background_color)
         )
-        self.strategy = DefaultStrategy(
-            prune_opa=self.config.cull_alpha_thresh,
-            grow_grad2d=self.config.densify_grad_thresh,
-            grow_scale3d=self.config.densify_size_thresh,
-            grow_scale2d=self.config.split_screen_size,
-            prune_scale3d=self.config.cull_scale_thresh,
-            prune_scale2d=self.config.cull_screen_size,
-            refine_scale2d_stop_iter=self.config.stop_screen_size_at,
-            refine_start_iter=self.config.warmup_length,
-            refine_stop_iter=self.config.stop_split_at,
-            reset_every=self.config.reset_alpha_every * self.config.refine_every,
-            refine_every=self.config.refine_every,
-            pause_refine_after_reset=self.num_train_data + self.config.refine_every,
-            absgrad=self.config.use_absgrad,
-            revised_opacity=False,
-            verbose=True,
-        )
-        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+        self.densification = build_densification(self.config, self.num_train_data)
 
     def _initial_splats(self) -> dict[str, Parameter]:
         """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
@@ -180,8 +183,10 @@ class NrfgsModel(SplatfactoModel):
         return {**groups, "field": shared} if shared else groups
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        cameras = attributes.pipeline.datamanager.train_dataset.cameras
+        self.densification.see_cameras(cameras.camera_to_worlds[:, :3, 3])
+
         def before_first_step(step: int) -> None:
-            cameras = attributes.pipeline.datamanager.train_dataset.cameras
             steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
             warm_up(self, cameras, steps, self.config.warmup_lr)
 
@@ -196,14 +201,32 @@ class NrfgsModel(SplatfactoModel):
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
-        self.strategy.step_post_backward(
-            params=self.gauss_params,
-            optimizers=self.optimizers,
-            state=self.strategy_state,
-            step=self.step,
-            info=self.info,
-            packed=True,
-        )
+        self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
+
+    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
+        """Splatfacto's losses, and in training what the densification protocol adds to them.
+
+        Terms that are zero in this step are left out. Nothing waits for the GPU.
+        """
+        truth = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        rgb = outputs["rgb"]
+        if "mask" in batch:  # what is outside is black in both
+            mask = self._downscale_if_required(batch["mask"]).to(self.device)
+            truth, rgb = truth * mask, rgb * mask
+        losses = {"main_loss": photometric_loss(rgb, truth, self.config.ssim_lambda)}
+        if self.config.use_scale_regularization and self.step % 10 == 0:
+            scales = self.scales.exp()
+            ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
+            losses["scale_reg"] = 0.1 * (ratios - self.config.max_gauss_ratio).clamp_min(0.0).mean()
+        if self.training:
+            self.camera_optimizer.get_loss_dict(losses)
+            if self.config.use_bilateral_grid:
+                losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
+            losses |= self.densification.regularisation(self.gauss_params)
+            watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
+            self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
+            self.watched_image = batch.get("image_idx")
+        return losses
 
     # Rendering.
 
@@ -213,11 +236,6 @@ class NrfgsModel(SplatfactoModel):
         Args:
             camera: a batch of one camera, [1].
         """
-        if self.training:
-            assert camera.shape[0] == 1, "Only one camera at a time"
-            camera_to_world = self.camera_optimizer.apply_to_camera(camera)
-        else:
-            camera_to_world = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
         if self.config.rasterize_mode not in ("antialiased", "classic"):
             raise InputError(
                 f"pipeline.model.rasterize_mode is {self.config.rasterize_mode!r}; use 'classic' or 'antialiased'."
@@ -226,18 +244,33 @@ class NrfgsModel(SplatfactoModel):
         if self.crop_box is not None and not self.training:
             inside = self.crop_box.within(splats["means"]).reshape(-1)
             splats = {name: value[inside] for name, value in splats.items()}
-        K, width, height = intrinsics(camera, self._get_downscale_factor(), self.device)
+        seen_from = self._pinhole(camera)
         projection = project(
             splats["means"],
             splats["quats"],
             splats["scales"].exp(),
-            world_to_camera(camera_to_world),
-            K,
-            width,
-            height,
+            seen_from.viewmat,
+            seen_from.K,
+            seen_from.width,
+            seen_from.height,
             rasterize_mode=self.config.rasterize_mode,
+            assume_finite=self.training,  # the trainer's guard watches
         )
-        return View(projection, splats, camera_to_world[0, :3, 3])
+        return View(projection, splats, seen_from.center)
+
+    def _pinhole(self, camera: Cameras) -> Pinhole:
+        """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
+        downscale = self._get_downscale_factor()
+        if not self.training:
+            pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
+            return pinhole(camera, pose.to(self.device), downscale)
+        assert camera.shape[0] == 1, "Only one camera at a time"
+        index = (camera.metadata or {}).get("cam_idx")
+        if index is None or self.camera_optimizer.config.mode != "off":
+            return pinhole(camera, self.camera_optimizer.apply_to_camera(camera), downscale)
+        if (index, downscale) not in self._pinholes:
+            self._pinholes[index, downscale] = pinhole(camera, camera.camera_to_worlds, downscale)
+        return self._pinholes[index, downscale]
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
         """Render one camera.
@@ -250,9 +283,7 @@ class NrfgsModel(SplatfactoModel):
         appearance = self.head(view.splats, view.visible, view.center)
         outputs, self.info = self._paint(view, appearance)
         if self.training:
-            self.strategy.step_pre_backward(
-                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
-            )
+            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.num_points)
             if self.config.use_bilateral_grid and "cam_idx" in (camera.metadata or {}):
                 height, width = outputs["rgb"].shape[:2]
                 index = camera.metadata["cam_idx"]
@@ -273,7 +304,8 @@ class NrfgsModel(SplatfactoModel):
             appearance.colors,
             appearance.opacities,
             render_mode="RGB+ED" if with_depth else "RGB",
-            absgrad=self.strategy.absgrad and self.training,
+            absgrad=self.densification.absgrad and self.training,
+            assume_finite=self.training,
         )
         render, alpha = render[0], alpha[0]
         height, width = alpha.shape[:2]
@@ -329,13 +361,20 @@ class NrfgsModel(SplatfactoModel):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a checkpoint holds beside tensors: the head's name, and densification's running statistics."""
-        return {"head": self.head.name, "strategy": dict(self.strategy_state)}
+        return {
+            "head": self.head.name,
+            "densification": self.densification.name,
+            "strategy": dict(self.densification.state),
+        }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.strategy_state = {
-            name: value.to(self.device) if isinstance(value, Tensor) else value
-            for name, value in state["strategy"].items()
-        }
+        written_by = state.get("densification", "splatfacto")  # older checkpoints do not say
+        if written_by != self.densification.name:
+            raise InputError(
+                f"The checkpoint was trained with --pipeline.model.densification {written_by}, this model with "
+                f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
+            )
+        self.densification.load_state(state["strategy"], self.device)
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):
         """Load a checkpoint with any number of splats.
@@ -350,25 +389,3 @@ class NrfgsModel(SplatfactoModel):
         for name, parameter in self.gauss_params.items():
             parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)
         return super(SplatfactoModel, self).load_state_dict(state, strict=strict, **kwargs)
-
-
-def world_to_camera(camera_to_world: Tensor) -> Tensor:
-    """World-to-camera matrices from nerfstudio's poses.
-
-    Args:
-        camera_to_world: [C, 3, 4], with y up and z backwards (OpenGL).
-
-    Returns:
-        [C, 4, 4], with y down and z forwards (OpenCV, gsplat).
-    """
-    rotation = (camera_to_world[:, :3, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).transpose(1, 2)
-    translation = -rotation @ camera_to_world[:, :3, 3:4]
-    last = camera_to_world.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(camera_to_world), 1, 4)
-    return torch.cat([torch.cat([rotation, translation], dim=2), last], dim=1)
-
-
-def intrinsics(camera: Cameras, downscale: int, device) -> tuple[Tensor, int, int]:
-    """Intrinsics [1, 3, 3], width and height of one camera, scaled by 1 / downscale and rounded down like its image."""
-    K = camera.get_intrinsics_matrices().reshape(1, 3, 3).to(device)
-    K = K / K.new_tensor([[downscale], [downscale], [1.0]])
-    return K, int(camera.width.item()) // downscale, int(camera.height.item()) // downscale

@@ -44,9 +44,17 @@ class NrfgsPipeline(VanillaPipeline):
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
         allow_nerfstudio_checkpoints()
+        self.steps_per_log = 1  # the trainer knows better
         super().__init__(config, device, test_mode, **kwargs)
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             self.datamanager.load_all_images()
+
+    def get_train_loss_dict(self, step: int):
+        """Nerfstudio's step, whose metrics are taken only when they are logged."""
+        camera, batch = self.datamanager.next_train(step)
+        outputs = self._model(camera)
+        metrics = self.model.get_metrics_dict(outputs, batch) if step % self.steps_per_log == 0 else {}
+        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

@@ -29,6 +29,24 @@ BUSY = {
 """Densify every 4th step, reset opacity every 24th. 8 training views hold densification back for 12 steps after it."""
 
 
+METHODS = {
+    "nrfgs": {},
+    "nrfgs-sh": {},
+    "nrfgs-vdgs": {},
+    "nrfgs-gsnb": {"--pipeline.model.appearance.ramp-steps": 30},
+    "nrfgs-sg": {"--pipeline.model.appearance.start-step": 10},
+}
+"""Each method, with the options that let its schedule happen within a test: the first lobes come after splits."""
+STORED = {
+    "nrfgs": (3 + 32, 6664),
+    "nrfgs-sh": (48, 0),
+    "nrfgs-vdgs": (48, 524_288 + 1729),
+    "nrfgs-gsnb": (48, 7760),
+    "nrfgs-sg": (24, 0),
+}
+"""Colour numbers per splat, and shared weights."""
+
+
 def options(scene: Path, out: Path, method: str = "nrfgs", steps: int = 20, **more) -> list[str]:
     """A command line for ns-train; `more` maps options, written with underscores for dashes and dots kept."""
     chosen = {
@@ -41,6 +59,7 @@ def options(scene: Path, out: Path, method: str = "nrfgs", steps: int = 20, **mo
         "--logging.local-writer.enable": False,
         "--logging.profiler": "none",
         **BUSY,
+        **METHODS[method],
         **more,
     }
     return [method, *(str(word) for option in chosen.items() for word in option)]
@@ -65,7 +84,7 @@ def checkpoint(config: Path) -> dict:
     return torch.load(path, weights_only=True)
 
 
-@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+@pytest.mark.parametrize("method", METHODS)
 def test_train_eval_render(method, trained, tmp_path, tiny_scene):
     config = trained(method)
     results = evaluate(config, tmp_path / "eval.json")
@@ -79,10 +98,8 @@ def test_train_eval_render(method, trained, tmp_path, tiny_scene):
     assert step == 19
     assert results["splats"] == pipeline.model.num_points
     assert results["parameter_bytes"] == pipeline.model.parameter_bytes
-    if method == "nrfgs":
-        assert results["parameter_bytes"] == 4 * (pipeline.model.num_points * (3 + 3 + 4 + 1 + 3 + 32) + 6664)
-    else:
-        assert results["parameter_bytes"] == 4 * pipeline.model.num_points * (3 + 3 + 4 + 1 + 48)
+    colors, shared = STORED[method]
+    assert results["parameter_bytes"] == 4 * (pipeline.model.num_points * (3 + 3 + 4 + 1 + colors) + shared)
 
     ComputePSNR(config, tmp_path / "again.json", render_output_path=tmp_path / "pairs").main()
     assert [file.name[:13] for file in sorted((tmp_path / "pairs").iterdir())] == ["eval_img_0000", "eval_img_0001"]
@@ -103,7 +120,26 @@ def test_training_changes_everything_and_densifies(trained, tiny_scene):
     assert model.head.low[-1].weight.abs().max() > 0 and model.head.high[-1].weight.abs().max() > 0
 
 
-@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+@pytest.mark.parametrize(
+    "method, groups",
+    [
+        ("nrfgs", ["latents", "field"]),
+        ("nrfgs-vdgs", ["field"]),
+        ("nrfgs-gsnb", ["features_rest", "field"]),
+        ("nrfgs-sg", ["sg_axes", "sg_sharpness", "sg_colors"]),
+    ],
+)
+def test_all_that_a_head_adds_is_learning(method, groups, trained):
+    """Adam's running mean of every tensor's gradient has moved, and there is one for each of the tensor's numbers."""
+    state = checkpoint(trained(method))
+    for group in groups:
+        learning = state["optimizers"][group]["state"]
+        assert learning and all((of_one["exp_avg"] != 0).any() for of_one in learning.values()), group
+        if group != "field":
+            assert learning[0]["exp_avg"].shape == state["pipeline"][f"_model.gauss_params.{group}"].shape
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_resumed_training_is_the_unbroken_one(method, tiny_scene, tmp_path):
     """40 steps at once, against 20 and 20 more from the checkpoint.
 

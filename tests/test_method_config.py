@@ -11,12 +11,34 @@ import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods, method_configs
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
+from nrfgs_ns.appearance.gsnb import NeuralBasis
 from nrfgs_ns.appearance.nrf import NeuralResidualField
+from nrfgs_ns.appearance.sg import SphericalGaussians
 from nrfgs_ns.appearance.sh import SphericalHarmonics
-from nrfgs_ns.method_config import nrfgs, nrfgs_sh
+from nrfgs_ns.appearance.vdgs import ViewDirectionFactors
+from nrfgs_ns.method_config import nrfgs, nrfgs_gsnb, nrfgs_sg, nrfgs_sh, nrfgs_vdgs
 
-METHODS = {"nrfgs": nrfgs, "nrfgs-sh": nrfgs_sh}
-OWN_GROUPS = {"nrfgs": {"latents", "field"}, "nrfgs-sh": set()}
+METHODS = {
+    "nrfgs": nrfgs,
+    "nrfgs-sh": nrfgs_sh,
+    "nrfgs-vdgs": nrfgs_vdgs,
+    "nrfgs-gsnb": nrfgs_gsnb,
+    "nrfgs-sg": nrfgs_sg,
+}
+HEADS = {
+    "nrfgs": NeuralResidualField,
+    "nrfgs-sh": SphericalHarmonics,
+    "nrfgs-vdgs": ViewDirectionFactors,
+    "nrfgs-gsnb": NeuralBasis,
+    "nrfgs-sg": SphericalGaussians,
+}
+OWN_GROUPS = {
+    "nrfgs": {"latents", "field"},
+    "nrfgs-sh": set(),
+    "nrfgs-vdgs": {"field"},
+    "nrfgs-gsnb": {"field"},
+    "nrfgs-sg": {"sg_axes", "sg_sharpness", "sg_colors"},
+}
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -25,9 +47,23 @@ def test_nerfstudio_finds_the_method(name):
     assert tyro.cli(AnnotatedBaseConfigUnion, args=[name, "--data", "x"]).method_name == name
 
 
-@pytest.mark.parametrize("name, head", [("nrfgs", NeuralResidualField), ("nrfgs-sh", SphericalHarmonics)])
-def test_each_method_has_its_head(name, head):
-    assert isinstance(METHODS[name].config.pipeline.model.appearance.setup(), head)
+@pytest.mark.parametrize("name", METHODS)
+def test_each_method_has_its_head_and_an_optimiser_for_all_that_it_learns(name):
+    head = METHODS[name].config.pipeline.model.appearance.setup()
+    assert type(head) is HEADS[name]
+    learnt = {*head.splat_params(torch.rand(1, 3)), *(["field"] if list(head.parameters()) else [])}
+    assert learnt <= set(METHODS[name].config.optimizers)
+    assert OWN_GROUPS[name] == learnt - {"features_dc", "features_rest"}
+
+
+@pytest.mark.parametrize(
+    "name, kind, decay", [("nrfgs-vdgs", torch.optim.Adam, 0.0), ("nrfgs-gsnb", torch.optim.AdamW, 0.01)]
+)
+def test_shared_weights_of_others_have_their_references_optimisers(name, kind, decay):
+    config = METHODS[name].config.optimizers["field"]
+    optimizer = config["optimizer"].setup([torch.nn.Parameter(torch.zeros(1))])
+    assert type(optimizer) is kind and config["scheduler"] is None
+    assert (optimizer.defaults["lr"], optimizer.defaults["weight_decay"]) == (1e-3, decay)
 
 
 @pytest.mark.parametrize("name", METHODS)

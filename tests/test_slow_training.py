@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real trainings: minutes, not seconds. Run with `pytest -m slow`."""
 
-import json
 import os
 import signal
 import subprocess
@@ -17,8 +16,6 @@ from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.studies.run import evaluate, train
 
 pytestmark = pytest.mark.slow
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def psnr(method: str, data: Path, out: Path, steps: int, *options: str) -> float:
@@ -49,21 +46,6 @@ def test_the_field_carries_what_depends_on_the_view(tmp_path):
 def test_real_photographs_train(scene, method, captures, tmp_path):
     scale = ["--pipeline.datamanager.camera-res-scale-factor", "0.125"]
     assert psnr(method, captures / scene, tmp_path, 300, *scale) > 17
-
-
-def test_compare_runs_resumes_and_reports_failures(tiny_scene, tmp_path):
-    """benchmarks/compare.py: a finished run is kept, a missing one is made, a crashed one is listed as missing."""
-    script = [sys.executable, str(ROOT / "benchmarks" / "compare.py"), "--scenes", str(tiny_scene), "--steps", "5"]
-    script += ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work"), "--methods", "nrfgs-sh"]
-    subprocess.run([*script, "nrfgs:broken=--pipeline.model.appearance.num-bands 0"], check=True)
-    record = tmp_path / "out" / "runs" / f"nrfgs-sh-{tiny_scene.name}-42.json"
-    first = record.stat().st_mtime_ns
-    summary = {row["method"]: row for row in json.loads((tmp_path / "out" / "summary.json").read_text())}
-    assert summary["nrfgs:broken"]["missing"] == 1 and summary["nrfgs-sh"]["missing"] == 0
-    subprocess.run([*script, "nrfgs"], check=True)
-    assert record.stat().st_mtime_ns == first
-    table = (tmp_path / "out" / "table.md").read_text()
-    assert f"| {tiny_scene.name} | nrfgs | 1 |" in table
 
 
 def test_killed_training_goes_on_from_its_checkpoint(tiny_scene, tmp_path):

@@ -4,11 +4,13 @@ to run without an accelerator, and to continue where it stopped."""
 
 import random
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
@@ -106,6 +108,31 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             The numbers of training and evaluation images.
         """
         return len(self.cached_train), len(self.cached_eval)
+
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """The next camera in turn, and its image.
+
+        The camera is the same object each time its turn comes: cutting it out of all the others and moving it to a GPU
+        takes longer than some training steps.
+
+        Returns:
+            camera [1] on the device, with "cam_idx" in its metadata, and "image" [H, W, 3 or 4], "image_idx", "mask".
+        """
+        index = self.train_unseen_cameras.pop(0)
+        if len(self.train_unseen_cameras) == 0:
+            self.train_unseen_cameras = self.sample_train_cameras()
+        batch = self.cached_train[index].copy()
+        batch["image"] = batch["image"].to(self.device)
+        if index not in self._views:
+            camera = self.train_cameras[index : index + 1].to(self.device)
+            camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
+            self._views[index] = camera
+        return self._views[index], batch
+
+    @cached_property
+    def _views(self) -> dict[int, Cameras]:
+        """Training cameras by index, as far as they have had their turn."""
+        return {}
 
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
