@@ -34,7 +34,8 @@ def cloud(device: str = "cpu", count: int = 6, **planted) -> dict[str, torch.Ten
     splats = {
         "means": torch.cat([0.3 * torch.randn(count, 2, generator=g), 2 + torch.rand(count, 1, generator=g)], 1),
         "quats": torch.randn(count, 4, generator=g),
-        "scales": torch.full((count, 3), 0.1),
+        # Oblong: the gradient of a round splat's quaternion is nothing but rounding.
+        "scales": torch.tensor([0.1, 0.15, 0.07]).repeat(count, 1),
         "opacities": torch.full((count,), 0.5),
         "colors": torch.rand(count, 3, generator=g),
     }
@@ -146,8 +147,12 @@ def test_quaternions_of_any_length(device, mode, length):
     image, _, info = assert_healthy(splats, rasterize_mode=mode)
     seen = MIN_QUATERNION <= length <= 1e19
     assert (0 in info["gaussian_ids"]) == seen
-    if seen:  # normalising is 4 roundings off, of which conics and an image of numbers below 10 make 1e-5
-        assert torch.allclose(image, unit.detach(), rtol=0, atol=1e-5)
+    if seen:
+        # Normalising is a few roundings off: 1e-6 of the conic, times a falloff's exponent of at most 5.5 (beyond, alpha
+        # is below 1/255) 6e-6 of alpha, twice that of a depth of 3, which is a ratio: 4e-5. A pixel whose alpha is at
+        # the cut-off of 1/255 to that precision may come or go.
+        off = (image - unit.detach()).abs().amax(-1) > 4e-5
+        assert off.sum() <= 1
 
 
 @devices
@@ -188,7 +193,9 @@ def test_a_splat_that_is_not_finite_is_not_there(device, mode, value, name):
     image, alpha, info = assert_healthy(splats, rasterize_mode=mode)
     assert torch.equal(image, expected[0]) and torch.equal(alpha, expected[1])
     for key in NAMES:
-        assert torch.allclose(splats[key].grad[1:], without[key].grad, rtol=1e-4, atol=1e-6), key
+        # Sums over pixels and splats, which a GPU takes in any order: 1e-5 of the largest terms.
+        scale = without[key].grad.abs().max()
+        assert (splats[key].grad[1:] - without[key].grad).abs().max() <= 1e-5 * scale, key
         assert (splats[key].grad[0] == 0).all(), key
     if name in ("means", "quats", "scales"):
         assert 0 not in info["gaussian_ids"]

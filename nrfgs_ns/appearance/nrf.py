@@ -69,7 +69,7 @@ class NrfConfig(AppearanceHeadConfig):
     implementation: Literal["auto", "torch", "fused"] = "auto"
     """auto: the fused Triton kernels on CUDA, where they can run, and PyTorch elsewhere. fused: an error instead of
     PyTorch."""
-    precision: Literal["fp32", "tf32", "bf16", "fp16"] = "fp32"
+    precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"
     """what the fused kernels round the factors of matrix products to; sums are always float32. PyTorch's path ignores
     it."""
 

@@ -61,6 +61,7 @@ def test_zero_outputs_add_exactly_nothing():
 EXTREMES = {
     "on the splat": lambda splats, centers: centers.copy_(splats["means"][0]),
     "far away": lambda splats, centers: centers.mul_(1e6),
+    "beyond reach": lambda splats, centers: centers.mul_(1e20),
     "logits": lambda splats, centers: splats["opacities"].sign_().mul_(1e4),
     "latents": lambda splats, centers: splats["latents"].mul_(1e4),
     "colours": lambda splats, centers: splats["features_dc"].mul_(1e3),

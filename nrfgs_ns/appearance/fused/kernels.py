@@ -20,6 +20,7 @@ import triton.language as tl
 
 OUT = tl.constexpr(16)  # columns of W2
 PI = tl.constexpr(3.141592653589793)
+FARTHEST = tl.constexpr(1e18)  # encoding.FARTHEST; the slope beyond, 0 there, is below 1e-18 here
 SMOOTH_SHARPNESS = tl.constexpr(50.0)  # opacity_bound.SHARPNESS
 LOGIT_SLOPE = tl.constexpr(4.0)  # opacity_bound.LOGIT_SLOPE
 
@@ -90,6 +91,7 @@ def _view(means, centers, rows, items, mask, lanes, eps_squared, ONE_CENTER: tl.
     else:
         center = tl.load(centers + items[:, None] * 3 + lanes, mask=mask, other=0.0)
     v = center - tl.load(means + rows[:, None] * 3 + lanes, mask=mask, other=0.0)
+    v = tl.minimum(tl.maximum(v, -FARTHEST, tl.PropagateNan.ALL), FARTHEST, tl.PropagateNan.ALL)
     square = tl.sum(v * v, axis=1)
     r = tl.sqrt(tl.maximum(square, eps_squared, propagate_nan=tl.PropagateNan.ALL))
     inverse = 1.0 / r
