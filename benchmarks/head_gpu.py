@@ -89,9 +89,18 @@ class HeadBenchmark:
     """programs for each multiprocessor"""
 
     def main(self) -> None:
-        results = self.sweep_launches() if self.sweep else {"times": self.times(), "errors": self.errors()}
-        results = {"machine": self.machine(), "rounds": self.rounds, "repeats": self.repeats, **results}
+        if self.sweep:
+            self.save(self.sweep_launches())
+            return
+        errors, times = self.errors(), []
+        for visible, share in itertools.product(self.sizes, ("all", "half")):
+            times += self.times(visible, share)
+            self.save({"errors": errors, "times": times})  # what is cut short keeps what it has
+        self.show(times)
+
+    def save(self, results: dict[str, list[dict]]) -> None:
         if self.out is not None:
+            results = {"machine": self.machine(), "rounds": self.rounds, "repeats": self.repeats, **results}
             self.out.parent.mkdir(parents=True, exist_ok=True)
             self.out.write_text(json.dumps(results, indent=2) + "\n")
 
@@ -169,18 +178,17 @@ class HeadBenchmark:
 
     # Timing.
 
-    def times(self) -> list[dict]:
-        rows = []
-        for visible, share in itertools.product(self.sizes, ("all", "half")):
-            count = visible if share == "all" else 2 * visible
-            rows += self.take_turns(
-                self.variants(*self.scene(count, visible)), {"visible": visible, "share": share}, memory=True
-            )
-        self.show(rows)
-        return rows
+    def times(self, visible: int, share: str) -> list[dict]:
+        count = visible if share == "all" else 2 * visible
+        labels = {"visible": visible, "share": share}
+        return self.take_turns(self.variants(*self.scene(count, visible)), labels, memory=True)
 
     def take_turns(self, builders: dict[str, Callable[[], Variant]], labels: dict, memory: bool = False) -> list[dict]:
-        """A row of medians for each variant: "forward_ms", "both_ms" and their spread, or "error"."""
+        """A row of medians for each variant: "forward_ms", "both_ms" and their spread, "gpu_ms", or "error".
+
+        The first three are taken as a training calls them: small sizes wait for the host. "gpu_ms" replays forward and
+        backward as one CUDA graph, which the host only starts; null where a variant cannot be captured.
+        """
         built: dict[str, Variant] = {}
         rows = {name: {**labels, "variant": name} for name in builders}
         for name, build in builders.items():
@@ -203,7 +211,29 @@ class HeadBenchmark:
         for name, (forward, both) in samples.items():
             rows[name] |= {"forward_ms": statistics.median(forward), "both_ms": statistics.median(both)}
             rows[name]["both_range_ms"] = [min(both), max(both)]
+            rows[name]["gpu_ms"] = self.replayed(built[name]) if self.device == "cuda" else None
         return list(rows.values())
+
+    def replayed(self, variant: Variant) -> float | None:
+        """Median milliseconds of forward and backward without the host, or None."""
+        for leaf in variant.leaves:
+            leaf.grad = None
+        try:
+            side = torch.cuda.Stream()
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):  # as CUDA graphs want it: warmed up off the default stream
+                variant.forward_backward()
+            torch.cuda.current_stream().wait_stream(side)
+            for leaf in variant.leaves:
+                leaf.grad = None
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph):
+                variant.forward_backward()
+        except Exception as error:
+            print(f"not captured: {type(error).__name__}: {error}"[:300], file=sys.stderr)
+            self.synchronize()
+            return None
+        return statistics.median(self.milliseconds(graph.replay) for _ in range(self.rounds))
 
     def milliseconds(self, call: Callable[[], None]) -> float:
         """Mean time of a call among `repeats`."""
@@ -298,9 +328,9 @@ class HeadBenchmark:
         return {"sweep": found}
 
     def show(self, rows: list[dict]) -> None:
-        table = Table("variant", "visible", "of all", "forward ms", "both ms", "peak MiB")
+        table = Table("variant", "visible", "of all", "forward ms", "both ms", "GPU alone ms", "peak MiB")
         for row in rows:
-            numbers = [f"{row[key]:.3f}" if key in row else "-" for key in ("forward_ms", "both_ms")]
+            numbers = [f"{row[key]:.3f}" if row.get(key) else "-" for key in ("forward_ms", "both_ms", "gpu_ms")]
             peak = f"{row['peak_mib']:.0f}" if "peak_mib" in row else "-"
             table.add_row(row["variant"], f"{row['visible']:,}", row.get("share", "all"), *numbers, peak)
         Console().print(table)

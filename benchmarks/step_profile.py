@@ -50,7 +50,9 @@ class StepProfile:
     extent: float = 1.0
     """side of the cube that the splats fill, in scene units"""
     steps: int = 200
-    """steps in each timed stretch; the whole must stay below 500, where densification begins"""
+    """steps in each timed stretch"""
+    warm: int = 300
+    """steps before the first: as many as there are training images, whose first use costs more"""
     traced: int = 20
     """steps under torch's profiler"""
     rounds: int = 2
@@ -71,7 +73,7 @@ class StepProfile:
         """Train `method` on `count` splats and watch it."""
         label, _, options = method.partition("=")
         name = label.partition(":")[0]
-        warm, end = 50, 50 + 2 * self.steps + self.traced
+        warm, end = self.warm, self.warm + 2 * self.steps + self.traced
         args = [name, "--max-num-iterations", str(end + 1), "--vis", "tensorboard", "--steps-per-save", "1000000"]
         args += ["--steps-per-eval-image", "1000000", "--steps-per-eval-all-images", "1000000"]
         args += ["--logging.local-writer.enable", "False", "--logging.profiler", "none"]
