@@ -29,6 +29,7 @@ from nrfgs_ns.studies.express.targets import (
     Targets,
     fibonacci_sphere,
     from_btf,
+    materials_by_gloss,
     measured_image,
     measured_pixels,
     random_cap,
@@ -220,6 +221,50 @@ def test_linear_bound_is_the_energy_outside_the_principal_components():
     assert_close(linear_bound(targets, 3), psnr((values[3:] ** 2).sum() / rows.size))
 
 
+FLOOR = {"samples": 328, "directions": 200}
+
+
+@pytest.mark.parametrize("what", ["decaying", "degrees-4-and-5", "degree-5", "lobe", "grey-lobe"])
+def test_altered_targets_leave_harmonics_where_they_are(what):
+    plain = synthetic(0, **FLOOR)
+    altered = synthetic(0, **FLOOR, **plan.TARGET_CHANGES["synthetic"][what])
+    reached = [measure(least_squares(targets), targets)["train_psnr"] for targets in (plain, altered)]
+    # The altered ones have exactly the energy that `test_floor_...` expects of the plain ones within 0.4 dB at worst.
+    assert reached[1] == pytest.approx(reached[0], abs=0.4)
+    assert reached[1] == pytest.approx(psnr(models.residual_floor(4, 5, SYNTHETIC_DEVIATION)), abs=0.4)
+
+
+def test_altered_targets_have_the_dimensions_that_they_say():
+    def dimensions(**changes):
+        targets = synthetic(0, samples=150, directions=200, held_out=5, **changes)
+        rows = targets.colors.flatten(1).double()
+        values = torch.linalg.svdvals(rows - rows.mean(dim=0))
+        return int((values > 1e-4 * values[0]).sum())  # float32 colours: noise at 1e-7 of the largest
+
+    changes = plan.TARGET_CHANGES["synthetic"]
+    assert dimensions() == 3 * 36
+    assert dimensions(**changes["grey"]) == 36
+    assert dimensions(**changes["degree-5"]) == 3 * 11
+    assert dimensions(**changes["degrees-4-and-5"]) == 3 * 20
+    assert dimensions(**changes["factors-8"]) == 8
+    assert dimensions(**changes["grey-lobe"]) == 36  # few numbers describe a lobe, but no linear code knows
+
+
+def test_scattered_directions_are_neither_even_nor_the_held_out_ones():
+    targets = synthetic(0, samples=2, directions=50, held_out=50, scattered=True)
+    assert not torch.equal(targets.directions, fibonacci_sphere(50))
+    assert (targets.directions @ targets.held_out_directions.T).max() < 1 - 1e-6
+
+
+def test_variations_are_named_in_the_report():
+    spec, fit_config = plan.ModelSpec("field"), FitConfig()
+    for setup in ("synthetic", "pixels", "image"):
+        for cell in plan.variation_cells(setup, spec, fit_config, 0, {}):
+            assert cell.name == f"{setup}-vary-{cell.label}-seed0"
+            assert any(cell.label == f"{model}-{what}" for model in ("sh-lsq", "linear", "nrf", "nrf-more")
+                       for what in report.CHANGES if what)  # fmt: skip
+
+
 def test_psnr_pools_and_clamps():
     colors = torch.zeros(3, 2, 3)
     targets = Targets(fibonacci_sphere(2), colors, fibonacci_sphere(2), colors)
@@ -263,6 +308,19 @@ def test_measured_samples_are_fixed_by_their_seed(networks):
         assert first.colors.var(dim=1).max() > 0
 
 
+def test_materials_are_ranked_by_how_much_they_change(networks):
+    weights = networks.weights.clone()
+    weights[1] = 0.0
+    weights[1, -3:] = 0.2  # the last bias alone: the same BRDF everywhere
+    still = replace(networks, weights=weights)
+    assert materials_by_gloss(still, 0.0, 0.0).tolist() == [1]
+    assert materials_by_gloss(still, 0.0, 1.0).tolist() == [0, 1, 2]
+    assert 1 not in materials_by_gloss(still, 0.5, 1.0).tolist()
+    targets = measured_pixels(still, 0, samples=9, held_out=5, gloss=(0.0, 0.0))
+    # That material has no highlight: what changes is rounding.
+    assert targets.colors.var(dim=1).max() < 1e-9
+
+
 def test_photographs_hold_every_fifth_view_out():
     images = torch.arange(11.0)[:, None, None, None].expand(11, 6, 4, 3) / 20
     btf = Btf([(i, 0) for i in range(11)], fibonacci_sphere(11), images)
@@ -279,7 +337,7 @@ def test_photographs_hold_every_fifth_view_out():
 
 def test_deviation_over_seeds_is_the_samples(tmp_path):
     def record(seed, value):
-        cell = plan.main_cells("synthetic", "sh", plan.ModelSpec("harmonics"), FitConfig(), (seed,), {})[0]
+        cell = plan.main_cell("synthetic", "sh", plan.ModelSpec("harmonics"), FitConfig(), seed)
         return {"name": cell.name, "settings": json.loads(json.dumps(cell.settings())), "train_psnr": value} | {
             "parameters": 15_744,
             "machine": {},
@@ -287,7 +345,7 @@ def test_deviation_over_seeds_is_the_samples(tmp_path):
 
     summary = report.summarise([record(0, 20.0), record(1, 22.0), record(2, 24.0)])
     assert summary["table"][0]["train_psnr"] == {"mean": 22.0, "deviation": 2.0}
-    assert "| synthetic | SH degree 3, Adam | 15,744 | 22.00 ± 2.00 | - | 21.1 |" in report.markdown(summary)
+    assert "| synthetic | SH degree 3, Adam | 15,744 | 3 | 22.00 ± 2.00 | - | 21.1 |" in report.markdown(summary)
 
 
 def test_the_verb_measures_once_and_resumes(tmp_path):
@@ -334,7 +392,10 @@ def test_the_verb_runs_on_photographs(tmp_path):
     assert record["settings"]["source"] == {"kind": "photographs", "material": "wool", "light": [30, 0], "side": 12}
     assert (record["samples"], record["directions"], record["held_out_directions"]) == (144, 4, 2)
     assert record["parameters"] == 144 * 35 + 4227
-    assert not list((tmp_path / "out" / "runs").glob("pixels-vary-*directions*"))
+    # Photographs have the directions and the material that they have; how the field is fitted can vary.
+    varied = {path.stem for path in (tmp_path / "out" / "runs").glob("*-vary-*")}
+    assert "pixels-vary-nrf-whole-batch-seed0" in varied and "image-vary-nrf-four-times-passes-seed0" in varied
+    assert not [name for name in varied if "directions" in name or "material" in name or "matter" in name]
 
 
 @pytest.mark.gpu

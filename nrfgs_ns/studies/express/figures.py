@@ -11,13 +11,12 @@ from torch import Tensor
 
 from nrfgs_ns.studies.express.fit import Fitted
 from nrfgs_ns.studies.express.plan import Cell
+from nrfgs_ns.studies.express.report import EXACT, SETUPS
 from nrfgs_ns.studies.express.targets import CAP_DEGREES, Targets
 
 SHOWN = ("sh-lsq", "nrf")
 """Models in the pictures."""
 TITLES = ("truth", "SH degree 3", "its error x 3", "NRF", "its error x 3")
-EXACT = 60.0
-"""PSNR in dB from which a fit counts as exact and is left out of the plot."""
 PERCENTILES = (0.99, 0.9, 0.6)
 """Which samples: by rank of how much their colour changes with the direction."""
 ERROR_GAIN = 3.0
@@ -35,7 +34,7 @@ def keep_panel(cell: Cell, targets: Targets, fitted: Fitted, folder: Path) -> No
     """Keep what the picture needs of this fit, if it is one that is shown: colours at held-out directions."""
     if cell.group != "main" or cell.label not in SHOWN:
         return
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     if cell.setup == "image":
         directions, rows = targets.held_out_directions[:1], [slice(i, i + 2000) for i in range(0, len(targets), 2000)]
         truth = targets.held_out_colors[:, 0]
@@ -56,8 +55,8 @@ def to_bytes(colors: Tensor) -> np.ndarray:
     return (colors.clamp(0.0, 1.0) * 255.0).round().byte().cpu().numpy()
 
 
-def draw(records: list[dict[str, Any]], out: Path) -> list[Path]:
-    """Draw what the records allow.
+def draw(summary: dict[str, Any], out: Path) -> list[Path]:
+    """Draw what the summary and the panels in `out` allow.
 
     Returns:
         the pictures' paths.
@@ -67,8 +66,8 @@ def draw(records: list[dict[str, Any]], out: Path) -> list[Path]:
 
     matplotlib.use("Agg")
     paths = []
-    if any(record["settings"]["group"] == "sweep" for record in records):
-        paths.append(draw_sweep(records, out / "express-sweep.png"))
+    if summary["sweep"]:
+        paths.append(draw_sweep(summary, out / "express-sweep.png"))
     for name, sheet in (
         ("express-samples.png", samples_sheet(out / "panels")),
         ("express-image.jpg", image_sheet(out / "panels")),
@@ -79,15 +78,11 @@ def draw(records: list[dict[str, Any]], out: Path) -> list[Path]:
     return paths
 
 
-def draw_sweep(records: list[dict[str, Any]], path: Path) -> Path:
-    """PSNR against the number of parameters; held-out directions dashed."""
+def draw_sweep(summary: dict[str, Any], path: Path) -> Path:
+    """PSNR against the number of parameters, mean over seeds; held-out directions dashed."""
     import matplotlib.pyplot as plt
 
-    setups = [
-        setup
-        for setup in ("synthetic", "pixels")
-        if any(r["settings"]["group"] == "sweep" and r["settings"]["setup"] == setup for r in records)
-    ]
+    setups = [setup for setup in SETUPS if any(row["setup"] == setup for row in summary["sweep"])]
     figure, axes = plt.subplots(1, len(setups), figsize=(5.0 * len(setups), 3.8), squeeze=False)
     names = {
         "degree": "SH, degree 0 to 5 (least squares)",
@@ -96,21 +91,22 @@ def draw_sweep(records: list[dict[str, Any]], path: Path) -> Path:
         "bands": "NRF, bands K = 1 to 6",
     }
     for axis, setup in zip(axes[0], setups, strict=True):
-        mine = [record for record in records if record["settings"]["setup"] == setup]
-        seed = next(r["settings"]["seed"] for r in mine if r["settings"]["group"] == "sweep")
-        center = [r for r in mine if r["name"] == f"{setup}-nrf-seed{seed}"]
+        center = [row for row in summary["table"] if (row["setup"], row["model"]) == (setup, "nrf")]
         for colour, (key, name) in zip(("0.4", "C0", "C1", "C2"), names.items(), strict=True):
-            points = [r for r in mine if r["settings"]["group"] == "sweep" and r["settings"]["label"] == key]
+            points = [row for row in summary["sweep"] if (row["setup"], row["model"]) == (setup, key)]
             points += center if key != "degree" else []
-            points = sorted((r for r in points if r["train_psnr"] < EXACT), key=lambda r: r["parameters"])
-            sizes = [r["parameters"] for r in points]
-            axis.plot(sizes, [r["train_psnr"] for r in points], "o-", color=colour, ms=3, lw=1, label=name)
-            axis.plot(sizes, [r["held_out_psnr"] for r in points], "x--", color=colour, ms=4, lw=0.8)
+            points = [row for row in points if row["train_psnr"]["mean"] < EXACT]
+            points.sort(key=lambda row: row["parameters"])
+            sizes = [row["parameters"] for row in points]
+            train = [row["train_psnr"]["mean"] for row in points]
+            held_out = [row["held_out_psnr"]["mean"] for row in points]
+            axis.plot(sizes, train, "o-", color=colour, ms=3, lw=1, label=name)
+            axis.plot(sizes, held_out, "x--", color=colour, ms=4, lw=0.8)
         axis.set_ylim(bottom=15.0)
         axis.set_xscale("log")
         axis.set_xlabel("parameters")
         axis.set_ylabel("PSNR (dB)")
-        axis.set_title({"synthetic": "synthetic", "pixels": "measured, pixels"}[setup], fontsize=10)
+        axis.set_title(SETUPS[setup], fontsize=10)
         axis.grid(alpha=0.3)
     axes[0][0].legend(fontsize=7)
     figure.suptitle("solid: training directions, dashed: held-out directions", fontsize=9)

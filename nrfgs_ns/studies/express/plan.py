@@ -45,6 +45,29 @@ SAMPLE_RATES = ((0.01, 0.01), (0.03, 0.01), (0.1, 0.01), (0.3, 0.01))
 """The same for models that share nothing."""
 RATE_SEED = 1000
 """Seed of the targets on which rates are chosen: none that is reported."""
+DIRECTIONS = {f"directions-{count}": {"directions": count} for count in (24, 48, 192)}
+TARGET_CHANGES: dict[Setup, dict[str, dict[str, Any]]] = {
+    "synthetic": {
+        **DIRECTIONS,
+        "scattered": {"scattered": True},
+        "decaying": {"by_degree": tuple((1 + degree) ** -2.0 for degree in range(6))},
+        "degrees-4-and-5": {"by_degree": (0.0, 0.0, 0.0, 0.0, 1.0, 1.0)},
+        "degree-5": {"by_degree": (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)},
+        "grey": {"grey": True},
+        **{f"factors-{count}": {"factors": count} for count in (8, 16, 32, 64)},
+        "lobe": {"lobes": 1},
+        "grey-lobe": {"lobes": 1, "grey": True},
+    },
+    "pixels": {**DIRECTIONS, "matter": {"gloss": (0.0, 0.75)}},
+    "image": {
+        "small": {},
+        "matter": {"gloss": (0.0, 0.75)},
+        **{f"one-material-{rank:g}": {"gloss": (rank, rank)} for rank in (0.25, 0.5, 0.75)},
+    },
+}
+"""Set-up -> name -> arguments of the targets: what the paper's may have been, as far as it does not say."""
+LOW_DIMENSIONAL = ("degree-5", "grey", "factors-8", "grey-lobe")
+"""Targets that few numbers describe: fitted with more passes, too."""
 
 
 @dataclass(frozen=True)
@@ -144,58 +167,56 @@ def rate_cells(setup: Setup, label: str, spec: ModelSpec, fit: FitConfig, target
     ]
 
 
-def main_cells(
-    setup: Setup, label: str, spec: ModelSpec, fit: FitConfig, seeds: tuple[int, ...], targets
-) -> list[Cell]:
-    """One row of the table."""
-    return [Cell(f"{setup}-{label}-seed{seed}", "main", setup, label, seed, spec, fit, targets) for seed in seeds]
+def main_cell(setup: Setup, label: str, spec: ModelSpec, fit: FitConfig, seed: int) -> Cell:
+    """One seed of one row of the table."""
+    return Cell(f"{setup}-{label}-seed{seed}", "main", setup, label, seed, spec, fit)
 
 
-def reference_cells(setup: Setup, seeds: tuple[int, ...], targets: dict[str, Any]) -> list[Cell]:
+def reference_cells(setup: Setup, seed: int) -> list[Cell]:
     """Least squares, and the bound of linear codes: nothing iterates."""
-    sh = ModelSpec("harmonics")
     return [
-        *(Cell(f"{setup}-sh-lsq-seed{seed}", "main", setup, "sh-lsq", seed, sh, None, targets) for seed in seeds),
-        *(Cell(f"{setup}-linear-seed{seed}", "main", setup, "linear", seed, None, None, targets) for seed in seeds),
+        Cell(f"{setup}-sh-lsq-seed{seed}", "main", setup, "sh-lsq", seed, ModelSpec("harmonics"), None),
+        Cell(f"{setup}-linear-seed{seed}", "main", setup, "linear", seed, None, None),
     ]
 
 
-def variation_cells(setup: Setup, spec: ModelSpec, fit: FitConfig, seed: int, targets: dict[str, Any]) -> list[Cell]:
-    """The guesses about what differs from the paper: one thing at a time. For the image, only more passes."""
+def variation_cells(setup: Setup, spec: ModelSpec, fit: FitConfig, seed: int, size: dict[str, int]) -> list[Cell]:
+    """The guesses about what differs from the paper: one thing at a time, first in the fit, then in the targets.
 
-    def vary(what: str, spec: ModelSpec = spec, fit: FitConfig | None = fit, **others: Any) -> Cell:
-        return Cell(f"{setup}-vary-{what}", "vary", setup, what, seed, spec, fit, {**targets, **others})
+    Args:
+        setup, spec, fit, seed: what is varied.
+        size: arguments of all targets: the image is a smaller one.
+    """
 
-    more = vary("nrf-four-times-passes", fit=replace(fit, passes=4 * fit.passes))
-    if setup == "image":
-        return [more]
-    method = replace(fit, sample_lr=0.0025, shared_lr=0.001)
+    def vary(what: str, spec: ModelSpec | None, fit: FitConfig | None, **targets: Any) -> Cell:
+        return Cell(f"{setup}-vary-{what}-seed{seed}", "vary", setup, what, seed, spec, fit, {**size, **targets})
+
+    more = replace(fit, passes=4 * fit.passes)
     cells = [
-        more,
-        vary("nrf-quarter-passes", fit=replace(fit, passes=max(fit.passes // 4, 1))),
-        vary("nrf-method-rates", fit=method),
-        vary("nrf-zero-output", spec.but(zero_output=True)),
-        vary("nrf-whole-batch", fit=replace(fit, block=10**6)),
+        vary("nrf-four-times-passes", spec, more),
+        vary("nrf-quarter-passes", spec, replace(fit, passes=max(fit.passes // 4, 1))),
+        vary("nrf-method-rates", spec, replace(fit, sample_lr=0.0025, shared_lr=0.001)),
+        vary("nrf-zero-output", spec.but(zero_output=True), fit),
+        vary("nrf-wide-latents", spec.but(latent_std=1.0), fit),
     ]
-    changes = [(f"directions-{count}", {"directions": count}) for count in (24, 48, 192)]
-    if setup == "synthetic":
-        changes += [("grey", {"grey": True})]
-        changes += [(f"factors-{count}", {"factors": count}) for count in (8, 16, 32, 64)]
-    for what, others in changes:
-        cells.append(vary(f"sh-lsq-{what}", ModelSpec("harmonics"), None, **others))
-        cells.append(vary(f"nrf-{what}", **others))
+    if setup != "image":
+        cells.append(vary("nrf-whole-batch", spec, replace(fit, block=10**6)))
+    for what, targets in TARGET_CHANGES[setup].items():
+        cells.append(vary(f"sh-lsq-{what}", ModelSpec("harmonics"), None, **targets))
+        cells.append(vary(f"linear-{what}", None, None, **targets))
+        cells.append(vary(f"nrf-{what}", spec, fit, **targets))
+        if what in LOW_DIMENSIONAL:
+            cells.append(vary(f"nrf-more-{what}", spec, more, **targets))
     return cells
 
 
-def sweep_cells(setup: Setup, spec: ModelSpec, fit: FitConfig, seed: int, targets: dict[str, Any]) -> list[Cell]:
+def sweep_cells(setup: Setup, spec: ModelSpec, fit: FitConfig, seed: int) -> list[Cell]:
     """Sizes of the field, one at a time, and degrees of the harmonics."""
+
+    def cell(key: str, size: int, spec: ModelSpec, fit: FitConfig | None) -> Cell:
+        return Cell(f"{setup}-sweep-{key}-{size}-seed{seed}", "sweep", setup, key, seed, spec, fit)
+
     sizes = [("latent_dim", size) for size in (4, 8, 16)]
     sizes += [("width", size) for size in (16, 32, 128)] + [("bands", size) for size in (1, 2, 3, 5, 6)]
-    cells = [
-        Cell(f"{setup}-sweep-{key}-{size}", "sweep", setup, key, seed, spec.but(**{key: size}), fit, targets)
-        for key, size in sizes
-    ]
-    for degree in range(6):
-        model = ModelSpec("harmonics", {"degree": degree})
-        cells.append(Cell(f"{setup}-sweep-degree-{degree}", "sweep", setup, "degree", seed, model, None, targets))
-    return cells
+    cells = [cell(key, size, spec.but(**{key: size}), fit) for key, size in sizes]
+    return cells + [cell("degree", degree, ModelSpec("harmonics", {"degree": degree}), None) for degree in range(6)]

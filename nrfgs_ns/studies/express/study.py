@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.studies.files import write_whole
 
 SETUPS = ("synthetic", "pixels", "image")
 MIN_SAMPLES = 120
@@ -49,7 +50,7 @@ class Express:
     passes: int = 500
     """how often a sample is seen"""
     image_passes: int = 12
-    """the same for the image; so few leave every model short of its optimum, but take an hour on two CPU cores"""
+    """the same for the image; so few leave every model short of its optimum, but each pass takes seconds"""
     device: Literal["cpu", "cuda"] = "cpu"
     """where to fit"""
     quick: bool = False
@@ -65,22 +66,20 @@ class Express:
             self.seeds, self.image_seeds = self.seeds[:1], self.image_seeds[:1]
         screen = Console()
         setups = self.checked_setups(screen)
-        (self.out / "runs").mkdir(parents=True, exist_ok=True)
         source = TargetSource(self)
         columns = TextColumn("{task.description:<44}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=screen) as progress:
             for setup in setups:
-                counts = plan.models(self.num_samples(setup, source))
-                for label, spec in counts.items():
-                    count = spec.build().count(self.num_samples(setup, source))
+                num_samples = self.num_samples(setup, source)
+                for label, spec in plan.models(num_samples).items():
+                    count = spec.build().count(num_samples)
                     progress.console.print(f"[dim]{setup}: {label:<12} {count:>10,} parameters", highlight=False)
                 self.run_setup(setup, source, progress)
-        records = read_records(self.out / "runs")
-        summary = report.summarise(records)
-        (self.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-        (self.out / "table.md").write_text(report.markdown(summary))
+        summary = report.summarise(read_records(self.out / "runs"))
+        write_whole(self.out / "summary.json", json.dumps(summary, indent=1) + "\n")
+        write_whole(self.out / "table.md", report.markdown(summary))
         screen.print(report.table(summary))
-        for path in figures.draw(records, self.out):
+        for path in figures.draw(summary, self.out):
             screen.print(f"Picture: {path}")
 
     def checked_setups(self, screen: Console) -> list[str]:
@@ -128,7 +127,8 @@ class Express:
         num_samples = self.num_samples(setup, source)
         fit = FitConfig(passes=self.image_passes, block=500) if image else FitConfig(passes=self.passes)
         specs = plan.models(num_samples)
-        # Rates are chosen on other data; for the image on a smaller one, with as many steps in a pass.
+        # Rates are chosen on other data. For the image on a smaller one, with as many steps in a pass, and variations
+        # are tried on such a one, too.
         trial, small = fit, {}
         if image:
             specs = {label: spec for label, spec in specs.items() if label in plan.IMAGE_MODELS}
@@ -140,16 +140,19 @@ class Express:
             records = [self.run_cell(cell, source, progress) for cell in cells]
             best = max(records, key=lambda record: record["train_psnr"])["settings"]["fit"]
             chosen[label] = replace(fit, sample_lr=best["sample_lr"], shared_lr=best["shared_lr"])
-        cells = plan.reference_cells(setup, seeds, {})
-        for label, spec in specs.items():
-            cells += plan.main_cells(setup, label, spec, chosen[label], seeds, {})
-        variations = plan.variation_cells(setup, specs["nrf"], chosen["nrf"], seeds[0], {})
-        # Photographs have the directions that they have.
-        cells += [cell for cell in variations if not (cell.targets and self.btf is not None and setup == "pixels")]
-        if not image:
-            cells += plan.sweep_cells(setup, specs["nrf"], chosen["nrf"], seeds[0], {})
+        cells = []
+        for seed in seeds:
+            cells += plan.reference_cells(setup, seed)
+            cells += [plan.main_cell(setup, label, spec, chosen[label], seed) for label, spec in specs.items()]
+        varied = replace(chosen["nrf"], block=trial.block)
+        for seed in seeds:
+            cells += plan.variation_cells(setup, specs["nrf"], varied, seed, small)
+            if not image:
+                cells += plan.sweep_cells(setup, specs["nrf"], chosen["nrf"], seed)
         for cell in cells:
-            self.run_cell(cell, source, progress)
+            # Photographs have the directions and the material that they have.
+            if self.btf is None or setup == "synthetic" or not set(cell.targets) - {"side"}:
+                self.run_cell(cell, source, progress)
 
     def run_cell(self, cell: Any, source: "TargetSource", progress: Progress) -> dict[str, Any]:
         """The cell's record: read if it is there with the same settings, else measured and written."""
@@ -170,10 +173,7 @@ class Express:
         record = {"settings": settings, **record, "machine": machine(self.device)}
         if fitted is not None:
             figures.keep_panel(cell, targets, fitted, self.out / "panels")
-        # Renamed when complete, so that an interruption leaves no half record.
-        unfinished = path.with_suffix(".tmp")
-        unfinished.write_text(json.dumps(record, indent=1) + "\n")
-        os.replace(unfinished, path)
+        write_whole(path, json.dumps(record, indent=1) + "\n")
         return record
 
 

@@ -87,9 +87,15 @@ def synthetic(
     degree: int = 5,
     grey: bool = False,
     factors: int | None = None,
+    by_degree: tuple[float, ...] | None = None,
+    lobes: int | None = None,
+    scattered: bool = False,
     deviation: float = SYNTHETIC_DEVIATION,
 ) -> Targets:
     """Random harmonics: 1/2 + sum_j k_j Y_j(d), k ~ N(0, deviation^2), for each sample and channel.
+
+    With `by_degree` or `lobes` the coefficients are scaled together until those of degrees 4 and 5 have that deviation:
+    harmonics of degree 3 do as well as before, and what changes is how much the other models can make of the rest.
 
     Args:
         seed: determines coefficients and held-out directions.
@@ -99,17 +105,33 @@ def synthetic(
         grey: the three channels share their coefficients.
         factors: the coefficients of all samples and channels lie in a random subspace of this many dimensions, with
             the same deviation. None: they are independent.
+        by_degree: factor on the deviation of each degree from 0 on. None: 1 for all.
+        lobes: each sample is a sum of so many impulses in random directions, of random height for each channel, cut
+            off above `degree`. None: no lobes, random coefficients.
+        scattered: training directions are random, as the held-out ones.
         deviation: of each coefficient.
     """
     generator = torch.Generator().manual_seed(seed)
     size = (num_bases(degree), 1 if grey else 3)
-    if factors is None:
+    if lobes is not None:
+        axes = random_cap(samples * lobes, 180.0, generator)
+        heights = torch.rand(samples, lobes, size[1], generator=generator)
+        coefficients = torch.einsum("slb,slc->sbc", sh_bases(degree, axes).unflatten(0, (samples, lobes)), heights)
+    elif factors is None:
         coefficients = torch.randn(samples, *size, generator=generator)
     else:
         mixing = torch.randn(factors, *size, generator=generator) / math.sqrt(factors)
         coefficients = torch.einsum("sf,fbc->sbc", torch.randn(samples, factors, generator=generator), mixing)
+    if by_degree is not None:
+        coefficients = (
+            coefficients * torch.tensor(by_degree).repeat_interleave(2 * torch.arange(degree + 1) + 1)[:, None]
+        )
+    if by_degree is not None or lobes is not None:
+        coefficients = coefficients / coefficients[:, num_bases(3) :].square().mean().sqrt()
     coefficients = deviation * coefficients.expand(-1, -1, 3)
     train, test = fibonacci_sphere(directions), random_cap(held_out, 180.0, generator)
+    if scattered:
+        train = random_cap(directions, 180.0, generator)
 
     def colors(at: Tensor) -> Tensor:
         return 0.5 + torch.einsum("db,sbc->sdc", sh_bases(degree, at), coefficients)
@@ -118,7 +140,12 @@ def synthetic(
 
 
 def measured_pixels(
-    networks: BrdfNetworks, seed: int, samples: int = 328, directions: int | None = None, held_out: int = 256
+    networks: BrdfNetworks,
+    seed: int,
+    samples: int = 328,
+    directions: int | None = None,
+    held_out: int = 256,
+    gloss: tuple[float, float] = (0.0, 1.0),
 ) -> Targets:
     """Unrelated samples: each a random measured material with a random normal, under one light.
 
@@ -127,9 +154,11 @@ def measured_pixels(
         seed: determines materials, normals (uniform within 15 degrees of z) and held-out directions.
         samples, held_out: how many. Held-out directions are random within 75 degrees of z.
         directions: how many training directions, evenly spread within 75 degrees. None: UBO2003's 81.
+        gloss: which materials are used, as for `materials_by_gloss`.
     """
     generator = torch.Generator().manual_seed(seed)
-    materials = torch.randint(len(networks), (samples,), generator=generator)
+    allowed = materials_by_gloss(networks, *gloss)
+    materials = allowed[torch.randint(len(allowed), (samples,), generator=generator)]
     normals = random_cap(samples, TILT_DEGREES, generator)
     surfaces = Surfaces(materials[:, None], torch.ones(samples, 1), normals, torch.ones(samples))
     train = ubo_views() if directions is None else fibonacci_sphere(directions, CAP_DEGREES)
@@ -144,6 +173,7 @@ def measured_image(
     cells: int = 60,
     directions: int | None = None,
     held_out: int = 64,
+    gloss: tuple[float, float] = (0.0, 1.0),
 ) -> Targets:
     """A picture of neighbouring samples: patches of measured materials on a bumpy surface, under one light.
 
@@ -156,11 +186,12 @@ def measured_image(
         seed: determines everything random.
         side: pixels along an edge; side^2 samples, row by row.
         cells: materials' patches.
-        directions, held_out: as in `measured_pixels`.
+        directions, held_out, gloss: as in `measured_pixels`.
     """
     generator = torch.Generator().manual_seed(seed)
     centers = torch.rand(cells, 2, generator=generator)
-    materials = torch.randint(len(networks), (cells,), generator=generator)
+    allowed = materials_by_gloss(networks, *gloss)
+    materials = allowed[torch.randint(len(allowed), (cells,), generator=generator)]
     axis = (torch.arange(side) + 0.5) / side
     points = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1).view(-1, 2)
     near, which = torch.cdist(points, centers).topk(2, dim=-1, largest=False)
@@ -175,6 +206,23 @@ def measured_image(
     train = ubo_views() if directions is None else fibonacci_sphere(directions, CAP_DEGREES)
     test = random_cap(held_out, CAP_DEGREES, generator)
     return Targets(train, shade(networks, surfaces, train), test, shade(networks, surfaces, test))
+
+
+def materials_by_gloss(networks: BrdfNetworks, least: float, most: float) -> Tensor:
+    """Indices of the materials between two quantiles of how much their colour changes with the view.
+
+    Args:
+        networks: the materials.
+        least, most: quantiles in [0, 1]; everything for 0 and 1, a single material where they are equal.
+
+    Returns:
+        indices, increasing.
+    """
+    count = len(networks)
+    flat = torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3)
+    surfaces = Surfaces(torch.arange(count)[:, None], torch.ones(count, 1), flat, torch.ones(count))
+    order = shade(networks, surfaces, ubo_views()).var(dim=1).sum(-1).argsort()
+    return order[round(least * (count - 1)) : round(most * (count - 1)) + 1].sort().values
 
 
 def smooth_noise(side: int, knots: int, generator: torch.Generator) -> Tensor:
