@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO_ARGS ?=
 
-.PHONY: demo test test-slow lint clean
+.PHONY: demo test test-slow test-browser lint clean
 
 demo: $(VENV)/.installed  ## make a scene, train NRF and SH on it, compare them
 	$(BIN)/nrfgs demo $(DEMO_ARGS)
@@ -14,6 +14,10 @@ test: $(VENV)/.installed  ## the default test suite
 
 test-slow: $(VENV)/.installed  ## real training runs
 	$(BIN)/python -m pytest -m slow
+
+test-browser: $(VENV)/.installed  ## the viewer in a headless Chromium, which must be on the path
+	$(BIN)/pip install --quiet --constraint requirements.lock --editable '.[browser]'
+	$(BIN)/python -m pytest -m browser
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check . && $(BIN)/ruff format --check .
