@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The photographs: found, opened once, turned upright, and the frames of a video."""
+
+import hashlib
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from PIL import ExifTags, Image, ImageOps
+
+from nrfgs_ns.errors import InputError
+
+PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+"""Suffixes of photographs, in any case."""
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+"""Suffixes of videos, in any case."""
+KEPT = (".jpg", ".jpeg", ".png")
+"""Formats that are used as they are; the others become PNG."""
+FEWEST = 3
+"""Photographs from which a scene can be reconstructed at all."""
+SHARPNESS_WIDTH = 320
+"""Frames are shrunk to this width before their sharpness is compared, pixels: motion blur counts, not noise."""
+UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+"""What PIL raises for files that are damaged, or no images at all."""
+
+Advance = Callable[[], None]
+
+
+def find_inputs(source: Path) -> list[Path]:
+    """The photographs of a folder by sorted name, or a video as a list of one.
+
+    Raises:
+        InputError: there is nothing to be used, or too little.
+    """
+    if source.is_file():
+        if source.suffix.lower() in VIDEOS:
+            return [source]
+        raise InputError(f"{source} is neither a folder of photographs nor a video ({', '.join(VIDEOS)}).")
+    if not source.is_dir():
+        raise InputError(f"{source}: no such folder or video. Check the path.")
+    files = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
+    photos = [path for path in files if path.suffix.lower() in PHOTOS]
+    if not photos:
+        raise InputError(f"{source} holds no photographs ({', '.join(PHOTOS)}). {_nearby(source, files)}")
+    if len(photos) < FEWEST:
+        raise InputError(
+            f"{source} holds {len(photos)} photographs; at least {FEWEST} are needed, better 30 or more. Take "
+            "them from different places, each seeing most of what the one before it sees."
+        )
+    return photos
+
+
+def _nearby(source: Path, files: list[Path]) -> str:
+    """What to do about a folder without photographs."""
+    if any(path.suffix.lower() in (".heic", ".heif") for path in files):
+        return "Convert the HEIC files to JPEG first (phones can export JPEG)."
+    if any(path.suffix.lower() in VIDEOS for path in files):
+        return "It holds a video: name that file itself."
+    if any(path.is_dir() for path in source.iterdir()):
+        return "Name the subfolder that has them."
+    return "Convert other formats to JPEG or PNG."
+
+
+def digest(paths: list[Path]) -> str:
+    """SHA-256 over names and contents."""
+    total = hashlib.sha256()
+    for path in paths:
+        total.update(path.name.encode())
+        with path.open("rb") as file:
+            for block in iter(lambda: file.read(1 << 20), b""):
+                total.update(block)
+    return total.hexdigest()
+
+
+def stored_names(photos: list[Path]) -> list[str]:
+    """File names in the scene, in order: all different, and without blanks, which end names in COLMAP's lists."""
+    names: list[str] = []
+    for index, path in enumerate(photos):
+        suffix = path.suffix.lower() if path.suffix.lower() in KEPT else ".png"
+        name = re.sub(r"[^\w.-]", "_", path.stem) + suffix
+        names.append(name if name not in names else f"{index:05d}_{name}")
+    return names
+
+
+def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
+    """Copy photographs into a folder, decoding each once; those that are rotated by EXIF are turned upright.
+
+    Raises:
+        InputError: naming the file that cannot be decoded.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, name in zip(photos, stored_names(photos), strict=True):
+        target = folder / name
+        if not target.exists():
+            aside = folder.with_name("photo" + target.suffix)  # an interrupted copy must not look like a whole one
+            try:
+                with Image.open(path) as image:
+                    _store(image, path, aside)
+            except UNREADABLE as error:
+                raise InputError(f"{path} cannot be read as an image ({error}). Restore or remove it.") from error
+            os.replace(aside, target)
+        advance()
+
+
+def _store(image: Image.Image, path: Path, target: Path) -> None:
+    """Write one photograph: as it is if it can be, else upright in 8-bit RGB, JPEG as JPEG and the rest as PNG."""
+    if image.mode[0] in "IF":
+        raise InputError(f"{path} has more than 8 bits per channel (mode {image.mode}). Convert it to 8 bits.")
+    image.load()
+    upright = image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+    if upright and image.mode in ("RGB", "L") and path.suffix.lower() in KEPT:
+        shutil.copyfile(path, target)
+        return
+    turned = ImageOps.exif_transpose(image)
+    if turned.mode in ("RGBA", "LA", "PA") or "transparency" in turned.info:  # nothing is behind a cut-out object
+        turned = Image.alpha_composite(Image.new("RGBA", turned.size, "white"), turned.convert("RGBA"))
+    exif = turned.getexif().tobytes()  # has the focal length, and no orientation any more
+    turned.convert("RGB").save(target, quality=97, subsampling=0, exif=exif)
+
+
+def same_camera(folder: Path, names: list[str]) -> bool:
+    """Whether all photographs have one size, and one camera model and focal length as far as EXIF says."""
+    seen = set()
+    for name in names:
+        with Image.open(folder / name) as image:
+            exif = image.getexif()
+            lens = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
+            seen.add((image.size, exif.get(ExifTags.Base.Model), None if lens is None else round(float(lens), 2)))
+    return len(seen) == 1
+
+
+def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:
+    """Write the sharpest frame of each of `frames` equal pieces of a video as JPEG, frame_00000.jpg and so on.
+
+    Sharpness is the variance of the Laplacian.
+
+    Raises:
+        InputError: OpenCV is not there, or cannot decode the file, or there are too few frames.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise InputError(
+            f"{video}: reading a video needs OpenCV, which cannot be imported ({error}). Run `pip install "
+            "opencv-python-headless`, or extract frames with another program and name their folder."
+        ) from error
+    reader = cv2.VideoCapture(str(video))
+    try:
+        total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+        if total < FEWEST:
+            raise InputError(
+                f"{video}: OpenCV finds {max(total, 0)} frames in it. Convert it to MP4 (H.264), or extract frames "
+                "with another program and name their folder."
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        frames = min(frames, total)
+        best, piece, written = (-1.0, None), 0, 0
+        for index in range(total + 1):
+            found, frame = reader.read() if index < total else (False, None)
+            if not found or index * frames // total != piece:
+                if best[1] is not None:
+                    cv2.imwrite(str(folder / f"frame_{written:05d}.jpg"), best[1], [cv2.IMWRITE_JPEG_QUALITY, 97])
+                    written += 1
+                    advance()
+                best, piece = (-1.0, None), index * frames // total
+            if not found:
+                break
+            height = max(round(frame.shape[0] * SHARPNESS_WIDTH / frame.shape[1]), 1)
+            small = cv2.resize(frame, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA)
+            sharpness = cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var()
+            if sharpness > best[0]:
+                best = sharpness, frame
+    finally:
+        reader.release()
+    if written < FEWEST:
+        raise InputError(f"{video}: only {written} frames could be decoded. Convert it to MP4 (H.264).")

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The posed scene that nerfstudio reads.
+
+<out>/images/NAME            undistorted photographs; images_2, images_4, images_8 at a half, a quarter, an eighth
+<out>/transforms.json        pinhole cameras (OpenGL camera-to-world), split, name of the point cloud
+<out>/sparse.ply             the reconstruction's points and colours, in the same world
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from nrfgs_ns.prepare.structure import colmap
+from nrfgs_ns.studies.files import write_whole
+
+DOWNSCALES = (2, 4, 8)
+"""nerfstudio looks for these copies; it takes the largest whose sides are at most 1600 pixels."""
+TEST_EVERY = 8
+"""Every eighth photograph by sorted name, beginning with the first, is for testing."""
+
+
+def write_scene(undistorted: Path, out: Path, advance: Callable[[], None]) -> None:
+    """Write a scene from an undistorted COLMAP model.
+
+    Args:
+        undistorted: has images/ and sparse/; its images are linked.
+        advance: called for each photograph.
+    """
+    model = colmap().Reconstruction(undistorted / "sparse")
+    images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
+    for folder in ("images", *(f"images_{factor}" for factor in DOWNSCALES)):
+        shutil.rmtree(out / folder, ignore_errors=True)
+        (out / folder).mkdir(parents=True)
+    for image in images:
+        source = undistorted / "images" / image.name
+        with Image.open(source) as picture:
+            picture = picture.convert("RGB")
+        for factor in DOWNSCALES:
+            size = max(picture.width // factor, 1), max(picture.height // factor, 1)  # as nerfstudio rounds its cameras
+            picture.resize(size, Image.Resampling.LANCZOS).save(out / f"images_{factor}" / image.name, quality=95)
+        try:
+            os.link(source, out / "images" / image.name)
+        except OSError:  # a file system without hard links
+            shutil.copyfile(source, out / "images" / image.name)
+        advance()
+    _write_points(model, out / "sparse.ply")
+    write_whole(out / "transforms.json", json.dumps(transforms(model, images), indent=1) + "\n")
+
+
+def transforms(model: Any, images: list[Any]) -> dict[str, Any]:
+    """The content of transforms.json for images sorted by name. Intrinsics that all share stand at the top."""
+    cameras = [_intrinsics(model.cameras[image.camera_id]) for image in images]
+    shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
+    names = [f"images/{image.name}" for image in images]
+    test = names[::TEST_EVERY]
+    train = [name for name in names if name not in set(test)]
+    return {
+        "camera_model": "OPENCV",
+        **shared,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "ply_file_path": "sparse.ply",
+        "train_filenames": train,
+        "val_filenames": test,
+        "test_filenames": test,
+        "frames": [
+            {"file_path": name, **({} if shared else camera), "transform_matrix": camera_to_world(image).tolist()}
+            for name, camera, image in zip(names, cameras, images, strict=True)
+        ],
+    }
+
+
+def camera_to_world(image: Any) -> np.ndarray:
+    """The pose [4, 4] of a registered image, with y up and z backwards (OpenGL) as nerfstudio has it."""
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().inverse().matrix()
+    pose[:3, 1:3] *= -1.0
+    return pose
+
+
+def _intrinsics(camera: Any) -> dict[str, Any]:
+    """Of a PINHOLE camera, in pixels; the centre of the first pixel is (0.5, 0.5) for COLMAP and nerfstudio alike."""
+    fl_x, fl_y, cx, cy = (float(value) for value in camera.params)
+    return {"w": camera.width, "h": camera.height, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
+
+
+def _write_points(model: Any, path: Path) -> None:
+    fields = [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
+    points = list(model.points3D.values())
+    vertices = np.empty(len(points), dtype=fields)
+    xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+    for column, (position, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        vertices[position], vertices[colour] = xyz[:, column], rgb[:, column]
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
