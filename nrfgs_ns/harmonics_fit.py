@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Any appearance head as spherical harmonics of degree 3, the only view dependence that a 3DGS file can hold.
+
+Training view v sees splat i from the unit direction d_v with the colour y_v that the head gives it there. How much of
+the picture it is, is the weight
+
+    w_v = sum over pixels of alpha T,
+
+the splat's own share of each pixel times the light that reaches it: exactly what the rasterizer multiplies its colour
+with, so it comes from the rasterizer's derivative with respect to that colour. With base colour c, harmonics Y(d) (16)
+and coefficients k (16 for each channel), which start from the base colour, k = k_c + delta,
+
+    minimise over delta    sum_v (n w_v / W) |y_v - c - Y(d_v) delta|^2 + strength |delta|^2,
+
+    W = sum_v w_v,    n = W^2 / sum_v w_v^2.
+
+n is the number of equal views that would tell as much (Kish's effective sample size), so the data term counts views,
+and `strength` is in views too: seen once, a splat moves 16 / (4 pi) / (16 / (4 pi) + strength) of the way from its base
+colour to what was seen; never seen, it keeps its base colour. In Bayes' terms strength = (variance of what degree 3
+cannot show) / (variance of a coefficient), and the right one depends on the scene. It is not set but found: every
+eighth view is held out, the others are fitted with each of `STRENGTHS`, and the one is taken that predicts the held-out
+colours, weighted as above, with the least squared error. All views are then fitted with it. For a head that is
+harmonics already the smallest strength wins and the fit is exact to 1e-8 of the coefficients.
+
+Opacity is the mean of the head's, with the weights w_v.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+
+from nrfgs_ns.appearance.head import base_colors
+from nrfgs_ns.appearance.spherical_harmonics import num_bases, sh_bases
+from nrfgs_ns.rasterizer import Projection, composite
+
+DEGREE = 3
+"""Degree of the harmonics in a 3DGS file."""
+BASES = num_bases(DEGREE)
+STRENGTHS = tuple(10.0**power for power in range(-8, 3))
+"""Ridges to choose from, in views. The lowest is far above float64's rounding, the highest leaves the base colour."""
+LONE_STRENGTH = 1.0
+"""Ridge where no view can be held out, in views: the base colour counts like one view."""
+HOLD_OUT_EVERY = 8
+"""Every eighth view is held out while the strength is chosen, as in the split into training and test images."""
+TUNING_SPLATS = 1 << 14
+"""Splats, evenly spread over the table, on which the strength is chosen: enough for a sum, and 60 MB."""
+LONGEST_SIDE = 1600
+"""Views are halved until no side is longer, pixels: nerfstudio does that to its training images by default."""
+SPLATS_AT_ONCE = 1 << 20
+"""Splats whose sums are held in memory, at 1.6 GB; the views are rendered again for the next as many."""
+ROWS_AT_ONCE = 1 << 15
+"""Rows of a view, or splats of a solution, that are worked on together: a few hundred MB."""
+OPAQUE = 1.0 - 1e-6
+"""Largest opacity that is written. Its logit is finite; the rasterizer caps alpha at 0.999."""
+
+
+class PlainSplats(NamedTuple):
+    """N splats as a 3DGS file holds them. The names are those of the model's tables."""
+
+    means: Tensor
+    """[N, 3], world units"""
+    quats: Tensor
+    """rotations (w, x, y, z) of unit length; NaN where there was none. [N, 4]"""
+    scales: Tensor
+    """logarithms of the standard deviations. [N, 3]"""
+    opacities: Tensor
+    """logits. [N, 1]"""
+    features_dc: Tensor
+    """coefficients of the constant harmonic: its colour is 1/2 + SH_C0 features_dc. [N, 3]"""
+    features_rest: Tensor
+    """coefficients of degree 1 to 3. [N, 15, 3]"""
+
+
+class Fit(NamedTuple):
+    """Splats with fitted harmonics, and how the fit was made."""
+
+    splats: PlainSplats
+    exact: bool
+    """nothing was fitted: the head is harmonics"""
+    strength: float | None
+    """the chosen ridge, in views; None if exact"""
+    views: int
+    """training views that were looked through"""
+    unseen: int
+    """splats that no training view sees: they have their base colour and opacity"""
+
+
+class Observations(NamedTuple):
+    """What one view tells of M splats."""
+
+    rows: Tensor
+    """of the table, ascending. [M]"""
+    weights: Tensor
+    """w of the module's docstring, pixels, > 0. [M]"""
+    bases: Tensor
+    """harmonics of the direction from camera to splat. [M, 16]"""
+    residuals: Tensor
+    """the head's colour minus the base colour. [M, 3]"""
+    opacities: Tensor
+    """the head's opacity. [M]"""
+
+    def where(self, keep: Tensor, rows: Tensor) -> "Observations":
+        """Those with `keep` [M] True, for other rows [M] of another table."""
+        return Observations(rows[keep], *(value[keep] for value in self[1:]))
+
+
+class Moments:
+    """Weighted sums over views from which the fit of `count` splats follows, in float64.
+
+    The gram matrix of directions in a narrow cone is nearly singular: in float32 its rounding would have to be covered
+    by a ridge of 1e-6 views, which is 1e-3 of the coefficients in the picture.
+    """
+
+    def __init__(self, count: int, device: torch.device):
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(count, *shape, dtype=torch.float64, device=device)
+
+        self.upper = torch.triu_indices(BASES, BASES, device=device)
+        self.gram = zeros(self.upper.shape[1])  # sum w Y_a Y_b for a <= b
+        self.target = zeros(BASES, 3)  # sum w Y residual
+        self.power = zeros()  # sum w |residual|^2
+        self.weight = zeros()
+        self.weight_squared = zeros()
+        self.opacity = zeros()  # sum w opacity
+
+    def add(self, seen: Observations) -> None:
+        """Add a view. No row may occur twice in it."""
+        for first in range(0, len(seen.rows), ROWS_AT_ONCE):
+            part = Observations(*(value[first : first + ROWS_AT_ONCE] for value in seen))
+            weights, bases, residuals, opacities = (value.double() for value in part[1:])
+            weighted = weights[:, None] * bases
+            self.gram.index_add_(0, part.rows, weighted[:, self.upper[0]] * bases[:, self.upper[1]])
+            self.target.index_add_(0, part.rows, weighted[:, :, None] * residuals[:, None, :])
+            self.power.index_add_(0, part.rows, weights * residuals.square().sum(dim=-1))
+            self.weight.index_add_(0, part.rows, weights)
+            self.weight_squared.index_add_(0, part.rows, weights.square())
+            self.opacity.index_add_(0, part.rows, weights * opacities)
+
+    def full_gram(self, rows: slice) -> Tensor:
+        """Both triangles of some splats' gram matrices, [count, 16, 16]."""
+        gram = self.gram[rows]
+        full = gram.new_zeros(len(gram), BASES, BASES)
+        full[:, self.upper[0], self.upper[1]] = gram
+        full[:, self.upper[1], self.upper[0]] = gram
+        return full
+
+    def solve(self, strength: float) -> Tensor:
+        """delta of the module's docstring, [count, 16, 3]; 0 for what was not seen."""
+        views_per_weight = self.weight / self.weight_squared.clamp_min(torch.finfo(torch.float64).tiny)  # n / W
+        ridge = strength * torch.eye(BASES, dtype=torch.float64, device=self.gram.device)
+        solution = torch.empty_like(self.target)
+        for first in range(0, len(solution), ROWS_AT_ONCE):
+            rows = slice(first, first + ROWS_AT_ONCE)
+            scale = views_per_weight[rows, None, None]
+            factor = torch.linalg.cholesky(scale * self.full_gram(rows) + ridge)
+            solution[rows] = torch.cholesky_solve(scale * self.target[rows], factor)
+        return solution
+
+    def squared_error(self, delta: Tensor) -> float:
+        """sum over splats and views of w |residual - Y delta|^2, for delta [count, 16, 3]."""
+        quadratic = (delta * (self.full_gram(slice(None)) @ delta)).sum()
+        return (self.power.sum() - 2.0 * (delta * self.target).sum() + quadratic).item()
+
+
+@torch.no_grad()
+def fit_harmonics(model, cameras: Cameras) -> Fit:
+    """Fit harmonics of degree 3 and one opacity to each splat of a model.
+
+    Args:
+        model: an NrfgsModel in evaluation mode.
+        cameras: the training cameras, [V].
+
+    Returns:
+        On the model's device. A head that is harmonics is not fitted: its coefficients are handed through, with zeros
+        for the degrees that it does not have.
+    """
+    splats = {name: value.detach() for name, value in model.gauss_params.items()}
+    plain = PlainSplats(
+        means=splats["means"],
+        quats=splats["quats"] / splats["quats"].norm(dim=-1, keepdim=True),
+        scales=splats["scales"],
+        opacities=splats["opacities"],
+        features_dc=splats["features_dc"],
+        features_rest=splats["features_dc"].new_zeros(len(splats["means"]), BASES - 1, 3),
+    )
+    if model.head.is_harmonics:
+        rest = splats["features_rest"]
+        plain.features_rest[:, : rest.shape[1]] = rest
+        return Fit(plain, exact=True, strength=None, views=0, unseen=0)
+
+    count = len(plain.means)
+    plain = plain._replace(opacities=plain.opacities.clone(), features_dc=plain.features_dc.clone())
+    stride = -(-count // TUNING_SPLATS)
+    kept, held_out = (Moments(-(-count // stride), model.device) for _ in range(2))
+    hold_out_every = min(HOLD_OUT_EVERY, len(cameras))
+    groups = range(0, count, SPLATS_AT_ONCE)
+    unseen, strength = 0, LONE_STRENGTH
+    columns = TextColumn("Fitting harmonics"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=CONSOLE, transient=True) as progress:
+        task = progress.add_task("", total=len(groups) * len(cameras))
+        for first in groups:
+            last = min(first + SPLATS_AT_ONCE, count)
+            moments = Moments(last - first, model.device)
+            for index in range(len(cameras)):
+                seen = observe(model, cameras[index : index + 1])
+                moments.add(seen.where((seen.rows >= first) & (seen.rows < last), seen.rows - first))
+                if first == 0:
+                    tuning = held_out if index % hold_out_every == hold_out_every - 1 else kept
+                    tuning.add(seen.where(seen.rows % stride == 0, seen.rows // stride))
+                progress.advance(task)
+            if first == 0:
+                strength = choose_strength(kept, held_out)
+            delta = moments.solve(strength).to(plain.means.dtype)
+            plain.features_dc[first:last] += delta[:, 0]
+            plain.features_rest[first:last] = delta[:, 1:]
+            seen_once = moments.weight > 0
+            unseen += int((~seen_once).sum())
+            mean = moments.opacity / moments.weight.clamp_min(torch.finfo(torch.float64).tiny)
+            logits = torch.logit(mean.clamp(1.0 - OPAQUE, OPAQUE)).to(plain.means.dtype)[:, None]
+            plain.opacities[first:last] = torch.where(seen_once[:, None], logits, plain.opacities[first:last])
+    return Fit(plain, exact=False, strength=strength, views=len(cameras), unseen=unseen)
+
+
+def choose_strength(kept: Moments, held_out: Moments) -> float:
+    """The ridge with which a fit of the kept views predicts the held-out ones best; see the module's docstring."""
+    if not (bool((kept.weight > 0).any()) and bool((held_out.weight > 0).any())):
+        return LONE_STRENGTH
+    return min(STRENGTHS, key=lambda strength: held_out.squared_error(kept.solve(strength)))
+
+
+def observe(model, camera: Cameras) -> Observations:
+    """What one training view tells of the splats that can be seen in it.
+
+    Args:
+        camera: a batch of one, [1].
+    """
+    camera = camera.to(model.device)
+    longest = max(int(camera.width.max()), int(camera.height.max()))
+    halvings = max(math.ceil(math.log2(longest / LONGEST_SIDE)), 0)
+    if halvings > 0:
+        camera.rescale_output_resolution(0.5**halvings)
+    view = model.look(camera)
+    appearance = model.head(view.splats, view.visible, view.center)
+    weights = contributions(view.projection, appearance.opacities)
+    towards = view.splats["means"].index_select(0, view.visible) - view.center
+    return Observations(
+        rows=view.visible,
+        weights=weights,
+        bases=sh_bases(DEGREE, torch.nn.functional.normalize(towards, dim=-1)),
+        residuals=appearance.colors - base_colors(view.splats["features_dc"].index_select(0, view.visible)),
+        opacities=appearance.opacities,
+    ).where(weights > 0, view.visible)
+
+
+def contributions(projection: Projection, opacities: Tensor) -> Tensor:
+    """What each projected splat contributes to the image: alpha T summed over pixels, [M].
+
+    Args:
+        projection: M rows.
+        opacities: [M].
+    """
+    with torch.enable_grad():
+        # The image is linear in its colours: its derivative does not ask which they are.
+        colors = opacities.new_zeros(len(opacities), 1).requires_grad_()
+        render, _, _ = composite(projection, colors, opacities.detach())
+        (weights,) = torch.autograd.grad(render.sum(), colors)
+    return weights[:, 0]
