@@ -185,7 +185,7 @@ class GradientDensification(Densification):
         name: of the protocol.
         strategy: gsplat's, with the protocol's thresholds.
         opacity_seen: which opacity pruning looks at. A reset always acts on the stored one.
-        measure_by_cameras: sizes are in extents of the cameras instead of scene units.
+        scene_unit: world units in a scene unit, which sizes are measured in; None: in extents of the cameras.
         reset_at_start: reset opacities at step 0, too, as gsplat 1.4 does; 3DGS counts its steps from 1.
     """
 
@@ -194,16 +194,16 @@ class GradientDensification(Densification):
         name: Protocol,
         strategy: PruneBySeenOpacity,
         opacity_seen: OpacitySeen,
-        measure_by_cameras: bool,
+        scene_unit: float | None,
         reset_at_start: bool,
     ):
         super().__init__(opacity_seen)
         self.name = name
         self.strategy = strategy
         self.absgrad = strategy.absgrad
-        self.measure_by_cameras = measure_by_cameras
+        self.measure_by_cameras = scene_unit is None
         self.reset_at_start = reset_at_start
-        self.state |= strategy.initialize_state(scene_scale=1.0)
+        self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
         if opacity_seen == "peak":
             strategy.seen_opacity = self.seen_opacity
 
@@ -245,12 +245,22 @@ class Mcmc(Densification):
         start, every: first step of, and steps between, relocations.
         opacity_seen: which opacity decides that a splat is dead. What a relocated splat gets is computed from the
             stored opacities.
+        scene_unit: world units in a scene unit.
     """
 
     name = "mcmc"
 
-    def __init__(self, config: McmcDensification, budget: int, start: int, every: int, opacity_seen: OpacitySeen):
+    def __init__(
+        self,
+        config: McmcDensification,
+        budget: int,
+        start: int,
+        every: int,
+        opacity_seen: OpacitySeen,
+        scene_unit: float = 1.0,
+    ):
         super().__init__(opacity_seen)
+        self.scene_unit = scene_unit
         self.config, self.budget, self.start, self.every = config, budget, start, every
 
     @torch.no_grad()
@@ -264,21 +274,22 @@ class Mcmc(Densification):
             if self.opacity_seen == "peak":
                 self.state["peak"] = None  # the rows have changed
         lr = float(optimizers["means"].param_groups[0]["lr"])
-        diffuse(splats, config.noise_lr * lr)
+        diffuse(splats, config.noise_lr * lr / self.scene_unit**2)  # times a covariance; lr is a length already
 
     def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {
             "mcmc_opacity_reg": self.config.opacity_regularisation * torch.sigmoid(splats["opacities"]).mean(),
-            "mcmc_scale_reg": self.config.scale_regularisation * splats["scales"].exp().mean(),
+            "mcmc_scale_reg": self.config.scale_regularisation * splats["scales"].exp().mean() / self.scene_unit,
         }
 
 
-def build_densification(config: Any, num_train_images: int) -> Densification:
+def build_densification(config: Any, num_train_images: int, scene_unit: float = 1.0) -> Densification:
     """The protocol that a model's configuration asks for.
 
     Args:
         config: an NrfgsModelConfig.
         num_train_images: splatfacto waits for as many steps after a reset.
+        scene_unit: world units in a scene unit, in which the configuration's sizes are.
 
     Raises:
         InputError: an option is out of range, or belongs to another protocol.
@@ -293,10 +304,10 @@ def build_densification(config: Any, num_train_images: int) -> Densification:
             f"pipeline.model.opacity_seen_by_densification is {config.opacity_seen_by_densification!r}; "
             "use 'base' or 'peak'."
         )
-    return makers[config.densification](config, num_train_images)
+    return makers[config.densification](config, num_train_images, scene_unit)
 
 
-def _splatfacto(config: Any, num_train_images: int) -> Densification:
+def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densification:
     strategy = PruneBySeenOpacity(
         prune_opa=config.cull_alpha_thresh,
         grow_grad2d=config.densify_grad_thresh,
@@ -315,11 +326,11 @@ def _splatfacto(config: Any, num_train_images: int) -> Densification:
         verbose=True,
     )
     return GradientDensification(
-        "splatfacto", strategy, config.opacity_seen_by_densification, measure_by_cameras=False, reset_at_start=True
+        "splatfacto", strategy, config.opacity_seen_by_densification, scene_unit, reset_at_start=True
     )
 
 
-def _original(config: Any, num_train_images: int) -> Densification:
+def _original(config: Any, num_train_images: int, scene_unit: float) -> Densification:
     _refuse_options(config, SPLATFACTOS_THRESHOLDS)
     rules: OriginalDensification = config.original
     strategy = PruneBySeenOpacity(
@@ -337,11 +348,11 @@ def _original(config: Any, num_train_images: int) -> Densification:
         verbose=True,
     )
     return GradientDensification(
-        "original", strategy, config.opacity_seen_by_densification, measure_by_cameras=True, reset_at_start=False
+        "original", strategy, config.opacity_seen_by_densification, scene_unit=None, reset_at_start=False
     )
 
 
-def _mcmc(config: Any, num_train_images: int) -> Densification:
+def _mcmc(config: Any, num_train_images: int, scene_unit: float) -> Densification:
     _refuse_options(config, (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at"))
     if not 1 <= config.splat_budget <= LARGEST_BUDGET:
         raise InputError(
@@ -353,6 +364,7 @@ def _mcmc(config: Any, num_train_images: int) -> Densification:
         start=config.warmup_length,
         every=config.refine_every,
         opacity_seen=config.opacity_seen_by_densification,
+        scene_unit=scene_unit,
     )
 
 

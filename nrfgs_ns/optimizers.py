@@ -8,6 +8,8 @@ and checkpoints find what they expect.
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
@@ -130,6 +132,22 @@ def fused_adam_step(optimizers: Iterable[Optimizer]) -> None:
             )
     if skips:
         torch._foreach_sub_(counters, skips)
+
+
+def in_world_units(group: dict[str, Any], scene_unit: float) -> dict[str, Any]:
+    """A parameter group's configuration for lengths, its learning rates from scene units to world units.
+
+    Args:
+        group: nerfstudio's "optimizer" and "scheduler".
+        scene_unit: world units in a scene unit.
+    """
+    if scene_unit == 1.0:
+        return group
+    optimizer, scheduler = group["optimizer"], group["scheduler"]
+    if scheduler is not None:
+        names = [name for name in ("lr_final", "lr_pre_warmup") if getattr(scheduler, name, None) is not None]
+        scheduler = replace(scheduler, **{name: getattr(scheduler, name) * scene_unit for name in names})
+    return {**group, "optimizer": replace(optimizer, lr=optimizer.lr * scene_unit), "scheduler": scheduler}
 
 
 def parameters_of(optimizer: Optimizer) -> list[Tensor]:

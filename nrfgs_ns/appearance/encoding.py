@@ -17,20 +17,22 @@ LOW_DIM = 9
 """Numbers in the low bands: the raw direction (3), sin and cos of band 0 (6)."""
 
 
-def view_geometry(means: Tensor, camera_centers: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float = 1.0) -> tuple[Tensor, Tensor]:
     """Unit directions from splats to their cameras, and log distances.
 
     Args:
         means: [M, 3], world units.
         camera_centers: [3] or [M, 3], world units.
-        eps: smallest distance told apart, world units, > 0.
+        eps: smallest distance told apart, in scene units, > 0.
+        unit: world units in a scene unit.
 
     Returns:
-        directions [M, 3] with norm <= 1 (1 wherever |v| >= eps), and log distances [M, 1] >= log eps.
+        directions [M, 3] with norm <= 1 (1 wherever |v| >= eps), and logs of the distances in scene units, [M, 1],
+        >= log eps.
     """
     v = (camera_centers - means).clamp(-FARTHEST, FARTHEST)
-    r = v.square().sum(dim=-1, keepdim=True).clamp_min(eps * eps).sqrt()
-    return v / r, r.log()
+    r = v.square().sum(dim=-1, keepdim=True).clamp_min((eps * unit) ** 2).sqrt()
+    return v / r, r.log() - math.log(unit)
 
 
 def high_dim(num_bands: int) -> int:

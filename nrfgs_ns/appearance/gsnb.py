@@ -58,6 +58,7 @@ class NeuralBasis(SphericalHarmonics):
     """Colours from harmonics and learnt functions, opacities from the base."""
 
     name = "gsnb"
+    is_harmonics = False
 
     def __init__(self, config: GsnbConfig):
         super().__init__(config)
@@ -79,7 +80,7 @@ class NeuralBasis(SphericalHarmonics):
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         means = splats["means"].index_select(0, visible)
-        directions = unit_vectors(means - camera_centers, self.config.distance_eps)
+        directions = unit_vectors(means - camera_centers, self.config.distance_eps * self.scene_unit)
         learnt = self.basis(torch.cat(fourier_bands(directions, self.config.num_bands), dim=-1))  # [M, B]
         coefficients = self.coefficients(splats, visible)
         colors = eval_sh(self.active_degree, directions, coefficients)

@@ -8,8 +8,8 @@ finds its own in row
     (i p_1) xor (j p_2) xor (k p_3)  mod T,    p = 1, 2654435761, 805459861
 
 (T. Mueller, A. Evans, C. Schied, A. Keller, "Instant Neural Graphics Primitives with a Multiresolution Hash
-Encoding", SIGGRAPH 2022). That paper normalises positions to the unit cube. Here they are world coordinates as they
-are: the lattice has no end and the hash is defined on all of it, negative integers included, so that nothing is
+Encoding", SIGGRAPH 2022). That paper normalises positions to the unit cube. Here they are coordinates in scene units
+as they are: the lattice has no end and the hash is defined on all of it, negative integers included, so that nothing is
 clamped however far a splat lies. The integers are in two's complement: T is a power of two, and modulo T the hash is
 that of unsigned 32-bit arithmetic.
 
@@ -71,7 +71,7 @@ class HashGrid(nn.Module):
         """Interpolated features.
 
         Args:
-            positions: [M, 3], world units.
+            positions: [M, 3], scene units.
 
         Returns:
             [M, levels * features], level by level.

@@ -4,7 +4,8 @@
 The model asks a head three things. Which numbers does a splat store (`splat_params`)? They join the model's
 `gauss_params`, so that densification, optimisers and checkpoints carry them without knowing what they mean. What do
 the splats that this camera sees look like from it (`forward`)? And what do they look like from nowhere in particular
-(`base_appearance`)? Shared weights are the head's own parameters and never enter `gauss_params`.
+(`base_appearance`)? Shared weights are the head's own parameters and never enter `gauss_params`. For people who want
+to see what a head has learnt, it can also be asked what its answer is made of (`components`).
 
 Nothing here knows nerfstudio or the rasterizer.
 """
@@ -12,7 +13,7 @@ Nothing here knows nerfstudio or the rasterizer.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +29,15 @@ class SplatAppearance(NamedTuple):
     """Linear blend colours, [M, 3], >= 0; 1 is white."""
     opacities: Tensor
     """Peak opacities, [M], in [0, 1]."""
+
+
+class Component(NamedTuple):
+    """One part of what a head answers, to be looked at."""
+
+    values: Tensor
+    """[M, 3] for a change of colour, in units of white; [M, 1] otherwise."""
+    kind: Literal["color", "opacity", "weight"]
+    """color, opacity: a change of it, of either sign, 0 where the head changes nothing. weight: a share, in [0, 1]."""
 
 
 @dataclass
@@ -69,6 +79,11 @@ class AppearanceHead(nn.Module, ABC):
     """Short name, written into checkpoints."""
     sh_degree: int = 0
     """Degree of the spherical harmonics among the splats' parameters; 0 if there are none."""
+    scene_unit: float = 1.0
+    """World units in a scene unit, told by the model: the lengths in a head's configuration, and what it makes of
+    distances, are in scene units, so that a scene looks the same whatever it is measured in."""
+    is_harmonics: bool = False
+    """Whether colours are exactly the harmonics in `features_dc` and `features_rest`, and opacities the base's."""
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """The tensors that each splat stores for this head, at the start of a training.
@@ -98,6 +113,21 @@ class AppearanceHead(nn.Module, ABC):
             colors=base_colors(splats["features_dc"].index_select(0, visible)).clamp_min(0.0),
             opacities=torch.sigmoid(splats["opacities"].index_select(0, visible)).squeeze(-1),
         )
+
+    def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
+        """What the head's answer is made of, for the viewer and for logs: training never asks.
+
+        A head that has more to show than its residual overrides this; every entry becomes a mode of the viewer under
+        its name. Which entries there are must not depend on the arguments, and no visible splats (M = 0) must do.
+
+        Args:
+            splats, visible, camera_centers: as for `forward`.
+
+        Returns:
+            name -> M values. Always "residual": the colours of `forward` less those of `base_appearance`.
+        """
+        colors = self(splats, visible, camera_centers).colors
+        return {"residual": Component(colors - self.base_appearance(splats, visible).colors, "color")}
 
     def set_step(self, step: int) -> None:  # noqa: B027  (most heads have no schedule)
         """Tell the head which training step it is, for heads that grow with training."""

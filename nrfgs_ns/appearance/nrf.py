@@ -20,14 +20,15 @@ all at the default sizes. Without the split there is one branch of twice the wid
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from nrfgs_ns.appearance.diffuse import DIFFUSE, Others
 from nrfgs_ns.appearance.encoding import LOW_DIM, fourier_bands, high_dim, view_geometry
 from nrfgs_ns.appearance.fused import FusedField
-from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_colors
+from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, Component, SplatAppearance, base_colors
 from nrfgs_ns.appearance.opacity_bound import OPACITY_BOUNDS, OpacityBound, bounded_opacity
 
 
@@ -90,6 +91,19 @@ class NrfConfig(AppearanceHeadConfig):
             self.require(getattr(self, name) in choices, name, "one of " + ", ".join(map(repr, choices)))
 
 
+class BranchOutputs(NamedTuple):
+    """What the branches answer for M splats, before any tanh; None for what the configuration leaves out."""
+
+    dc_low: Tensor
+    """[M, 3]; of the one branch, if there is only one."""
+    dc_high: Tensor | None
+    """[M, 3]"""
+    gate: Tensor | None
+    """sigmoid(w), [M, 1]"""
+    d_alpha: Tensor | None
+    """[M, 1]"""
+
+
 class NeuralResidualField(AppearanceHead):
     """The field, as in the module's docstring."""
 
@@ -120,8 +134,11 @@ class NeuralResidualField(AppearanceHead):
         return {**super().splat_params(rgb), "latents": latents}
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
+        if DIFFUSE in splats:
+            others = Others(splats, visible, camera_centers)
+            return others.over(self.base_appearance(splats, visible), self.forward(*others.arguments))
         if self.fused.takes(splats, camera_centers):
-            return SplatAppearance(*self.fused(splats, visible, camera_centers))
+            return SplatAppearance(*self.fused(splats, visible, camera_centers, self.scene_unit))
         color, logit = self._base(splats, visible)
         d_color, d_alpha = self._residual(splats, visible, camera_centers, color, logit)
         if d_alpha is None:
@@ -131,6 +148,31 @@ class NeuralResidualField(AppearanceHead):
         return SplatAppearance(
             colors=(color + self.config.color_scale * d_color).clamp_min(0.0), opacities=opacity.squeeze(-1)
         )
+
+    def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
+        """The residuals, before colours are clamped at black, and the branches and the gate, if there are two branches.
+
+        "low branch" is the residual that a shut gate would leave, and "high branch" what the gate lets through makes
+        of it: s_c tanh(dc_low), and s_c (tanh(dc_low + sigmoid(w) dc_high) - tanh(dc_low)). They add up to "residual".
+        """
+        if DIFFUSE in splats:
+            others = Others(splats, visible, camera_centers)
+            return others.spread(self.components(*others.arguments))
+        color, logit = self._base(splats, visible)
+        dc_low, dc_high, gate, d_alpha = self._branches(splats, visible, camera_centers, color, logit)
+        low = whole = self.config.color_scale * torch.tanh(dc_low)
+        if dc_high is not None:
+            whole = self.config.color_scale * torch.tanh(dc_low + gate * dc_high)
+        shown = {"residual": Component(whole, "color")}
+        if dc_high is not None:
+            shown["low branch"] = Component(low, "color")
+            shown["high branch"] = Component(whole - low, "color")
+            shown["gate weight"] = Component(gate, "weight")
+        if d_alpha is not None:
+            scale, bound = self.config.opacity_scale, self.config.opacity_bound
+            change = bounded_opacity(logit, torch.tanh(d_alpha), scale, bound) - torch.sigmoid(logit)
+            shown["opacity residual"] = Component(change, "opacity")
+        return shown
 
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor:
         """Mean square of the colour and opacity residuals."""
@@ -147,9 +189,18 @@ class NeuralResidualField(AppearanceHead):
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, color: Tensor, logit: Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """What the scales multiply, in [-1, 1]: colour's [M, 3]; opacity's [M, 1], or None if it is switched off."""
+        d_color, dc_high, gate, d_alpha = self._branches(splats, visible, camera_centers, color, logit)
+        if dc_high is not None:
+            d_color = d_color + gate * dc_high
+        return torch.tanh(d_color), None if d_alpha is None else torch.tanh(d_alpha)
+
+    def _branches(
+        self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, color: Tensor, logit: Tensor
+    ) -> BranchOutputs:
+        """Both branches, for the visible splats with base colours [M, 3] and base opacities' logits [M, 1]."""
         means = splats["means"].index_select(0, visible)
         latents = splats["latents"].index_select(0, visible)
-        directions, log_distance = view_geometry(means, camera_centers, self.config.distance_eps)
+        directions, log_distance = view_geometry(means, camera_centers, self.config.distance_eps, self.scene_unit)
         if not self.config.geometry_gradient:
             directions, log_distance = directions.detach(), log_distance.detach()
         low, high = fourier_bands(directions, self.config.num_bands)
@@ -157,11 +208,11 @@ class NeuralResidualField(AppearanceHead):
         shared = [latents, color] + ([log_distance] if self.config.use_distance else [])
         inputs = [*shared, torch.sigmoid(logit), low]
         out = self.low(torch.cat(inputs if self.config.split_bands else [*inputs, high], dim=-1))
-        d_color = out[:, :3]
+        dc_high = gate = None
         if self.high is not None:
             detail = self.high(torch.cat([*shared, high], dim=-1))
-            d_color = d_color + torch.sigmoid(detail[:, 3:]) * detail[:, :3]
-        return torch.tanh(d_color), torch.tanh(out[:, 3:]) if self.config.opacity_residual else None
+            dc_high, gate = detail[:, :3], torch.sigmoid(detail[:, 3:])
+        return BranchOutputs(out[:, :3], dc_high, gate, out[:, 3:] if self.config.opacity_residual else None)
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:

@@ -95,7 +95,7 @@ class SphericalGaussians(AppearanceHead):
     def _lobes(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor:
         """What the lobes add to the visible splats' colours, [M, 3]."""
         means = splats["means"].index_select(0, visible)
-        directions = unit_vectors(means - camera_centers, self.config.distance_eps)
+        directions = unit_vectors(means - camera_centers, self.config.distance_eps * self.scene_unit)
         axes = unit_vectors(splats["sg_axes"].index_select(0, visible), SHORTEST_AXIS)
         sharpness = splats["sg_sharpness"].index_select(0, visible).abs()
         heights = torch.exp(sharpness * ((axes * directions[:, None]).sum(dim=-1) - 1.0))  # [M, L]

@@ -36,6 +36,7 @@ class SphericalHarmonics(AppearanceHead):
     """Colours from harmonics, opacities from the base."""
 
     name = "sh"
+    is_harmonics = True
 
     def __init__(self, config: ShConfig):
         super().__init__()

@@ -72,6 +72,7 @@ class ViewDirectionFactors(SphericalHarmonics):
     """Harmonics and base opacity, multiplied by the network's factors."""
 
     name = "vdgs"
+    is_harmonics = False
 
     def __init__(self, config: VdgsConfig):
         super().__init__(config)
@@ -95,8 +96,8 @@ class ViewDirectionFactors(SphericalHarmonics):
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         means = splats["means"].index_select(0, visible)
-        directions = unit_vectors(means - camera_centers, self.config.distance_eps)
-        factors = torch.sigmoid(self.network(torch.cat([directions, self.grid(means)], dim=-1)))
+        directions = unit_vectors(means - camera_centers, self.config.distance_eps * self.scene_unit)
+        factors = torch.sigmoid(self.network(torch.cat([directions, self.grid(means / self.scene_unit)], dim=-1)))
 
         coefficients = self.coefficients(splats, visible)
         if self.config.mode != "opacity":

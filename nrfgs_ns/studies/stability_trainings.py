@@ -11,9 +11,8 @@ per run) and `trainings.md`, the table. A run that is in the JSON already is not
 import json
 import math
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,6 @@ from PIL import Image
 from plyfile import PlyData
 from rich.progress import track
 
-import nrfgs_ns.appearance.nrf as nrf_module
-import nrfgs_ns.model as model_module
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.studies.run import evaluate, machine, train
@@ -52,8 +49,6 @@ class HardTraining:
     """nerfstudio's scaling of poses into a unit cube"""
     method: str = "nrfgs"
     """what is trained"""
-    unit: float = 1.0
-    """what near plane, camera distance and distance_eps are multiples of: a trial of what the package does not do"""
     seeds: tuple[int, ...] = (42,)
     """one training for each"""
 
@@ -95,16 +90,6 @@ def keep(folder: Path, count: int, identical: bool = False) -> None:
     path.write_text(json.dumps(meta))
 
 
-def in_unit(factor: float) -> dict[str, Any]:
-    """Splatfacto's own lengths, in a unit `factor` times smaller: what a user would have to set by hand."""
-    return {
-        "--optimizers.means.optimizer.lr": 1.6e-4 * factor,
-        "--optimizers.means.scheduler.lr-final": 1.6e-6 * factor,
-        "--pipeline.model.densify-size-thresh": 0.01 * factor,
-        "--pipeline.model.cull-scale-thresh": 0.5 * factor,
-    }
-
-
 def ten_times_faster() -> dict[str, Any]:
     """Every learning rate times 10."""
     groups = nrfgs.config.optimizers.items()
@@ -121,13 +106,6 @@ def hard_trainings() -> list[HardTraining]:
                 name = f"{method}, unit x {factor:g}, auto-scaling {'on' if auto_scale else 'off'}"
                 edit = partial(rescale, factor=factor)
                 rows.append(HardTraining(name, edit, auto_scale=auto_scale, method=method, seeds=seeds))
-    for factor in (1e-3, 1e3):
-        name = f"nrfgs, unit x {factor:g}, auto-scaling off, splatfacto's lengths by hand"
-        base = HardTraining(name, partial(rescale, factor=factor), in_unit(factor), auto_scale=False, seeds=seeds)
-        no_distance = {**in_unit(factor), "--pipeline.model.appearance.use-distance": False}
-        rows.append(replace(base, name=f"{name}, near plane and distance in that unit", unit=factor))
-        if factor > 1:  # in the smaller unit, the near plane alone decides
-            rows += [base, replace(base, name=f"{name}, no distance", options=no_distance)]
     return [
         *rows,
         HardTraining("learning rates x 10", options=ten_times_faster()),
@@ -138,30 +116,6 @@ def hard_trainings() -> list[HardTraining]:
         # With auto-scaling, cameras at one place are refused: they have no extent to scale by.
         HardTraining("two identical images", partial(keep, count=2, identical=True), auto_scale=False),
     ]
-
-
-@contextmanager
-def measured_in(unit: float) -> Iterator[None]:
-    """Let near plane, camera distance and distance_eps be multiples of `unit` for a while.
-
-    Stands in for a scene unit that model and field would be told; nothing is touched at unit 1.
-    """
-    if unit == 1.0:
-        yield
-        return
-    before = model_module.project, nrf_module.view_geometry
-
-    def project(*args, **kwargs):
-        return before[0](*args, near_plane=0.01 * unit, far_plane=1e10 * unit, **kwargs)
-
-    def view_geometry(means, camera_centers, eps):
-        return before[1](means / unit, camera_centers / unit, eps)
-
-    model_module.project, nrf_module.view_geometry = project, view_geometry
-    try:
-        yield
-    finally:
-        model_module.project, nrf_module.view_geometry = before
 
 
 def run(training: HardTraining, seed: int, steps: int, work: Path) -> dict[str, Any]:
@@ -194,9 +148,8 @@ def run(training: HardTraining, seed: int, steps: int, work: Path) -> dict[str, 
     }
     args = [training.method, *(str(word) for option in chosen.items() for word in option)]
     args += ["nrfgs-data", "--auto-scale-poses", str(training.auto_scale)]
-    with measured_in(training.unit):
-        record = train(args)
-        results = evaluate(Path(record.config_path), work / "eval.json")
+    record = train(args)
+    results = evaluate(Path(record.config_path), work / "eval.json")
     _, pipeline, _, _ = eval_setup(Path(record.config_path))
     tensors = all(bool(torch.isfinite(value).all()) for value in pipeline.model.parameters())
     numbers = [results[name] for name in ("psnr", "ssim", "l1")]

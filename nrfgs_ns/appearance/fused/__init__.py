@@ -9,6 +9,7 @@ the CPU: slowly, for tests.
 
 import importlib.util
 import logging
+import math
 import os
 from collections.abc import Mapping
 
@@ -57,14 +58,16 @@ class FusedField:
             )
         return reason is None
 
-    def __call__(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(
+        self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float = 1.0
+    ) -> tuple[Tensor, Tensor]:
         """Colours [M, 3] and opacities [M]: see AppearanceHead.forward, after `takes` said yes."""
         from nrfgs_ns.appearance.fused.launch import FusedFunction
 
         weights = [weight for branch in self.branches for weight in branch.parameters()]
         tables = [splats[name] for name in ("means", "latents", "features_dc", "opacities")]
         packing = self._packing_on(visible.device)
-        return FusedFunction.apply(packing, self._options(), *tables, visible, camera_centers, *weights)
+        return FusedFunction.apply(packing, self._options(scene_unit), *tables, visible, camera_centers, *weights)
 
     def _why_not(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> str | None:
         """What keeps the kernels from computing this call, or None."""
@@ -111,7 +114,7 @@ class FusedField:
             return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
         return packing
 
-    def _options(self):
+    def _options(self, scene_unit: float = 1.0):
         """The configuration as the launcher wants it."""
         from nrfgs_ns.appearance.fused.launch import FieldOptions
 
@@ -119,7 +122,8 @@ class FusedField:
         return FieldOptions(
             color_scale=config.color_scale,
             opacity_scale=config.opacity_scale,
-            distance_eps=config.distance_eps,
+            distance_eps=config.distance_eps * scene_unit,
+            log_unit=math.log(scene_unit),
             bound=config.opacity_bound if config.opacity_residual else "none",
             geometry_gradient=config.geometry_gradient,
             precision=config.precision,

@@ -84,8 +84,8 @@ def _last(tile, lanes):
 
 
 @triton.jit
-def _view(means, centers, rows, items, mask, lanes, eps_squared, ONE_CENTER: tl.constexpr):
-    """encoding.view_geometry: direction [B, 4] (lane 3 is 0), log r, 1 / r, and whether |v| is above the floor."""
+def _view(means, centers, rows, items, mask, lanes, eps_squared, log_unit, ONE_CENTER: tl.constexpr):
+    """encoding.view_geometry: direction [B, 4] (lane 3 is 0), log distance in scene units, 1 / r, |v| above the floor."""
     if ONE_CENTER:
         center = tl.load(centers + lanes, mask=lanes < 3, other=0.0)
     else:
@@ -95,7 +95,7 @@ def _view(means, centers, rows, items, mask, lanes, eps_squared, ONE_CENTER: tl.
     square = tl.sum(v * v, axis=1)
     r = tl.sqrt(tl.maximum(square, eps_squared, propagate_nan=tl.PropagateNan.ALL))
     inverse = 1.0 / r
-    return v * inverse[:, None], tl.log(r), inverse, square >= eps_squared
+    return v * inverse[:, None], tl.log(r) - log_unit, inverse, square >= eps_squared
 
 
 @triton.jit
@@ -197,7 +197,7 @@ def _outputs(Y, lanes, B: tl.constexpr):
 def forward_kernel(
     means, latents, features_dc, opacities, visible, centers, packed,
     colors_out, opacities_out,
-    count, eps_squared, color_scale, opacity_scale, sh_c0,
+    count, eps_squared, log_unit, color_scale, opacity_scale, sh_c0,
     D: tl.constexpr, P: tl.constexpr, H: tl.constexpr, B: tl.constexpr,
     ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, KIND: tl.constexpr,
 ):  # fmt: skip
@@ -218,7 +218,7 @@ def forward_kernel(
         mask = valid[:, None] & (lanes < 3)
         latent_mask = valid[:, None] & (columns < D)
         Z = tl.load(latents + rows[:, None] * D + columns, mask=latent_mask, other=0.0)
-        d, log_r, _, _ = _view(means, centers, rows, items, mask, lanes, eps_squared, ONE_CENTER)
+        d, log_r, _, _ = _view(means, centers, rows, items, mask, lanes, eps_squared, log_unit, ONE_CENTER)
         base, logit, alpha = _base(features_dc, opacities, rows, valid, mask, lanes, sh_c0)
 
         F = tl.reshape(_features(d, base, log_r, lanes, P // 4), (B, P))
@@ -249,7 +249,7 @@ def backward_kernel(
     means, latents, features_dc, opacities, visible, centers, packed,
     d_colors, d_opacities,
     d_means, d_latents, d_features_dc, d_logits, d_centers, partials,
-    count, eps_squared, color_scale, opacity_scale, sh_c0,
+    count, eps_squared, log_unit, color_scale, opacity_scale, sh_c0,
     D: tl.constexpr, P: tl.constexpr, H: tl.constexpr, B: tl.constexpr, SLOTS: tl.constexpr,
     ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, GEOMETRY: tl.constexpr, CENTER: tl.constexpr,
     KIND: tl.constexpr, GRADIENT_KIND: tl.constexpr,
@@ -284,7 +284,7 @@ def backward_kernel(
         mask = valid[:, None] & (lanes < 3)
         latent_mask = valid[:, None] & (columns < D)
         Z = tl.load(latents + rows[:, None] * D + columns, mask=latent_mask, other=0.0)
-        d, log_r, inverse, above = _view(means, centers, rows, items, mask, lanes, eps_squared, ONE_CENTER)
+        d, log_r, inverse, above = _view(means, centers, rows, items, mask, lanes, eps_squared, log_unit, ONE_CENTER)
         base, logit, alpha = _base(features_dc, opacities, rows, valid, mask, lanes, sh_c0)
 
         # Forward again.

@@ -70,6 +70,9 @@ class FieldOptions:
     color_scale: float
     opacity_scale: float
     distance_eps: float
+    """in world units"""
+    log_unit: float
+    """log of the world units in a scene unit"""
     bound: str
     """an OpacityBound, or "none" for a field without opacity residual"""
     geometry_gradient: bool
@@ -95,7 +98,7 @@ class FusedFunction(torch.autograd.Function):
             how = FORWARD[options.precision]
             forward_kernel[(_programs(how, count, means.device),)](
                 *tables, visible, centers, packed, colors, seen,
-                count, options.distance_eps**2, options.color_scale, options.opacity_scale, SH_C0,
+                count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
                 D=packing.latent_dim, P=packing.width, H=packing.hidden, B=how.block,
                 ONE_CENTER=centers.dim() == 1, BOUND=options.bound, KIND=KINDS[options.precision][0],
                 num_warps=how.warps, num_stages=how.stages,
@@ -121,7 +124,7 @@ class FusedFunction(torch.autograd.Function):
             backward_kernel[(programs,)](
                 *tables, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
-                count, options.distance_eps**2, options.color_scale, options.opacity_scale, SH_C0,
+                count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
                 D=packing.latent_dim, P=packing.width, H=packing.hidden, B=how.block, SLOTS=partials.shape[1],
                 ONE_CENTER=one_center, BOUND=options.bound, GEOMETRY=options.geometry_gradient, CENTER=wants_center,
                 KIND=kind, GRADIENT_KIND=gradient_kind,

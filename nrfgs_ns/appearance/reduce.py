@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A trained neural residual field made smaller: a new head with edited weights, and the splats' tables that go with it.
+
+Nothing here trains. What is left out is left out of the configuration where that is possible, so that the smaller field
+also costs less; the rest of the weights are the old ones. Inputs that become constant, and latents that lie in a
+subspace, are folded into the first layer, which is exact: with z = m + B y,
+
+    W z + b = (W B) y + (W m + b).
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
+
+Layers = tuple[Tensor, Tensor, Tensor, Tensor]
+"""Weights of a branch: W1 [H, I], b1 [H], W2 [O, H], b2 [O]."""
+
+
+class Field(NamedTuple):
+    """A head and the table of the splats that it draws."""
+
+    head: NeuralResidualField
+    splats: dict[str, Tensor]
+
+    @property
+    def bytes(self) -> int:
+        """Bytes that a renderer needs in float32: parameters, no latents for diffuse splats, a bit each that says so."""
+        size = sum(weight.numel() * weight.element_size() for weight in self.head.parameters())
+        diffuse = self.splats.get(DIFFUSE)
+        for name, value in self.splats.items():
+            if name == DIFFUSE:
+                size += -(-len(value) // 8)
+            else:
+                rows = int((~diffuse).sum()) if name == "latents" and diffuse is not None else len(value)
+                size += rows * value[:1].numel() * value.element_size()
+        return size
+
+
+def input_columns(config: NrfConfig, branch: str) -> dict[str, list[int]]:
+    """Where the inputs lie in the first layer of the branch "low" (or the only one) or "high": name -> columns.
+
+    Names: latents, color, distance, opacity, direction, "band 0", "band 1", ...
+    """
+    bands = {f"band {k}": 6 for k in range(config.num_bands)}
+    high_bands = dict(list(bands.items())[1:])
+    sizes = {"latents": config.latent_dim, "color": 3}
+    if config.use_distance:
+        sizes["distance"] = 1
+    if branch == "low":
+        sizes |= {"opacity": 1, "direction": 3, "band 0": 6}
+        if not config.split_bands:
+            sizes |= high_bands
+    else:
+        sizes |= high_bands
+    columns, first = {}, 0
+    for name, size in sizes.items():
+        columns[name] = list(range(first, first + size))
+        first += size
+    return columns
+
+
+def without_high_branch(field: Field) -> Field:
+    """Only the low branch; the same as a gate that is shut.
+
+    Raises:
+        ValueError: there is no high branch.
+    """
+    if field.head.high is None:
+        raise ValueError("this field has no high branch")
+    return Field(_build(field.head, {"num_bands": 1}, layers(field.head.low), None), field.splats)
+
+
+def without_low_branch(field: Field) -> Field:
+    """The low branch answers 0 for colours; opacity's residual, which is its other answer, stays."""
+    w1, b1, w2, b2 = layers(field.head.low)
+    w2, b2 = w2.clone(), b2.clone()
+    w2[:3], b2[:3] = 0.0, 0.0
+    return Field(_build(field.head, {}, (w1, b1, w2, b2), _high(field.head)), field.splats)
+
+
+def without_opacity_residual(field: Field) -> Field:
+    """Opacities are the base's."""
+    w1, b1, w2, b2 = layers(field.head.low)
+    return Field(
+        _build(field.head, {"opacity_residual": False}, (w1, b1, w2[:3], b2[:3]), _high(field.head)), field.splats
+    )
+
+
+def with_constant_distance(field: Field, log_distance: float) -> Field:
+    """The log distance is the same number everywhere, and no input any more."""
+    changed = []
+    for name, branch in _branches(field.head):
+        w1, b1, w2, b2 = layers(branch)
+        (column,) = input_columns(field.head.config, name)["distance"]
+        keep = [i for i in range(w1.shape[1]) if i != column]
+        changed.append((w1[:, keep], b1 + log_distance * w1[:, column], w2, b2))
+    return Field(_build(field.head, {"use_distance": False}, *_pair(changed)), field.splats)
+
+
+def without_input(field: Field, name: str) -> Field:
+    """An input of `input_columns` is 0 everywhere."""
+    changed = []
+    for branch_name, branch in _branches(field.head):
+        w1, b1, w2, b2 = layers(branch)
+        w1 = w1.clone()
+        w1[:, input_columns(field.head.config, branch_name).get(name, [])] = 0.0
+        changed.append((w1, b1, w2, b2))
+    return Field(_build(field.head, {}, *_pair(changed)), field.splats)
+
+
+class LatentBasis(NamedTuple):
+    """Principal components: z = mean + axes y, y = inverse (z - mean). float64."""
+
+    mean: Tensor
+    """[D]"""
+    axes: Tensor
+    """B, one component in each column, the strongest first. [D, D]"""
+    inverse: Tensor
+    """[D, D]"""
+    variances: Tensor
+    """of y, weighted, descending. [D]"""
+
+
+def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
+    """Principal components of the latents, in the metric of what the first layer makes of them.
+
+    A direction of the latents counts by how far it moves the hidden units, |W (z - z')|^2 over both branches: the
+    components are those whose first r predict W z with the least squared error, weighted, for each r.
+
+    Args:
+        weight: of each splat, >= 0; all are alike if their sum is 0. [N]
+    """
+    latents = field.splats["latents"].detach().double()
+    if not float(weight.sum()) > 0:
+        weight = torch.ones_like(weight)
+    weight = (weight / weight.sum()).double()[:, None]
+    mean = (weight * latents).sum(dim=0)
+    seen_by_units = torch.cat(
+        [layers(branch)[0][:, : latents.shape[1]].double() for _, branch in _branches(field.head)]
+    )
+    gram = seen_by_units.T @ seen_by_units
+    values, vectors = torch.linalg.eigh(gram)
+    # Latents beside the layer's row space keep a millionth of the strongest one's metric: everything can be inverted.
+    roots = values.clamp_min(max(float(values[-1]) * 1e-12, 1e-300)).sqrt()
+    stretch, shrink = (vectors * roots) @ vectors.T, (vectors / roots) @ vectors.T
+    centred = (latents - mean) @ stretch
+    variances, turns = torch.linalg.eigh(centred.T @ (weight * centred))
+    turns = turns.flip(1)
+    return LatentBasis(mean, shrink @ turns, turns.T @ stretch, variances.flip(0).clamp_min(0.0))
+
+
+def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
+    """Latents of `rank` numbers, 1..D: their first principal components, with the basis folded into the first layer."""
+    size = field.head.config.latent_dim
+    if not 1 <= rank <= size:
+        raise ValueError(f"rank is {rank}; latents of {size} numbers have ranks 1 to {size}")
+    latents = field.splats["latents"]
+    reduced = (latents.detach().double() - basis.mean) @ basis.inverse[:rank].T
+    changed = []
+    for _, branch in _branches(field.head):
+        w1, b1, w2, b2 = layers(branch)
+        of_latents = w1[:, :size].double()
+        folded = torch.cat([of_latents @ basis.axes[:, :rank], w1[:, size:].double()], dim=1)
+        changed.append((folded, b1.double() + of_latents @ basis.mean, w2, b2))
+    head = _build(field.head, {"latent_dim": rank}, *_pair(changed))
+    return Field(head, {**field.splats, "latents": reduced.to(latents.dtype)})
+
+
+def with_diffuse(field: Field, diffuse: Tensor, features_dc: Tensor, opacities: Tensor) -> Field:
+    """Some splats without residual.
+
+    Args:
+        diffuse: which, bool [N].
+        features_dc, opacities: what they look like instead, [N, 3] and [N, 1]; other rows are ignored.
+    """
+    rows = diffuse[:, None]
+    splats = {
+        **field.splats,
+        "features_dc": torch.where(rows, features_dc, field.splats["features_dc"].detach()),
+        "opacities": torch.where(rows, opacities, field.splats["opacities"].detach()),
+        DIFFUSE: diffuse,
+    }
+    return Field(field.head, splats)
+
+
+def layers(branch: nn.Sequential) -> Layers:
+    """A branch's weights, detached."""
+    return tuple(weight.detach() for weight in (branch[0].weight, branch[0].bias, branch[2].weight, branch[2].bias))
+
+
+def build(config: NrfConfig, weights: Mapping[str, Tensor], scene_unit: float) -> NeuralResidualField:
+    """A head with given weights, by their names in its `state_dict`. The random generators are left alone."""
+    with torch.random.fork_rng(devices=[]):
+        head = config.setup()
+    head.load_state_dict({name: value.float() for name, value in weights.items()})
+    head.scene_unit = scene_unit
+    return head.to(next(iter(weights.values())).device).requires_grad_(False).eval()
+
+
+def _build(old: NeuralResidualField, changes: dict, low: Layers, high: Layers | None) -> NeuralResidualField:
+    weights = {}
+    for name, branch in (("low", low), ("high", high)):
+        if branch is not None:
+            keys = (f"{name}.0.weight", f"{name}.0.bias", f"{name}.2.weight", f"{name}.2.bias")
+            weights |= dict(zip(keys, branch, strict=True))
+    return build(replace(old.config, **changes), weights, old.scene_unit)
+
+
+def _branches(head: NeuralResidualField) -> list[tuple[str, nn.Sequential]]:
+    return [(name, branch) for name, branch in (("low", head.low), ("high", head.high)) if branch is not None]
+
+
+def _high(head: NeuralResidualField) -> Layers | None:
+    return None if head.high is None else layers(head.high)
+
+
+def _pair(changed: list[Layers]) -> tuple[Layers, Layers | None]:
+    return changed[0], changed[1] if len(changed) > 1 else None
