@@ -195,7 +195,9 @@ def read_splats(path: Path) -> "PlainSplats":
 
 
 @torch.no_grad()
-def render_splats(splats: "PlainSplats", camera, background: Tensor, rasterize_mode: str = "classic") -> Tensor:
+def render_splats(
+    splats: "PlainSplats", camera, background: Tensor, rasterize_mode: str = "classic", near_plane: float = 0.01
+) -> Tensor:
     """Render a file's splats as any viewer would, with this project's rasterizer.
 
     Args:
@@ -203,6 +205,7 @@ def render_splats(splats: "PlainSplats", camera, background: Tensor, rasterize_m
         camera: nerfstudio's, a batch of one.
         background: [3] or [H, W, 3].
         rasterize_mode: as the model was trained.
+        near_plane: smallest depth that is drawn, in the file's unit of length.
 
     Returns:
         [H, W, 3] in [0, 1].
@@ -222,6 +225,7 @@ def render_splats(splats: "PlainSplats", camera, background: Tensor, rasterize_m
         seen_from.K,
         seen_from.width,
         seen_from.height,
+        near_plane=near_plane,
         rasterize_mode=rasterize_mode,
     )
     appearance = ShConfig(degree=3).setup()(splats._asdict(), projection.gaussian_ids, seen_from.center)
@@ -246,8 +250,10 @@ def measure_loss(pipeline, path: Path, fitted: "PlainSplats") -> dict[str, Any]:
 
     from nrfgs_ns.appearance.sh import ShConfig
     from nrfgs_ns.metrics import psnr
+    from nrfgs_ns.model import NEAR_PLANE
 
     model = pipeline.model
+    near_plane = NEAR_PLANE * model.scene_unit
     file = read_splats(path)
     file, fitted = (type(file)(*(value.to(model.device) for value in splats)) for splats in (file, fitted))
     harmonics = ShConfig(degree=3).setup()
@@ -258,7 +264,7 @@ def measure_loss(pipeline, path: Path, fitted: "PlainSplats") -> dict[str, Any]:
     with Progress(*columns, console=CONSOLE, transient=True) as progress:
         for image_name, (camera, batch) in progress.track(images):
             outputs = model.get_outputs_for_camera(camera)
-            rendered = render_splats(file, camera, outputs["background"], model.config.rasterize_mode)
+            rendered = render_splats(file, camera, outputs["background"], model.config.rasterize_mode, near_plane)
             truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
             mask = model._mask(batch)
             view = model.look(camera)
