@@ -109,7 +109,7 @@ class Guard:
                 gradients = [parameter.grad for parameter in parameters_of(optimizer)]
                 watched += [(name, gradient) for gradient in gradients if gradient is not None and gradient.numel() > 0]
         names, tensors = [list(column) for column in zip(*watched, strict=True)]
-        sizes = torch.stack(torch._foreach_norm(tensors, math.inf))
+        names, tensors, sizes = self._share(names, tensors, torch.stack(torch._foreach_norm(tensors, math.inf)))
         self._verdict = _Verdict(self.step, names, tensors, sizes, None)
         if not gradients_are_scaled and optimizers.all_fused:
             verdict = (~(sizes <= MAX_GRADIENT)).any().float()  # NaN compares as false
@@ -123,6 +123,10 @@ class Guard:
                 self._verdict.arrived.record()
         else:
             self.settle()
+
+    def _share(self, names: list[str], tensors: list[Tensor], sizes: Tensor) -> tuple[list[str], list[Tensor], Tensor]:
+        """Here joins in what other devices have found, where there are any (`distributed`)."""
+        return names, tensors, sizes
 
     def settle(self) -> None:
         """Read the verdict on the step before.

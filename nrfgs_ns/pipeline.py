@@ -16,6 +16,8 @@ from torchvision.utils import save_image
 
 from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+from nrfgs_ns.distributed.config import ShardingConfig
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.metrics import METRIC_NAMES
 from nrfgs_ns.model import NrfgsModelConfig
 
@@ -30,6 +32,8 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
     """specifies the datamanager config"""
     model: NrfgsModelConfig = field(default_factory=NrfgsModelConfig)
     """specifies the model config"""
+    sharding: ShardingConfig = field(default_factory=ShardingConfig)
+    """with several devices: how the splats are spread over them, and what a step counts"""
 
 
 class NrfgsPipeline(VanillaPipeline):
@@ -41,6 +45,8 @@ class NrfgsPipeline(VanillaPipeline):
     """
 
     config: NrfgsPipelineConfig
+    images_per_step: int = 1
+    """images for which a step counts in the schedules (`distributed.schedules`)"""
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
         allow_nerfstudio_checkpoints()
@@ -48,6 +54,8 @@ class NrfgsPipeline(VanillaPipeline):
         super().__init__(config, device, test_mode, **kwargs)
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             self.datamanager.load_all_images()
+        if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
+            self.model.fit_on(self.datamanager.train_dataset.cameras)
 
     def get_train_loss_dict(self, step: int):
         """Nerfstudio's step, whose metrics are taken only when they are logged."""
@@ -121,10 +129,21 @@ class NrfgsPipeline(VanillaPipeline):
             "sampling": self.datamanager.sampling_state(),
         }
 
+    def check_schedules(self, state: dict[str, Any]) -> None:
+        """Raise InputError where a training goes on whose step numbers mean another number of images."""
+        written = state.get("images_per_step", 1)
+        if written != self.images_per_step:
+            raise InputError(
+                f"The checkpoint's steps count for {written} images of the schedules, this training's for "
+                f"{self.images_per_step}. Go on with --machine.num-devices {written} and the same "
+                "--pipeline.sharding.schedules."
+            )
+
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave, in a training; an evaluation ignores it."""
         if self.test_mode != "val":
             return
+        self.check_schedules(state)
         torch.set_rng_state(state["torch_rng"].cpu())
         if len(state["cuda_rng"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all([rng.cpu() for rng in state["cuda_rng"]])

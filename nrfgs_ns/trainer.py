@@ -6,12 +6,18 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
+import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils import writer
+from nerfstudio.utils import comms, writer
+from nerfstudio.utils.decorators import check_eval_enabled
+from nerfstudio.utils.misc import step_check
 
 from nrfgs_ns.guard import Guard, TrainingStopped, WatchedOptimizers
+from nrfgs_ns.optimizers import in_world_units
+from nrfgs_ns.tracking import track
 
 
 @dataclass
@@ -21,6 +27,23 @@ class NrfgsTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: NrfgsTrainer)
     """target class to instantiate"""
 
+    def setup(self, **kwargs) -> "NrfgsTrainer":
+        """The trainer; for several devices, the one that spreads the splats over them (`distributed`)."""
+        if kwargs.get("world_size", 1) == 1:
+            return super().setup(**kwargs)
+        from nrfgs_ns.distributed.trainer import ShardedTrainer
+
+        return ShardedTrainer(self, **kwargs)
+
+    def save_config(self) -> None:
+        """Save config.yml, as every training does before it starts; with several devices, also see to it that they
+        are there, and that a message about one that is lost can be read."""
+        super().save_config()
+        if self.machine.num_devices * self.machine.num_machines > 1:
+            from nrfgs_ns.distributed.launch import prepare
+
+            prepare(self)
+
 
 class NrfgsTrainer(Trainer):
     """Trainer that never leaves a torn checkpoint, or one with NaN, where `--load-dir` would find it."""
@@ -29,7 +52,13 @@ class NrfgsTrainer(Trainer):
         """The optimisers, behind a guard (see `nrfgs_ns.guard`)."""
         self.guard = Guard(self.pipeline)
         every = self.pipeline.steps_per_log = self.config.logging.steps_per_log
-        return WatchedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self.guard, every)
+        return WatchedOptimizers(self.optimizer_configs(), self.pipeline.get_param_groups(), self.guard, every)
+
+    def optimizer_configs(self) -> dict[str, Any]:
+        """The configured optimisers; the means', whose learning rate is a length, in world units."""
+        groups = self.config.optimizers.copy()
+        groups["means"] = in_world_units(groups["means"], self.pipeline.model.scene_unit)
+        return groups
 
     def train(self) -> None:
         """Train, from parameters that are finite.
@@ -53,6 +82,17 @@ class NrfgsTrainer(Trainer):
         super()._update_viewer_state(step)
         if step % self.config.logging.steps_per_log != 0:
             writer.EVENT_STORAGE.clear()
+
+    @check_eval_enabled
+    def eval_iteration(self, step: int) -> None:
+        """Nerfstudio's, and a look at the appearance head whenever test images are looked at."""
+        super().eval_iteration(step)
+        pictures = step_check(step, self.config.steps_per_eval_all_images)
+        if pictures or step_check(step, self.config.steps_per_eval_image):
+            self.pipeline.eval()
+            camera = self.pipeline.datamanager.eval_dataset.cameras[:1].to(self.device)
+            track(self.pipeline.model, camera, step, pictures)
+            self.pipeline.train()
 
     def train_iteration(self, step: int):
         """One step.
@@ -93,17 +133,26 @@ class NrfgsTrainer(Trainer):
         Args:
             step: training step that the checkpoint is named after.
         """
-        final = self.checkpoint_dir
-        self.checkpoint_dir = final.with_name(final.name + ".writing")
-        try:
-            super().save_checkpoint(step)
-            written = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-            if written.exists():  # only the main process writes
-                final.mkdir(parents=True, exist_ok=True)
-                os.replace(written, final / written.name)
-                if self.config.save_only_latest_checkpoint:
-                    for older in set(final.glob("*.ckpt")) - {final / written.name}:
-                        older.unlink()
-                self.checkpoint_dir.rmdir()
-        finally:
-            self.checkpoint_dir = final
+        content = self._checkpoint(step)
+        if not comms.is_main_process():
+            return
+        name, final = f"step-{step:09d}.ckpt", self.checkpoint_dir
+        aside = final.with_name(final.name + ".writing")
+        aside.mkdir(parents=True, exist_ok=True)
+        torch.save(content, aside / name)
+        final.mkdir(parents=True, exist_ok=True)
+        os.replace(aside / name, final / name)
+        if self.config.save_only_latest_checkpoint:
+            for older in set(final.glob("*.ckpt")) - {final / name}:
+                older.unlink()
+        aside.rmdir()
+
+    def _checkpoint(self, step: int) -> dict[str, Any]:
+        """What a checkpoint holds: nerfstudio's entries."""
+        return {
+            "step": step,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
+            "schedulers": {name: value.state_dict() for name, value in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }

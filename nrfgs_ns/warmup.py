@@ -27,20 +27,18 @@ def warm_up(model, cameras: Cameras, steps: int, lr: float) -> None:
     first = last = None
     for step in range(steps):
         index = step % len(cameras)
-        with torch.no_grad():
-            view = model.look(cameras[index : index + 1].to(model.device))
-        loss = model.head.neutral_loss(view.splats, view.visible, view.center)
-        if loss is None:
+        found = model.far_from_neutral(cameras[index : index + 1].to(model.device), weights)
+        if found is None:
             return
-        if len(view.visible) == 0:
+        visible, loss, gradients = found
+        if visible == 0:
             continue
         last = loss.item() ** 0.5
         first = last if first is None else first
         if last == 0.0:
             CONSOLE.log("Warm-up: the head adds nothing from the start; skipped.")
             return
-        # Only the shared weights learn: the splats' parameters keep no gradient from here.
-        for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
+        for weight, gradient in zip(weights, gradients, strict=True):
             weight.grad = gradient
         optimizer.step()
     optimizer.zero_grad(set_to_none=True)

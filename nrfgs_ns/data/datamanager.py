@@ -20,6 +20,7 @@ from torch import Tensor
 
 from nrfgs_ns.data.checks import UNREADABLE
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.scene_unit import scene_unit
 from nrfgs_ns.errors import InputError
 
 
@@ -35,6 +36,7 @@ class NrfgsInputDataset(InputDataset):
         super().__init__(dataparser_outputs, scale_factor)
         # A copy: the datamanager removes entries in place, and the original is shared by all datasets of the process.
         self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
+        self.metadata["scene_unit"] = scene_unit(self.cameras.camera_to_worlds[:, :3, 3])
         # A copy too: undistortion crops the cameras while it loads the images.
         self._sizes = torch.cat([self.cameras.width, self.cameras.height], dim=-1).tolist()
 
@@ -118,16 +120,37 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         Returns:
             camera [1] on the device, with "cam_idx" in its metadata, and "image" [H, W, 3 or 4], "image_idx", "mask".
         """
+        index = self._next_index()
+        return self._view(index), self._image(index)
+
+    def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
+        """The next `count` cameras in turn, as `next_train` would give them one by one, and the image of one of them.
+
+        Args:
+            count: how many.
+            own: whose image is wanted, 0 <= own < count.
+        """
+        indices = [self._next_index() for _ in range(count)]
+        return [self._view(index) for index in indices], self._image(indices[own])
+
+    def _next_index(self) -> int:
         index = self.train_unseen_cameras.pop(0)
         if len(self.train_unseen_cameras) == 0:
             self.train_unseen_cameras = self.sample_train_cameras()
+        return index
+
+    def _image(self, index: int) -> dict[str, Any]:
         batch = self.cached_train[index].copy()
         batch["image"] = batch["image"].to(self.device)
+        return batch
+
+    def _view(self, index: int) -> Cameras:
         if index not in self._views:
+            self.cached_train  # noqa: B018  (nerfstudio makes train_cameras when it has read, and cropped, the images)
             camera = self.train_cameras[index : index + 1].to(self.device)
             camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
             self._views[index] = camera
-        return self._views[index], batch
+        return self._views[index]
 
     @cached_property
     def _views(self) -> dict[int, Cameras]:

@@ -14,13 +14,14 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Annotated
+from typing import IO, Annotated, Literal
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.studies.bench_executor import Queue, Submitted
 from nrfgs_ns.studies.files import write_whole
 
 CHILD = (sys.executable, "-m", "nrfgs_ns.studies.bench_run")
@@ -33,7 +34,7 @@ class Running:
     """A child at work."""
 
     name: str
-    process: subprocess.Popen
+    process: "subprocess.Popen | Submitted"
     log: IO
     work: Path
     record: Path
@@ -77,6 +78,12 @@ class Bench:
     """runs at once on each GPU, or on the CPU; times are reported only with 1"""
     gpus: int | None = None
     """GPUs to spread the runs over"""
+    executor: Literal["local", "slurm"] | None = None
+    """run each training as a task of submitit: on this machine, or in a Slurm queue. None: as a child process"""
+    slurm: tuple[str, ...] = ()
+    """parameters of a task, KEY=VALUE: timeout_min=600 partition=gpu gpus_per_node=1 cpus_per_task=8 ..."""
+    queued: int = 64
+    """slurm: most runs in the queue at once"""
     report_only: bool = False
     """run nothing: report what is there"""
     redo_stale: bool = False
@@ -163,7 +170,11 @@ class Bench:
         for folder in (self.out / "runs", self.work):
             folder.mkdir(parents=True, exist_ok=True)
         waiting, running, finished = list(pending.items()), {}, 0
-        slots = [gpu for _ in range(plan.jobs) for gpu in gpu_names(plan.gpus)]
+        queue = Queue(self.executor, self.work, self.slurm) if self.executor else None
+        if self.executor == "slurm":
+            slots = [""] * self.queued
+        else:
+            slots = [gpu for _ in range(plan.jobs) for gpu in gpu_names(plan.gpus)]
         columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
         with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
             bar = progress.add_task("", total=len(pending) * plan.steps)
@@ -181,7 +192,7 @@ class Bench:
                                 write_whole(failure(done.record), json.dumps(note, indent=1) + "\n")
                                 progress.console.print(f"  see {done.log.name}", highlight=False, soft_wrap=True)
                         if slot not in running and waiting:
-                            running[slot] = self.start(*waiting.pop(0), gpu)
+                            running[slot] = self.start(*waiting.pop(0), gpu, queue)
                     steps = finished * plan.steps + sum(child.steps() for child in running.values())
                     label = f"{finished} of {len(pending)} runs"
                     progress.update(bar, completed=steps, description=label)
@@ -193,12 +204,16 @@ class Bench:
                     child.process.wait()
                     child.log.close()
 
-    def start(self, name: str, job, gpu: str) -> Running:
-        """Start one job on a GPU."""
+    def start(self, name: str, job, gpu: str, queue: Queue | None) -> Running:
+        """Start one job on a GPU, or hand it to a queue."""
         failure(self.record(name)).unlink(missing_ok=True)
         file = self.work / f"{name}.job.json"
         write_whole(file, json.dumps(asdict(job), indent=1))
         log = (self.work / f"{name}.log").open("a")
+        if queue is not None:
+            command, note = [*CHILD, str(file.resolve())], self.work / f"{name}.task.json"
+            process = queue.start(name, command, Path(log.name), gpu, note)
+            return Running(name, process, log, Path(job.work), self.record(name), job.identity)
         environment = {**os.environ, "CUDA_VISIBLE_DEVICES": gpu}
         process = subprocess.Popen([*CHILD, str(file)], stdout=log, stderr=subprocess.STDOUT, env=environment)
         return Running(name, process, log, Path(job.work), self.record(name), job.identity)
@@ -223,9 +238,9 @@ def gpu_names(count: int) -> list[str]:
 
 
 def _named_run(text: str) -> tuple[str, dict]:
-    """A run as the command line gives it: METHOD or NAME=METHOD OPTIONS."""
+    """A run as the command line gives it: METHOD OPTIONS or NAME=METHOD OPTIONS; options may have "=" too."""
     name, equals, rest = text.partition("=")
-    if not equals or " " in name:
+    if not equals or " -" in name:
         name, rest = text, text
     method, _, options = rest.strip().partition(" ")
     return name.strip(), {"method": method, "options": options}

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the devices say to each other. Every function here must be called on all of them, in the same order.
+
+gsplat has such functions too (`gsplat.distributed`), which serve NCCL alone: `all_gather_int32` insists on CUDA, and
+`all_to_all_tensor_list` is built on lists of tensors, which gloo does not exchange; it also divides by the number of
+rows, which is zero where a camera sees none of a device's splats, and its backward pass has no room for gsplat's
+`absgrad`. `dist.all_to_all_single`, which both back ends have, needs none of that.
+"""
+
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+ROWS_AT_ONCE = 2**18
+"""Rows of a device that are gathered at a time: what the main device needs beside its shard stays small."""
+
+
+def rank() -> int:
+    """This device's number among all, from 0. Device 0 is the main one."""
+    return dist.get_rank()
+
+
+def world() -> int:
+    """Number of devices W."""
+    return dist.get_world_size()
+
+
+def swap(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
+    """Send each device its part of the rows.
+
+    Args:
+        rows: [M, ...], those for device 0 first.
+        sent: how many rows go to each device, [W], M in all.
+        received: how many rows come from each device, [W].
+
+    Returns:
+        The rows that have arrived, those of device 0 first, [sum(received), ...].
+    """
+    arrived = rows.new_empty(sum(received), *rows.shape[1:])
+    dist.all_to_all_single(arrived, rows.contiguous(), received, sent)
+    return arrived
+
+
+def swap_counts(counts: Tensor) -> tuple[list[int], list[int]]:
+    """Tell each device how many rows it will get.
+
+    Args:
+        counts: how many go to each device, int64 [W].
+
+    Returns:
+        `counts`, and how many come from each device. The host waits for both.
+    """
+    received = torch.empty_like(counts)
+    dist.all_to_all_single(received, counts)
+    return tuple(torch.stack([counts, received]).tolist())
+
+
+def gather_counts(count: int, device: torch.device) -> list[int]:
+    """Every device's count, [W]."""
+    counts = torch.empty(world(), dtype=torch.int64, device=device)
+    dist.all_gather_into_tensor(counts, torch.tensor([count], device=device))
+    return counts.tolist()
+
+
+def gather_objects(value: Any) -> list[Any]:
+    """Every device's value, [W]: plain numbers, strings, lists, dicts and CPU tensors."""
+    values = [None] * world()
+    dist.all_gather_object(values, value)
+    return values
+
+
+def gather_rows(rows: Tensor, counts: list[int]) -> Tensor | None:
+    """Put a table together on the main device's host.
+
+    Args:
+        rows: this device's part [N, ...].
+        counts: every device's N.
+
+    Returns:
+        All rows, those of device 0 first, on the CPU; None on the other devices.
+    """
+    main = rank() == 0
+    parts: list[list[Tensor]] = [[] for _ in counts]
+    for begin in range(0, max(counts), ROWS_AT_ONCE):
+        block = rows[begin : begin + ROWS_AT_ONCE]
+        received = [min(max(count - begin, 0), ROWS_AT_ONCE) if main else 0 for count in counts]
+        arrived = swap(block, [len(block)] + [0] * (len(counts) - 1), received)
+        if main:
+            for part, piece in zip(parts, arrived.cpu().split(received), strict=True):
+                part.append(piece)
+    if not main:
+        return None
+    return torch.cat([piece for part in parts for piece in part]) if max(counts) else rows.cpu()
+
+
+def sum_over_devices(tensors: list[Tensor]) -> None:
+    """Replace each tensor by its sum over the devices, all in one message. Every device must have the same shapes."""
+    if not tensors:
+        return
+    flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
+    dist.all_reduce(flat)
+    for tensor, total in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
+        tensor.copy_(total.view_as(tensor))

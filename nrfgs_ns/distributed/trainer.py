@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trainer on one of several devices: shared weights stay the same everywhere, all devices stop together, and the
+main one writes checkpoints of the whole."""
+
+import math
+import random
+import re
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from nrfgs_ns.distributed import comm
+from nrfgs_ns.distributed.pipeline import ShardedPipeline
+from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
+from nrfgs_ns.distributed.shards import cut_optimizer_state, gather_model_state, gather_optimizer_state
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.guard import MAX_GRADIENT, Guard, TrainingStopped, WatchedOptimizers
+from nrfgs_ns.optimizers import LeanOptimizers, parameters_of
+from nrfgs_ns.trainer import NrfgsTrainer, NrfgsTrainerConfig
+
+ELSEWHERE = "a number on another device"
+WITHOUT_VIEWER = {"viewer": "tensorboard", "viewer_legacy": "tensorboard"}
+"""What `--vis` becomes: the viewer renders when it likes, and a rendering takes all devices."""
+
+
+class ShardedGuard(Guard):
+    """The guard of one device. What one device finds stops all of them, at the same step and with one message."""
+
+    def _share(self, names: list[str], tensors: list[Tensor], sizes: Tensor) -> tuple[list[str], list[Tensor], Tensor]:
+        here = (~(sizes <= MAX_GRADIENT)).any().to(sizes.dtype)
+        anywhere = here.clone()
+        dist.all_reduce(anywhere, dist.ReduceOp.MAX)
+        elsewhere = torch.where(anywhere > here, math.inf, 0.0)
+        return [*names, ELSEWHERE], [*tensors, elsewhere], torch.cat([sizes, elsewhere[None]])
+
+    def _full_name(self, name: str, tensor: Tensor) -> str:
+        return name if name == ELSEWHERE else super()._full_name(name, tensor)
+
+    def settle(self) -> None:
+        try:
+            super().settle()
+        except TrainingStopped as stopped:  # on all devices
+            raise self._together(stopped) from None
+
+    def check_parameters(self, optimizers: LeanOptimizers) -> None:
+        stopped = None
+        try:
+            super().check_parameters(optimizers)
+        except TrainingStopped as error:
+            stopped = error
+        if max(comm.gather_counts(int(stopped is not None), self.model.device)) > 0:
+            raise self._together(stopped) from None
+
+    def _together(self, stopped: TrainingStopped | None) -> TrainingStopped:
+        """One exception for all devices, with the message of the first whose own image or loss is bad, since from
+        there it spreads to the gradients of all; else of the first that found something itself."""
+        of_others = f"Training stopped at step {self.step if stopped is None else stopped.step}: {ELSEWHERE}"
+        own = None
+        if stopped is not None and not str(stopped).startswith(of_others):
+            own = str(stopped)
+        found = comm.gather_objects((own, stopped is None or stopped.savable, stopped and stopped.step))
+        told = [(rank, text) for rank, (text, _, _) in enumerate(found) if text is not None]
+        sources = [(rank, text) for rank, text in told if re.match(r".* step \d+: (the rendered image|loss )", text)]
+        device, message = (sources or told)[0]
+        steps = [step for _, _, step in found if step is not None]
+        savable = all(good for _, good, _ in found)
+        return TrainingStopped(f"On device {device} of {comm.world()}: {message}", steps[0], savable)
+
+
+class ShardedOptimizers(WatchedOptimizers):
+    """The optimisers of one device: gradients of what all devices have are summed before the step."""
+
+    def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:
+        self.guard.before_optimizers(self, gradients_are_scaled=False)
+        shared = [name for name in param_groups if name not in self.guard.model.gauss_params]
+        gradients = [parameter.grad for name in shared for parameter in parameters_of(self.optimizers[name])]
+        comm.sum_over_devices([gradient for gradient in gradients if gradient is not None])
+        LeanOptimizers.optimizer_scaler_step_some(self, grad_scaler, param_groups)
+
+    def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
+        """Load this device's rows of a whole checkpoint; the model has been loaded."""
+        model = self.guard.model
+        super().load_optimizers(
+            {
+                name: cut_optimizer_state(state, model.loaded) if name in model.gauss_params else state
+                for name, state in loaded_state.items()
+            }
+        )
+
+
+class ShardedTrainer(NrfgsTrainer):
+    """The trainer of one device.
+
+    Args:
+        config: of the training, as for one device.
+        local_rank: the device's number on its machine.
+        world_size: number of devices W on all machines.
+
+    Raises:
+        InputError: an option cannot be had on several devices.
+    """
+
+    def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        for name in ("mixed_precision", "use_grad_scaler"):
+            if getattr(config, name):
+                raise InputError(f"{name} is on, which training on several devices does not do. Leave it out.")
+        if config.machine.device_type == "cuda":
+            torch.cuda.set_device(local_rank)
+        CONSOLE.quiet = comm.rank() > 0
+        vis = WITHOUT_VIEWER.get(config.vis, config.vis.removeprefix("viewer+"))
+        if vis != config.vis:
+            CONSOLE.print(f"No viewer while training on several devices: --vis {config.vis} is {vis} here.")
+        self.count_images = config.pipeline.sharding.schedules == "images"
+        if self.count_images:
+            config = with_fewer_steps(config, world_size)
+        config = replace(config, vis=vis, pipeline=replace(config.pipeline, _target=ShardedPipeline))
+        super().__init__(config, local_rank, world_size)
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        # nerfstudio seeds each device differently; the initial splats and the order of the cameras must be the same.
+        seed = self.config.machine.seed
+        random.seed(seed)
+        np.random.seed(seed)
+        torch.manual_seed(seed)
+        super().setup(test_mode)
+
+    def setup_optimizers(self) -> Optimizers:
+        self.guard = ShardedGuard(self.pipeline)
+        every = self.pipeline.steps_per_log = self.config.logging.steps_per_log
+        groups = self.pipeline.get_param_groups()
+        optimizers = ShardedOptimizers(self.optimizer_configs(), groups, self.guard, every)
+        if self.count_images:
+            forget_faster(optimizers.optimizers, self.world_size)
+        return optimizers
+
+    def _checkpoint(self, step: int) -> dict[str, Any]:
+        """The whole, on the main device: what one device would write, and every device's generators and shard."""
+        content = super()._checkpoint(step)
+        model = self.pipeline.model
+        model.count()
+        gather_model_state(content["pipeline"], model.counts, "_model.")
+        for name in model.gauss_params:
+            content["optimizers"][name] = gather_optimizer_state(content["optimizers"][name], model.counts)
+        extra = content["pipeline"]["_extra_state"]
+        own = {name: extra[name] for name in ("torch_rng", "cuda_rng", "python_rng")}
+        images = self.world_size if self.count_images else 1
+        content["pipeline"]["_extra_state"] = {
+            **extra,
+            "devices": comm.gather_objects(own),
+            "images_per_step": images,
+        }
+        return content

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DEVICE = Path(__file__).with_name("device.py")
+TIMEOUT = 500
+"""Seconds after which processes that wait for each other are ended."""
+
+
+def meet(job: str, scene: Path, folder: Path, world: int = 2, device_type: str = "cpu") -> Path:
+    """Run a job of `jobs.py` on `world` processes; `folder`, into which they save their results."""
+    folder.mkdir(parents=True, exist_ok=True)
+    processes = []
+    for rank in range(world):
+        arguments = [job, rank, world, folder / "meeting", scene, folder, device_type]
+        log = (folder / f"log-{rank}.txt").open("w")
+        processes.append(
+            subprocess.Popen(
+                [sys.executable, str(DEVICE), *map(str, arguments)],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "OMP_NUM_THREADS": "1"},
+            )
+        )
+    try:
+        codes = [process.wait(timeout=TIMEOUT) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    tails = [(folder / f"log-{rank}.txt").read_text()[-3000:] for rank in range(world)]
+    assert codes == [0] * world, "\n---\n".join(tails)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def two_devices(tiny_scene, tmp_path_factory) -> Path:
+    """The results of `jobs.everything` on two processes with gloo between them."""
+    return meet("everything", tiny_scene, tmp_path_factory.mktemp("two") / "devices")
+
+
+@pytest.fixture
+def step_results(two_devices) -> Path:
+    return two_devices
+
+
+@pytest.fixture(scope="session")
+def run_together(tmp_path_factory, tiny_scene):
+    """Run another job: name, processes, device type -> folder of its results."""
+
+    def run(job: str, world: int = 2, device_type: str = "cpu") -> Path:
+        return meet(job, tiny_scene, tmp_path_factory.mktemp(job) / "devices", world, device_type)
+
+    return run

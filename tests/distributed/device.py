@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one device does in the tests: `python device.py JOB RANK WORLD MEETING_FILE SCENE FOLDER DEVICE_TYPE`.
+
+JOB is a function of `jobs.py`. Results are saved in FOLDER for the tests to look at.
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+
+COMMON = {
+    "--vis": "tensorboard",
+    "--steps-per-eval-image": 1000,
+    "--steps-per-eval-all-images": 1000,
+    "--logging.local-writer.enable": False,
+    "--logging.profiler": "none",
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.background-color": "black",
+    "--pipeline.model.appearance.output-init": "default",
+}
+PLAIN = {"--pipeline.model.opacity-seen-by-densification": "peak"}
+RICH = {
+    "--pipeline.model.densification": "mcmc",
+    "--pipeline.model.rasterize-mode": "antialiased",
+    "--pipeline.model.use-scale-regularization": True,
+    "--pipeline.model.max-gauss-ratio": 0.5,  # below every ratio: each splat has a gradient from this term
+    "--pipeline.model.use-bilateral-grid": True,
+    "--pipeline.model.camera-optimizer.mode": "SO3xR3",
+}
+BUSY = {
+    "--pipeline.model.warmup-length": 2,
+    "--pipeline.model.refine-every": 4,
+    "--pipeline.model.reset-alpha-every": 6,
+    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.stop-split-at": 1000,
+}
+"""Densify every 4th step, reset opacity every 24th."""
+
+
+def trainer_of(scene: Path, out: Path, world: int, **options):
+    """A trainer, set up, on `world` devices, of which this process is one."""
+    from nrfgs_ns.studies.run import parse
+
+    chosen = {"--data": scene, "--output-dir": out, **COMMON, **options}
+    config = parse(["nrfgs", *(str(word) for option in chosen.items() for word in option)])
+    torch.manual_seed(config.machine.seed)
+    trainer = config.setup(local_rank=dist.get_rank(), world_size=world)
+    trainer.setup()
+    return trainer
+
+
+def precise(trainer) -> None:
+    """Go on in float64, with odd training images of another size than the even: 40 x 30 of 48 x 36."""
+    torch.set_default_dtype(torch.float64)
+    trainer.pipeline.double()
+    splats = trainer.pipeline.model.gauss_params
+    splats["scales"].data += torch.sin(37.0 * splats["means"].data)  # a round splat has no gradient by its rotation
+    data = trainer.pipeline.datamanager
+    data.train_cameras.camera_to_worlds = data.train_cameras.camera_to_worlds.double()
+    for index in range(1, len(data.cached_train), 2):
+        data.cached_train[index]["image"] = data.cached_train[index]["image"][:30, :40]
+        data.train_cameras.width[index], data.train_cameras.height[index] = 40, 30
+
+
+def one_step(options: dict, scene: Path, folder: Path, name: str) -> None:
+    """A step on two devices, and, on the main one, the same step by one process; all in float64."""
+    rank, world = dist.get_rank(), dist.get_world_size()
+    trainer = trainer_of(scene, folder / name, world, **options)
+    precise(trainer)
+    torch.save(step_together(trainer), folder / f"{name}-{rank}.pt")
+    torch.set_default_dtype(torch.float32)
+    if rank == 0:
+        trainer = trainer_of(scene, folder / f"{name}-alone", 1, **options)
+        precise(trainer)
+        cameras, _ = trainer.pipeline.datamanager.next_train_views(world, 0)
+        torch.save(step_alone(trainer, cameras), folder / f"{name}-alone.pt")
+        torch.set_default_dtype(torch.float32)
+    dist.barrier()
+
+
+def step_together(trainer) -> dict:
+    model, pipeline = trainer.pipeline.model, trainer.pipeline
+    weights = list(model.head.parameters())
+    cameras = pipeline.datamanager.train_cameras
+    visible, neutral, slopes = model.far_from_neutral(cameras[0:1], weights)
+    model.step_cb(trainer.optimizers, 0)
+    outputs, losses, _ = pipeline.get_train_loss_dict(0)
+    sum(losses.values()).backward()
+    shared = {name: value for name, value in pipeline.named_parameters() if "gauss_params" not in name}
+    from nrfgs_ns.distributed import comm
+
+    comm.sum_over_devices([value.grad for value in shared.values() if value.grad is not None])
+    screen = model._screen_info()
+    return {
+        "rgb": outputs["rgb"].detach(),
+        "losses": {key: value.detach() for key, value in losses.items()},
+        "splats": {key: value.detach() for key, value in model.gauss_params.items()},
+        "gradients": {key: value.grad for key, value in model.gauss_params.items()},
+        "shared": {key: value.grad for key, value in shared.items()},
+        "statistics": statistics(model, screen),
+        "neutral": [visible, neutral, *slopes],
+    }
+
+
+def step_alone(trainer, cameras) -> dict:
+    """The same cameras one after the other; gradients of the mean of their losses, statistics of each by itself."""
+    pipeline, model = trainer.pipeline, trainer.pipeline.model
+    weights = list(model.head.parameters())
+    neutral = model.far_from_neutral(pipeline.datamanager.train_cameras[0:1], weights)
+    model.step_cb(trainer.optimizers, 0)
+    images, all_losses, stats = [], [], {}
+    for camera in cameras:
+        outputs = model(camera)
+        batch = pipeline.datamanager._image(camera.metadata["cam_idx"])
+        losses = model.get_loss_dict(outputs, batch, {})
+        before = {name: value.grad for name, value in pipeline.named_parameters()}
+        for value in pipeline.parameters():
+            value.grad = None
+        sum(losses.values()).backward()
+        stats = statistics(model, model.info)
+        for name, value in pipeline.named_parameters():
+            if value.grad is not None:
+                value.grad = value.grad / len(cameras) + (0 if before[name] is None else before[name])
+            else:
+                value.grad = before[name]
+        images.append(outputs["rgb"].detach())
+        all_losses.append({key: value.detach() for key, value in losses.items()})
+    return {
+        "rgb": images,
+        "losses": all_losses,
+        "splats": {key: value.detach() for key, value in model.gauss_params.items()},
+        "gradients": {key: value.grad for key, value in model.gauss_params.items()},
+        "shared": {key: value.grad for key, value in pipeline.named_parameters() if "gauss_params" not in key},
+        "statistics": stats,
+        "neutral": [neutral[0], neutral[1], *neutral[2]],
+    }
+
+
+def statistics(model, info) -> dict:
+    """Densification's, after it has seen a step."""
+    from nrfgs_ns.densification import GradientDensification
+
+    rules = model.densification
+    if isinstance(rules, GradientDensification):
+        if rules.state["count"] is None:  # gsplat adds ones of float32, whatever the default
+            rules.state["count"] = torch.zeros(model.num_points, dtype=torch.float32)
+        rules.strategy._update_state(model.gauss_params, rules.state, info, packed=True)
+    return {key: value.clone() for key, value in rules.state.items() if isinstance(value, torch.Tensor)}
+
+
+def train(scene: Path, out: Path, world: int, steps: int, load: Path | None = None, watch=None, **options):
+    """Train for some steps; the trainer.
+
+    Args:
+        load: folder of checkpoints to go on from.
+        watch: called with the trainer before it trains.
+    """
+    more = {"--max-num-iterations": steps, **BUSY, **options, **({"--load-dir": load} if load else {})}
+    trainer = trainer_of(scene, out, world, **more)
+    if watch is not None:
+        watch(trainer)
+    trainer.train()
+    return trainer
+
+
+def told(trainer) -> Path:
+    """The main device's folder of checkpoints, on all: each has a time stamp of its own."""
+    box = [trainer and trainer.checkpoint_dir]
+    dist.broadcast_object_list(box)
+    return box[0]
+
+
+def main() -> None:
+    from nrfgs_ns.distributed.launch import join_group
+
+    job, rank, world, meeting, scene, folder, device_type = sys.argv[1:]
+    COMMON["--machine.device-type"] = device_type
+    join_group(int(rank), int(world), f"file://{meeting}", device_type)
+    import jobs
+
+    getattr(jobs, job)(Path(scene), Path(folder))
+    dist.barrier()
+    dist.destroy_process_group()
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main()

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Jobs of `device.py`. Each runs on all devices at once, in a process group of its own making."""
+
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+from device import PLAIN, RICH, one_step, told, train
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+MORE = {"--pipeline.sharding.rebalance-at": 1.0}
+"""Rows move after each refinement that has left the shards unequal."""
+
+
+def everything(scene: Path, folder: Path) -> None:
+    """All that the default suite looks at, in one meeting: to meet takes longer than most of it."""
+    one_step(PLAIN, scene, folder, "plain")
+    one_step(RICH, scene, folder, "rich")
+    fifty_steps(scene, folder)
+    there_and_back(scene, folder)
+    stops_together(scene, folder)
+
+
+def unbroken(scene: Path, folder: Path) -> None:
+    """24 steps at once, and 12 and 12 more from the checkpoint."""
+    world = dist.get_world_size()
+    whole = told(train(scene, folder / "whole", world, 24, **PLAIN, **MORE))
+    half = told(train(scene, folder / "half", world, 12, **PLAIN, **MORE))
+    rest = told(train(scene, folder / "rest", world, 12, load=half, **PLAIN, **MORE))
+    if dist.get_rank() == 0:
+        torch.save([str(path) for path in (whole, half, rest)], folder / "unbroken.pt")
+
+
+def fifty_steps(scene: Path, folder: Path) -> None:
+    """50 steps with splits, pruning and resets; how the shards fared is saved beside the checkpoint."""
+    counts = []
+
+    def watch(trainer) -> None:
+        model = trainer.pipeline.model
+
+        def count(step: int) -> None:
+            counts.append((step, model.num_points, list(model.counts)))
+
+        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], count))
+
+    trainer = train(scene, folder / "fifty", dist.get_world_size(), 50, watch=watch, **PLAIN, **MORE)
+    shared = {name: value.detach().cpu() for name, value in trainer.pipeline.model.head.named_parameters()}
+    result = {"counts": counts, "shared": shared, "saved": str(told(trainer))}
+    torch.save(result, folder / f"fifty-{dist.get_rank()}.pt")
+
+
+def there_and_back(scene: Path, folder: Path) -> None:
+    """Checkpoints from two devices to one and to two again. Loading is looked at before anything is trained, and the
+    first checkpoint is evaluated by both."""
+    world, main = dist.get_world_size(), dist.get_rank() == 0
+    two = train(scene, folder / "half", world, 6, **PLAIN, **MORE)
+    scores, half = [evaluation(two)], told(two)
+
+    def look(name: str):
+        def see(trainer) -> None:
+            torch.save(holds(trainer), folder / f"{name}-{dist.get_rank()}.pt")
+            if name == "one":
+                scores.append(evaluation(trainer))
+
+        return see
+
+    one = told(train(scene, folder / "one", 1, 6, load=half, watch=look("one"), **PLAIN) if main else None)
+    again = told(train(scene, folder / "two", world, 6, load=one, watch=look("two"), **PLAIN, **MORE))
+    torch.save(scores, folder / f"scores-{dist.get_rank()}.pt")
+    if main:
+        torch.save([str(path) for path in (half, one, again)], folder / "there-and-back.pt")
+
+
+def evaluation(trainer) -> dict:
+    """What the test images say, without times."""
+    metrics = trainer.pipeline.get_average_eval_image_metrics()
+    return {name: value for name, value in metrics.items() if name not in ("seconds_per_image", "fps")}
+
+
+def holds(trainer) -> dict:
+    """A device's splats, their moments and statistics."""
+    model = trainer.pipeline.model
+    optimizers = trainer.optimizers.optimizers
+    held = {name: optimizers[name].param_groups[0]["params"][0] for name in model.gauss_params}
+    return {
+        "splats": {name: value.detach() for name, value in model.gauss_params.items()},
+        "same": all(held[name] is value for name, value in model.gauss_params.items()),
+        "moments": {name: optimizers[name].state[value]["exp_avg_sq"] for name, value in held.items()},
+        "statistics": {k: v for k, v in model.densification.state.items() if isinstance(v, torch.Tensor)},
+        "sampling": trainer.pipeline.datamanager.sampling_state()["unseen_cameras"],
+    }
+
+
+def fits_one_process(scene: Path, folder: Path) -> None:
+    """Device 0's image and loss in the first step, and those of one process; in the devices' own precision."""
+    from device import step_alone, step_together, trainer_of
+
+    world = dist.get_world_size()
+    torch.save(step_together(trainer_of(scene, folder / "step", world, **PLAIN)), folder / f"step-{dist.get_rank()}.pt")
+    if dist.get_rank() == 0:
+        alone = trainer_of(scene, folder / "alone", 1, **PLAIN)
+        cameras, _ = alone.pipeline.datamanager.next_train_views(world, 0)
+        torch.save(step_alone(alone, cameras), folder / "step-alone.pt")
+    dist.barrier()
+    fifty_steps(scene, folder)
+
+
+def stops_together(scene: Path, folder: Path) -> None:
+    """The second device's image has NaN at step 7."""
+    from nrfgs_ns.guard import TrainingStopped
+
+    def break_image(trainer) -> None:
+        step = trainer.pipeline.get_train_loss_dict
+
+        def broken(step_number: int, **kwargs):
+            outputs, losses, metrics = step(step_number)
+            if step_number == 7 and dist.get_rank() == 1:
+                losses["main_loss"] = losses["main_loss"] * float("nan")
+                trainer.pipeline.model.watched["loss main_loss"] = losses["main_loss"].detach()
+            return outputs, losses, metrics
+
+        trainer.pipeline.get_train_loss_dict = lambda step: broken(step)
+
+    try:
+        train(scene, folder / "stopped", dist.get_world_size(), 10, watch=break_image, **PLAIN)
+        said = ""
+    except TrainingStopped as stopped:
+        said = str(stopped)
+    torch.save(said, folder / f"stopped-{dist.get_rank()}.pt")

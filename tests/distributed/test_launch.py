@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is said when a process is lost, and that nothing else is lost with it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
+
+from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.distributed import launch
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.method_config import nrfgs
+
+
+@pytest.fixture
+def config(tmp_path):
+    machine = replace(nrfgs.config.machine, num_devices=2, device_type="cpu")
+    return replace(nrfgs.config, output_dir=tmp_path, machine=machine, experiment_name="x", timestamp="now")
+
+
+def test_a_killed_process_is_named_and_the_checkpoint_shown(config):
+    error = ProcessExitedException("died", error_index=1, error_pid=7, exit_code=-9, signal_name="SIGKILL")
+    assert "No checkpoint had been written." in launch.explain(error, config)
+    config.get_checkpoint_dir().mkdir(parents=True)
+    (config.get_checkpoint_dir() / "step-000000010.ckpt").touch()
+    said = launch.explain(error, config)
+    assert "process of device 1 of 2 was killed by SIGKILL. Out of memory" in said
+    assert "step-000000010.ckpt, whole; with --load-dir" in said
+
+
+def test_of_a_failed_process_the_error_is_shown_without_its_traceback(config):
+    report = (
+        "\n\n-- Process 0 terminated with the following error:\nTraceback (most recent call last):\n"
+        '  File "x.py", line 1, in f\n    g()\nnrfgs_ns.errors.InputError: image.png cannot be decoded.\nReplace it.\n'
+    )
+    said = launch.explain(ProcessRaisedException(report, error_index=0, error_pid=7), config)
+    assert "device 0 of 2 failed:\nnrfgs_ns.errors.InputError: image.png cannot be decoded.\nReplace it." in said
+    assert "Traceback" not in said
+
+
+def test_what_cannot_start_is_refused_before_it_does(config, monkeypatch):
+    with pytest.raises(InputError, match="nrfgs_ns.distributed.launch"):
+        config.save_config()  # what ns-train does, on CPUs
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(InputError, match="num_devices is 2, but this machine shows 1"):
+        launch.prepare(replace(config, machine=replace(config.machine, device_type="cuda")))
+    with pytest.raises(InputError, match="dist_url"):
+        launch.launch(replace(config, machine=replace(config.machine, num_machines=2)))
+
+
+def test_nerfstudio_s_launcher_says_it_in_one_message(config, monkeypatch, capsys):
+    """`ns-train` lets the exception of its children through to Python, which would print both their traceback and its
+    own."""
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(sys, "excepthook", lambda kind, error, trace: print("as ever:", error, file=sys.stderr))
+    replace(config, machine=replace(config.machine, device_type="cuda")).save_config()
+    error = ProcessExitedException("died", error_index=1, error_pid=7, exit_code=-9, signal_name="SIGKILL")
+    sys.excepthook(type(error), error, None)
+    sys.excepthook(ValueError, ValueError("another"), None)
+    said = capsys.readouterr().err
+    assert said.startswith("Training stopped: the process of device 1 of 2 was killed by SIGKILL.")
+    assert said.endswith("as ever: another\n")
+
+
+@pytest.mark.parametrize("option", ["mixed_precision", "use_grad_scaler"])
+def test_scaled_gradients_are_refused(config, option):
+    with pytest.raises(InputError, match=option):
+        replace(config, **{option: True}).setup(local_rank=0, world_size=2)
+
+
+def workers(parent: int) -> list[int]:
+    """Processes that multiprocessing has spawned, in the order of their ranks."""
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return [int(pid) for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_process_ends_the_others_and_leaves_the_checkpoint(victim, tiny_scene, tmp_path):
+    options = {
+        "--data": tiny_scene,
+        "--output-dir": tmp_path,
+        "--machine.num-devices": 2,
+        "--machine.device-type": "cpu",
+        "--max-num-iterations": 100_000,
+        "--steps-per-save": 10,
+        "--vis": "tensorboard",
+        "--steps-per-eval-image": 0,
+        "--steps-per-eval-all-images": 0,
+        "--pipeline.model.stop-split-at": 0,
+    }
+    words = [str(word) for option in options.items() for word in option]
+    command = [sys.executable, "-m", "nrfgs_ns.distributed.launch", "nrfgs", *words]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
+    try:
+        deadline = time.time() + 300
+        while not list(tmp_path.rglob("*.ckpt")) and process.poll() is None and time.time() < deadline:
+            time.sleep(0.1)
+        ranks = workers(process.pid)
+        assert len(ranks) == 2
+        os.kill(ranks[victim], signal.SIGKILL)
+        killed = time.time()
+        _, stderr = process.communicate(timeout=120)
+        took = time.time() - killed
+    finally:
+        process.kill()
+    said = stderr[stderr.index("Training stopped") :]
+    assert said.startswith(f"Training stopped: the process of device {victim} of 2 was killed by SIGKILL.")
+    assert "Traceback" not in said
+    assert process.returncode == 1 and took < 60, "waited for a dead process"
+    for pid in ranks:
+        assert not Path(f"/proc/{pid}").exists(), "a process was left behind"
+    path = max(tmp_path.rglob("nerfstudio_models/*.ckpt"))
+    assert str(path) in said
+    allow_nerfstudio_checkpoints()
+    content = torch.load(path, weights_only=True)
+    assert len(content["pipeline"]["_model.gauss_params.means"]) == 300

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One step of two devices against the same step of one process, value for value, in float64.
+
+Both do the same arithmetic on the same numbers; only the order of sums differs. An image's and a gradient's entry is a
+sum of at most P = 48 x 36 pixels x 300 splats = 5e5 products, so that rounding moves it by at most P eps = 1.2e-10 of
+the sum of the products' sizes. Cancellation makes that sum larger than the largest entry of its tensor by a factor,
+for which 100 is allowed: 1e-8 of the largest entry. A gradient that were lost, doubled or given to another splat would
+be wrong by 1e-3 of it or more.
+"""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+RELATIVE = 1e-8
+
+
+def agree(name, ours, theirs) -> None:
+    assert_close(ours, theirs, rtol=0.0, atol=RELATIVE * float(theirs.abs().max()), msg=lambda text: f"{name}: {text}")
+
+
+@pytest.fixture(params=["plain", "rich"])
+def results(request, step_results):
+    """(device 0, device 1, one process) of a step: `plain` is splatfacto's densification with absgrad and running peaks
+    of opacity; `rich` has antialiasing, learnt poses, bilateral grids, and losses over splats (MCMC's, aspect ratios).
+    The two cameras differ in size."""
+    read = lambda who: torch.load(step_results / f"{request.param}-{who}.pt")  # noqa: E731
+    return read(0), read(1), read("alone")
+
+
+def dealt(ours: dict, theirs: dict, name: str):
+    """Each device's rows and those of one process that they are: dealt out in turn."""
+    return [(part[name], theirs[name][rank::2]) for rank, part in enumerate(ours)]
+
+
+def test_every_device_renders_its_own_camera(results):
+    first, second, alone = results
+    assert first["rgb"].shape != second["rgb"].shape
+    for ours, theirs in zip((first, second), alone["rgb"], strict=True):
+        agree("rgb", ours["rgb"], theirs)
+        assert float(theirs.std()) > 0.02, "an image without contents proves nothing"
+
+
+def test_losses(results):
+    first, second, alone = results
+    for name in alone["losses"][0]:
+        mine, theirs = torch.stack([part["losses"][name] for part in (first, second)]), alone["losses"]
+        theirs = torch.stack([losses[name] for losses in theirs])
+        if name.startswith("mcmc") or name == "scale_reg":  # a mean over splats: each device has its part
+            mine, theirs = mine.mean(), theirs.mean()
+        agree(name, mine, theirs)
+
+
+def test_gradients_of_splats_arrive_where_they_live(results):
+    first, second, alone = results
+    assert alone["gradients"].keys() == first["gradients"].keys()
+    for name, theirs in alone["gradients"].items():
+        assert float(theirs.abs().max()) > 0, name
+        for rank, ours in enumerate((first, second)):
+            agree(name, ours["splats"][name], alone["splats"][name][rank::2])
+            agree(name, ours["gradients"][name], theirs[rank::2])
+
+
+def test_gradients_of_shared_weights_are_whole(results):
+    first, second, alone = results
+    for name, theirs in alone["shared"].items():
+        for ours in (first, second):
+            assert (ours["shared"][name] is None) == (theirs is None), name
+            if theirs is not None:
+                agree(name, ours["shared"][name], theirs)
+    learning = [name for name, value in alone["shared"].items() if value is not None and float(value.abs().max()) > 0]
+    assert any("head" in name for name in learning)
+    if any("bil_grids" in name for name in alone["shared"]):
+        assert any("bil_grids" in name for name in learning) and any("camera_opt" in name for name in learning)
+
+
+def test_statistics_of_densification_are_those_of_single_views(results):
+    """Gradients are counted for each view by itself, though the loss is a mean: thresholds mean the same."""
+    first, second, alone = results
+    for name, theirs in alone["statistics"].items():
+        for rank, ours in enumerate((first, second)):
+            agree(name, ours["statistics"][name].double(), theirs[rank::2].double())
+    if "grad2d" in alone["statistics"]:
+        assert {"grad2d", "count", "radii", "peak"} <= alone["statistics"].keys()
+        assert float(alone["statistics"]["count"].max()) == 2, "no splat is seen by both cameras"
+
+
+def test_the_warm_up_sees_all_splats(results):
+    first, second, alone = results
+    for ours in (first, second):
+        assert ours["neutral"][0] == alone["neutral"][0] > 0
+        for mine, theirs in zip(ours["neutral"][1:], alone["neutral"][1:], strict=True):
+            agree("neutral", mine, theirs)
