@@ -175,6 +175,8 @@ class Bench:
             slots = [""] * self.queued
         else:
             slots = [gpu for _ in range(plan.jobs) for gpu in gpu_names(plan.gpus)]
+        # A training on a GPU needs few CPU threads, but torch takes all cores: side by side they wait for each other.
+        threads = max(1, (os.cpu_count() or 1) // len(slots))
         columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
         with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
             bar = progress.add_task("", total=len(pending) * plan.steps)
@@ -192,7 +194,7 @@ class Bench:
                                 write_whole(failure(done.record), json.dumps(note, indent=1) + "\n")
                                 progress.console.print(f"  see {done.log.name}", highlight=False, soft_wrap=True)
                         if slot not in running and waiting:
-                            running[slot] = self.start(*waiting.pop(0), gpu, queue)
+                            running[slot] = self.start(*waiting.pop(0), gpu, threads, queue)
                     steps = finished * plan.steps + sum(child.steps() for child in running.values())
                     label = f"{finished} of {len(pending)} runs"
                     progress.update(bar, completed=steps, description=label)
@@ -204,8 +206,8 @@ class Bench:
                     child.process.wait()
                     child.log.close()
 
-    def start(self, name: str, job, gpu: str, queue: Queue | None) -> Running:
-        """Start one job on a GPU, or hand it to a queue."""
+    def start(self, name: str, job, gpu: str, threads: int, queue: Queue | None) -> Running:
+        """Start one job on a GPU, with as many CPU threads unless OMP_NUM_THREADS says otherwise, or queue it."""
         failure(self.record(name)).unlink(missing_ok=True)
         file = self.work / f"{name}.job.json"
         write_whole(file, json.dumps(asdict(job), indent=1))
@@ -214,7 +216,7 @@ class Bench:
             command, note = [*CHILD, str(file.resolve())], self.work / f"{name}.task.json"
             process = queue.start(name, command, Path(log.name), gpu, note)
             return Running(name, process, log, Path(job.work), self.record(name), job.identity)
-        environment = {**os.environ, "CUDA_VISIBLE_DEVICES": gpu}
+        environment = {"OMP_NUM_THREADS": str(threads), **os.environ, "CUDA_VISIBLE_DEVICES": gpu}
         process = subprocess.Popen([*CHILD, str(file)], stdout=log, stderr=subprocess.STDOUT, env=environment)
         return Running(name, process, log, Path(job.work), self.record(name), job.identity)
 

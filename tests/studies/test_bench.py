@@ -293,3 +293,11 @@ def test_a_finished_run_is_not_repeated_by_a_late_child(tmp_path, trained):
     Path(job.record).write_text("{}")
     bench_run.run(job)
     assert not trained and Path(job.record).read_text() == "{}"
+
+
+def test_runs_on_the_command_line_may_have_names_with_spaces_and_options_with_equals():
+    assert bench._named_run("nrfgs-sh") == ("nrfgs-sh", {"method": "nrfgs-sh", "options": ""})
+    named = ("NRF-GS logit", {"method": "nrfgs", "options": "--pipeline.model.appearance.opacity-bound=logit"})
+    assert bench._named_run("NRF-GS logit=nrfgs --pipeline.model.appearance.opacity-bound=logit") == named
+    plain = "nrfgs --machine.seed=3"
+    assert bench._named_run(plain) == (plain, {"method": "nrfgs", "options": "--machine.seed=3"})
