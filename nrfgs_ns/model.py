@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
@@ -20,7 +21,8 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.checkpoint import check_compatible
 from nrfgs_ns.densification import (
@@ -31,12 +33,17 @@ from nrfgs_ns.densification import (
     build_densification,
 )
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.exported import ExportedTables
 from nrfgs_ns.metrics import ImageMetrics
+from nrfgs_ns.pace import Pace
 from nrfgs_ns.pinhole import Pinhole, pinhole
 from nrfgs_ns.rasterizer import Projection, composite, project
 from nrfgs_ns.ssim import photometric_loss
+from nrfgs_ns.viewer import ViewerPanel, asked_by_viewer
 from nrfgs_ns.warmup import warm_up
 
+NEAR_PLANE, FAR_PLANE = 0.01, 1e10
+"""Depths between which splats are drawn, in scene units: splatfacto's."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
 
@@ -87,7 +94,7 @@ class View(NamedTuple):
         return self.projection.gaussian_ids
 
 
-class NrfgsModel(SplatfactoModel):
+class NrfgsModel(ExportedTables, SplatfactoModel):
     """Gaussian splatting with an appearance head.
 
     Args:
@@ -96,6 +103,8 @@ class NrfgsModel(SplatfactoModel):
     """
 
     config: NrfgsModelConfig
+    pace: Pace | None = None
+    """how fast the training walks through its schedules; None: a step is a step"""
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
@@ -104,7 +113,10 @@ class NrfgsModel(SplatfactoModel):
                 f"pipeline.model.appearance is {self.config.appearance!r}, which is not the configuration of an "
                 "appearance head. Use one from nrfgs_ns.appearance, such as NrfConfig or ShConfig."
             )
+        self.scene_unit: float = (self.kwargs.get("metadata") or {}).get("scene_unit", 1.0)
+        """World units in a scene unit; lengths in the configuration are in scene units."""
         self.head = self.config.appearance.setup()
+        self.head.scene_unit = self.scene_unit
         self.config.sh_degree = self.head.sh_degree
         self.gauss_params = torch.nn.ParameterDict(self._initial_splats())
         self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
@@ -114,56 +126,39 @@ class NrfgsModel(SplatfactoModel):
         self.image_metrics = ImageMetrics()
         self.step = 0
         self.crop_box = None
+        self.viewer_panel = ViewerPanel(self)
         self._pinholes: dict[tuple[int, int], Pinhole] = {}
         self.background_color = (
             torch.tensor(VISER_BACKGROUND)
             if self.config.background_color == "random"
             else get_color(self.config.background_color)
         )
-        self.densification = build_densification(self.config, self.num_train_data)
+        self.densification = build_densification(self.config, self.num_train_data, self.scene_unit)
 
     def _initial_splats(self) -> dict[str, Parameter]:
         """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
         if self.seed_points is not None and not self.config.random_init:
             means, rgb = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
         else:
-            means = (torch.rand(self.config.num_random, 3) - 0.5) * self.config.random_scale
+            means = (torch.rand(self.config.num_random, 3) - 0.5) * self.config.random_scale * self.scene_unit
             rgb = torch.rand(len(means), 3)
         neighbours = min(3, len(means) - 1)
         if neighbours > 0:
             distances, _ = self.k_nearest_sklearn(means, neighbours)
             width = torch.from_numpy(distances).mean(dim=-1, keepdim=True)
         else:
-            width = torch.full((len(means), 1), self.config.densify_size_thresh)
+            width = torch.full((len(means), 1), self.config.densify_size_thresh * self.scene_unit)
         return {
             name: Parameter(value)
             for name, value in {
                 "means": means.clone(),
-                "scales": width.clamp_min(1e-7).log().repeat(1, 3),  # duplicate points have distance 0
+                # Duplicate points have distance 0.
+                "scales": width.clamp_min(1e-7 * self.scene_unit).log().repeat(1, 3),
                 "quats": random_quat_tensor(len(means)),
                 "opacities": torch.logit(torch.full((len(means), 1), 0.1)),
                 **self.head.splat_params(rgb),
             }.items()
         }
-
-    # What nerfstudio's exporter and viewer read.
-
-    @property
-    def colors(self) -> Tensor:
-        """Base colours [N, 3]."""
-        return base_colors(self.features_dc)
-
-    @property
-    def shs_0(self) -> Tensor:
-        """Coefficients of the constant harmonic [N, 3]."""
-        return self.features_dc
-
-    @property
-    def features_rest(self) -> Tensor:
-        """Coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any."""
-        if "features_rest" in self.gauss_params:
-            return self.gauss_params["features_rest"]
-        return self.features_dc.new_zeros(self.num_points, 0, 3)
 
     @property
     def parameter_bytes(self) -> int:
@@ -197,7 +192,18 @@ class NrfgsModel(SplatfactoModel):
 
     def step_cb(self, optimizers, step: int) -> None:
         super().step_cb(optimizers, step)
-        self.head.set_step(step)
+        self.head.set_step(self.schedule_step)
+
+    @property
+    def schedule_step(self) -> int:
+        """The step that the head and the resolution are scheduled by."""
+        return self.step if self.pace is None else int(self.pace.position)
+
+    def _get_downscale_factor(self) -> int:
+        if not self.training:
+            return 1
+        risen = self.schedule_step // self.config.resolution_schedule
+        return 2 ** max(self.config.num_downscales - risen, 0)
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
@@ -228,6 +234,27 @@ class NrfgsModel(SplatfactoModel):
             self.watched_image = batch.get("image_idx")
         return losses
 
+    def far_from_neutral(
+        self, camera: Cameras, weights: list[Parameter]
+    ) -> tuple[int, Tensor, tuple[Tensor, ...]] | None:
+        """How far the head is from adding nothing to what a camera sees, for the warm-up.
+
+        Args:
+            camera: a batch of one camera, [1].
+            weights: the head's shared weights.
+
+        Returns:
+            The number of visible splats; the head's neutral loss, NaN if that is 0; its gradients by the weights. None
+            if there is nothing that could be taught.
+        """
+        with torch.no_grad():
+            view = self.look(camera)
+        loss = self.head.neutral_loss(view.splats, view.visible, view.center)
+        if loss is None:
+            return None
+        # Only the shared weights learn: the splats' parameters keep no gradient from here.
+        return len(view.visible), loss.detach(), torch.autograd.grad(loss, weights)
+
     # Rendering.
 
     def look(self, camera: Cameras) -> View:
@@ -236,27 +263,41 @@ class NrfgsModel(SplatfactoModel):
         Args:
             camera: a batch of one camera, [1].
         """
+        splats = self._splats_to_draw()
+        seen_from = self._pinhole(camera)
+        projection = self._project(splats, seen_from.viewmat, seen_from.K, seen_from.width, seen_from.height)
+        return View(projection, splats, seen_from.center)
+
+    def _splats_to_draw(self) -> dict[str, Tensor]:
+        """The table of splats: all of them, or those in the crop box; with "diffuse" (`appearance/diffuse.py`) if it is
+        known which are."""
+        splats: dict[str, Tensor] = dict(self.gauss_params.items())
+        if (diffuse := self.densification.state.get(DIFFUSE)) is not None:
+            splats[DIFFUSE] = diffuse
+        if self.crop_box is not None and not self.training:
+            inside = self.crop_box.within(splats["means"]).reshape(-1)
+            splats = {name: value[inside] for name, value in splats.items()}
+        return splats
+
+    def _project(self, splats: dict[str, Tensor], viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Projection:
+        """Project a table of splats into cameras [C, 4, 4], [C, 3, 3] of one size."""
         if self.config.rasterize_mode not in ("antialiased", "classic"):
             raise InputError(
                 f"pipeline.model.rasterize_mode is {self.config.rasterize_mode!r}; use 'classic' or 'antialiased'."
             )
-        splats: dict[str, Tensor] = dict(self.gauss_params.items())
-        if self.crop_box is not None and not self.training:
-            inside = self.crop_box.within(splats["means"]).reshape(-1)
-            splats = {name: value[inside] for name, value in splats.items()}
-        seen_from = self._pinhole(camera)
-        projection = project(
+        return project(
             splats["means"],
             splats["quats"],
             splats["scales"].exp(),
-            seen_from.viewmat,
-            seen_from.K,
-            seen_from.width,
-            seen_from.height,
+            viewmats,
+            Ks,
+            width,
+            height,
+            near_plane=NEAR_PLANE * self.scene_unit,
+            far_plane=FAR_PLANE * self.scene_unit,
             rasterize_mode=self.config.rasterize_mode,
             assume_finite=self.training,  # the trainer's guard watches
         )
-        return View(projection, splats, seen_from.center)
 
     def _pinhole(self, camera: Cameras) -> Pinhole:
         """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
@@ -281,23 +322,53 @@ class NrfgsModel(SplatfactoModel):
         """
         view = self.look(camera)
         appearance = self.head(view.splats, view.visible, view.center)
-        outputs, self.info = self._paint(view, appearance)
+        outputs, self.info = self.paint(view, appearance)
         if self.training:
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.num_points)
-            if self.config.use_bilateral_grid and "cam_idx" in (camera.metadata or {}):
-                height, width = outputs["rgb"].shape[:2]
-                index = camera.metadata["cam_idx"]
-                outputs["rgb"] = self._apply_bilateral_grid(outputs["rgb"][None], index, height, width)[0]
+            self._correct_colors(outputs, camera)
         return outputs
+
+    def _correct_colors(self, outputs: dict[str, Tensor], camera: Cameras) -> None:
+        """Apply the training camera's bilateral grid to "rgb", if there are grids."""
+        if self.config.use_bilateral_grid and "cam_idx" in (camera.metadata or {}):
+            height, width = outputs["rgb"].shape[:2]
+            index = camera.metadata["cam_idx"]
+            outputs["rgb"] = self._apply_bilateral_grid(outputs["rgb"][None], index, height, width)[0]
 
     @torch.no_grad()
     def get_base_color(self, camera: Cameras) -> Tensor:
         """The image [H, W, 3] of the base colours and opacities alone, without what depends on the view."""
         view = self.look(camera)
-        return self._paint(view, self.head.base_appearance(view.splats, view.visible))[0]["rgb"]
+        return self.paint(view, self.head.base_appearance(view.splats, view.visible))[0]["rgb"]
 
-    def _paint(self, view: View, appearance: SplatAppearance) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite the visible splats over the background; also the rasterizer's `info`, for densification."""
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Render one camera as it was trained; for a browser, as the viewer's panel says (`viewer.py`).
+
+        Args:
+            camera: a batch of one camera, [1].
+            obb_box: only splats with their centre inside are drawn, if given.
+        """
+        if asked_by_viewer():
+            return self.viewer_panel.render(camera.to(self.device), obb_box)
+        return super().get_outputs_for_camera(camera, obb_box)
+
+    def set_background(self, background_color: Tensor) -> None:
+        """Take the viewer's background [3], for the viewer's pictures alone: what evaluation uses must not change."""
+        self.viewer_panel.background = background_color
+
+    def paint(
+        self, view: View, appearance: SplatAppearance, background: Tensor | None = None
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Composite the visible splats over the background.
+
+        Args:
+            view: what one camera sees.
+            appearance: colours and opacities of the M visible splats.
+            background: a colour [3] instead of the configuration's.
+
+        Returns:
+            As `get_outputs`; and the rasterizer's `info`, for densification.
+        """
         with_depth = self.config.output_depth_during_training or not self.training
         render, alpha, info = composite(
             view.projection,
@@ -310,7 +381,8 @@ class NrfgsModel(SplatfactoModel):
         render, alpha = render[0], alpha[0]
         height, width = alpha.shape[:2]
         self.last_size = (height, width)
-        background = self._get_background_color()
+        if background is None:
+            background = self._get_background_color()
         outputs = {
             "rgb": torch.clamp(render[..., :3] + (1 - alpha) * background, 0.0, 1.0),
             "accumulation": alpha,
@@ -361,11 +433,12 @@ class NrfgsModel(SplatfactoModel):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a checkpoint holds beside tensors: the head's name, and densification's running statistics."""
-        return {
+        state = {
             "head": self.head.name,
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
         }
+        return state if self.pace is None else {**state, "pace": self.pace.state()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         written_by = state.get("densification", "splatfacto")  # older checkpoints do not say
@@ -375,6 +448,10 @@ class NrfgsModel(SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
+        if "pace" in state:
+            self.pace = self.pace or Pace(state["pace"]["length"])
+            self.pace.load_state(state["pace"])
+            self.head.set_step(self.schedule_step)
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):
         """Load a checkpoint with any number of splats.
@@ -386,6 +463,7 @@ class NrfgsModel(SplatfactoModel):
             InputError: the checkpoint belongs to another head, or to another size of this one.
         """
         check_compatible(self, state)
+        self.forget_fit()
         for name, parameter in self.gauss_params.items():
             parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)
         return super(SplatfactoModel, self).load_state_dict(state, strict=strict, **kwargs)

@@ -330,7 +330,7 @@ def test_trainings_and_viewers_see_the_stored_tables(mode, tiny_scene, tmp_path,
     """The viewer reads every property of the model several times at its start: nothing may be fitted there."""
     config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path)])
     model = config.pipeline.setup(device="cpu", test_mode=mode).model
-    monkeypatch.setattr("nrfgs_ns.model.fit_harmonics", None)
+    monkeypatch.setattr("nrfgs_ns.exported.fit_harmonics", None)
     assert model.fit is None and model.shs_rest.shape == (model.num_points, 0, 3)
     for name in ("opacities", "quats", "features_dc"):
         assert getattr(model, name) is model.gauss_params[name]
