@@ -29,6 +29,8 @@ from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.studies.run import evaluate, machine, train
 
+NO_DENSIFICATION = {"--pipeline.model.warmup-length": 10**6}
+"""So that the longest training stays one of minutes."""
 SCENE = SceneConfig(views=16, width=48, height=36, points=600, samples=2)
 """Small enough for a run a minute on one core."""
 RESETS = {"--pipeline.model.refine-every": 25, "--pipeline.model.reset-alpha-every": 2}
@@ -112,7 +114,7 @@ def hard_trainings() -> list[HardTraining]:
         *rows,
         HardTraining("learning rates x 10", options=ten_times_faster()),
         HardTraining("opacity reset every 50 steps", options=RESETS),
-        HardTraining("100,000 steps", steps=100_000),
+        HardTraining("100,000 steps, no densification", options=NO_DENSIFICATION, steps=100_000),
         HardTraining("black images", partial(paint, value=0)),
         HardTraining("white images", partial(paint, value=255)),
         HardTraining("one image", partial(keep, count=1)),
