@@ -7,8 +7,10 @@
 
 The loop is what one would write first: gsplat's lists of 16-pixel tiles, then for each tile alpha, cumulative product
 and sum in plain torch, differentiated by autograd. Both compute the same image, which is checked before anything is
-timed. Figures are medians in milliseconds over three rounds of repeats, ours and the loop in turn; projection is
-included. Peak memory is measured in a process of its own per size.
+timed. Figures are medians in milliseconds over rounds of repeats, ours and the loop in turn; projection is included.
+Beside the median of the rounds' ratios stands the ratio of the fastest rounds: on a machine with other work to do,
+several threads make every operation wait for the slowest of them. `load` is the number of processes that ran or
+waited meanwhile, ours included. Peak memory is measured in a process of its own per size.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import platform
+import os
 import statistics
 import subprocess
 import sys
@@ -34,7 +36,6 @@ from nrfgs_ns.rasterizer import Projection, project, rasterization  # noqa: E402
 
 SIZES = ["20000x256x256", "50000x400x300", "200000x800x600", "200000x1600x1200"]
 LOOP_TILE = 16
-ROUNDS = 3
 
 
 @dataclass
@@ -175,6 +176,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", default=SIZES, help="splats x width x height")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--checkpoint", type=Path, help="a nerfstudio checkpoint, timed at 800 x 600")
     parser.add_argument("--no-loop", action="store_true", help="skip the baseline")
@@ -204,16 +206,20 @@ def main() -> None:
                 sys.exit(f"{name}: the two images differ by {row['mean_difference']:.1e} on average")
             # In turns, so that a machine that slows down for a while slows both.
             rounds = [(row["ours"], timed(plain_loop, scene, 1))]
-            for _ in range(ROUNDS - 1):
+            for _ in range(arguments.rounds - 1):
                 rounds.append((timed(rasterization, scene, arguments.repeats), timed(plain_loop, scene, 1)))
             row["rounds"] = [{"ours": ours, "loop": loop} for ours, loop in rounds]
             ratios = [sum(loop.values()) / sum(ours.values()) for ours, loop in rounds]
             row["times_faster"] = statistics.median(ratios)
+            fastest = [min(sum(turn.values()) for turn in turns) for turns in zip(*rounds, strict=True)]
+            row["times_faster_fastest"] = fastest[1] / fastest[0]
             for which, values in zip(("ours", "loop"), zip(*rounds, strict=True), strict=True):
                 row[which] = {key: statistics.median(value[key] for value in values) for key in values[0]}
             line = f"{name:24} ours {row['ours']['forward_ms']:6.0f} + {row['ours']['backward_ms']:6.0f} ms"
             line += f"   loop {row['loop']['forward_ms']:6.0f} + {row['loop']['backward_ms']:6.0f} ms"
             line += f"   {row['times_faster']:5.1f} ({min(ratios):.1f}-{max(ratios):.1f}) times faster"
+            line += f", fastest rounds {row['times_faster_fastest']:.1f}"
+        row["load"] = round(os.getloadavg()[0], 1)
         if name in arguments.sizes:
             command = [sys.executable, __file__, "--peak-memory", name, "--threads", str(arguments.threads)]
             row["peak_memory_mib"] = float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
@@ -222,7 +228,7 @@ def main() -> None:
         rows[name] = row
 
     machine = {
-        "cpu": platform.processor() or platform.machine(),
+        "name": f"{os.cpu_count()} CPU cores",
         "threads": arguments.threads,
         "torch": torch.__version__,
     }

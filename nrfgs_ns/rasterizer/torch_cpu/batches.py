@@ -5,7 +5,8 @@ Tiles advance together in *slabs* of 32 splats of depth. After each slab the til
 light leave, so hidden splats cost nothing. A slab is cut into batches of tiles with similar counts, so little is
 padded, and the arrays [B, n, 64] of a batch stay within `BATCH_ELEMENTS`, the memory knob of the arithmetic.
 
-Nothing per pixel is stored for the backward pass but T in front of each slab; everything else is computed again.
+For the backward pass a batch keeps T in front of its slab and the numbers of its splats; all that is per pixel and
+splat is computed again.
 """
 
 from __future__ import annotations
@@ -22,8 +23,6 @@ from .tiles import Footprints, TileLists
 
 SLAB = 32  # splats of depth between two looks at which tiles are finished
 BATCH_ELEMENTS = 2**19  # pixels x splats in flight; four float arrays of this size exist at a time (8 MiB)
-ROWS_AT_ONCE = 2**15  # float64 intermediates of this length stay in cache
-N_NUMBERS = 9  # columns of a row of `pair_rows` before the colours
 LN_2 = math.log(2.0)
 LOG2_NEARLY_MAX_ALPHA = math.log2(0.9989)  # a splat below this opacity stays below 0.999 however l is rounded
 NOTHING = -1e5  # exp2(NOTHING) = 0: the log-alpha of padding
@@ -35,6 +34,8 @@ class Sheet:
     def __init__(self, prints: Footprints, colors: Tensor, n_cameras: int, width: int, height: int) -> None:
         self.prints = prints
         self.colors = colors  # [F, D]
+        # Conic and ln(o) divided by ln 2, because exp2 is three times faster than exp.
+        self.shape = torch.cat([prints.shape[:2], prints.shape[2:] / LN_2])  # [6, F], float64
         self.n_tiles = n_cameras * prints.tiles_y * prints.tiles_x
         edge, dtype = prints.edge, colors.dtype
         offsets = torch.arange(edge, dtype=dtype) - (edge - 1) / 2
@@ -64,6 +65,12 @@ class Sheet:
             self._buffers[key] = tensor, tensor.unbind(1)
         return self._buffers[key]
 
+    def centres(self, tiles: Tensor) -> Tensor:
+        """Centres x, y of tiles in pixels, y counted from the top of the first image. [L] -> [2, L, 1], float64"""
+        tiles_x = self.prints.tiles_x
+        corners = torch.stack([tiles % tiles_x, tiles // tiles_x])[..., None]
+        return (corners.double() + 0.5) * self.prints.edge
+
     def image(self, values: Tensor, n_cameras: int, width: int, height: int) -> Tensor:
         """Put tiles back into images. [C * tiles, D, P] -> [C, H, W, D]"""
         edge, tiles_x, tiles_y = self.prints.edge, self.prints.tiles_x, self.prints.tiles_y
@@ -79,27 +86,13 @@ class Sheet:
         return images.reshape(self.n_tiles, channels, edge * edge)
 
 
-def pair_rows(sheet: Sheet, lists: TileLists) -> Tensor:
-    """What compositing needs of each (tile, splat) pair, in one row: sigma expanded around the tile's centre.
+class Numbers(NamedTuple):
+    """What compositing needs of the R = B n splats of a batch: sigma expanded around the centres of their tiles."""
 
-    Columns: the coefficients of l in (1, x, y, x^2, xy, y^2), divided by ln 2 because exp2 is three times faster than
-    exp; mx, my; log2 o; colours. [K, 9 + D]
-    """
-    edge, tiles_x = sheet.prints.edge, sheet.prints.tiles_x
-    rows = sheet.colors.new_empty(lists.splat.numel(), N_NUMBERS + sheet.colors.shape[1])
-    centres = torch.stack([lists.tiles % tiles_x, lists.tiles // tiles_x]).double().add_(0.5).mul_(edge)
-    tile_x, tile_y = (t.repeat_interleave(lists.count, output_size=len(rows)) for t in centres)
-    pieces = (t.split(ROWS_AT_ONCE) for t in (rows, lists.splat, tile_x, tile_y))
-    for piece, splat, tile_x, tile_y in zip(*pieces, strict=True):
-        x, y, a, b, c, log_opacity = (row.index_select(0, splat) for row in sheet.prints.shape)
-        mx, my = x - tile_x, y - tile_y
-        a, b, c, log_opacity = (t / LN_2 for t in (a, b, c, log_opacity))
-        gx, gy = a * mx + b * my, b * mx + c * my
-        peak = log_opacity - 0.5 * (mx * gx + my * gy)
-        for column, values in enumerate((peak, gx, gy, -0.5 * a, -b, -0.5 * c, mx, my, log_opacity)):
-            piece[:, column] = values
-        piece[:, N_NUMBERS:] = sheet.colors.index_select(0, splat)
-    return rows
+    coefficients: Tensor  # of l / ln 2 in (1, x, y, x^2, xy, y^2). [6, R]
+    centres: Tensor  # mx, my. [2, R]
+    colors: Tensor  # [B, n, D]
+    strong: Tensor  # which of the R can exceed an alpha of 0.999
 
 
 @dataclass
@@ -107,37 +100,47 @@ class Batch:
     """Tiles that are composited together over one slab: B tiles, n splats each, P pixels per tile."""
 
     tiles: Tensor  # positions in TileLists.tiles. [B]
-    first: int  # depth of the slab's first splat
-    n: int
+    pairs: Tensor  # of its tiles and splats; padding has the number of all pairs. [B, n]
+    numbers: Numbers
     transmittance: Tensor  # T where the slab begins; 0 in finished pixels. [B, P]
 
-    def pairs(self, lists: TileLists) -> tuple[Tensor, Tensor]:
-        """The pairs [B, n] of its tiles, and which of them are listed: the others pad shorter lists."""
-        depth = torch.arange(self.first, self.first + self.n)
-        pairs = lists.start.index_select(0, self.tiles)[:, None] + depth
-        listed = depth < lists.count.index_select(0, self.tiles)[:, None]
-        return pairs.clamp_(max=lists.splat.numel() - 1), listed
+
+def pairs_of(lists: TileLists, tiles: Tensor, first: int, n: int) -> Tensor:
+    """The pairs [B, n] of some tiles from depth `first` on; K, one more than the last, where a list is shorter."""
+    depth = torch.arange(first, first + n)
+    pairs = lists.start.index_select(0, tiles)[:, None] + depth
+    listed = depth < lists.count.index_select(0, tiles)[:, None]
+    return pairs.masked_fill_(~listed, lists.splat.numel())
 
 
-class Numbers(NamedTuple):
-    """The rows of a batch. [B, n, ...]"""
+def expand(sheet: Sheet, lists: TileLists, centres: Tensor, pairs: Tensor) -> Numbers:
+    """Gather the splats of a batch and expand sigma around the centres of its tiles; padding gets an opacity of 0.
 
-    coefficients: Tensor  # [B, n, 6]
-    centres: Tensor  # mx, my. [B, n, 2]
-    colors: Tensor  # [B, n, D]
-    strong: Tensor  # which of the B * n can exceed 0.999
+    Args:
+        centres: x and y of the tiles' centres in pixels, as columns. [2, B, 1], float64
+        pairs: [B, n]
+    """
+    n_pairs = lists.splat.numel()
+    splat = lists.splat.index_select(0, pairs.clamp(max=n_pairs - 1).flatten())
+    x, y, a, b, c, log_opacity = (row.index_select(0, splat).view_as(pairs) for row in sheet.shape)
+    mx, my = x - centres[0], y - centres[1]
+    gx, gy = a * mx + b * my, b * mx + c * my
+    peak = (log_opacity - 0.5 * (mx * gx + my * gy)).masked_fill_(pairs == n_pairs, NOTHING)
+    dtype = sheet.colors.dtype
+    coefficients = sheet.colors.new_empty(6, *pairs.shape)
+    for row, values in zip(coefficients, (peak, gx, gy, -0.5 * a, -b, -0.5 * c), strict=True):
+        row.copy_(values)
+    strong = (log_opacity > LOG2_NEARLY_MAX_ALPHA).flatten().nonzero().squeeze(1)
+    colors = sheet.colors.index_select(0, splat).view(*pairs.shape, -1)
+    return Numbers(coefficients.flatten(1), torch.stack([mx, my]).to(dtype).flatten(1), colors, strong)
 
 
-def gather(rows: Tensor, pairs: Tensor, listed: Tensor) -> Numbers:
-    """Gather the rows of a batch; padding gets an opacity of 0."""
-    rows = rows.index_select(0, pairs.flatten()).view(*pairs.shape, -1)
-    rows[..., 0].masked_fill_(~listed, NOTHING)
-    strong = (rows[..., 8] > LOG2_NEARLY_MAX_ALPHA).flatten().nonzero().squeeze(1)
-    return Numbers(rows[..., :6], rows[..., 6:8], rows[..., N_NUMBERS:], strong)
+def similar_tiles(remaining: Tensor, tiles: Tensor, pixels: int) -> list[tuple[Tensor, int]]:
+    """Cut tiles, sorted by falling number of splats, into groups of similar numbers within BATCH_ELEMENTS.
 
-
-def similar_tiles(remaining: Tensor, tiles: Tensor, pixels: int) -> list[Tensor]:
-    """Cut tiles, sorted by falling number of splats, into groups of similar numbers within BATCH_ELEMENTS."""
+    Returns:
+        For each group its tiles and the largest of their numbers.
+    """
     counts = remaining.tolist()
     groups, begin = [], 0
     while begin < len(counts):
@@ -145,6 +148,6 @@ def similar_tiles(remaining: Tensor, tiles: Tensor, pixels: int) -> list[Tensor]
         enough = 0.75 * counts[begin] - 4  # bounds the padding to a quarter, or four splats
         while counts[end - 1] < enough:
             end -= 1
-        groups.append(tiles[begin:end])
+        groups.append((tiles[begin:end], counts[begin]))
         begin = end
     return groups

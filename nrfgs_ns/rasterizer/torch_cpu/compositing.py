@@ -42,6 +42,7 @@ How the work is cut up is the business of `batches`.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -52,7 +53,7 @@ from torch.nn import functional as F
 
 from ..contract import Projection
 from . import batches
-from .batches import LN_2, Batch, Numbers, Sheet, gather, pair_rows, similar_tiles
+from .batches import LN_2, Batch, Numbers, Sheet, expand, pairs_of, similar_tiles
 from .tiles import MIN_ALPHA, TileLists, footprints, list_tiles, split_into_blocks
 
 MAX_ALPHA = 0.999
@@ -78,13 +79,14 @@ def full_precision() -> Iterator[None]:
 
 @dataclass
 class _Blend:
-    """A batch, composited."""
+    """A batch, composited. Most of it is scratch memory, which the next batch overwrites."""
 
-    alpha: Tensor  # 0 where splat k is not drawn. [B, n, P]
+    alpha: Tensor  # 0 where splat k is not drawn, but for pixels that had ended before. [B, n, P]
     alphas: tuple[Tensor, ...]  # its n slices. [B, P] each
+    through: Tensor  # T_0 ... T_n as if no pixel ended. [B, n + 1, P]
     weights: Tensor  # w_k = alpha_k T_{k-1}. [B, n, P]
     last: Tensor  # T behind the slab, 0 in pixels that have ended. [B, P]
-    final: Tensor  # T behind the last drawn splat; meaningless in pixels that had ended before. [B, P]
+    drawn: Tensor | None  # 1 where splat k is drawn, else 0; None if no pixel ends in this slab. [B, n, P]
     capped: tuple[Tensor, Tensor] | None  # rows (of B * n) that can exceed 0.999, and their pixels that do
 
 
@@ -97,7 +99,7 @@ def _blend(sheet: Sheet, numbers: Numbers, start: Tensor) -> _Blend:
     pixels = start.shape[1]
     alpha, alphas = sheet.buffer("alpha", n_tiles, n, pixels)
     flat = alpha.view(-1, pixels)
-    torch.mm(numbers.coefficients.flatten(0, 1), sheet.basis, out=flat).exp2_()
+    torch.mm(numbers.coefficients.t(), sheet.basis, out=flat).exp2_()
     F.threshold_(flat, _just_below(MIN_ALPHA, flat.dtype), 0.0)
     capped = None
     if numbers.strong.numel() > 0:
@@ -109,76 +111,78 @@ def _blend(sheet: Sheet, numbers: Numbers, start: Tensor) -> _Blend:
     steps[0].copy_(start)
     for before, own, after in zip(steps, alphas, steps[1:], strict=False):
         torch.addcmul(before, own, before, value=-1, out=after)  # T_k = T_{k-1} - alpha_k T_{k-1}
+
+    drawn, last = None, F.threshold(steps[-1], MIN_TRANSMITTANCE, 0.0)
+    if last.count_nonzero() < start.count_nonzero():  # T may also have underflowed, so `last` alone does not tell
+        drawn = torch.gt(through[:, 1:], MIN_TRANSMITTANCE, out=sheet.buffer("spare", n_tiles, n, pixels)[0])
+        alpha *= drawn
     weights = torch.mul(alpha, through[:, :-1], out=sheet.buffer("weights", n_tiles, n, pixels)[0])
-
-    last = final = steps[-1].clone()
-    if last.min() <= MIN_TRANSMITTANCE:
-        # T never rises, so the last value above the threshold is the smallest.
-        spare, _ = sheet.buffer("spare", *through.shape)
-        final = torch.threshold(through, MIN_TRANSMITTANCE, 2.0, out=spare).amin(1)
-        drawn = through.gt_(MIN_TRANSMITTANCE)  # 1 or 0
-        last = last * drawn[:, -1]
-        weights *= drawn[:, 1:]
-        alpha *= drawn[:, 1:]
-    return _Blend(alpha, alphas, weights, last, final, capped)
+    return _Blend(alpha, alphas, through, weights, last, drawn, capped)
 
 
+@functools.cache
 def _just_below(value: float, dtype: torch.dtype) -> float:
     """The largest number of a type below a value of that type, as threshold_ keeps what is strictly greater."""
     value = torch.tensor(value, dtype=dtype)
     return float(torch.nextafter(value, torch.zeros_like(value)))
 
 
-def _sweep(sheet: Sheet, lists: TileLists, rows: Tensor, final: Tensor, render: Tensor | None) -> list[Batch]:
+def _sweep(sheet: Sheet, lists: TileLists, final: Tensor, render: Tensor | None) -> list[Batch]:
     """Composite one block front to back.
 
     Args:
-        rows: see `pair_rows`. [K, 9 + D]
-        final: transmittance behind the last drawn splat, updated in place. [C * tiles, P]
-        render: colours, added in place; None repeats a sweep for its transmittances only. [C * tiles, D, P]
+        final: transmittance behind the last drawn splat, set for the tiles that have splats. [C * tiles, P]
+        render: colours, added in place; None repeats a sweep for its batches only. [C * tiles, D, P]
 
     Returns:
         The batches in the order of work: all that the backward pass needs.
     """
     record = []
     live = sheet.inside.index_select(0, lists.tiles)  # T, or 0 in finished pixels. [L, P]
+    ended = torch.zeros_like(live)  # T where a pixel ended, or 0 in live pixels
+    centres = sheet.centres(lists.tiles)
     active = torch.arange(lists.tiles.numel())
     first = 0
     while active.numel() > 0:
         remaining = (lists.count.index_select(0, active) - first).clamp(max=batches.SLAB)
         remaining, by_count = torch.sort(remaining, descending=True)
         active = active.index_select(0, by_count)
-        for tiles in similar_tiles(remaining, active, live.shape[1]):
-            n = min(batches.SLAB, int(lists.count[tiles[0]]) - first)
-            batch = Batch(tiles, first, n, live.index_select(0, tiles))
+        for tiles, n in similar_tiles(remaining, active, live.shape[1]):
+            pairs = pairs_of(lists, tiles, first, n)
+            numbers = expand(sheet, lists, centres.index_select(1, tiles), pairs)
+            batch = Batch(tiles, pairs, numbers, live.index_select(0, tiles))
             record.append(batch)
-            numbers = gather(rows, *batch.pairs(lists))
             blend = _blend(sheet, numbers, batch.transmittance)
-            where = lists.tiles.index_select(0, tiles)
             live.index_copy_(0, tiles, blend.last)
-            final.index_copy_(0, where, blend.final.minimum(final.index_select(0, where)))
+            if blend.drawn is not None:
+                n_drawn = blend.drawn.sum(1, keepdim=True).long()
+                left = blend.through.gather(1, n_drawn).squeeze(1)
+                ended.index_add_(0, tiles, left.sub_(blend.last))
             if render is not None:
+                where = lists.tiles.index_select(0, tiles)
                 so_far = render.index_select(0, where)
                 render.index_copy_(0, where, so_far.baddbmm_(numbers.colors.transpose(1, 2), blend.weights))
         first += batches.SLAB
-        unfinished = (lists.count.index_select(0, active) > first) & (live.index_select(0, active) > 0).any(1)
+        unfinished = (lists.count.index_select(0, active) > first) & (live.index_select(0, active).amax(1) > 0)
         active = active[unfinished]
+    final.index_copy_(0, lists.tiles, live + ended)
     return record
 
 
 def _backward_batch(
-    sheet: Sheet, numbers: Numbers, start: Tensor, grad: Tensor, behind: Tensor, absgrad: bool
+    sheet: Sheet, batch: Batch, grad: Tensor, behind: Tensor, absgrad: bool, gradients: Tensor
 ) -> Tensor:
     """Gradients of one batch with respect to its splats: the backward equations of the module docstring.
 
     Args:
-        start: T in front of the batch. [B, P]
         grad: dL/dC of its tiles. [B, D, P]
-        behind: U of the last splat; becomes U in front of the first, in place. [B, P]
+        behind: U of the last splat. [B, P]
+        gradients: receives those of centre x, y, conic a, b, c, ln o, colours, then absgrad. [B * n, 6 + D (+ 2)]
 
     Returns:
-        Gradients of centre x, y, conic a, b, c, ln o, colours, then absgrad. [B, n, 6 + D (+ 2)]
+        U in front of the first splat. [B, P]
     """
+    numbers, start = batch.numbers, batch.transmittance
     blend = _blend(sheet, numbers, start)
     n_tiles, n, pixels = blend.alpha.shape
     worth, each_worth = sheet.buffer("spare", n_tiles, n, pixels)
@@ -187,33 +191,33 @@ def _backward_batch(
     steps[-1].copy_(behind)
     for k in range(n - 1, -1, -1):
         torch.lerp(steps[k + 1], each_worth[k], blend.alphas[k], out=steps[k])
-    behind.copy_(steps[0])
-    v = worth.sub_(beyond[:, 1:]).mul_(blend.weights)  # dL/dl
+    in_front = torch.where(start > 0, steps[0], behind)
+    v = worth.sub_(beyond[:, 1:]).mul_(blend.weights).view(-1, pixels)  # dL/dl
     if blend.capped is not None:
         where, pixels_capped = blend.capped
-        v.view(-1, pixels)[where] *= ~pixels_capped
+        v[where] *= ~pixels_capped
 
     channels = numbers.colors.shape[-1]
-    gradients = v.new_empty(n_tiles, n, 6 + channels + 2 * absgrad)
-    v0, vx, vy, vxx, vxy, vyy = (v.view(-1, pixels) @ sheet.basis.t()).view(n_tiles, n, 6).unbind(-1)
-    mx, my = numbers.centres.unbind(-1)
-    _, gx, gy, half_a, b, half_c = numbers.coefficients.unbind(-1)  # peak, gx, gy, -a / 2, -b, -c / 2, all over ln 2
+    v0, vx, vy, vxx, vxy, vyy = sheet.basis @ v.t()
+    mx, my = numbers.centres
+    _, gx, gy, half_a, b, half_c = numbers.coefficients  # peak, gx, gy, -a / 2, -b, -c / 2, all over ln 2
     a, c = 2 * half_a, 2 * half_c
     dx, dy = vx - mx * v0, vy - my * v0  # sums of v dx, v dy
-    gradients[..., 0] = -LN_2 * (a * vx + b * vy + gx * v0)
-    gradients[..., 1] = -LN_2 * (b * vx + c * vy + gy * v0)
-    gradients[..., 2] = -0.5 * (vxx - mx * (vx + dx))
-    gradients[..., 3] = my * vx + mx * dy - vxy
-    gradients[..., 4] = -0.5 * (vyy - my * (vy + dy))
-    gradients[..., 5] = v0
-    gradients[..., 6 : 6 + channels] = torch.bmm(blend.weights, grad.transpose(1, 2))
+    gradients[:, 0] = -LN_2 * (a * vx + b * vy + gx * v0)
+    gradients[:, 1] = -LN_2 * (b * vx + c * vy + gy * v0)
+    gradients[:, 2] = -0.5 * (vxx - mx * (vx + dx))
+    gradients[:, 3] = my * vx + mx * dy - vxy
+    gradients[:, 4] = -0.5 * (vyy - my * (vy + dy))
+    gradients[:, 5] = v0
+    of_colors = torch.bmm(grad, blend.weights.transpose(1, 2))  # [B, D, n]
+    gradients[:, 6 : 6 + channels].view(n_tiles, n, channels).copy_(of_colors.transpose(1, 2))
     if absgrad:
         size = v.abs_()
         for axis, pull in enumerate(([gx, a, b], [gy, b, c])):  # -Q d is linear in the pixel
-            pulls, _ = sheet.buffer("through", n_tiles, n, pixels)
-            torch.mm(torch.stack(pull, dim=-1).view(-1, 3), sheet.basis[:3], out=pulls.view(-1, pixels))
-            gradients[..., 6 + channels + axis] = LN_2 * pulls.abs_().mul_(size).sum(-1)
-    return gradients
+            pulls = sheet.buffer("through", n_tiles, n, pixels)[0].view(-1, pixels)
+            torch.mm(torch.stack(pull).t(), sheet.basis[:3], out=pulls)
+            gradients[:, 6 + channels + axis] = LN_2 * pulls.abs_().mul_(size).sum(-1)
+    return in_front
 
 
 class _Composite(torch.autograd.Function):
@@ -231,10 +235,9 @@ class _Composite(torch.autograd.Function):
         records = []
         for block in blocks:
             lists = list_tiles(prints, block)
-            rows = pair_rows(sheet, lists)
-            work = _sweep(sheet, lists, rows, final, render)
+            work = _sweep(sheet, lists, final, render)
             # With several blocks, keeping the record of each would undo the bound on memory: they are swept again.
-            records.append((lists, rows, work) if len(blocks) == 1 else None)
+            records.append((lists, work) if len(blocks) == 1 else None)
         ctx.save_for_backward(means2d, conics, opacities, colors)
         ctx.sheet, ctx.blocks, ctx.records, ctx.absgrad = sheet, blocks, records, absgrad
         return sheet.image(render, *size), sheet.image(final[:, None], *size)
@@ -253,26 +256,30 @@ class _Composite(torch.autograd.Function):
         for block, record in zip(ctx.blocks, ctx.records, strict=True):
             if record is None:
                 lists = list_tiles(sheet.prints, block)
-                rows = pair_rows(sheet, lists)
-                record = lists, rows, _sweep(sheet, lists, rows, torch.ones_like(sheet.inside), None)
-            lists, rows, work = record
-            per_pair = grad.new_zeros(lists.splat.numel(), n_columns)
+                record = lists, _sweep(sheet, lists, torch.empty_like(sheet.inside), None)
+            lists, work = record
+            # Gradients in the order of work, and the row of each slot; pairs that no batch reached share a row of 0.
+            n_pairs, end = lists.splat.numel(), sum(batch.pairs.numel() for batch in work)
+            gradients = grad.new_empty(end + 1, n_columns)
+            gradients[end] = 0
+            slot = torch.cat([lists.slot, lists.slot.new_tensor([n_pairs])])  # padding has one of its own
+            row_of_slot = torch.full((n_pairs + 1,), end)
             for batch in reversed(work):
                 where = lists.tiles.index_select(0, batch.tiles)
-                state = behind.index_select(0, where)
-                pairs, listed = batch.pairs(lists)
-                numbers = gather(rows, pairs, listed)
-                gradients = _backward_batch(
-                    sheet, numbers, batch.transmittance, grad.index_select(0, where), state, ctx.absgrad
+                begin = end - batch.pairs.numel()
+                behind[where] = _backward_batch(
+                    sheet,
+                    batch,
+                    grad.index_select(0, where),
+                    behind.index_select(0, where),
+                    ctx.absgrad,
+                    gradients[begin:end],
                 )
-                slots, gradients = lists.slot.index_select(0, pairs.flatten()), gradients.flatten(0, 1)
-                if not listed[-1, -1]:  # the last tile of a batch has the fewest splats
-                    listed = listed.flatten().nonzero().squeeze(1)
-                    slots, gradients = slots.index_select(0, listed), gradients.index_select(0, listed)
-                per_pair.index_copy_(0, slots, gradients)
-                behind[where] = state
+                slots = slot.index_select(0, batch.pairs.flatten())
+                row_of_slot.index_copy_(0, slots, torch.arange(begin, end))
+                end = begin
             # Pairs of a splat lie in consecutive slots: one segmented sum, many times faster than a scatter.
-            summed = F.embedding_bag(torch.arange(len(per_pair)), per_pair, lists.splat_start, mode="sum")
+            summed = F.embedding_bag(row_of_slot[:n_pairs], gradients, lists.splat_start, mode="sum")
             total[sheet.prints.rows] += summed
         if ctx.absgrad:
             means2d.absgrad = total[:, -2:].contiguous()
