@@ -12,7 +12,7 @@ table, whoever's head it belongs to, and to the optimisers' moments. The model n
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
+from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.relocation import add_samples, diffuse, relocate
 
@@ -35,6 +36,8 @@ EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
 LARGEST_BUDGET = 2**24
 """`torch.multinomial` draws from no more categories than this."""
+STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop_iter")
+"""What begins or ends by step number in gsplat's strategy."""
 SPLATFACTOS_THRESHOLDS = (
     "cull_alpha_thresh",
     "densify_grad_thresh",
@@ -132,11 +135,23 @@ class Densification(ABC):
         """Terms that the protocol adds to the loss, by name."""
         return {}
 
+    @abstractmethod
+    def reschedule(self, step_at: Callable[[float], int]) -> None:
+        """Begin and end when the training's pace says (`pace.py`); the steps between two refinements stay.
+
+        Args:
+            step_at: step of the configuration -> step of this training.
+        """
+
     def load_state(self, state: Mapping[str, Any], device: torch.device) -> None:
         """Continue from a checkpoint's `state`. A statistic that it does not hold starts anew."""
         for name in self.state:
             value = state.get(name, self.state[name])
             self.state[name] = value.to(device) if isinstance(value, Tensor) else value
+        for name in (DIFFUSE, SHIFT):  # which protocol it is does not matter, nor whether such splats are looked for
+            self.state.pop(name, None)
+            if state.get(name) is not None:
+                self.state[name] = state[name].to(device)
 
     def seen_opacity(self, opacities: Tensor) -> Tensor:
         """The opacities [N] that decide whether a splat is dead.
@@ -200,6 +215,7 @@ class GradientDensification(Densification):
         super().__init__(opacity_seen)
         self.name = name
         self.strategy = strategy
+        self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.absgrad = strategy.absgrad
         self.measure_by_cameras = scene_unit is None
         self.reset_at_start = reset_at_start
@@ -225,6 +241,10 @@ class GradientDensification(Densification):
         strategy.step_post_backward(splats, optimizers, self.state, step, info, packed=True)
         if step % strategy.reset_every == 0 or self._refines(step):
             self.forget_peak()
+
+    def reschedule(self, step_at: Callable[[float], int]) -> None:
+        for name, step in self.bounds.items():
+            setattr(self.strategy, name, step_at(step) if step > 0 else step)
 
     def _refines(self, step: int) -> bool:
         """Whether gsplat's strategy grows and prunes at this step."""
@@ -262,11 +282,12 @@ class Mcmc(Densification):
         super().__init__(opacity_seen)
         self.scene_unit = scene_unit
         self.config, self.budget, self.start, self.every = config, budget, start, every
+        self.stop, self.bounds = config.stop_at, (start, config.stop_at)
 
     @torch.no_grad()
     def post_backward(self, step, info, splats, optimizers) -> None:
         config = self.config
-        if self.start < step < config.stop_at and step % self.every == 0:
+        if self.start < step < self.stop and step % self.every == 0:
             dead = self.seen_opacity(splats["opacities"]) <= config.min_opacity
             relocate(splats, optimizers, dead, config.min_opacity)
             count = len(splats["means"])
@@ -275,6 +296,9 @@ class Mcmc(Densification):
                 self.state["peak"] = None  # the rows have changed
         lr = float(optimizers["means"].param_groups[0]["lr"])
         diffuse(splats, config.noise_lr * lr / self.scene_unit**2)  # times a covariance; lr is a length already
+
+    def reschedule(self, step_at: Callable[[float], int]) -> None:
+        self.start, self.stop = (step_at(step) for step in self.bounds)
 
     def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {

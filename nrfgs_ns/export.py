@@ -10,7 +10,7 @@ colours become harmonics; `ns-export gaussian-splat` gets them from the model's 
 import json
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,6 +21,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
+from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.errors import InputError
 
 if TYPE_CHECKING:  # nerfstudio takes seconds to import: `nrfgs --help` answers at once
@@ -43,8 +44,9 @@ FAINTEST_LOGIT = -5.5373
 class Export:
     """Write a trained model as a file that other programs read."""
 
-    format: tyro.conf.Positional[Literal["ply"]]
-    """ply: the format of 3D Gaussian Splatting, with spherical harmonics fitted to the colours"""
+    format: tyro.conf.Positional[Literal["ply", "compact"]]
+    """ply: the format of 3D Gaussian Splatting, with spherical harmonics fitted to the colours. compact: the field
+    itself in a small file, which ns-eval, ns-viewer and ns-render read (docs/compact-format.md)"""
     load_config: Path
     """config.yml of the training"""
     output: Path
@@ -53,12 +55,19 @@ class Export:
     """render the test views from the model and from the written file, and tell what the fit loses"""
     report: Path | None = None
     """also write the numbers to this file, as JSON"""
+    compact: CompactOptions = field(default_factory=CompactOptions)
+    """what a compact file may leave out"""
 
     def main(self) -> None:
         from nerfstudio.utils.rich_utils import CONSOLE
 
         if self.output.is_dir():
             raise InputError(f"--output {self.output} is a folder. Name a file in it, such as splats.ply.")
+        if self.format == "compact":
+            from nrfgs_ns.compact.verb import export_compact
+
+            export_compact(self.load_config, self.output, self.compact, self.measure, self.report)
+            return
         # Set up exactly as in ns-export, so that both fit over the same cameras.
         fit = load_model(self.load_config, "inference").model.fit
         written = write_splats(fit.splats, self.output)

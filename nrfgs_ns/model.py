@@ -32,6 +32,7 @@ from nrfgs_ns.densification import (
     Protocol,
     build_densification,
 )
+from nrfgs_ns.diffuse_splats import DiffuseSplats, schedule_for
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.exported import ExportedTables
 from nrfgs_ns.metrics import ImageMetrics
@@ -73,6 +74,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """thresholds of the densification 'original'"""
     mcmc: McmcDensification = field(default_factory=McmcDensification)
     """constants of the densification 'mcmc'"""
+    diffuse: DiffuseSplats = field(default_factory=DiffuseSplats)
+    """when splats whose residual never matters lose it"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -185,10 +188,17 @@ class NrfgsModel(ExportedTables, SplatfactoModel):
             steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
             warm_up(self, cameras, steps, self.config.warmup_lr)
 
-        return [
+        callbacks = [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before_first_step, iters=(0,)),
             *super().get_training_callbacks(attributes),
         ]
+        diffuse = schedule_for(self, attributes.pipeline.datamanager, attributes.pipeline.world_size)
+        if diffuse is not None:
+            after = TrainingCallback(
+                [TrainingCallbackLocation.AFTER_TRAIN_ITERATION], lambda step: diffuse.after_step(self, step)
+            )
+            callbacks.append(after)
+        return callbacks
 
     def step_cb(self, optimizers, step: int) -> None:
         super().step_cb(optimizers, step)

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torchvision.utils import save_image
 
 from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.compact.decode import model_state
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.distributed.config import ShardingConfig
 from nrfgs_ns.errors import InputError
@@ -34,6 +35,8 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
     """specifies the model config"""
     sharding: ShardingConfig = field(default_factory=ShardingConfig)
     """with several devices: how the splats are spread over them, and what a step counts"""
+    compact: Path | None = None
+    """a file of `nrfgs export compact` that the model is read from instead of the checkpoint"""
 
 
 class NrfgsPipeline(VanillaPipeline):
@@ -56,6 +59,17 @@ class NrfgsPipeline(VanillaPipeline):
             self.datamanager.load_all_images()
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
             self.model.fit_on(self.datamanager.train_dataset.cameras)
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint, or the compact file that the configuration names.
+
+        Raises:
+            InputError: either cannot be this model's.
+        """
+        if self.config.compact is not None:
+            state = model_state(self.model, self.config.compact)
+            loaded_state = {f"_model.{name}": value for name, value in state.items()}
+        super().load_pipeline(loaded_state, step)
 
     def get_train_loss_dict(self, step: int):
         """Nerfstudio's step, whose metrics are taken only when they are logged."""

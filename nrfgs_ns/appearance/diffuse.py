@@ -15,6 +15,8 @@ from nrfgs_ns.appearance.head import Component, SplatAppearance
 
 DIFFUSE = "diffuse"
 """Name of the table's entry."""
+SHIFT = "diffuse_shift"
+"""Name of what was added to a diffuse splat's "features_dc" and "opacities" when it became one, [N, 4]."""
 
 
 class Others:

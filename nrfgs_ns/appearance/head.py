@@ -82,6 +82,8 @@ class AppearanceHead(nn.Module, ABC):
     scene_unit: float = 1.0
     """World units in a scene unit, told by the model: the lengths in a head's configuration, and what it makes of
     distances, are in scene units, so that a scene looks the same whatever it is measured in."""
+    knows_diffuse: bool = False
+    """Whether a table may have "diffuse" among its entries (`diffuse.py`)."""
     is_harmonics: bool = False
     """Whether colours are exactly the harmonics in `features_dc` and `features_rest`, and opacities the base's."""
 

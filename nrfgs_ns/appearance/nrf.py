@@ -108,6 +108,7 @@ class NeuralResidualField(AppearanceHead):
     """The field, as in the module's docstring."""
 
     name = "nrf"
+    knows_diffuse = True
 
     def __init__(self, config: NrfConfig):
         super().__init__()

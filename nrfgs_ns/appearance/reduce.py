@@ -30,7 +30,7 @@ class Field(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """Bytes that a renderer needs in float32: parameters, no latents for diffuse splats, a bit each that says so."""
+        """Bytes that a renderer needs in float32: no latents for diffuse splats, and a bit each that says so."""
         size = sum(weight.numel() * weight.element_size() for weight in self.head.parameters())
         diffuse = self.splats.get(DIFFUSE)
         for name, value in self.splats.items():

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A compact file as the tables of a model."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.head import SH_C0
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.compact.encode import FORMAT, GROUPS
+from nrfgs_ns.compact.format import read_container
+from nrfgs_ns.compact.quantise import Grid, from_morton, from_smallest_three
+from nrfgs_ns.errors import InputError
+
+
+class Decoded(NamedTuple):
+    """What a compact file holds."""
+
+    config: NrfConfig
+    """of the head"""
+    weights: dict[str, Tensor]
+    """the head's, float32, by their names in its `state_dict`"""
+    splats: dict[str, Tensor]
+    """the table, float32, and "diffuse", bool [N]; latents of diffuse splats are 0"""
+    header: dict[str, Any]
+
+
+def decode(path: Path) -> Decoded:
+    """Read a compact file.
+
+    Raises:
+        InputError: it cannot be read, is damaged, or does not hold what it should.
+    """
+    header, streams = read_container(path)
+    try:
+        if header["format"] != FORMAT:
+            raise ValueError(f"it holds {header['format']!r}")
+        return Decoded(_config(header["head"]), _weights(streams), _splats(header, streams), header)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        # The checksums hold: it was written like this.
+        raise InputError(
+            f"{path} does not describe a field ({type(error).__name__}: {error}). Export it again with nrfgs export "
+            "compact."
+        ) from error
+
+
+def _config(head: dict[str, Any]) -> NrfConfig:
+    if head["name"] != "nrf":
+        raise ValueError(f"a head named {head['name']!r}")
+    known = {field.name for field in fields(NrfConfig)} - {"_target"}
+    unknown = set(head["config"]) - known
+    if unknown:
+        raise ValueError(f"an unknown option {sorted(unknown)[0]!r} of the head")
+    config = NrfConfig(**head["config"])
+    config.validate()
+    return config
+
+
+def _weights(streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
+    weights = {name.removeprefix("head."): value for name, value in streams.items() if name.startswith("head.")}
+    return {name: torch.from_numpy(value.astype(np.float32)) for name, value in weights.items()}
+
+
+def _splats(header: dict[str, Any], streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
+    grids = {name: Grid(np.array(grid["low"]), np.array(grid["step"])) for name, grid in header["grids"].items()}
+    rank = header["head"]["config"]["latent_dim"]
+    parts: dict[str, list[np.ndarray]] = {
+        name: [] for name in ("means", "quats", "scales", "opacities", "colors", "latents", DIFFUSE)
+    }
+    for group in GROUPS:
+        count = header["splats"][group]
+
+        def codes(name: str, columns: int, group: str = group, count: int = count) -> np.ndarray:
+            stream = streams[f"{group}.{name}"]
+            if stream.shape != (columns, count):
+                raise ValueError(f"{group}.{name} of shape {list(stream.shape)} instead of {[columns, count]}")
+            return stream.T.astype(np.int64)
+
+        differences, largest = streams[f"{group}.means"], streams[f"{group}.quats_largest"]
+        if differences.shape != (count,) or largest.shape != (count,) or largest.max(initial=0) > 3:
+            raise ValueError(f"{group}.means or {group}.quats_largest are not {count} numbers in range")
+        places = np.cumsum(differences.astype(np.uint64), dtype=np.uint64)
+        parts["means"].append(grids["means"].values(from_morton(places)))
+        parts["quats"].append(from_smallest_three(largest.astype(np.int64), codes("quats", 3), header["quats_bits"]))
+        for name, columns in (("scales", 3), ("opacities", 1), ("colors", 3)):
+            parts[name].append(grids[name].values(codes(name, columns)))
+        parts["latents"].append(
+            grids["latents"].values(codes("latents", rank)) if group == "view" else np.zeros((count, rank))
+        )
+        parts[DIFFUSE].append(np.full(count, group == DIFFUSE))
+    tables = {name: torch.from_numpy(np.concatenate(values)) for name, values in parts.items()}
+    tables["features_dc"] = (tables.pop("colors") - 0.5) / SH_C0
+    return {name: value if value.dtype == torch.bool else value.float() for name, value in tables.items()}
+
+
+def model_state(model, path: Path) -> dict[str, Any]:
+    """What `load_state_dict` of a model takes, from a compact file.
+
+    Args:
+        model: an NrfgsModel with the file's head.
+
+    Raises:
+        InputError: as `decode`.
+    """
+    decoded = decode(path)
+    splats = dict(decoded.splats)
+    diffuse = splats.pop(DIFFUSE)
+    # What is no part of a picture stays as the model has it.
+    own = {n: v for n, v in model.state_dict().items() if not n.startswith(("gauss_params.", "head."))}
+    return {
+        **own,
+        **{f"gauss_params.{name}": value for name, value in splats.items()},
+        **{f"head.{name}": value for name, value in decoded.weights.items()},
+        "_extra_state": {
+            "head": decoded.header["head"]["name"],
+            "densification": model.densification.name,
+            "strategy": {DIFFUSE: diffuse} if diffuse.any() else {},
+        },
+    }

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The container: named arrays of whole numbers or floats, compressed, each with a checksum, behind a JSON header.
+
+    offset  bytes
+    0       8      magic: 89 4E 52 46 0D 0A 1A 0A ("NRF" between bytes that a transfer as text would change)
+    8       4      version of the format, uint32
+    12      4      length L of the header, uint32
+    16      8      length of the whole file, uint64
+    24      L      header: a JSON object in UTF-8, with a list "streams"
+    24 + L  4      CRC-32 of everything before, uint32
+    28 + L         the streams, one after the other, in the order of the list
+
+All numbers are little-endian. An entry of "streams" has "name", "dtype" (of the numbers: uint8, uint16, uint32, uint64,
+float16 or float32), "shape", "bytes" (in the file) and "crc32" (of these bytes). A stream is in the xz format and holds
+the numbers' bytes by significance: first every number's lowest byte, then every number's next, and so on; numbers are
+in row-major order.
+
+Nothing in a file is ever run, and nothing is allocated before its size was checked against the lengths in the header.
+"""
+
+import json
+import lzma
+import math
+import os
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nrfgs_ns.errors import InputError
+
+MAGIC = b"\x89NRF\r\n\x1a\n"
+VERSION = 1
+PREAMBLE = struct.Struct("<8sIIQ")
+CHECKSUM = struct.Struct("<I")
+DTYPES = ("uint8", "uint16", "uint32", "uint64", "float16", "float32")
+LARGEST_STREAM = 2**36
+"""Bytes that a stream may unpack to: 64 GB; more is a broken file."""
+LARGEST_DICTIONARY = 2**26
+"""Bytes within which xz looks for repetitions."""
+LARGEST_MEMORY = 2**28
+"""Bytes that xz may take to unpack: more than the dictionary needs."""
+
+
+def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray]) -> int:
+    """Write a file, whole or not at all.
+
+    Args:
+        header: what JSON can hold; "streams" is added.
+        streams: arrays of DTYPES.
+
+    Returns:
+        The bytes of the file.
+    """
+    entries, bodies = [], []
+    for name, array in streams.items():
+        if array.dtype.name not in DTYPES:
+            raise ValueError(f"stream {name} is {array.dtype.name}; use one of {', '.join(DTYPES)}")
+        bodies.append(body := _pack(_planes(array)))
+        entries.append(
+            {
+                "name": name,
+                "dtype": array.dtype.name,
+                "shape": list(array.shape),
+                "bytes": len(body),
+                "crc32": zlib.crc32(body),
+            }
+        )
+    text = json.dumps({**header, "streams": entries}, allow_nan=False).encode("utf-8")
+    total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
+    start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".writing")
+    aside.write_bytes(b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies]))
+    os.replace(aside, path)
+    return total
+
+
+def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Read a file.
+
+    Returns:
+        the header, and the streams by name.
+
+    Raises:
+        InputError: there is no such file, it is of another kind or a later version, it is cut short or longer than it
+            says, or a checksum does not hold.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}). Export it again, or mend the path.") from error
+    mend = "Copy it again, or export it again with nrfgs export compact."
+    if data[: len(MAGIC)] != MAGIC[: len(data)] or not data:
+        raise InputError(f"{path} is not a compact file of nrfgs: it begins with {data[:8]!r}. {mend}")
+    if len(data) < PREAMBLE.size:
+        raise InputError(f"{path} is cut short: {len(data)} bytes. {mend}")
+    _, version, length, total = PREAMBLE.unpack_from(data)
+    first = PREAMBLE.size + length + CHECKSUM.size
+    # A file of a later version may lie otherwise: what it is comes before whether it is whole.
+    if version > VERSION:
+        raise InputError(
+            f"{path} says that it is of version {version} of the format, and this program reads up to {VERSION}. "
+            "Install a newer nrfgs-ns, or copy the file again."
+        )
+    if len(data) != total or len(data) < first:
+        raise InputError(f"{path} has {len(data)} bytes, and its header says {total}. {mend}")
+    header_end = first - CHECKSUM.size
+    if version < 1 or zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
+        raise InputError(f"{path} is damaged: the header's checksum does not hold. {mend}")
+    header = json.loads(data[PREAMBLE.size : header_end])
+    streams = {}
+    for entry in header["streams"]:
+        body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
+        if len(body) != entry["bytes"] or zlib.crc32(body) != entry["crc32"]:
+            raise InputError(f"{path} is damaged: the checksum of its stream {entry['name']!r} does not hold. {mend}")
+        streams[entry["name"]] = _unpack(path, entry, body)
+    if first != len(data):
+        raise InputError(f"{path} has {len(data) - first} bytes after its last stream. {mend}")
+    return header, streams
+
+
+def _pack(raw: bytes) -> bytes:
+    """Compressed without context: a quantised number's byte does not depend on the one beside it."""
+    dictionary = min(max(len(raw), 4096), LARGEST_DICTIONARY)
+    options = {"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0, "dict_size": dictionary}
+    return lzma.compress(raw, format=lzma.FORMAT_XZ, check=lzma.CHECK_NONE, filters=[options])
+
+
+def _unpack(path: Path, entry: Mapping[str, Any], body: bytes) -> np.ndarray:
+    """The numbers of one stream whose checksum holds; a file that was made to mislead is refused all the same."""
+    count = math.prod(entry["shape"])
+    if entry["dtype"] not in DTYPES or min(entry["shape"], default=0) < 0:
+        raise InputError(f"{path}: its stream {entry['name']!r} is {entry['dtype']} {entry['shape']}, which cannot be.")
+    size = np.dtype(entry["dtype"]).itemsize
+    if count * size > LARGEST_STREAM:
+        raise InputError(f"{path}: its stream {entry['name']!r} would unpack to {count * size} bytes.")
+    unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=LARGEST_MEMORY)
+    try:
+        raw = unpacker.decompress(body, max_length=count * size + 1) if body else b""
+    except lzma.LZMAError as error:
+        raise InputError(f"{path}: its stream {entry['name']!r} cannot be unpacked ({error}).") from error
+    if len(raw) != count * size:
+        raise InputError(f"{path}: its stream {entry['name']!r} does not hold {count} numbers of {size} bytes.")
+    planes = np.frombuffer(raw, dtype=np.uint8).reshape(size, count)
+    return np.ascontiguousarray(planes.T).view(np.dtype(entry["dtype"]).newbyteorder("<")).reshape(entry["shape"])
+
+
+def _planes(array: np.ndarray) -> bytes:
+    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    return np.ascontiguousarray(little.reshape(-1, 1).view(np.uint8).reshape(-1, little.dtype.itemsize).T).tobytes()

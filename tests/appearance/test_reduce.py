@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Smaller fields: exact where they claim to be, and equal to what the parts' own definition says."""
+
+import pytest
+import torch
+from head_cases import awake, scene
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.encoding import view_geometry
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.reduce import (
+    Field,
+    input_columns,
+    latent_basis,
+    with_constant_distance,
+    with_diffuse,
+    with_rank,
+    without_high_branch,
+    without_input,
+    without_low_branch,
+    without_opacity_residual,
+)
+
+CONFIGS = {
+    "default": NrfConfig(latent_dim=8, hidden_width=16),
+    "one branch": NrfConfig(latent_dim=8, hidden_width=16, split_bands=False),
+    "low only": NrfConfig(latent_dim=8, hidden_width=16, num_bands=1, use_distance=False, opacity_residual=False),
+}
+FLOAT32 = {"rtol": 0, "atol": 2e-5}
+"""Sums of up to 60 products of numbers of order 1 to 10, rounded at 2^-24 each, behind slopes of at most 0.2."""
+
+
+@pytest.fixture(params=CONFIGS)
+def case(request):
+    head = awake(CONFIGS[request.param], torch.float32).requires_grad_(False)
+    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
+    return Field(head, splats), visible, centers
+
+
+def assert_same(field: Field, other: Field, visible, centers, **tolerance) -> None:
+    for a, b in zip(
+        field.head(field.splats, visible, centers), other.head(other.splats, visible, centers), strict=True
+    ):
+        assert_close(a, b, **tolerance)
+
+
+def test_the_columns_are_the_heads(case):
+    field, _, _ = case
+    for name, branch in (("low", field.head.low), ("high", field.head.high)):
+        if branch is not None:
+            columns = [i for part in input_columns(field.head.config, name).values() for i in part]
+            assert columns == list(range(branch[0].in_features))
+
+
+def test_full_rank_is_the_head(case):
+    field, visible, centers = case
+    basis = latent_basis(field, torch.rand(40))
+    whole = with_rank(field, basis, 8)
+    assert (whole.splats["latents"] - field.splats["latents"]).abs().max() > 0.01, "the basis must have turned"
+    assert_same(whole, field, visible, centers, **FLOAT32)
+
+
+def test_components_predict_the_hidden_units_better_the_more_there_are(case):
+    field, _, _ = case
+    weight = torch.rand(40) ** 4
+    basis = latent_basis(field, weight)
+    layers = [branch[0].weight[:, :8] for branch in (field.head.low, field.head.high) if branch is not None]
+    first = torch.cat(layers).double()
+    centred = field.splats["latents"].double() - basis.mean
+
+    def error(latents):
+        return (weight[:, None] * ((latents - centred) @ first.T).square()).sum() / weight.sum()
+
+    errors = []
+    for rank in range(1, 9):
+        reduced = (centred @ basis.inverse[:rank].T) @ basis.axes[:, :rank].T
+        errors.append(error(reduced).item())
+        # What is left is the variance of the components that were left out.
+        assert errors[-1] == pytest.approx(basis.variances[rank:].sum().item(), rel=1e-6, abs=1e-9)
+    assert errors == sorted(errors, reverse=True) and errors[0] > errors[-2] > 1e-6
+    torch.manual_seed(0)
+    for rank in (1, 3, 6):  # no other subspace does better
+        for _ in range(20):
+            axes, _ = torch.linalg.qr(torch.randn(8, rank, dtype=torch.float64))
+            codes = torch.linalg.lstsq(first @ axes, (centred @ first.T).T).solution
+            assert error((axes @ codes).T) >= errors[rank - 1] * (1 - 1e-9)
+
+
+def test_latents_in_a_subspace_need_no_more(case):
+    field, visible, centers = case
+    torch.manual_seed(0)
+    flat = torch.randn(40, 3) @ torch.randn(3, 8) * 0.5 + torch.randn(8)
+    field = Field(field.head, {**field.splats, "latents": flat})
+    small = with_rank(field, latent_basis(field, torch.ones(40)), 3)
+    assert small.splats["latents"].shape == (40, 3) and small.head.config.latent_dim == 3
+    assert_same(small, field, visible, centers, rtol=0, atol=1e-4)  # numbers up to 5 here, 2^-24 of them 60 times
+    assert small.bytes < field.bytes
+
+
+def test_a_rank_out_of_range_is_refused(case):
+    field, _, _ = case
+    for rank in (0, 9):
+        with pytest.raises(ValueError, match="ranks 1 to 8"):
+            with_rank(field, latent_basis(field, torch.ones(40)), rank)
+
+
+def test_without_the_high_branch_its_gate_is_shut():
+    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
+    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
+    small = without_high_branch(Field(head, splats))
+    shut = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
+    shut.load_state_dict(head.state_dict())
+    shut.high[2].weight[3], shut.high[2].bias[3] = 0.0, -1e4
+    assert small.head.high is None and small.bytes < Field(head, splats).bytes
+    assert_same(small, Field(shut, splats), visible, centers, **FLOAT32)
+    with pytest.raises(ValueError, match="no high branch"):
+        without_high_branch(small)
+
+
+def test_without_the_low_branch_colours_are_the_high_ones():
+    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
+    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
+    small = without_low_branch(Field(head, splats))
+    parts = small.head.components(splats, visible, centers)
+    assert (parts["low branch"].values == 0).all() and parts["high branch"].values.abs().max() > 1e-3
+    assert (small.head(splats, visible, centers).opacities == head(splats, visible, centers).opacities).all()
+
+
+def test_without_opacitys_residual_only_colours_change():
+    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
+    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
+    small = without_opacity_residual(Field(head, splats))
+    found = small.head(splats, visible, centers)
+    assert (found.opacities == head.base_appearance(splats, visible).opacities).all()
+    assert_close(found.colors, head(splats, visible, centers).colors, **FLOAT32)
+
+
+def test_a_constant_distance_is_what_the_field_sees(case):
+    field, visible, _ = case
+    if not field.head.config.use_distance:
+        pytest.skip("this field sees no distance")
+    # From cameras that are all as far away from their splats.
+    torch.manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(len(visible), 3), dim=-1)
+    centers = field.splats["means"][visible] + 3.0 * directions
+    _, log_distance = view_geometry(field.splats["means"][visible], centers, 0.01)
+    small = with_constant_distance(field, float(log_distance[0]))
+    assert not small.head.config.use_distance
+    assert_same(small, field, visible, centers, **FLOAT32)
+
+
+def test_an_input_that_is_0_no_longer_counts(case):
+    field, visible, _ = case
+    center = torch.tensor([5.0, 4.0, 3.0])
+    small = field
+    for name in input_columns(field.head.config, "low") | input_columns(field.head.config, "high"):
+        if name in ("direction", "distance") or name.startswith("band"):
+            small = without_input(small, name)
+    a, b = (small.head(small.splats, visible, c) for c in (center, -center))
+    assert (a.colors == b.colors).all() and (a.opacities == b.opacities).all()
+    a, b = (field.head(field.splats, visible, c) for c in (center, -center))
+    assert (a.colors != b.colors).any()
+
+
+def test_diffuse_splats_have_what_they_are_given(case):
+    field, visible, centers = case
+    diffuse = torch.rand(40, generator=torch.Generator().manual_seed(0)) < 0.5
+    base = {"features_dc": torch.randn(40, 3), "opacities": torch.randn(40, 1)}
+    small = with_diffuse(field, diffuse, **base)
+    found, full = small.head(small.splats, visible, centers), field.head(field.splats, visible, centers)
+    given = field.head.base_appearance({**field.splats, **base}, visible)
+    is_diffuse = diffuse[visible]
+    assert is_diffuse.any() and not is_diffuse.all()
+    for a, b, c in zip(found, full, given, strict=True):
+        assert (a[is_diffuse] == c[is_diffuse]).all()
+        assert_close(a[~is_diffuse], b[~is_diffuse], rtol=0, atol=1e-6)  # other sizes of a product, other rounding
+    saved = int(diffuse.sum()) * 8 * 4 - 40 // 8
+    assert small.bytes == field.bytes - saved
+
+
+def test_the_head_is_evaluated_for_the_others_only(case):
+    """A latent of NaN would show; and what does not count gets no gradient."""
+    field, visible, centers = case
+    diffuse = torch.arange(40) % 3 == 0
+    splats = {**field.splats, DIFFUSE: diffuse}
+    splats["latents"] = field.splats["latents"].clone()
+    splats["latents"][diffuse] = torch.nan
+    splats["latents"].requires_grad_()
+    one_center = torch.tensor([1.0, 2.0, 3.0])
+    for center in (centers, one_center):
+        found = field.head(splats, visible, center)
+        assert torch.isfinite(found.colors).all() and torch.isfinite(found.opacities).all()
+        for name, (values, _) in field.head.components(splats, visible, center).items():
+            assert len(values) == len(visible) and (values[diffuse[visible]] == 0).all(), name
+    (gradient,) = torch.autograd.grad(found.colors.sum(), splats["latents"])
+    assert (gradient[diffuse] == 0).all()
+    seen = torch.zeros(40, dtype=torch.bool).index_fill(0, visible, True)
+    assert gradient[seen & ~diffuse].abs().sum() > 0
+
+
+def test_nobody_visible_and_all_diffuse_are_fine(case):
+    field, visible, centers = case
+    for diffuse in (torch.zeros(40, dtype=torch.bool), torch.ones(40, dtype=torch.bool)):
+        splats = {**field.splats, DIFFUSE: diffuse}
+        assert field.head(splats, visible[:0], centers[:0]).colors.shape == (0, 3)
+        assert field.head(splats, visible, centers).opacities.shape == (len(visible),)

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A field through a compact file and back, and nerfstudio's commands on the result."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import tyro
+from nerfstudio.scripts.render import DatasetRender
+from nerfstudio.utils.eval_utils import eval_setup
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.head import base_colors
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.reduce import Field, latent_basis, with_diffuse, with_rank
+from nrfgs_ns.compact.decode import decode
+from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode
+from nrfgs_ns.compact.format import read_container, write_container
+from nrfgs_ns.compact.precision import Precision
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.export import Export
+from nrfgs_ns.studies.run import evaluate, train
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+
+def field(count: int = 60) -> Field:
+    torch.manual_seed(3)
+    config = NrfConfig(latent_dim=8, hidden_width=16, output_init="default")
+    head = config.setup().requires_grad_(False)
+    splats = {
+        "means": torch.randn(count, 3) * torch.tensor([1.0, 5.0, 0.2]),
+        "quats": torch.randn(count, 4) * 3,
+        "scales": torch.randn(count, 3) - 4,
+        "opacities": torch.randn(count, 1) * 4,
+        "features_dc": torch.randn(count, 3),
+        "latents": torch.randn(count, 8) * torch.linspace(2.0, 0.1, 8),
+    }
+    diffuse = torch.rand(count) < 0.4
+    return with_diffuse(Field(head, splats), diffuse, splats["features_dc"], splats["opacities"])
+
+
+def through_a_file(one: Field, tmp_path: Path, precision: Precision | None = None):
+    header, streams = encode(one, precision or Precision(), {"rasterize_mode": "classic"})
+    write_container(tmp_path / "f.nrf", header, streams)
+    return decode(tmp_path / "f.nrf")
+
+
+def matched(one: Field, found: dict) -> torch.Tensor:
+    """The row of the field that each row of the file came from: the nearest mean."""
+    rows = torch.cdist(found["means"].double(), one.splats["means"].double()).argmin(dim=1)
+    assert len(rows.unique()) == len(rows)
+    return rows
+
+
+@pytest.mark.parametrize("finer", [1.0, 0.25])
+def test_every_number_comes_back_within_half_a_step(finer, tmp_path):
+    precision = Precision()
+    precision = replace(
+        precision,
+        **{name: getattr(precision, name) * finer for name in ("means", "scales", "opacities", "colors", "latents")},
+    )
+    one = field()
+    decoded = through_a_file(one, tmp_path, precision)
+    found, truth = decoded.splats, {name: value[matched(one, decoded.splats)] for name, value in one.splats.items()}
+    diffuse = found[DIFFUSE]
+    assert (diffuse == truth[DIFFUSE]).all() and 0 < diffuse.sum() < 60
+    # Half a step, and float32's rounding of numbers below 16: 2^-20.
+    rounding = 2.0**-20
+    median = one.splats["scales"].mean(dim=1).median().exp().item()
+    assert (found["means"] - truth["means"]).abs().max() <= precision.means * median / 2 + rounding
+    assert (found["scales"] - truth["scales"]).abs().max() <= precision.scales / 2 + rounding
+    cut = truth["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
+    assert (found["opacities"] - cut).abs().max() <= precision.opacities / 2 + rounding
+    drawn = base_colors(truth["features_dc"])
+    drawn[diffuse] = drawn[diffuse].clamp_min(0.0)  # as the rasterizer gets them
+    assert (base_colors(found["features_dc"]) - drawn).abs().max() <= precision.colors / 2 + rounding
+    spread = one.splats["latents"][~one.splats[DIFFUSE]].double().std(dim=0, correction=0).max().item()
+    off = (found["latents"] - truth["latents"])[~diffuse].abs().max()
+    assert off <= precision.latents * spread / 2 + rounding
+    assert off > precision.latents * spread / 8, "a bound that is far from reached would be the wrong one"
+    assert (found["latents"][diffuse] == 0).all()
+    turned = (torch.nn.functional.normalize(truth["quats"], dim=1) * found["quats"]).sum(dim=1).abs()
+    assert turned.min() > 1 - (8 * math.sqrt(0.5) / 255) ** 2  # `test_quantise.py` has the bound of each component
+    for name, weight in one.head.state_dict().items():
+        assert_close(decoded.weights[name], weight, rtol=2**-11, atol=2**-25)  # float16, subnormal below 2^-14
+    assert decoded.config == one.head.config
+
+
+def test_splats_are_in_morton_order_and_the_file_is_small(tmp_path):
+    one = field(3000)
+    through_a_file(one, tmp_path)
+    header, streams = read_container(tmp_path / "f.nrf")
+    places = np.cumsum(streams["view.means"], dtype=np.uint64)
+    assert (np.diff(places.astype(np.int64)) >= 0).all()
+    assert header["splats"]["view"] + header["splats"][DIFFUSE] == 3000
+    assert "diffuse.latents" not in streams
+    size = (tmp_path / "f.nrf").stat().st_size
+    assert size < 248 * 3000 / 10, "random splats already take a tenth of a PLY file"
+
+
+def test_splats_that_are_not_finite_are_left_out(tmp_path):
+    one = field()
+    one.splats["means"][3, 1] = math.nan
+    one.splats["quats"][5] = 0.0
+    one.splats["scales"][7, 0] = math.inf
+    assert len(through_a_file(one, tmp_path).splats["means"]) == 57
+    one.splats["opacities"][:] = math.nan
+    with pytest.raises(InputError, match="None of the 60"):
+        through_a_file(one, tmp_path)
+
+
+@pytest.mark.parametrize("diffuse", [True, False])
+def test_all_splats_of_one_kind(diffuse, tmp_path):
+    one = field()
+    one.splats[DIFFUSE][:] = diffuse
+    found = through_a_file(one, tmp_path).splats
+    assert len(found["means"]) == 60 and bool(found[DIFFUSE].all()) == diffuse
+    del one.splats[DIFFUSE]
+    assert not through_a_file(one, tmp_path).splats[DIFFUSE].any()
+
+
+def test_large_weights_and_a_lone_splat(tmp_path):
+    one = field(1)
+    one.head.low[0].weight[0, 0] = 1e6  # beyond float16
+    decoded = through_a_file(one, tmp_path)
+    assert decoded.weights["low.0.weight"][0, 0] == 1e6
+    assert_close(decoded.splats["means"], one.splats["means"])
+
+
+def test_a_field_of_low_rank_is_written_at_its_rank(tmp_path):
+    one = field()
+    small = with_rank(one, latent_basis(one, torch.ones(60)), 3)
+    decoded = through_a_file(small, tmp_path)
+    assert decoded.config.latent_dim == 3 and decoded.splats["latents"].shape == (60, 3)
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        (lambda header, streams: header.update(format="jpeg"), "holds 'jpeg'"),
+        (lambda header, streams: header["head"].update(name="sh"), "head named 'sh'"),
+        (lambda header, streams: header["head"]["config"].update(shine=1), "unknown option 'shine'"),
+        (lambda header, streams: header["head"]["config"].update(latent_dim=9), "view.latents of shape"),
+        (lambda header, streams: header["head"]["config"].update(num_bands=0), "num_bands is 0"),
+        (lambda header, streams: header["splats"].update(view=1), "view.means"),
+        (lambda header, streams: header.pop("grids"), "KeyError"),
+        (lambda header, streams: streams.pop("diffuse.colors"), "diffuse.colors"),
+        (lambda header, streams: streams["view.quats_largest"].fill(7), "in range"),
+    ],
+)
+def test_files_that_describe_no_field_are_refused(change, says, tmp_path):
+    header, streams = encode(field(), Precision(), {})
+    change(header, streams)
+    write_container(tmp_path / "f.nrf", header, streams)
+    with pytest.raises(InputError, match=says):
+        decode(tmp_path / "f.nrf")
+
+
+@pytest.mark.parametrize("precision", [Precision(means=0.0), Precision(latents=-1.0), Precision(quats=1)])
+def test_impossible_precision_is_refused(precision):
+    with pytest.raises(InputError, match="precision"):
+        encode(field(), precision, {})
+
+
+# The verb.
+
+
+@pytest.fixture(scope="module")
+def exported(tiny_scene, tmp_path_factory):
+    """config.yml of an 8-step training with a loud field, the compact file, and the report."""
+    out = tmp_path_factory.mktemp("runs")
+    options = {
+        "--data": tiny_scene,
+        "--output-dir": out,
+        "--max-num-iterations": 8,
+        "--vis": "tensorboard",
+        "--logging.local-writer.enable": False,
+        "--logging.profiler": "none",
+        "--pipeline.model.appearance.output-init": "default",
+        "--pipeline.model.warmup-steps": 0,
+        "--pipeline.model.appearance.latent-dim": 8,
+        "--pipeline.model.camera-optimizer.mode": "SO3xR3",  # its poses are no part of the file
+    }
+    config = Path(train(["nrfgs", *(str(w) for option in options.items() for w in option)]).config_path)
+    words = ["compact", "--load-config", str(config), "--output", str(out / "small.nrf")]
+    tyro.cli(Export, args=[*words, "--compact.views", "2", "--report", str(out / "report.json")]).main()
+    return config, out / "small.nrf", out / "report.json"
+
+
+def test_nerfstudios_commands_read_the_file(exported, tmp_path):
+    _, file, report = exported
+    numbers = json.loads(report.read_text())
+    config = file.parent / "small" / "nrfgs" / "compact" / "config.yml"
+    results = evaluate(config, tmp_path / "eval.json")
+    assert results["splats"] == numbers["written"]
+    # The same pictures, measured by two pieces of code in float32.
+    assert results["psnr"] == pytest.approx(numbers["psnr_file"], abs=1e-3)
+    assert numbers["bytes"] == file.stat().st_size and numbers["ply_bytes"] == 248 * numbers["written"]
+    assert numbers["loss_db"] == pytest.approx(numbers["psnr_model"] - numbers["psnr_file"])
+    # 0.03 dB of budget, and rounding: steps of 1/512 of white are worth 65 dB, far above this model's 16 dB.
+    assert abs(numbers["loss_db"]) < 0.1
+    DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
+    assert len(list((tmp_path / "renders" / "test" / "rgb").rglob("*.png"))) == 2
+
+
+def test_the_file_says_which_splats_are_diffuse(exported):
+    _, file, report = exported
+    _, pipeline, _, step = eval_setup(file.parent / "small" / "nrfgs" / "compact" / "config.yml")
+    model, numbers = pipeline.model, json.loads(report.read_text())
+    assert step == 7
+    diffuse = model.densification.state.get(DIFFUSE)
+    count = 0 if diffuse is None else int(diffuse.sum())
+    assert count == numbers["written"] - numbers["view_dependent"]
+    assert model.config.appearance.latent_dim == numbers["rank"]
+
+
+def test_a_broken_file_stops_ns_eval_with_a_sentence(exported, tmp_path):
+    _, file, _ = exported
+    whole = file.read_bytes()
+    try:
+        file.write_bytes(whole[:-5])
+        with pytest.raises(InputError, match="its header says"):
+            evaluate(file.parent / "small" / "nrfgs" / "compact" / "config.yml", tmp_path / "eval.json")
+        file.unlink()
+        with pytest.raises(InputError, match="cannot be read"):
+            evaluate(file.parent / "small" / "nrfgs" / "compact" / "config.yml", tmp_path / "eval.json")
+    finally:
+        file.write_bytes(whole)
+
+
+def test_what_is_asked_for_is_written(exported, tmp_path):
+    config, _, _ = exported
+    words = ["compact", "--load-config", str(config), "--output", str(tmp_path / "x.nrf"), "--no-measure"]
+    tyro.cli(Export, args=[*words, "--compact.rank", "3", "--compact.threshold", "0", "--compact.views", "1"]).main()
+    decoded = decode(tmp_path / "x.nrf")
+    assert decoded.config.latent_dim == 3 and not decoded.splats[DIFFUSE].any()
+    for options, says in (
+        (["--compact.rank", "9"], "ranks 1 to 8"),
+        (["--compact.views", "0"], "at least 1"),
+        (["--compact.precision.colors", "0"], "positive"),
+    ):
+        with pytest.raises(InputError, match=says):
+            tyro.cli(Export, args=[*words, *options]).main()

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The container: what goes in comes out, and what is damaged is refused."""
+
+import json
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nrfgs_ns.compact import format as container
+from nrfgs_ns.compact.format import CHECKSUM, DTYPES, MAGIC, PREAMBLE, read_container, write_container
+from nrfgs_ns.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def arrays() -> dict[str, np.ndarray]:
+    random = np.random.default_rng(0)
+    whole = {name: random.integers(0, np.iinfo(name).max, (3, 17), dtype=name) for name in DTYPES if "uint" in name}
+    return {**whole, "half": random.normal(size=(5,)).astype("float16"), "none": np.zeros((2, 0), dtype="float32")}
+
+
+@pytest.fixture(scope="module")
+def written(arrays, tmp_path_factory):
+    path = tmp_path_factory.mktemp("compact") / "deep" / "file.nrf"
+    assert write_container(path, {"format": "x", "list": [1.5, None]}, arrays) == path.stat().st_size
+    return path
+
+
+def test_what_goes_in_comes_out(arrays, written):
+    header, streams = read_container(written)
+    assert header["format"] == "x" and header["list"] == [1.5, None]
+    assert list(streams) == list(arrays)
+    for name, array in arrays.items():
+        assert streams[name].shape == array.shape and streams[name].dtype == array.dtype
+        assert (streams[name] == array).all()
+    assert [path.name for path in written.parent.iterdir()] == ["file.nrf"], "nothing is left beside it"
+
+
+def test_layout_is_as_documented(written):
+    data = written.read_bytes()
+    magic, version, length, total = struct.unpack("<8sIIQ", data[:24])
+    assert magic == b"\x89NRF\r\n\x1a\n" and version == 1 and total == len(data)
+    header = json.loads(data[24 : 24 + length])
+    assert struct.unpack("<I", data[24 + length : 28 + length]) == (zlib.crc32(data[: 24 + length]),)
+    first = 28 + length
+    for entry in header["streams"]:
+        assert zlib.crc32(data[first : first + entry["bytes"]]) == entry["crc32"]
+        assert data[first : first + 6] == b"\xfd7zXZ\x00"
+        first += entry["bytes"]
+    assert first == len(data)
+
+
+@settings(max_examples=150)
+@given(data=st.data())
+def test_a_changed_byte_is_noticed(data, written, tmp_path_factory):
+    """CRC-32 finds every change of one byte; the length finds the file's own."""
+    whole = written.read_bytes()
+    where = data.draw(st.integers(0, len(whole) - 1))
+    changed = bytearray(whole)
+    changed[where] ^= data.draw(st.integers(1, 255))
+    broken = written.parent.parent / "broken.nrf"
+    broken.write_bytes(changed)
+    with pytest.raises(InputError, match="broken.nrf"):
+        read_container(broken)
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_a_cut_or_longer_file_is_noticed(data, written):
+    whole = written.read_bytes()
+    cut = written.parent.parent / "cut.nrf"
+    cut.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
+    with pytest.raises(InputError, match="cut.nrf"):
+        read_container(cut)
+    cut.write_bytes(whole + data.draw(st.binary(min_size=1, max_size=9)))
+    with pytest.raises(InputError, match="its header says"):
+        read_container(cut)
+
+
+def rewritten(path, change) -> None:
+    """Change a file's header and mend its checksum and length: a file that was made wrong, not one that was damaged."""
+    data = path.read_bytes()
+    _, version, length, _ = PREAMBLE.unpack_from(data)
+    header = json.loads(data[PREAMBLE.size : PREAMBLE.size + length])
+    version = change(header) or version
+    text = json.dumps(header).encode()
+    body = data[PREAMBLE.size + length + CHECKSUM.size :]
+    start = PREAMBLE.pack(MAGIC, version, len(text), PREAMBLE.size + len(text) + CHECKSUM.size + len(body)) + text
+    path.write_bytes(start + CHECKSUM.pack(zlib.crc32(start)) + body)
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        (lambda header: 2, "version 2"),
+        (lambda header: header["streams"][0].update(shape=[3, 18]), "does not hold 54 numbers"),
+        (lambda header: header["streams"][0].update(shape=[3, 16]), "does not hold 48 numbers"),
+        (lambda header: header["streams"][0].update(shape=[2**40]), "would unpack to"),
+        (lambda header: header["streams"][0].update(dtype="object"), "which cannot be"),
+        (lambda header: header["streams"][0].update(crc32=1), "checksum of its stream"),
+        (lambda header: header["streams"].pop() and None, "after its last stream"),
+    ],
+)
+def test_a_misleading_header_is_refused(change, says, written, tmp_path):
+    path = tmp_path / "made.nrf"
+    path.write_bytes(written.read_bytes())
+    rewritten(path, change)
+    with pytest.raises(InputError, match=says):
+        read_container(path)
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_container(tmp_path / "none.nrf")
+    (tmp_path / "text.nrf").write_text("ply\nformat binary_little_endian 1.0\n" * 9)
+    with pytest.raises(InputError, match="not a compact file"):
+        read_container(tmp_path / "text.nrf")
+    with pytest.raises(ValueError, match="float64"):
+        write_container(tmp_path / "x.nrf", {}, {"a": np.zeros(3)})
+
+
+def test_a_write_that_is_cut_short_leaves_the_older_file(written, monkeypatch):
+    before = written.read_bytes()
+
+    def torn(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(container.os, "replace", torn)
+    with pytest.raises(OSError, match="disk full"):
+        write_container(written, {}, {})
+    assert written.read_bytes() == before
+    written.with_name("file.nrf.writing").unlink()

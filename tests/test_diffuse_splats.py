@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splats that lose their residual in training: what moves, what is carried along, and that they come back."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from gsplat.strategy.ops import duplicate, remove, split
+from nerfstudio.utils.eval_utils import eval_setup
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT
+from nrfgs_ns.appearance.reduce import Field
+from nrfgs_ns.diffuse_splats import DiffuseSchedule, DiffuseSplats, give_back, make_diffuse, schedule_for
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.field_views import FieldViews
+from nrfgs_ns.residuals import look_over
+from nrfgs_ns.studies.run import parse, train
+
+BELOW_4 = DiffuseSplats(threshold=4.0)
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+
+def words(scene: Path, out: Path, method: str = "nrfgs", steps: int = 24, **more) -> list[str]:
+    """A training that splits and prunes every 4th step, and in which splats become diffuse after step 6, 14 and 22."""
+    chosen = {
+        "--data": scene,
+        "--output-dir": out,
+        "--max-num-iterations": steps,
+        "--vis": "tensorboard",
+        "--steps-per-eval-image": 1000,
+        "--steps-per-eval-all-images": 1000,
+        "--logging.local-writer.enable": False,
+        "--logging.profiler": "none",
+        "--pipeline.model.warmup-length": 2,
+        "--pipeline.model.refine-every": 4,
+        "--pipeline.model.reset-alpha-every": 20,
+        "--pipeline.model.densify-grad-thresh": 1e-6,
+        "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.stop-split-at": 100,
+        "--pipeline.model.appearance.output-init": "default",
+        "--pipeline.model.warmup-steps": 0,
+        "--pipeline.model.appearance.latent-dim": 4,
+        "--pipeline.model.diffuse.start": 6,
+        "--pipeline.model.diffuse.every": 8,
+        "--pipeline.model.diffuse.trial": 3,
+        "--pipeline.model.diffuse.threshold": 4.0,
+        **more,
+    }
+    return [method, *(str(word) for option in chosen.items() for word in option)]
+
+
+@pytest.fixture
+def untrained(tiny_scene, tmp_path):
+    """A model whose field says something, and its datamanager."""
+    torch.manual_seed(0)
+    pipeline = parse(words(tiny_scene, tmp_path)).pipeline.setup(device="cpu", test_mode="test")
+    pipeline.eval()
+    return pipeline.model, pipeline.datamanager
+
+
+def picture(model, camera) -> torch.Tensor:
+    with torch.no_grad():
+        return model.get_outputs_for_camera(camera)["rgb"]
+
+
+def test_some_become_diffuse_and_all_get_back_what_they_had(untrained):
+    model, data = untrained
+    cameras = data.train_dataset.cameras
+    before = {name: value.detach().clone() for name, value in model.gauss_params.items()}
+    full = picture(model, cameras[:1])
+    make_diffuse(model, data, BELOW_4)
+    diffuse, shift = model.densification.state[DIFFUSE], model.densification.state[SHIFT]
+    assert 20 < int(diffuse.sum()) < model.num_points - 20
+    assert (shift[~diffuse] == 0).all() and shift[diffuse].abs().max() > 1e-3
+    assert (model.gauss_params["features_dc"][~diffuse] == before["features_dc"][~diffuse]).all()
+    changed = picture(model, cameras[:1])
+    again = look_over(model, cameras)
+    assert (again.largest[diffuse] < 1e-2).all() and again.largest[~diffuse].max() > 4.0  # float32's rounding of means
+    assert 0 < (changed - full).abs().mean() < 4.0 / 255  # what one splat changes by at most, on average
+    give_back(model)
+    assert DIFFUSE not in model.densification.state and SHIFT not in model.densification.state
+    for name, value in before.items():
+        # Added and taken away in float32; the numbers are below 8.
+        assert_close(model.gauss_params[name].detach(), value, rtol=0, atol=2e-6, msg=name)
+    assert_close(picture(model, cameras[:1]), full, rtol=0, atol=1e-5)
+    give_back(model)  # nothing to give: nothing happens
+
+
+def test_a_splat_that_starts_to_matter_comes_back(untrained):
+    model, data = untrained
+    cameras = data.train_dataset.cameras
+    make_diffuse(model, data, BELOW_4)
+    first = model.densification.state[DIFFUSE].clone()
+    give_back(model)
+    row, loud = int(first.nonzero()[0]), int(look_over(model, cameras).largest.argmax())
+    assert not first[loud]
+    with torch.no_grad():  # it becomes another of those that matter most, at the same place
+        for value in model.gauss_params.values():
+            value[row] = value[loud]
+    make_diffuse(model, data, BELOW_4)
+    assert first[row] and not model.densification.state[DIFFUSE][row]
+    assert model.densification.state[DIFFUSE].any()
+
+
+def test_a_threshold_is_chosen_by_what_it_costs(untrained):
+    """Nothing at no cost in dB but what does not change a picture; everything where everything may be lost."""
+    model, data = untrained
+    shares = []
+    for budget in (1e-9, 0.02, 1e3):
+        make_diffuse(model, data, DiffuseSplats(budget=budget, views=3))
+        shares.append(model.densification.state[DIFFUSE].float().mean().item())
+        give_back(model)
+    assert shares == sorted(shares) and shares[0] < 0.9 and shares[-1] == 1.0
+    # The views were photographs of another scene than these splats: dropping may gain. A loss is at most the budget.
+    views = FieldViews(model, some_views(data, 3))
+    field = Field(model.head, dict(model.gauss_params.items()))
+    full = views.psnr(field)
+    make_diffuse(model, data, DiffuseSplats(budget=0.02, views=3))
+    assert views.psnr(Field(model.head, model._splats_to_draw())) >= full - 0.02 - 1e-4
+
+
+def some_views(data, count: int):
+    """Evenly spaced training views with their images, as a look chooses them."""
+    images, cameras = data.cached_train, data.train_dataset.cameras
+    return [(cameras[i : i + 1], images[i]) for i in (j * len(images) // count for j in range(count))]
+
+
+def test_the_head_is_evaluated_for_the_others_only(untrained):
+    model, data = untrained
+    cameras = data.train_dataset.cameras
+    make_diffuse(model, data, BELOW_4)
+    diffuse, rows = model.densification.state[DIFFUSE], []
+    handle = model.head.low.register_forward_hook(lambda _, inputs, __: rows.append(len(inputs[0])))
+    model.train()
+    model.step = 0
+    outputs = model.get_outputs(cameras[:1])
+    handle.remove()
+    visible = model.info["gaussian_ids"]
+    assert rows == [int((~diffuse[visible]).sum())] and 0 < rows[0] < len(visible)
+    outputs["rgb"].sum().backward()
+    assert (model.gauss_params["latents"].grad[diffuse] == 0).all()
+    assert model.gauss_params["features_dc"].grad[diffuse].abs().sum() > 0
+
+
+def test_densification_carries_the_tables_along(untrained):
+    model, data = untrained
+    make_diffuse(model, data, BELOW_4)
+    state = model.densification.state
+    params = model.gauss_params
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
+    with torch.no_grad():  # a mark that tells whose row it is
+        params["latents"][:, 0] = state[DIFFUSE].float()
+        params["latents"][:, 1:4] = state[SHIFT][:, :3]
+    torch.manual_seed(0)
+    for change in (duplicate, split, remove):
+        chosen = torch.rand(len(params["means"])) < 0.3
+        change(params, optimizers, state, chosen)
+        assert len(state[DIFFUSE]) == len(state[SHIFT]) == len(params["means"])
+        assert (params["latents"][:, 0].bool() == state[DIFFUSE]).all()
+        assert (params["latents"][:, 1:4] == state[SHIFT][:, :3]).all()
+    assert 0 < state[DIFFUSE].sum() < len(state[DIFFUSE])
+
+
+def test_the_schedule(untrained, monkeypatch):
+    model, data = untrained
+    done = []
+
+    def look(model, *_):
+        done.append(("look", step))
+        model.densification.state[DIFFUSE] = torch.zeros(1)
+
+    def trial(model):
+        done.append(("trial", step))
+        model.densification.state.pop(DIFFUSE, None)
+
+    monkeypatch.setattr("nrfgs_ns.diffuse_splats.make_diffuse", look)
+    monkeypatch.setattr("nrfgs_ns.diffuse_splats.give_back", trial)
+    schedule = DiffuseSchedule(DiffuseSplats(start=6, every=10, trial=3, stop=30), data)
+    for step in range(60):
+        schedule.after_step(model, step)
+    assert done == [("look", 6), ("trial", 13), ("look", 16), ("trial", 23), ("look", 26)]
+
+
+def checkpoint(config: Path) -> dict:
+    (path,) = (config.parent / "nerfstudio_models").glob("*.ckpt")
+    return torch.load(path, weights_only=True)
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_scene, tmp_path_factory):
+    """config.yml of the unbroken training."""
+    return Path(train(words(tiny_scene, tmp_path_factory.mktemp("whole"))).config_path)
+
+
+@pytest.mark.parametrize("half", [8, pytest.param(12, marks=pytest.mark.slow)])
+def test_resumed_training_is_the_unbroken_one(half, whole, tiny_scene, tmp_path):
+    """Cut while some splats are diffuse (after step 7) and in a trial (after step 11 to 13)."""
+    first = Path(train(words(tiny_scene, tmp_path / "half", steps=half)).config_path)
+    rest = {"--load-dir": first.parent / "nerfstudio_models"}
+    resumed = Path(train(words(tiny_scene, tmp_path / "rest", steps=24 - half, **rest)).config_path)
+    a, b = checkpoint(whole)["pipeline"], checkpoint(resumed)["pipeline"]
+    of_half = checkpoint(first)["pipeline"]["_model._extra_state"]["strategy"]
+    assert (DIFFUSE in of_half) == (half == 8)
+    strategies = [state["_model._extra_state"]["strategy"] for state in (a, b)]
+    count = len(a["_model.gauss_params.means"])
+    assert count != 300 and 0 < int(strategies[0][DIFFUSE].sum()) < count == len(strategies[0][DIFFUSE])
+    for name in (DIFFUSE, SHIFT):
+        assert_close(strategies[1][name], strategies[0][name], rtol=1e-5, atol=1e-7)
+    for name, value in a.items():
+        if isinstance(value, torch.Tensor):
+            assert_close(b[name], value, rtol=1e-5, atol=1e-7, msg=name)
+    _, pipeline, _, _ = eval_setup(resumed)
+    assert (pipeline.model.densification.state[DIFFUSE] == strategies[1][DIFFUSE]).all()
+
+
+def test_off_is_off(tiny_scene, tmp_path):
+    config = parse(words(tiny_scene, tmp_path, **{"--pipeline.model.diffuse.start": None}))
+    assert config.pipeline.model.diffuse.start is None
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    assert schedule_for(trainer.pipeline.model, trainer.pipeline.datamanager, 1) is None
+    trainer.train()
+    state = trainer.pipeline.model.densification.state
+    assert DIFFUSE not in state and SHIFT not in state
+    assert DIFFUSE not in trainer.pipeline.model._splats_to_draw()
+
+
+@pytest.mark.parametrize(
+    "method, more, says",
+    [
+        ("nrfgs-sh", {}, "'sh' head has no residual"),
+        ("nrfgs", {"--pipeline.model.densification": "mcmc"}, "'mcmc' moves splats"),
+        ("nrfgs", {"--pipeline.model.diffuse.start": -1}, "start is -1"),
+        ("nrfgs", {"--pipeline.model.diffuse.trial": 8}, "trial is 8 steps"),
+        ("nrfgs", {"--pipeline.model.diffuse.threshold": 0.0}, "threshold is 0.0"),
+        ("nrfgs", {"--pipeline.model.diffuse.budget": -1}, "budget is -1"),
+        ("nrfgs", {"--pipeline.model.diffuse.views": 0}, "views is 0"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused_before_training(method, more, says, tiny_scene, tmp_path):
+    line = words(tiny_scene, tmp_path, method, **more)
+    own = ("appearance", "warmup-steps")
+    if method != "nrfgs":
+        line = line[:1] + [
+            w for k, v in zip(line[1::2], line[2::2], strict=True) for w in (k, v) if not any(o in k for o in own)
+        ]
+    if "mcmc" in line:
+        gone = ("densify-grad", "reset-alpha", "stop-split")
+        line = line[:1] + [
+            w for k, v in zip(line[1::2], line[2::2], strict=True) for w in (k, v) if not any(o in k for o in gone)
+        ]
+    with pytest.raises(InputError, match=says):
+        parse(line).setup(local_rank=0, world_size=1).setup()
