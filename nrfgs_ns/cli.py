@@ -8,8 +8,12 @@ import tyro
 
 from nrfgs_ns.demo import Demo
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export import Export
+from nrfgs_ns.prepare.verb import Prepare
 from nrfgs_ns.studies.bench import Bench
 from nrfgs_ns.studies.express.study import Express
+from nrfgs_ns.studies.inspect.verb import Inspect
+from nrfgs_ns.studies.tradeoff.verb import Tradeoff
 
 
 def entrypoint() -> None:
@@ -17,7 +21,16 @@ def entrypoint() -> None:
     # Deprecations inside nerfstudio, and a loss that it logs undetached: not the reader's business.
     warnings.simplefilter("ignore", FutureWarning)
     warnings.filterwarnings("ignore", "Converting a tensor with requires_grad=True to a scalar")
-    verb = tyro.extras.subcommand_cli_from_dict({"demo": Demo, "bench": Bench, "express": Express}, description=__doc__)
+    verbs = {
+        "demo": Demo,
+        "prepare": Prepare,
+        "export": Export,
+        "bench": Bench,
+        "tradeoff": Tradeoff,
+        "express": Express,
+        "inspect": Inspect,
+    }
+    verb = tyro.extras.subcommand_cli_from_dict(verbs, description=__doc__)
     try:
         verb.main()
     except (InputError, FileExistsError) as error:

@@ -17,6 +17,8 @@ from nerfstudio.utils import writer
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
+from nrfgs_ns.pace import Pace
+
 
 class LeanOptimizers(Optimizers):
     """Nerfstudio's optimisers, stepped with few calls.
@@ -30,6 +32,7 @@ class LeanOptimizers(Optimizers):
     def __init__(self, config, param_groups, steps_per_log: int = 10):
         super().__init__(config, param_groups)
         self.steps_per_log = steps_per_log
+        self.pace: Pace | None = None
         self._warm: set[Optimizer] = set()
         self.fuse()
 
@@ -77,6 +80,10 @@ class LeanOptimizers(Optimizers):
         )
 
     def scheduler_step_all(self, step: int) -> None:
+        if self.pace is not None:
+            self.pace.advance()
+            for scheduler in self.schedulers.values():
+                scheduler.last_epoch = self.pace.position - 1  # to which `step` adds 1
         for name, scheduler in self.schedulers.items():
             scheduler.step()
             if step % self.steps_per_log == 0:

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's trainer, with checkpoints that are whole or not there, and a guard over every number."""
+"""Nerfstudio's trainer, with checkpoints that are whole or not there, a guard over every number, and a time budget."""
 
 import gc
+import math
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -15,8 +17,10 @@ from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_eval_enabled
 from nerfstudio.utils.misc import step_check
 
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.optimizers import in_world_units
+from nrfgs_ns.pace import Pace, TimedPace, resolution_phases
 from nrfgs_ns.tracking import track
 
 
@@ -26,9 +30,25 @@ class NrfgsTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: NrfgsTrainer)
     """target class to instantiate"""
+    time_budget: float | None = None
+    """minutes that training may take, from the first step to the end of the last. As many steps are made as fit, and
+    all schedules are stretched to them. None: max_num_iterations steps"""
+    schedule_steps: int | None = None
+    """steps of the training that learning rates, resolution, harmonics and densification are laid out for; they are
+    stretched to the steps that are made. None: not stretched, or with a time budget laid out for max_num_iterations"""
 
     def setup(self, **kwargs) -> "NrfgsTrainer":
-        """The trainer; for several devices, the one that spreads the splats over them (`distributed`)."""
+        """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
+
+        Raises:
+            InputError: an option is out of range, or cannot be had on several devices.
+        """
+        for name in ("time_budget", "schedule_steps"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"{name} is {value}; it must be positive.")
+            if value is not None and kwargs.get("world_size", 1) > 1:
+                raise InputError(f"{name} is for one device. Leave it out, or use --machine.num-devices 1.")
         if kwargs.get("world_size", 1) == 1:
             return super().setup(**kwargs)
         from nrfgs_ns.distributed.trainer import ShardedTrainer
@@ -48,11 +68,44 @@ class NrfgsTrainerConfig(TrainerConfig):
 class NrfgsTrainer(Trainer):
     """Trainer that never leaves a torn checkpoint, or one with NaN, where `--load-dir` would find it."""
 
+    pace: Pace | None = None
+    """how fast the training walks through its schedules; None: a step is a step"""
+
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard (see `nrfgs_ns.guard`)."""
         self.guard = Guard(self.pipeline)
         every = self.pipeline.steps_per_log = self.config.logging.steps_per_log
-        return WatchedOptimizers(self.optimizer_configs(), self.pipeline.get_param_groups(), self.guard, every)
+        groups = self.pipeline.get_param_groups()
+        optimizers = WatchedOptimizers(self.optimizer_configs(), groups, self.guard, every)
+        self.pace = optimizers.pace = self.pipeline.model.pace = self._pace()
+        return optimizers
+
+    def _pace(self) -> Pace | None:
+        """How fast to walk through the schedules (`pace.py`), or None for a step at a time."""
+        length = self.config.schedule_steps or self.config.max_num_iterations
+        if self.config.time_budget is not None:
+            model = self.config.pipeline.model
+            phases = resolution_phases(model.num_downscales, model.resolution_schedule)
+            return TimedPace(length, 60.0 * self.config.time_budget, phases)
+        return None if self.config.schedule_steps is None else Pace(length)
+
+    def _load_checkpoint(self) -> None:
+        """Nerfstudio's; and the pace goes on from where it was.
+
+        Raises:
+            InputError: the checkpoint's schedules were stretched, and this training's are not.
+        """
+        super()._load_checkpoint()
+        if self.pace is None and self.pipeline.model.pace is not None:
+            raise InputError(
+                "The checkpoint's training had a --time-budget or --schedule-steps. Give the same to go on from it."
+            )
+        if self.pace is not None and self.pace.position == 0.0:
+            self.pace.position = float(self._start_step)  # of a checkpoint whose schedules were not stretched
+        if self.pace is not None and not isinstance(self.pace, TimedPace):
+            rate = (self.pace.length - self.pace.position) / max(self.config.max_num_iterations, 1)
+            if not math.isclose(rate, self.pace.rate, rel_tol=1e-9):  # the same to the last bit, if it is the same
+                self.pace.rate = max(rate, 1e-9)
 
     def optimizer_configs(self) -> dict[str, Any]:
         """The configured optimisers; the means', whose learning rate is a length, in world units."""
@@ -69,9 +122,14 @@ class NrfgsTrainer(Trainer):
         with self._last_good_state_on_disk():  # the warm-up comes before the first step
             self.guard.step = self._start_step
             self.guard.check_parameters(self.optimizers)
+        if isinstance(self.pace, TimedPace):  # the clock says which step is the last
+            self.config = replace(self.config, max_num_iterations=0 if self.pace.is_spent else sys.maxsize // 2)
+            self.step = self._start_step - 1
         gc.collect()
         gc.freeze()  # what is there now stays: the collector need not walk through it again and again
         try:
+            if self.pace is not None:
+                self.pace.start()
             super().train()
         finally:
             gc.unfreeze()
@@ -100,9 +158,22 @@ class NrfgsTrainer(Trainer):
         Raises:
             TrainingStopped: this step, or on a GPU the one before, met a number that is not finite.
         """
+        if self.pace is not None:
+            self.pace.begin_step()
+            self.pipeline.model.densification.reschedule(lambda position: self.pace.step_at(position, step))
         with self._last_good_state_on_disk():
             self.guard.begin(step, self.optimizers)
-            return super().train_iteration(step)
+            result = super().train_iteration(step)
+        if isinstance(self.pace, TimedPace):  # the step that brings the time's end is the last
+            self._last_step = step
+            self.stop_training = self.stop_training or self.pace.is_spent
+            writer.GLOBAL_BUFFER["max_iter"] = step + 1 + self.pace.steps_left  # what the terminal counts towards
+        return result
+
+    def _after_train(self) -> None:
+        """Nerfstudio's, whose step number is one too many when it stopped early."""
+        self.step = getattr(self, "_last_step", self.step)
+        super()._after_train()
 
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint of finite numbers.

@@ -137,13 +137,13 @@ class Bench:
 
     def jobs_of(self, plan, parsers: dict) -> dict:
         """Name -> `Job` of every training."""
-        from nrfgs_ns.studies.bench_spec import Job, cells_of, command, identity
+        from nrfgs_ns.studies.bench_spec import Job, cells_of, command, identity, steps_of
 
         return {
             cell.name: Job(
                 args=command(plan, cell, parsers[cell.scene], self.work / cell.name),
                 identity=identity(plan, cell, parsers[cell.scene]),
-                steps=plan.steps,
+                steps=steps_of(plan, cell.run),
                 record=str(self.record(cell.name)),
                 work=str(self.work / cell.name),
                 train_views=plan.train_views,
@@ -169,7 +169,7 @@ class Bench:
         """Run the jobs, `plan.jobs` at once on each GPU, with the time that is left."""
         for folder in (self.out / "runs", self.work):
             folder.mkdir(parents=True, exist_ok=True)
-        waiting, running, finished = list(pending.items()), {}, 0
+        waiting, running, finished, steps_finished = list(pending.items()), {}, 0, 0
         queue = Queue(self.executor, self.work, self.slurm) if self.executor else None
         if self.executor == "slurm":
             slots = [""] * self.queued
@@ -179,14 +179,14 @@ class Bench:
         threads = max(1, (os.cpu_count() or 1) // len(slots))
         columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
         with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
-            bar = progress.add_task("", total=len(pending) * plan.steps)
+            bar = progress.add_task("", total=sum(job.steps for job in pending.values()))
             try:
                 while waiting or running:
                     for slot, gpu in enumerate(slots):
                         if slot in running and running[slot].process.poll() is not None:
                             done = running.pop(slot)
                             done.log.close()
-                            finished += 1
+                            finished, steps_finished = finished + 1, steps_finished + pending[done.name].steps
                             good = done.process.returncode == 0 and done.record.exists()
                             progress.console.print(f"{done.name}: {'done' if good else 'FAILED'}", highlight=False)
                             if not good:
@@ -195,7 +195,7 @@ class Bench:
                                 progress.console.print(f"  see {done.log.name}", highlight=False, soft_wrap=True)
                         if slot not in running and waiting:
                             running[slot] = self.start(*waiting.pop(0), gpu, threads, queue)
-                    steps = finished * plan.steps + sum(child.steps() for child in running.values())
+                    steps = steps_finished + sum(child.steps() for child in running.values())
                     label = f"{finished} of {len(pending)} runs"
                     progress.update(bar, completed=steps, description=label)
                     time.sleep(POLL_SECONDS)

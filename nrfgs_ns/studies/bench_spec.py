@@ -41,6 +41,8 @@ class Method:
     options: tuple[str, ...] = ()
     protocols: tuple[str, ...] | None = None
     """instead of the benchmark's; a method that is not of this project has `own` only, unless it says otherwise"""
+    steps: int | None = None
+    """instead of the benchmark's"""
 
 
 @dataclass(frozen=True)
@@ -205,6 +207,11 @@ def rows_of(spec: Spec) -> list[tuple[str, Method]]:
     return [(protocol, run) for protocol in order for run in spec.runs if protocol in protocols(run)]
 
 
+def steps_of(spec: Spec, run: Method) -> int:
+    """Training steps of a run."""
+    return spec.steps if run.steps is None else run.steps
+
+
 def protocol_options(protocol: str) -> list[str]:
     """Options of ns-train for a protocol of densification.
 
@@ -227,11 +234,12 @@ def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
         work: folder for checkpoints.
     """
     # Only this project's methods go on from a checkpoint.
-    every = spec.checkpoint_every if cell.run.method.startswith("nrfgs") else spec.steps
+    steps = steps_of(spec, cell.run)
+    every = spec.checkpoint_every if cell.run.method.startswith("nrfgs") else steps
     return [
         cell.run.method,
         *("--output-dir", str(work), "--experiment-name", cell.scene.short_name),
-        *("--max-num-iterations", str(spec.steps), "--steps-per-save", str(min(every, spec.steps))),
+        *("--max-num-iterations", str(steps), "--steps-per-save", str(min(every, steps))),
         *("--machine.seed", str(cell.seed)),
         *QUIET,
         *spec.options,
@@ -273,10 +281,13 @@ def _method(name: str, value: Any, where: str) -> Method:
     value = {"method": value} if isinstance(value, str) else value
     where = f"{where}: runs: {name}"
     _require(isinstance(value, dict) and isinstance(value.get("method"), str), f"{where} names no method.")
-    unknown = sorted(set(value) - {"method", "options", "protocols"})
-    _require(not unknown, f"{where}: unknown key {unknown}. Known are method, options, protocols.")
+    unknown = sorted(set(value) - {"method", "options", "protocols", "steps"})
+    _require(not unknown, f"{where}: unknown key {unknown}. Known are method, options, protocols, steps.")
+    if value.get("steps") is not None:
+        _whole(value["steps"], 1, f"{where}: steps")
     protocols = tuple(str(one) for one in _list(value["protocols"])) if "protocols" in value else None
-    return Method(str(name), value["method"], _words(value.get("options", ()), f"{where}: options"), protocols)
+    options = _words(value.get("options", ()), f"{where}: options")
+    return Method(str(name), value["method"], options, protocols, value.get("steps"))
 
 
 def _scene(value: Any, where: str) -> Scene:

@@ -29,8 +29,6 @@ from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.studies.run import evaluate, machine, train
 
-NO_DENSIFICATION = {"--pipeline.model.warmup-length": 10**6}
-"""So that the longest training stays one of minutes."""
 SCENE = SceneConfig(views=16, width=48, height=36, points=600, samples=2)
 """Small enough for a run a minute on one core."""
 RESETS = {"--pipeline.model.refine-every": 25, "--pipeline.model.reset-alpha-every": 2}
@@ -51,8 +49,6 @@ class HardTraining:
     """nerfstudio's scaling of poses into a unit cube"""
     method: str = "nrfgs"
     """what is trained"""
-    steps: int | None = None
-    """training steps, if not the study's"""
     seeds: tuple[int, ...] = (42,)
     """one training for each"""
 
@@ -114,7 +110,6 @@ def hard_trainings() -> list[HardTraining]:
         *rows,
         HardTraining("learning rates x 10", options=ten_times_faster()),
         HardTraining("opacity reset every 50 steps", options=RESETS),
-        HardTraining("100,000 steps, no densification", options=NO_DENSIFICATION, steps=100_000),
         HardTraining("black images", partial(paint, value=0)),
         HardTraining("white images", partial(paint, value=255)),
         HardTraining("one image", partial(keep, count=1)),
@@ -185,7 +180,7 @@ def main(out: Path, work: Path, steps: int = 400) -> None:
     Args:
         out: folder for trainings.json and trainings.md.
         work: folder for data sets and checkpoints.
-        steps: steps of each training that does not name its own.
+        steps: steps of each training.
     """
     out.mkdir(parents=True, exist_ok=True)
     file = out / "trainings.json"
@@ -196,7 +191,7 @@ def main(out: Path, work: Path, steps: int = 400) -> None:
         if str(seed) in done:
             continue
         # A folder each: tensorboard's writers outlive their training.
-        done[str(seed)] = run(training, seed, training.steps or steps, work / f"run-{index}")
+        done[str(seed)] = run(training, seed, steps, work / f"run-{index}")
         file.write_text(json.dumps(record, indent=1) + "\n")
         (out / "trainings.md").write_text(table(record["runs"]))
 

@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Knobs become a benchmark, its records become a front and prices, and noise is called noise."""
+
+import json
+import math
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import t as student
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.studies.bench_spec import cells_of, command, identity, make_spec, steps_of
+from nrfgs_ns.studies.bench_table import Row
+from nrfgs_ns.studies.tradeoff.analysis import (
+    BY_NAME,
+    COSTS,
+    PSNR,
+    Change,
+    changes,
+    front_of,
+    noise_bound,
+    pareto_front,
+    pooled_deviation,
+    price,
+)
+from nrfgs_ns.studies.tradeoff.plan import bench_plan
+from nrfgs_ns.studies.tradeoff.report import report
+from nrfgs_ns.studies.tradeoff.verb import Tradeoff
+
+D = "--pipeline.model.appearance.latent-dim"
+KNOBS = {
+    "default": {"method": "nrfgs", "options": "--a 1"},
+    "scenes": ["s"],
+    "seeds": [1, 2],
+    "steps": 100,
+    "knobs": {
+        "D": {"option": D, "values": [4, 8]},
+        "steps": {"steps": [50]},
+        "budget": {"protocols": ["mcmc@200"]},
+        "precision": {"option": "--p", "values": ["fp32"], "cuda": True},
+        "head": {"settings": {"SH": {"method": "nrfgs-sh", "options": "--b 2"}, "one": {"options": "--c 3"}}},
+    },
+}
+
+
+def planned(cuda=False, only=(), **changes):
+    content, settings = bench_plan({**KNOBS, **changes}, "knobs.yaml", cuda, only)
+    return make_spec(yaml.safe_load(yaml.safe_dump(content, sort_keys=False)), "bench.yaml"), settings
+
+
+def test_knobs_become_runs():
+    spec, settings = planned()
+    runs = {run.name: run for run in spec.runs}
+    assert [setting.name for setting in settings] == list(runs)
+    assert list(runs) == ["default", "D 4", "D 8", "steps 50", "budget mcmc@200", "head SH", "head one"]
+    assert runs["D 4"].options == ("--a", "1", D, "4") and runs["D 4"].method == "nrfgs"
+    assert runs["steps 50"].steps == 50 and runs["default"].steps is None
+    assert runs["budget mcmc@200"].protocols == ("mcmc@200",)
+    assert runs["head SH"].method == "nrfgs-sh" and runs["head SH"].options == ("--b", "2")  # not the default's
+    assert runs["head one"].options == ("--a", "1", "--c", "3")
+    # Every setting once for each seed; a run's own steps are in its command and in what its record is compared with.
+    assert len(cells_of(spec)) == 7 * 2
+    cell = next(cell for cell in cells_of(spec) if cell.run.name == "steps 50")
+    assert steps_of(spec, cell.run) == 50
+    assert ["--max-num-iterations", "50"] == command(spec, cell, [], "w")[5:7]
+    assert "50" in identity(spec, cell, None)["options"]
+
+
+def test_gpu_knobs_and_chosen_knobs():
+    assert "precision fp32" in [setting.name for setting in planned(cuda=True)[1]]
+    assert [setting.name for setting in planned(only=("D",))[1]] == ["default", "D 4", "D 8"]
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"knobs": {}}, "knobs is missing"),
+        ({"knobs": {"D": {"values": [1]}}}, "exactly one of option, steps"),
+        ({"knobs": {"D": {"option": D, "steps": [1]}}}, "exactly one of"),
+        ({"knobs": {"D": {"option": D}}}, "values"),
+        ({"knobs": {"D": {"option": D, "values": [1], "cude": True}}}, "unknown key cude"),
+        ({"knobs": {"D": {"option": D, "values": [1, 1.0, 1]}}}, None),
+        ({"knobs": {"steps": {"steps": 5}}}, "must be a list"),
+        ({"knobs": {"head": {"settings": {"x": {"option": "--a"}}}}}, "x may have method"),
+        ({"knobs": {"a": {"settings": {"b c": {}}}, "a b": {"settings": {"c": {}}}}}, "there twice"),
+        ({"default": {"options": "--a"}}, "default names no method"),
+        ({"runs": {"x": "nrfgs"}}, "Leave runs out"),
+        ({"protocols": ["splatfacto", "original"]}, "protocols names several"),
+    ],
+)
+def test_a_bad_file_is_named(change, words):
+    if words is None:  # equal values are one setting
+        assert [setting.name for setting in planned(**change)[1]] == ["default", "D 1", "D 1.0"]
+        return
+    with pytest.raises(InputError, match=words):
+        planned(**change)
+    with pytest.raises(InputError, match="no knob E"):
+        planned(only=("E",))
+
+
+@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
+def test_front_is_what_nothing_beats(points):
+    """Against the definition, on a grid so coarse that ties are common."""
+
+    def beats(a, b):
+        return a[0] <= b[0] and a[1] >= b[1] and a != b
+
+    expected = {i for i, point in enumerate(points) if not any(beats(other, point) for other in points)}
+    front = pareto_front(points)
+    assert set(front) == expected and len(front) == len(expected)
+    assert [points[i][0] for i in front] == sorted(points[i][0] for i in front)
+
+
+def test_pooled_deviation_by_hand():
+    # Variances 2 (1 degree of freedom) and 1 (2): s^2 = (2 + 2) / 3. A sample of one adds nothing.
+    deviation, freedom = pooled_deviation([[1.0, 3.0], [4.0, 5.0, 6.0], [9.0]])
+    assert freedom == 3 and deviation == pytest.approx(math.sqrt(4 / 3))
+    bound = noise_bound(deviation, freedom, 2, 3)
+    assert bound == pytest.approx(student.ppf(0.975, 3) * math.sqrt(4 / 3) * math.sqrt(1 / 2 + 1 / 3))
+    assert pooled_deviation([[1.0], [2.0]]) == (None, 0) and noise_bound(None, 0, 1, 1) == math.inf
+
+
+def record(psnr, seconds=10.0, fps=50.0, size=2e6, jobs=1):
+    return {
+        "identity": {},
+        "machine": {"device": "a card", "torch": "2.11"},
+        "jobs": jobs,
+        "train": {"seconds": seconds, "parts": 1, "splats": [[0, 10], [100, 20]], "peak_memory_bytes": None},
+        "measured": {
+            "test": {"psnr": psnr, "ssim": 0.9, "ms_ssim": None, "l1": 0.01, "lpips": None},
+            "train": None,
+            "fps": fps,
+            "splats": 20,
+            "parameter_bytes": size,
+            "checkpoint_bytes": 3 * size,
+        },
+    }
+
+
+def row(name, *records):
+    return Row("s", name, "own", dict(enumerate(records))).fill()
+
+
+def test_differences_inside_the_noise_are_marked():
+    """One deviation for all: pairs 0.2 apart have s = 0.1414, 3 degrees of freedom, so the bound is
+    t(3) 0.1414 = 3.182 * 0.1414 = 0.450."""
+    rows = [
+        row("default", record(30.0), record(30.2)),
+        row("near", record(30.4), record(30.6)),
+        row("far", record(30.5), record(30.7)),
+    ]
+    result = changes(rows, rows[0], PSNR, ratio=False)
+    assert result["near"].value == pytest.approx(0.4) and result["near"].is_noise
+    assert result["far"].value == pytest.approx(0.5) and not result["far"].is_noise
+    assert result["far"].noise == pytest.approx(0.4501, abs=1e-4)
+    # One seed each: nothing can be told.
+    single = [row("default", record(30.0)), row("far", record(40.0))]
+    assert changes(single, single[0], PSNR, ratio=False)["far"].is_noise
+
+
+def test_costs_are_ratios_of_geometric_means():
+    rows = [
+        row("default", record(30.0, seconds=10.0), record(30.0, seconds=40.0)),
+        row("half", record(30.0, seconds=5.0), record(30.0, seconds=20.0)),
+        row("shared", record(30.0, jobs=2), record(30.0, jobs=2)),
+    ]
+    result = changes(rows, rows[0], BY_NAME["time s"], ratio=True)
+    assert result["half"].value == pytest.approx(0.5)
+    # The same spread, a factor of 4, in both: s = ln 4 / sqrt 2, 2 degrees of freedom, bound t(2) s = 4.303 * 0.980.
+    assert result["half"].noise == pytest.approx(math.exp(4.3027 * math.log(4) / math.sqrt(2)), rel=1e-4)
+    assert result["half"].is_noise and "shared" not in result  # its time was not measured alone
+
+
+def test_prices():
+    def ratio(value):
+        return Change(value, 1.05, True)
+
+    up, down, nothing = Change(0.6, 0.1), Change(-0.6, 0.1), Change(0.05, 0.1)
+    assert price(up, ratio(4.0)) == ("trade", pytest.approx(0.3))
+    assert price(down, ratio(0.25)) == ("trade", pytest.approx(0.3))
+    assert price(up, ratio(0.25), power=-1) == ("trade", pytest.approx(0.3))  # a quarter of the frames
+    assert price(up, ratio(0.5)) == ("better", None) and price(down, ratio(2.0)) == ("worse", None)
+    assert price(up, ratio(0.97)) == ("gain", None) and price(down, ratio(1.0)) == ("loss", None)
+    assert price(nothing, ratio(2.0)) == ("noise", None) and price(nothing, ratio(1.02)) == ("same", None)
+
+
+def test_front_by_frames_wants_many():
+    rows = [row("slow", record(32.0, fps=10.0)), row("fast", record(30.0, fps=90.0)), row("bad", record(29.0, fps=50))]
+    assert front_of(rows, next(cost for cost in COSTS if cost.power < 0)) == ["fast", "slow"]
+
+
+def test_report_from_records(tmp_path, capsys):
+    """Two scenes, one setting failed on the second: fronts and table of each, and of the average where both are."""
+    knobs = {**KNOBS, "scenes": ["s", "t"], "knobs": {"D": {"option": D, "values": [4, 8]}}}
+    content, settings = bench_plan(knobs, "knobs.yaml", False)
+    spec = make_spec(content, "bench.yaml")
+    quality = {"default": 30.0, "D 4": 29.0, "D 8": 30.01}
+    seconds = {"default": 10.0, "D 4": 5.0, "D 8": 9.0}
+    (tmp_path / "runs").mkdir()
+    for cell in cells_of(spec):
+        file = tmp_path / "runs" / f"{cell.name}.json"
+        if cell.scene.name == "t" and cell.run.name == "D 8":
+            file.with_suffix(".failed").write_text("{}")
+            continue
+        jitter = 0.01 * (cell.seed - 1)
+        name = cell.run.name
+        file.write_text(json.dumps(record(quality[name] + jitter, seconds[name] * (1 + jitter))))
+    report(spec, settings, tmp_path, {})
+    results = {result["scene"]: result for result in json.loads((tmp_path / "tradeoff.json").read_text())}
+    assert list(results) == ["s", "t", "average"]
+    assert results["s"]["fronts"]["training time"] == ["D 4", "D 8"]
+    assert results["t"]["fronts"]["training time"] == ["D 4", "default"]
+    by_run = {one["run"]: one for one in results["s"]["settings"]}
+    # Half the time for 1 dB: 1 dB per doubling. 0.01 dB is noise; nothing is known of memory, and bytes are the same.
+    assert by_run["D 4"]["prices"]["training time"] == ["trade", pytest.approx(1.0)]
+    assert by_run["D 8"]["changes"]["PSNR"]["is_noise"] and by_run["D 8"]["prices"]["training time"][0] == "noise"
+    assert by_run["D 4"]["changes"]["peak MB"] is None
+    text = (tmp_path / "tradeoff.md").read_text()
+    assert "| D 4 | 2 | -1.00 |" in text and "| D 8 | 2 | (+0.01) |" in text and "2 FAILED" in text
+    assert (tmp_path / "tradeoff.png").stat().st_size > 5000
+    assert "D 8" in capsys.readouterr().out
+
+
+def test_the_verb_runs_a_benchmark(tmp_path, monkeypatch):
+    """It leaves the benchmark's file, hands it to `nrfgs bench` with its options, and reports what that has left."""
+    from nrfgs_ns.studies import bench
+
+    ran = []
+    monkeypatch.setattr(
+        bench.Bench, "parsers", lambda self, plan: {s: ["nrfgs-data", "--data", "d"] for s in plan.scenes}
+    )
+
+    def run_all(self, pending, plan):
+        ran.extend(pending)
+        (self.out / "runs").mkdir(parents=True, exist_ok=True)
+        for name, job in pending.items():
+            self.record(name).write_text(json.dumps({**record(30.0), "identity": job.identity}))
+
+    monkeypatch.setattr(bench.Bench, "run_all", run_all)
+    (tmp_path / "knobs.yaml").write_text(yaml.safe_dump({**KNOBS, "knobs": {"D": KNOBS["knobs"]["D"]}}))
+    verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", seeds=(7,), cuda=False)
+    verb.main()
+    assert ran == ["default-own-s-7", "D_4-own-s-7", "D_8-own-s-7"]
+    assert yaml.safe_load((tmp_path / "out" / "bench.yaml").read_text())["seeds"] == [7]
+    assert (tmp_path / "out" / "tradeoff.md").exists() and (tmp_path / "out" / "table.md").exists()
+    ran.clear()
+    verb.main()
+    assert ran == []
