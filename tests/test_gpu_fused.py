@@ -54,11 +54,11 @@ def test_every_switch(config):
 @pytest.mark.parametrize("repeated", [False, True])
 @pytest.mark.parametrize("precision", ["tf32", "bf16", "fp16"])
 def test_rounded_products(precision, repeated):
-    """Values: derivation in fused_interpreted.py; the card's float32 is coarser, so that four times as many factors differ.
+    """Values: derivation in fused_interpreted.py; the card's float32 is coarser, so four times as many factors differ.
 
-    Gradients: where a factor is rounded up by one and down by the other, a hidden unit near zero may be on in one and off
-    in the other, and its whole gradient comes or goes. One in 2^9 features of tf32 is 2^-10 off, which moves the sum
-    before the ReLU by some 2^-10 sqrt(2^-9) / 2 = 2^-15.5 of its own size. About as many units change sides, of half
+    Gradients: where a factor is rounded up by one and down by the other, a hidden unit near zero may be on in one and
+    off in the other, and its whole gradient comes or goes. One in 2^9 features of tf32 is 2^-10 off, which moves the
+    sum before the ReLU by some 2^-10 sqrt(2^-9) / 2 = 2^-15.5 of its own size. About as many units change sides, of half
     that are on: sqrt(2 * 2^-15.5) = 2^-7 of a gradient's norm if all features are as coarse, and most (the latents)
     are exact: 2^-8. Not rounding in the twin at all would leave 2^-6 (tf32) to 2^-4.6 (bf16).
     """

@@ -148,9 +148,9 @@ def test_quaternions_of_any_length(device, mode, length):
     seen = MIN_QUATERNION <= length <= 1e19
     assert (0 in info["gaussian_ids"]) == seen
     if seen:
-        # Normalising is a few roundings off: 1e-6 of the conic, times a falloff's exponent of at most 5.5 (beyond, alpha
-        # is below 1/255) 6e-6 of alpha, twice that of a depth of 3, which is a ratio: 4e-5. A pixel whose alpha is at
-        # the cut-off of 1/255 to that precision may come or go.
+        # Normalising is a few roundings off: 1e-6 of the conic, times a falloff's exponent of at most 5.5 (beyond,
+        # alpha is below 1/255) 6e-6 of alpha, twice that of a depth of 3, which is a ratio: 4e-5. A pixel whose alpha
+        # is at the cut-off of 1/255 to that precision may come or go.
         off = (image - unit.detach()).abs().amax(-1) > 4e-5
         assert off.sum() <= 1
 

@@ -85,7 +85,7 @@ def _last(tile, lanes):
 
 @triton.jit
 def _view(means, centers, rows, items, mask, lanes, eps_squared, log_unit, ONE_CENTER: tl.constexpr):
-    """encoding.view_geometry: direction [B, 4] (lane 3 is 0), log distance in scene units, 1 / r, |v| above the floor."""
+    """encoding.view_geometry: direction [B, 4] (lane 3 is 0), log r in scene units, 1 / r, |v| above the floor."""
     if ONE_CENTER:
         center = tl.load(centers + lanes, mask=lanes < 3, other=0.0)
     else:

@@ -43,8 +43,8 @@ loss that is a mean over pixels gives them any size down to 1e-10, below what fp
 largest number would cost a reduction over the tile and a multiplication after every product. bf16 has float32's
 range; its rounding is unbiased and averages out over the splats."""
 
-# Chosen by benchmarks/head_gpu.py --sweep on an H200 (tf32, bf16), and by the compiler's account of registers, spills and
-# instructions (fp32). A tensor core's tile has 64 rows. Backward, the weights' gradients and the activations fill
+# Chosen by benchmarks/head_gpu.py --sweep on an H200 (tf32, bf16), and by the compiler's account of registers, spills
+# and instructions (fp32). A tensor core's tile has 64 rows. Backward, the weights' gradients and the activations fill
 # the registers (255 a thread, 65,536 a multiprocessor), so that 8 warps run at once. float32's three products take
 # 208 KB of shared memory at 32 splats, of 227 KB on an H100 or H200.
 FORWARD: dict[str, Launch] = {
