@@ -59,8 +59,8 @@ def test_rounded_products(precision, repeated):
     Gradients: where a factor is rounded up by one and down by the other, a hidden unit near zero may be on in one and
     off in the other, and its whole gradient comes or goes. One in 2^9 features of tf32 is 2^-10 off, which moves the
     sum before the ReLU by some 2^-10 sqrt(2^-9) / 2 = 2^-15.5 of its own size. About as many units change sides, of
-    half that are on: sqrt(2 * 2^-15.5) = 2^-7 of a gradient's norm if all features are as coarse, and most (the latents)
-    are exact: 2^-8. Not rounding in the twin at all would leave 2^-6 (tf32) to 2^-4.6 (bf16).
+    half that are on: sqrt(2 * 2^-15.5) = 2^-7 of a gradient's norm if all features are as coarse, and most (the
+    latents) are exact: 2^-8. Not rounding in the twin at all would leave 2^-6 (tf32) to 2^-4.6 (bf16).
     """
     from nrfgs_ns.appearance.fused.launch import KINDS
 
