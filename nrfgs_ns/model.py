@@ -102,7 +102,7 @@ class NrfgsModel(ExportedTables, SplatfactoModel):
 
     Args:
         config: which head, and splatfacto's options.
-        seed_points: points [P, 3] in scene units and their colours [P, 3] in 0..255, to start from.
+        seed_points: points [P, 3] in world units and their colours [P, 3] in 0..255, to start from.
     """
 
     config: NrfgsModelConfig
