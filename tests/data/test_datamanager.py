@@ -84,6 +84,11 @@ def test_other_images_are_converted_to_colour(capture, mode, channels, tolerance
     image = Image.fromarray(pixels).convert(mode.split()[-1])
     options = {"transparency": 0} if mode == "transparent P" else {}
     image.save(capture.folder / "images/001.png", "TIFF" if mode in ("CMYK", "YCbCr") else "PNG", **options)
+    if mode == "YCbCr":
+        try:
+            Image.open(capture.folder / "images/001.png").load()
+        except OSError:  # seen with 12.3, which Python 3.10 gets
+            pytest.skip("this Pillow cannot read the YCbCr TIFF that it writes")
     data = NrfgsInputDataset(capture.parse()).get_data(0, "uint8")["image"]
     assert data.shape == (9, 12, channels)
     assert np.abs(data[..., :3].numpy().astype(int) - pixels).max() <= tolerance
