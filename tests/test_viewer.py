@@ -259,6 +259,11 @@ def test_page_is_served_and_every_output_can_be_shown(build, open_viewer, method
             assert shown.shape[-1] == 3 and torch.isfinite(shown).all(), name
 
 
+def coarse(rgb: torch.Tensor) -> torch.Tensor:
+    """Means over an 8 x 8 grid: nerfstudio picks the size of a picture by how fast the last ones were."""
+    return torch.nn.functional.adaptive_avg_pool2d(rgb.permute(2, 0, 1), 8)
+
+
 def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
     pipeline = build()
     model, (camera, elsewhere) = pipeline.model, two_cameras(pipeline)
@@ -267,19 +272,19 @@ def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
     before_metrics = model.get_image_metrics_and_images(before, batch)[0]
 
     viewer, panel, pose = open_viewer(pipeline), model.viewer_panel, camera.camera_to_worlds[0]
-    plain = Browser.sees(viewer, pose)["rgb"]
+    plain = coarse(Browser.sees(viewer, pose)["rgb"])
     assert panel.count.value == "300"
     panel.mode.value, panel.gain.value = "residual", 1.5
     panel.frozen_center, panel.freeze.value = model.look(elsewhere).center, True
     viewer.control_panel.background_color = (255, 0, 0)
     viewer.control_panel.crop_viewport = True
     assert panel.shown.mode == "residual" and panel.shown.gain == 1.5
-    assert (Browser.sees(viewer, pose)["rgb"] - plain).abs().mean() > 0.05
+    assert (coarse(Browser.sees(viewer, pose)["rgb"]) - plain).abs().mean() > 0.05
     assert model.crop_box is None
     # The viewer's crop box is one unit wide, and the scene is larger: there is less to see.
-    cropped = Browser.sees(viewer, pose)["accumulation"].sum()
+    cropped = Browser.sees(viewer, pose)["accumulation"].mean()
     viewer.control_panel.crop_viewport = False
-    assert 0 < cropped < Browser.sees(viewer, pose)["accumulation"].sum()
+    assert 0 < cropped < Browser.sees(viewer, pose)["accumulation"].mean()
     panel.mode.value = FULL  # transparent pixels show the viewer's background now
     assert Browser.sees(viewer, pose)["background"][0, 0].tolist() == [1.0, 0.0, 0.0]
 
