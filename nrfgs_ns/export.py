@@ -259,7 +259,7 @@ def measure_loss(pipeline, path: Path, fitted: "PlainSplats") -> dict[str, Any]:
 
     from nrfgs_ns.appearance.sh import ShConfig
     from nrfgs_ns.metrics import psnr
-    from nrfgs_ns.model import NEAR_PLANE
+    from nrfgs_ns.rendering import NEAR_PLANE
 
     model = pipeline.model
     near_plane = NEAR_PLANE * model.scene_unit

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splatfacto with an appearance head: geometry -> head -> rasterizer -> image.
+"""Splatfacto with an appearance head: what is trained, and how. `rendering.py` draws it.
 
 Loss, schedules and crop are nerfstudio's, and so is densification unless another protocol is asked for
 (`densification.py`). What differs: colours and opacities come from the head, for the splats that the camera sees only;
@@ -8,12 +8,11 @@ hold, so that an interrupted training can go on.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
@@ -21,8 +20,7 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance
+from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.checkpoint import check_compatible
 from nrfgs_ns.densification import (
@@ -37,14 +35,11 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.exported import ExportedTables
 from nrfgs_ns.metrics import ImageMetrics
 from nrfgs_ns.pace import Pace
-from nrfgs_ns.pinhole import Pinhole, pinhole
-from nrfgs_ns.rasterizer import Projection, composite, project
+from nrfgs_ns.rendering import Rendering
 from nrfgs_ns.ssim import photometric_loss
-from nrfgs_ns.viewer import ViewerPanel, asked_by_viewer
+from nrfgs_ns.viewer import ViewerPanel
 from nrfgs_ns.warmup import warm_up
 
-NEAR_PLANE, FAR_PLANE = 0.01, 1e10
-"""Depths between which splats are drawn, in scene units: splatfacto's."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
 
@@ -81,23 +76,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
 
-class View(NamedTuple):
-    """One camera as the rasterizer wants it, and what it sees."""
-
-    projection: Projection
-    """the visible splats on the image plane, M of them"""
-    splats: dict[str, Tensor]
-    """the table of splats that was projected: all of them, or those in the crop box"""
-    center: Tensor
-    """camera centre in world coordinates, [3]"""
-
-    @property
-    def visible(self) -> Tensor:
-        """Rows of `splats` that are visible, int64 [M]."""
-        return self.projection.gaussian_ids
-
-
-class NrfgsModel(ExportedTables, SplatfactoModel):
+class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     """Gaussian splatting with an appearance head.
 
     Args:
@@ -130,7 +109,6 @@ class NrfgsModel(ExportedTables, SplatfactoModel):
         self.step = 0
         self.crop_box = None
         self.viewer_panel = ViewerPanel(self)
-        self._pinholes: dict[tuple[int, int], Pinhole] = {}
         self.background_color = (
             torch.tensor(VISER_BACKGROUND)
             if self.config.background_color == "random"
@@ -209,12 +187,6 @@ class NrfgsModel(ExportedTables, SplatfactoModel):
         """The step that the head and the resolution are scheduled by."""
         return self.step if self.pace is None else int(self.pace.position)
 
-    def _get_downscale_factor(self) -> int:
-        if not self.training:
-            return 1
-        risen = self.schedule_step // self.config.resolution_schedule
-        return 2 ** max(self.config.num_downscales - risen, 0)
-
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
         self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
@@ -264,144 +236,6 @@ class NrfgsModel(ExportedTables, SplatfactoModel):
             return None
         # Only the shared weights learn: the splats' parameters keep no gradient from here.
         return len(view.visible), loss.detach(), torch.autograd.grad(loss, weights)
-
-    # Rendering.
-
-    def look(self, camera: Cameras) -> View:
-        """Project the splats into one camera.
-
-        Args:
-            camera: a batch of one camera, [1].
-        """
-        splats = self._splats_to_draw()
-        seen_from = self._pinhole(camera)
-        projection = self._project(splats, seen_from.viewmat, seen_from.K, seen_from.width, seen_from.height)
-        return View(projection, splats, seen_from.center)
-
-    def _splats_to_draw(self) -> dict[str, Tensor]:
-        """The table of splats: all of them, or those in the crop box; with "diffuse" (`appearance/diffuse.py`) if it is
-        known which are."""
-        splats: dict[str, Tensor] = dict(self.gauss_params.items())
-        if (diffuse := self.densification.state.get(DIFFUSE)) is not None:
-            splats[DIFFUSE] = diffuse
-        if self.crop_box is not None and not self.training:
-            inside = self.crop_box.within(splats["means"]).reshape(-1)
-            splats = {name: value[inside] for name, value in splats.items()}
-        return splats
-
-    def _project(self, splats: dict[str, Tensor], viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Projection:
-        """Project a table of splats into cameras [C, 4, 4], [C, 3, 3] of one size."""
-        if self.config.rasterize_mode not in ("antialiased", "classic"):
-            raise InputError(
-                f"pipeline.model.rasterize_mode is {self.config.rasterize_mode!r}; use 'classic' or 'antialiased'."
-            )
-        return project(
-            splats["means"],
-            splats["quats"],
-            splats["scales"].exp(),
-            viewmats,
-            Ks,
-            width,
-            height,
-            near_plane=NEAR_PLANE * self.scene_unit,
-            far_plane=FAR_PLANE * self.scene_unit,
-            rasterize_mode=self.config.rasterize_mode,
-            assume_finite=self.training,  # the trainer's guard watches
-        )
-
-    def _pinhole(self, camera: Cameras) -> Pinhole:
-        """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
-        downscale = self._get_downscale_factor()
-        if not self.training:
-            pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
-            return pinhole(camera, pose.to(self.device), downscale)
-        assert camera.shape[0] == 1, "Only one camera at a time"
-        index = (camera.metadata or {}).get("cam_idx")
-        if index is None or self.camera_optimizer.config.mode != "off":
-            return pinhole(camera, self.camera_optimizer.apply_to_camera(camera), downscale)
-        if (index, downscale) not in self._pinholes:
-            self._pinholes[index, downscale] = pinhole(camera, camera.camera_to_worlds, downscale)
-        return self._pinholes[index, downscale]
-
-    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
-        """Render one camera.
-
-        Returns:
-            "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [3] in training and [H, W, 3] otherwise,
-            and "depth" [H, W, 1], which is left out of training unless `output_depth_during_training`.
-        """
-        view = self.look(camera)
-        appearance = self.head(view.splats, view.visible, view.center)
-        outputs, self.info = self.paint(view, appearance)
-        if self.training:
-            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.num_points)
-            self._correct_colors(outputs, camera)
-        return outputs
-
-    def _correct_colors(self, outputs: dict[str, Tensor], camera: Cameras) -> None:
-        """Apply the training camera's bilateral grid to "rgb", if there are grids."""
-        if self.config.use_bilateral_grid and "cam_idx" in (camera.metadata or {}):
-            height, width = outputs["rgb"].shape[:2]
-            index = camera.metadata["cam_idx"]
-            outputs["rgb"] = self._apply_bilateral_grid(outputs["rgb"][None], index, height, width)[0]
-
-    @torch.no_grad()
-    def get_base_color(self, camera: Cameras) -> Tensor:
-        """The image [H, W, 3] of the base colours and opacities alone, without what depends on the view."""
-        view = self.look(camera)
-        return self.paint(view, self.head.base_appearance(view.splats, view.visible))[0]["rgb"]
-
-    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render one camera as it was trained; for a browser, as the viewer's panel says (`viewer.py`).
-
-        Args:
-            camera: a batch of one camera, [1].
-            obb_box: only splats with their centre inside are drawn, if given.
-        """
-        if asked_by_viewer():
-            return self.viewer_panel.render(camera.to(self.device), obb_box)
-        return super().get_outputs_for_camera(camera, obb_box)
-
-    def set_background(self, background_color: Tensor) -> None:
-        """Take the viewer's background [3], for the viewer's pictures alone: what evaluation uses must not change."""
-        self.viewer_panel.background = background_color
-
-    def paint(
-        self, view: View, appearance: SplatAppearance, background: Tensor | None = None
-    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite the visible splats over the background.
-
-        Args:
-            view: what one camera sees.
-            appearance: colours and opacities of the M visible splats.
-            background: a colour [3] instead of the configuration's.
-
-        Returns:
-            As `get_outputs`; and the rasterizer's `info`, for densification.
-        """
-        with_depth = self.config.output_depth_during_training or not self.training
-        render, alpha, info = composite(
-            view.projection,
-            appearance.colors,
-            appearance.opacities,
-            render_mode="RGB+ED" if with_depth else "RGB",
-            absgrad=self.densification.absgrad and self.training,
-            assume_finite=self.training,
-        )
-        render, alpha = render[0], alpha[0]
-        height, width = alpha.shape[:2]
-        self.last_size = (height, width)
-        if background is None:
-            background = self._get_background_color()
-        outputs = {
-            "rgb": torch.clamp(render[..., :3] + (1 - alpha) * background, 0.0, 1.0),
-            "accumulation": alpha,
-            "background": background if self.training else background.expand(height, width, 3),
-        }
-        if with_depth:
-            depth = render[..., 3:4]
-            outputs["depth"] = torch.where(alpha > 0, depth, depth.detach().max())
-        return outputs, info
 
     # Metrics.
 

@@ -34,7 +34,8 @@ from nrfgs_ns.appearance.head import AppearanceHead, Component, SplatAppearance
 from nrfgs_ns.rasterizer import composite
 
 if TYPE_CHECKING:
-    from nrfgs_ns.model import NrfgsModel, View
+    from nrfgs_ns.model import NrfgsModel
+    from nrfgs_ns.rendering import View
 
 FULL, BASE, VIEW_DEPENDENCE, DEPTH = "full", "base colour", "view dependence", "depth"
 

@@ -21,7 +21,8 @@ from rich.progress import track
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import SplatAppearance
-from nrfgs_ns.model import NrfgsModel, View
+from nrfgs_ns.model import NrfgsModel
+from nrfgs_ns.rendering import View
 from nrfgs_ns.studies.files import write_whole
 from nrfgs_ns.studies.measure import evenly_spaced
 

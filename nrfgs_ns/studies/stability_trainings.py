@@ -51,6 +51,8 @@ class HardTraining:
     """what is trained"""
     seeds: tuple[int, ...] = (42,)
     """one training for each"""
+    steps: int | None = None
+    """its length where it is not that of the others"""
 
 
 def rescale(folder: Path, factor: float) -> None:
@@ -109,6 +111,7 @@ def hard_trainings() -> list[HardTraining]:
     return [
         *rows,
         HardTraining("learning rates x 10", options=ten_times_faster()),
+        HardTraining("100,000 steps", steps=100_000),
         HardTraining("opacity reset every 50 steps", options=RESETS),
         HardTraining("black images", partial(paint, value=0)),
         HardTraining("white images", partial(paint, value=255)),
@@ -180,7 +183,7 @@ def main(out: Path, work: Path, steps: int = 400) -> None:
     Args:
         out: folder for trainings.json and trainings.md.
         work: folder for data sets and checkpoints.
-        steps: steps of each training.
+        steps: steps of each training that has no length of its own.
     """
     out.mkdir(parents=True, exist_ok=True)
     file = out / "trainings.json"
@@ -191,7 +194,7 @@ def main(out: Path, work: Path, steps: int = 400) -> None:
         if str(seed) in done:
             continue
         # A folder each: tensorboard's writers outlive their training.
-        done[str(seed)] = run(training, seed, steps, work / f"run-{index}")
+        done[str(seed)] = run(training, seed, training.steps or steps, work / f"run-{index}")
         file.write_text(json.dumps(record, indent=1) + "\n")
         (out / "trainings.md").write_text(table(record["runs"]))
 
