@@ -181,18 +181,20 @@ def table(runs: dict[str, dict[str, dict[str, Any]]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(out: Path, work: Path, steps: int = 400) -> None:
+def main(out: Path, work: Path, steps: int = 400, rows: tuple[str, ...] = ()) -> None:
     """Run all hard trainings and write their table.
 
     Args:
         out: folder for trainings.json and trainings.md.
         work: folder for data sets and checkpoints.
         steps: steps of each training that has no length of its own.
+        rows: names of the trainings to run, if not all.
     """
     out.mkdir(parents=True, exist_ok=True)
     file = out / "trainings.json"
     record = json.loads(file.read_text()) if file.exists() else {"machine": machine(), "steps": steps, "runs": {}}
-    todo = [(training, seed) for training in hard_trainings() for seed in training.seeds]
+    chosen = [training for training in hard_trainings() if not rows or training.name in rows]
+    todo = [(training, seed) for training in chosen for seed in training.seeds]
     for index, (training, seed) in enumerate(track(todo, "Hard trainings")):
         done = record["runs"].setdefault(training.name, {})
         if str(seed) in done:
