@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time the CPU rasterizer, forward and backward, beside a plain autograd tile loop in the same run.
 
-    python benchmarks/rasterizer_cpu.py                                   # the four standard sizes
-    python benchmarks/rasterizer_cpu.py --checkpoint path/to/step.ckpt    # and a trained nerfstudio scene
-    python benchmarks/rasterizer_cpu.py --sizes 20000x256x256 --no-loop --repeats 5
+    python benchmarks/rasterizer_cpu.py                                       # the standard cases, two threads
+    python benchmarks/rasterizer_cpu.py --scene SCENES/fox                    # and a scene that is trained first
+    python benchmarks/rasterizer_cpu.py --config outputs/.../config.yml       # and one that has been trained
+    python benchmarks/rasterizer_cpu.py --sizes 20000x256x256 --no-loop --repeats 5 --out small.json
 
 The loop is what one would write first: gsplat's lists of 16-pixel tiles, then for each tile alpha, cumulative product
 and sum in plain torch, differentiated by autograd. Both compute the same image, which is checked before anything is
 timed. Figures are medians in milliseconds over rounds of repeats, ours and the loop in turn; projection is included.
 Beside the median of the rounds' ratios stands the ratio of the fastest rounds: on a machine with other work to do,
 several threads make every operation wait for the slowest of them. `load` is the number of processes that ran or
-waited meanwhile, ours included. Peak memory is measured in a process of its own per size.
+waited meanwhile, ours included. Peak memory is measured in a process of its own.
+
+The process is bound to as many cores as threads, which share a cache where the machine tells. Two threads are slower on
+cores that share none: `neighbour` tells, before and after each row, how many times longer it takes to work on numbers
+of which another thread wrote half than on one's own; it is 1.0 on cores that share a cache.
+
+The file is written after each row. Started again with the same settings, the script goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -22,20 +29,24 @@ import os
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from torch import Tensor
+os.environ["CUDA_VISIBLE_DEVICES"] = ""  # before torch looks for GPUs: this is about the CPU
+
+import torch  # noqa: E402
+from torch import Tensor  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints  # noqa: E402
 from nrfgs_ns.rasterizer import Projection, project, rasterization  # noqa: E402
 
 SIZES = ["20000x256x256", "50000x400x300", "200000x800x600", "200000x1600x1200"]
 LOOP_TILE = 16
+TRAINED_AT, SEEN_AT = 1 / 8, 1 / 2  # size of the images of a scene that is trained here
 
 
 @dataclass
@@ -68,26 +79,71 @@ def cloud(n: int, width: int, height: int, opaque: bool = False) -> Scene:
     return Scene([t.requires_grad_() for t in tensors] + [torch.eye(4)[None], K[None]], width, height)
 
 
-def trained(path: Path, width: int, height: int) -> Scene:
-    """The splats of a nerfstudio checkpoint, base colours only, seen from outside along the mean viewing axis of its
-    cloud.
+def cloud_of(size: str) -> Scene:
+    """The cloud of a name: splats x width x height, perhaps followed by "opaque"."""
+    size, *opaque = size.split()
+    return cloud(*map(int, size.split("x")), opaque=bool(opaque))
+
+
+def train(scene: Path | None, config: Path | None, steps: int, out: Path) -> None:
+    """Save the splats of a training and one of its cameras: of a scene that is trained now, or of a saved config.yml.
+
+    The scene is trained at an eighth of its size, with as many steps, and is seen at half its size.
     """
-    allow_nerfstudio_checkpoints()
-    state = torch.load(path, map_location="cpu", weights_only=True)["pipeline"]
-    splats = {key.rsplit(".", 1)[-1]: t.float() for key, t in state.items() if ".gauss_params." in key}
+    from nrfgs_ns.pinhole import pinhole
+
+    if config:
+        from nerfstudio.utils.eval_utils import eval_setup
+
+        from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
+
+        allow_nerfstudio_checkpoints()
+        pipeline = eval_setup(config, test_mode="val")[1]
+    else:
+        pipeline = trained_pipeline(scene, steps)
+    camera = pipeline.datamanager.train_dataset.cameras[0:1].to("cpu")
+    target = camera.width.item() * (1 if config else SEEN_AT / TRAINED_AT)
+    camera.rescale_output_resolution(target / camera.width.item())
+    view = pinhole(camera, camera.camera_to_worlds, 1)
+    splats = {name: tensor.detach().float() for name, tensor in pipeline.model.gauss_params.items()}
     base = splats.get("features_dc", splats.get("colors"))
-    if base is None:
-        raise KeyError(f"{path} holds no base colours: found {sorted(splats)}")
-    means = splats["means"]
-    centre, spread = means.median(0).values, (means - means.median(0).values).norm(dim=-1).median()
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # nerfstudio's z is up; look along +y
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (centre - torch.tensor([0.0, 1.0, 0.0]) * 1.5 * spread)
-    focal = 0.8 * width
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    tensors = [means, splats["quats"], splats["scales"].exp(), splats["opacities"].squeeze(-1).sigmoid(), base]
-    leaves = [t.detach().clone().requires_grad_() for t in tensors]
-    return Scene([*leaves, viewmat[None], K[None]], width, height)
+    shapes = [splats["means"], splats["quats"], splats["scales"].exp(), splats["opacities"].squeeze(-1).sigmoid()]
+    torch.save({"tensors": [*shapes, base, view.viewmat, view.K], "size": [view.width, view.height]}, out)
+
+
+def trained_pipeline(scene: Path, steps: int):
+    """Train `nrfgs-sh` with nerfstudio's defaults but for the size of the images and the number of steps."""
+    from nerfstudio.scripts.train import _set_random_seed
+
+    from nrfgs_ns.studies.run import parse
+
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        options = {
+            "--data": scene,
+            "--output-dir": folder,
+            "--max-num-iterations": steps,
+            "--vis": "tensorboard",
+            "--steps-per-eval-image": 10 * steps,
+            "--steps-per-eval-all-images": 10 * steps,
+            "--logging.profiler": "none",
+            "--machine.device-type": "cpu",
+            "--pipeline.model.num-downscales": 0,
+            "--pipeline.datamanager.camera-res-scale-factor": TRAINED_AT,
+        }
+        config = parse(["nrfgs-sh", *(str(word) for option in options.items() for word in option)])
+        config.save_config()
+        _set_random_seed(config.machine.seed)
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.train()
+        return trainer.pipeline
+
+
+def load_trained(path: Path) -> Scene:
+    """What `train` has saved."""
+    saved = torch.load(path, weights_only=True)
+    *splats, viewmat, K = saved["tensors"]
+    return Scene([t.clone().requires_grad_() for t in splats] + [viewmat, K], *saved["size"])
 
 
 def plain_loop(
@@ -133,10 +189,10 @@ def plain_loop(
     return image[None], alphas[None]
 
 
-def timed(render, scene: Scene, repeats: int) -> dict[str, float]:
-    """Median milliseconds of forward and backward after one unmeasured run."""
+def timed(render, scene: Scene, repeats: int, warm: bool = True) -> dict[str, float]:
+    """Median milliseconds of forward and backward, after one unmeasured run where `warm`."""
     forward, backward = [], []
-    for i in range(repeats + 1):
+    for i in range(repeats + warm):
         for t in scene.tensors:
             t.grad = None
         start = time.perf_counter()
@@ -144,7 +200,7 @@ def timed(render, scene: Scene, repeats: int) -> dict[str, float]:
         middle = time.perf_counter()
         (image.sum() + alphas.sum()).backward()
         end = time.perf_counter()
-        if i > 0 or repeats == 0:
+        if i >= warm:
             forward.append(1e3 * (middle - start))
             backward.append(1e3 * (end - middle))
     return {"forward_ms": statistics.median(forward), "backward_ms": statistics.median(backward)}
@@ -156,13 +212,12 @@ def agree(scene: Scene) -> float:
         return float((rasterization(*scene.arguments)[0] - plain_loop(*scene.arguments)[0]).abs().mean())
 
 
-def peak_memory(n: int, width: int, height: int) -> float:
+def peak_memory(scene: Scene) -> float:
     """MiB by which the peak of one forward and backward exceeds what the process held before. Linux only."""
-    scene = cloud(n, width, height)
     # A first small image loads libraries and starts threads.
-    timed(rasterization, cloud(100, 32, 32), 0)
+    timed(rasterization, cloud(100, 32, 32), 1, warm=False)
     before = memory_kib("VmRSS")
-    timed(rasterization, scene, 0)
+    timed(rasterization, scene, 1, warm=False)
     return (memory_kib("VmHWM") - before) / 1024
 
 
@@ -172,70 +227,142 @@ def memory_kib(field: str) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith(field))
 
 
+def neighbour() -> float | None:
+    """How many times longer a thread works on numbers of which another thread wrote half than on its own."""
+    if torch.get_num_threads() == 1:
+        return None
+    numbers = torch.zeros(200_000)
+    parts = numbers.split(25_000)  # each too small for torch to divide it among threads
+
+    def fastest(write: Callable[[], object]) -> float:
+        seconds = math.inf
+        for _ in range(100):
+            write()
+            start = time.perf_counter()
+            for part in parts:
+                part.add_(1)
+            seconds = min(seconds, time.perf_counter() - start)
+        return seconds
+
+    return round(fastest(lambda: numbers.add_(1)) / fastest(lambda: [part.add_(1) for part in parts]), 2)
+
+
+def bind(threads: int) -> list[int]:
+    """Keep this process and its children on as many physical cores as threads, sharing a cache where possible."""
+
+    def listed(cpu: int, file: str) -> str:
+        path = Path(f"/sys/devices/system/cpu/cpu{cpu}/{file}")
+        return path.read_text().strip() if path.exists() else str(cpu)
+
+    groups: dict[str, dict[str, int]] = {}  # the first hyperthread of each core, by the cache that it shares
+    for cpu in sorted(os.sched_getaffinity(0)):
+        cores = groups.setdefault(listed(cpu, "cache/index3/shared_cpu_list"), {})
+        cores.setdefault(listed(cpu, "topology/thread_siblings_list"), cpu)
+    by_size = sorted((list(cores.values()) for cores in groups.values()), key=len, reverse=True)
+    chosen = [cpu for cores in by_size for cpu in cores][:threads]
+    os.sched_setaffinity(0, chosen)
+    return chosen
+
+
+def measure(name: str, scene: Scene, arguments: argparse.Namespace) -> dict:
+    """One row, printed and returned."""
+    row: dict = {"splats": len(scene.tensors[0]), "image": [scene.width, scene.height], "neighbour": [neighbour()]}
+    begin = time.perf_counter()
+    rounds: list[dict[str, dict[str, float]]] = []
+    if not arguments.no_loop:
+        row["mean_difference"] = agree(scene)  # also the loop's unmeasured run
+        if row["mean_difference"] > 1e-4:
+            sys.exit(f"{name}: the two images differ by {row['mean_difference']:.1e} on average")
+    while len(rounds) < arguments.rounds and (not rounds or time.perf_counter() - begin < arguments.budget):
+        # In turns, so that a machine that slows down for a while slows both.
+        rounds.append({"ours": timed(rasterization, scene, arguments.repeats)})
+        if not arguments.no_loop:
+            rounds[-1]["loop"] = timed(plain_loop, scene, 1, warm=False)
+    for which in rounds[0]:
+        row[which] = {key: statistics.median(r[which][key] for r in rounds) for key in rounds[0][which]}
+    row["rounds"] = rounds
+    row["load"] = round(os.getloadavg()[0], 1)
+    row["neighbour"].append(neighbour())
+    line = f"{name:24} ours {row['ours']['forward_ms']:6.0f} + {row['ours']['backward_ms']:6.0f} ms"
+    if not arguments.no_loop:
+        ratios = [sum(r["loop"].values()) / sum(r["ours"].values()) for r in rounds]
+        fastest = [min(sum(r[which].values()) for r in rounds) for which in ("ours", "loop")]
+        row["times_faster"] = statistics.median(ratios)
+        row["times_faster_fastest"] = fastest[1] / fastest[0]
+        line += f"   loop {row['loop']['forward_ms']:6.0f} + {row['loop']['backward_ms']:6.0f} ms"
+        line += f"   {row['times_faster']:5.1f} ({min(ratios):.1f}-{max(ratios):.1f}) times faster"
+        line += f", fastest rounds {row['times_faster_fastest']:.1f}"
+    print(line, flush=True)
+    return row
+
+
+def again(*words: object) -> str:
+    """Run this script in a process of its own, and return what it prints."""
+    command = [sys.executable, __file__, *map(str, words)]
+    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", default=SIZES, help="splats x width x height")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--scene", type=Path, help="a scene to train at an eighth of its size, seen at half its size")
+    parser.add_argument("--scene-steps", type=int, default=1000, help="training steps of --scene")
+    parser.add_argument("--config", type=Path, help="config.yml of a training, seen from its first camera at full size")
+    parser.add_argument("--repeats", type=int, default=3, help="runs of ours in a round")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--budget", type=float, default=45, help="seconds after which a row begins no other round")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--checkpoint", type=Path, help="a nerfstudio checkpoint, timed at 800 x 600")
+    parser.add_argument("--no-bind", action="store_true", help="let the process wander over all cores")
     parser.add_argument("--no-loop", action="store_true", help="skip the baseline")
     parser.add_argument("--out", type=Path, default=Path("docs/results/rasterizer_cpu.json"))
-    parser.add_argument("--peak-memory", metavar="SIZE", help=argparse.SUPPRESS)
+    parser.add_argument("--train", type=Path, metavar="FILE", help=argparse.SUPPRESS)
+    parser.add_argument("--peak-memory", metavar="SIZE or FILE", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    cores = sorted(os.sched_getaffinity(0)) if arguments.no_bind else bind(arguments.threads)
     torch.set_num_threads(arguments.threads)
     if arguments.peak_memory:
-        print(peak_memory(*map(int, arguments.peak_memory.split("x"))))
+        is_file = arguments.peak_memory.endswith(".pt")
+        print(peak_memory(load_trained(Path(arguments.peak_memory)) if is_file else cloud_of(arguments.peak_memory)))
+        return
+    if arguments.train:
+        train(arguments.scene, arguments.config, arguments.scene_steps, arguments.train)
         return
 
-    scenes = {}
-    for size in arguments.sizes:
-        scenes[size] = cloud(*map(int, size.split("x")))
-    if "50000x400x300" in scenes:
-        scenes["50000x400x300 opaque"] = cloud(50000, 400, 300, opaque=True)
-    if arguments.checkpoint:
-        scenes[f"{arguments.checkpoint.stem} 800x600"] = trained(arguments.checkpoint, 800, 600)
-
-    rows = {}
-    for name, scene in scenes.items():
-        row: dict = {"ours": timed(rasterization, scene, arguments.repeats)}
-        line = f"{name:24} ours {row['ours']['forward_ms']:6.0f} + {row['ours']['backward_ms']:6.0f} ms"
-        if not arguments.no_loop:
-            row["mean_difference"] = agree(scene)
-            if row["mean_difference"] > 1e-4:
-                sys.exit(f"{name}: the two images differ by {row['mean_difference']:.1e} on average")
-            # In turns, so that a machine that slows down for a while slows both.
-            rounds = [(row["ours"], timed(plain_loop, scene, 1))]
-            for _ in range(arguments.rounds - 1):
-                rounds.append((timed(rasterization, scene, arguments.repeats), timed(plain_loop, scene, 1)))
-            row["rounds"] = [{"ours": ours, "loop": loop} for ours, loop in rounds]
-            ratios = [sum(loop.values()) / sum(ours.values()) for ours, loop in rounds]
-            row["times_faster"] = statistics.median(ratios)
-            fastest = [min(sum(turn.values()) for turn in turns) for turns in zip(*rounds, strict=True)]
-            row["times_faster_fastest"] = fastest[1] / fastest[0]
-            for which, values in zip(("ours", "loop"), zip(*rounds, strict=True), strict=True):
-                row[which] = {key: statistics.median(value[key] for value in values) for key in values[0]}
-            line = f"{name:24} ours {row['ours']['forward_ms']:6.0f} + {row['ours']['backward_ms']:6.0f} ms"
-            line += f"   loop {row['loop']['forward_ms']:6.0f} + {row['loop']['backward_ms']:6.0f} ms"
-            line += f"   {row['times_faster']:5.1f} ({min(ratios):.1f}-{max(ratios):.1f}) times faster"
-            line += f", fastest rounds {row['times_faster_fastest']:.1f}"
-        row["load"] = round(os.getloadavg()[0], 1)
-        if name in arguments.sizes:
-            command = [sys.executable, __file__, "--peak-memory", name, "--threads", str(arguments.threads)]
-            row["peak_memory_mib"] = float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-            line += f"   peak {row['peak_memory_mib']:4.0f} MiB"
-        print(line, flush=True)
-        rows[name] = row
-
-    machine = {
-        "name": f"{os.cpu_count()} CPU cores",
+    settings = {
+        "machine": {"name": f"{os.cpu_count()} CPU cores", "cores": len(cores), "torch": torch.__version__},
         "threads": arguments.threads,
-        "torch": torch.__version__,
+        "repeats": arguments.repeats,
+        "results": {},
     }
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(
-        json.dumps({"machine": machine, "repeats": arguments.repeats, "results": rows}, indent=2) + "\n"
-    )
+    results = settings
+    if arguments.out.exists():
+        earlier = json.loads(arguments.out.read_text())
+        if {**earlier, "results": {}} == settings:
+            results = earlier
+    with tempfile.TemporaryDirectory() as folder:
+        saved = Path(folder) / "trained.pt"
+        names = {size: size for size in arguments.sizes}
+        if "50000x400x300" in names:
+            names["50000x400x300 opaque"] = "50000x400x300 opaque"
+        source = arguments.scene or (arguments.config and arguments.config.parent)
+        if source:
+            names[f"{source.resolve().name} trained"] = str(saved)
+        common = ["--threads", arguments.threads, *["--no-bind"] * arguments.no_bind]
+        for name, what in names.items():
+            if name in results["results"]:
+                print(f"{name:24} is in {arguments.out}", flush=True)
+                continue
+            if what == str(saved):
+                source = ["--config", arguments.config] if arguments.config else ["--scene", arguments.scene]
+                again("--train", saved, *source, "--scene-steps", arguments.scene_steps, *common)
+            row = measure(name, load_trained(saved) if what == str(saved) else cloud_of(what), arguments)
+            row["peak_memory_mib"] = float(again("--peak-memory", what, *common))
+            print(f"{'':24} peak memory {row['peak_memory_mib']:.0f} MiB", flush=True)
+            results["results"][name] = row
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            unfinished = arguments.out.with_suffix(".part")
+            unfinished.write_text(json.dumps(results, indent=1) + "\n")
+            unfinished.replace(arguments.out)
 
 
 if __name__ == "__main__":

@@ -268,8 +268,8 @@ def test_indices_of_16_million_splats():
     prints = tiles.Footprints(edge, side, side, torch.arange(count), shape, spans)
     lists = tiles.list_tiles(prints, prints.whole)
     assert torch.equal(lists.tiles, torch.arange(count))
-    assert torch.equal(lists.splat, torch.arange(count))
-    assert torch.equal(lists.slot, torch.arange(count)) and (lists.count == 1).all()
+    assert torch.equal(lists.splat[:-1], torch.arange(count))
+    assert torch.equal(lists.slot[:-1], torch.arange(count)) and (lists.count == 1).all()
     blocks = tiles.split_into_blocks(prints, compositing.BLOCK_PAIRS)
     assert sum((b.row1 - b.row0) * (b.col1 - b.col0) for b in blocks) == count
 

@@ -11,7 +11,7 @@ import torch
 from make_gsplat_fixtures import CASES
 
 from nrfgs_ns.rasterizer import composite, project, rasterization
-from nrfgs_ns.rasterizer.torch_cpu import compositing, projection
+from nrfgs_ns.rasterizer.torch_cpu import batches, compositing, projection
 
 
 def test_two_stages_are_the_whole_call():
@@ -237,7 +237,7 @@ def test_one_very_long_tile():
 
 
 def test_hidden_splats_cost_nothing(monkeypatch):
-    """Behind an opaque wall of 20 layers, 5000 more splats are never looked at: one slab of 32 instead of 157."""
+    """Behind an opaque wall of 20 layers, 5000 more splats are never looked at: one slab of 16 instead of 314."""
     looked_at = []
     batch = compositing.Batch
     monkeypatch.setattr(compositing, "Batch", lambda *a: looked_at.append(tuple(a[1].shape)) or batch(*a))
@@ -246,7 +246,26 @@ def test_hidden_splats_cost_nothing(monkeypatch):
     K = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
     shape = [torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1), torch.full((n, 3), 10.0)]
     rasterization(means, *shape, torch.full((n,), 0.9), torch.ones(n, 1), torch.eye(4)[None], K, 8, 8)
-    assert looked_at == [(1, 32)]  # tiles, splats
+    assert looked_at == [(1, batches.SLAB)]  # tiles, splats
+
+
+def test_threads_widen_the_batches_and_change_nothing(monkeypatch):
+    """With three threads a batch has three times the tiles; a tile's arithmetic is its own, in any company."""
+    monkeypatch.setattr(batches, "BATCH_ELEMENTS", 64 * (batches.SLAB + 1) * 5)
+    widest = []
+    batch = compositing.Batch
+    monkeypatch.setattr(compositing, "Batch", lambda *a: widest[-1].append(len(a[0])) or batch(*a))
+    case, images = CASES["opaque_layers"](), []
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            widest.append([])
+            images.append(rasterization(*case.arguments(), **case.options)[0])
+    finally:
+        torch.set_num_threads(before)
+    assert max(widest[0]) == 5 and max(widest[1]) == 15
+    torch.testing.assert_close(images[0], images[1], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -262,7 +281,7 @@ def test_peak_memory_is_bounded(size):
 
 @pytest.mark.slow
 def test_a_tile_of_a_hundred_thousand_splats():
-    """All over the same 8 x 8 pixels and nearly transparent to the last one: 3,125 slabs, a handful of arrays of 2,048
+    """All over the same 8 x 8 pixels and nearly transparent to the last one: 6,250 slabs, a handful of arrays of 1,024
     each.
     """
     n = 100_000

@@ -47,7 +47,7 @@ def tile_maxima(alpha, prints):
 
 def listed(lists, prints, shape):
     table = torch.zeros(shape, dtype=torch.bool)
-    table[prints.rows[lists.splat], lists.tiles.repeat_interleave(lists.count)] = True
+    table[prints.rows[lists.splat[:-1]], lists.tiles.repeat_interleave(lists.count)] = True
     return table
 
 
@@ -57,14 +57,14 @@ def test_lists_are_complete_ordered_and_tight(name):
     lists = list_tiles(prints, prints.whole)
     maxima = tile_maxima(brute_force(projection, opacities), prints)
     table = listed(lists, prints, maxima.shape)
-    assert len(lists.splat) == table.sum(), "a pair is listed twice"
+    assert lists.n_pairs == table.sum(), "a pair is listed twice"
     assert table[maxima >= MIN_ALPHA * (1 + 1e-6)].all(), "a splat that can be seen is missing"
     # The ellipse can pass between pixel centres of a tile that it enters, so some pairs turn out empty. Never most of
     # them for splats wider than a pixel; a bounding box would list three times too many for the needles.
     assert table.sum() <= 1.5 * (maxima >= MIN_ALPHA).sum() + 20
 
-    depth = projection.depths[prints.rows[lists.splat]]
-    rows = prints.rows[lists.splat]
+    rows = prints.rows[lists.splat[:-1]]
+    depth = projection.depths[rows]
     for start, count in zip(lists.start.tolist(), lists.count.tolist(), strict=True):
         keys = [
             (float(d), int(r)) for d, r in zip(depth[start : start + count], rows[start : start + count], strict=True)
@@ -77,8 +77,9 @@ def test_slots_put_the_pairs_of_a_splat_side_by_side():
     lists = list_tiles(prints, prints.whole)
     by_slot = torch.empty_like(lists.splat)
     by_slot[lists.slot] = lists.splat
-    counts = torch.diff(torch.cat([lists.splat_start, torch.tensor([len(by_slot)])]))
-    assert torch.equal(by_slot, torch.arange(len(prints.rows)).repeat_interleave(counts))
+    counts = torch.diff(torch.cat([lists.splat_start, torch.tensor([lists.n_pairs])]))
+    assert torch.equal(by_slot[:-1], torch.arange(len(prints.rows)).repeat_interleave(counts))
+    assert by_slot[-1] == len(prints.rows), "the pair that pads has the splat that shows nothing"
 
 
 @pytest.mark.parametrize("name", ["ordinary", "larger_than_image", "several_cameras", "needles"])
@@ -88,9 +89,11 @@ def test_blocks_partition_the_lists(name):
     blocks = split_into_blocks(prints, 50)
     assert len(blocks) > 1
     parts = [list_tiles(prints, block) for block in blocks]
-    pairs = {(int(t), int(s)) for p in parts for t, s in zip(p.tiles.repeat_interleave(p.count), p.splat, strict=True)}
-    assert sum(len(p.splat) for p in parts) == len(whole.splat) == len(pairs)
-    expected = zip(whole.tiles.repeat_interleave(whole.count), whole.splat, strict=True)
+    pairs = {
+        (int(t), int(s)) for p in parts for t, s in zip(p.tiles.repeat_interleave(p.count), p.splat[:-1], strict=True)
+    }
+    assert sum(p.n_pairs for p in parts) == whole.n_pairs == len(pairs)
+    expected = zip(whole.tiles.repeat_interleave(whole.count), whole.splat[:-1], strict=True)
     assert pairs == {(int(t), int(s)) for t, s in expected}
 
 
@@ -98,7 +101,7 @@ def test_blocks_respect_their_bound_down_to_single_tiles():
     _, _, prints = setup("larger_than_image")
     for block in split_into_blocks(prints, 100):
         single = block.row1 - block.row0 == 1 and block.col1 - block.col0 == 1
-        assert single or len(list_tiles(prints, block).splat) <= 100
+        assert single or list_tiles(prints, block).n_pairs <= 100
 
 
 def test_nothing_to_list():

@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches: how the work of compositing is cut up, and the numbers that each piece needs.
 
-Tiles advance together in *slabs* of 32 splats of depth. After each slab the tiles that have run out of splats or of
+Tiles advance together in *slabs* of 16 splats of depth. After each slab the tiles that have run out of splats or of
 light leave, so hidden splats cost nothing. A slab is cut into batches of tiles with similar counts, so little is
-padded, and the arrays [B, n, 64] of a batch stay within `BATCH_ELEMENTS`, the memory knob of the arithmetic.
+padded, and the arrays [B, n, 64] of a batch stay within `BATCH_ELEMENTS` for each thread, the memory knob of the
+arithmetic.
+
+Slabs are shallow so that batches are wide. What one core has written is dear to read for another that shares no cache
+with it, and torch divides only operations on more than 32,768 numbers among its threads. In a wide batch even the slice
+[B, 64] of a single splat is divided, and at the same tile as the whole: each core keeps to its own.
 
 For the backward pass a batch keeps T in front of its slab and the numbers of its splats; all that is per pixel and
 splat is computed again.
@@ -21,49 +26,45 @@ from torch.nn import functional as F
 
 from .tiles import Footprints, TileLists
 
-SLAB = 32  # splats of depth between two looks at which tiles are finished
-BATCH_ELEMENTS = 2**19  # pixels x splats in flight; four float arrays of this size exist at a time (8 MiB)
+SLAB = 16  # splats of depth between two looks at which tiles are finished
+BATCH_ELEMENTS = 2**19  # pixels x splats in flight per thread; four float arrays of this size exist at a time (8 MiB)
+MAX_THREADS = 16  # for more threads than these, batches grow no further
 LN_2 = math.log(2.0)
 LOG2_NEARLY_MAX_ALPHA = math.log2(0.9989)  # a splat below this opacity stays below 0.999 however l is rounded
 NOTHING = -1e5  # exp2(NOTHING) = 0: the log-alpha of padding
 
 
+def batch_elements() -> int:
+    """Pixels x splats of a batch: `BATCH_ELEMENTS` for every thread of torch."""
+    return BATCH_ELEMENTS * min(torch.get_num_threads(), MAX_THREADS)
+
+
 class Sheet:
-    """The constant part of the work: splats in depth order, the tile grid and its pixel basis."""
+    """The constant part of the work: splats in depth order, the tile grid and its pixel basis.
+
+    Behind the last of the F splats the tables have one more that shows nothing: lists that are too short are padded
+    with it. A row of a table holds all that is read of a splat together, so that each pair fetches it once.
+    """
 
     def __init__(self, prints: Footprints, colors: Tensor, n_cameras: int, width: int, height: int) -> None:
         self.prints = prints
-        self.colors = colors  # [F, D]
-        # Conic and ln(o) divided by ln 2, because exp2 is three times faster than exp.
-        self.shape = torch.cat([prints.shape[:2], prints.shape[2:] / LN_2])  # [6, F], float64
-        self.n_tiles = n_cameras * prints.tiles_y * prints.tiles_x
         edge, dtype = prints.edge, colors.dtype
+        # Conic and ln(o) divided by ln 2, because exp2 is three times faster than exp.
+        shape = torch.cat([prints.shape[:2], prints.shape[2:] / LN_2])  # [6, F], float64
+        padding = shape.new_tensor([[0.0, 0.0, 0.0, 0.0, 0.0, NOTHING]])
+        self.shape = torch.cat([shape.t(), padding])  # centre x, y, conic a, b, c, ln(o). [F + 1, 6], float64
+        self.looks = F.pad(torch.cat([-shape[2:5].t().to(dtype), colors], 1), (0, 0, 0, 1))  # -a, -b, -c, colours
+
+        self.n_tiles = n_cameras * prints.tiles_y * prints.tiles_x
         offsets = torch.arange(edge, dtype=dtype) - (edge - 1) / 2
         y, x = (grid.flatten() for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
-        self.basis = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])  # [6, P]
+        self.basis = torch.stack([torch.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])  # [6, P]
 
         inside_x = (torch.arange(prints.tiles_x * edge) < width).view(1, 1, prints.tiles_x, 1, edge)
         inside_y = (torch.arange(prints.tiles_y * edge) < height).view(1, prints.tiles_y, 1, edge, 1)
         inside = (inside_x & inside_y).expand(n_cameras, -1, -1, -1, -1)
         self.inside = inside.reshape(self.n_tiles, edge * edge).to(dtype)  # 1 in pixels of the image. [C * tiles, P]
-
-        self._memory: dict[str, Tensor] = {}
-        self._buffers: dict[tuple, tuple[Tensor, tuple[Tensor, ...]]] = {}
-
-    def buffer(self, name: str, n_tiles: int, n: int, pixels: int) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """Scratch memory as [B, n, P] and its n slices [B, P].
-
-        It is reused: the allocator returns arrays of megabytes to the system, and getting them back costs more than a
-        pass of arithmetic; making n slices costs as much as a fifth of their arithmetic.
-        """
-        key = name, n_tiles, n, pixels
-        if key not in self._buffers:
-            size = n_tiles * n * pixels
-            if name not in self._memory:
-                self._memory[name] = self.basis.new_empty(max(BATCH_ELEMENTS, (SLAB + 1) * pixels))
-            tensor = self._memory[name][:size].view(n_tiles, n, pixels)
-            self._buffers[key] = tensor, tensor.unbind(1)
-        return self._buffers[key]
+        self.scratch = Scratch(max(batch_elements(), (SLAB + 1) * edge * edge), dtype)
 
     def centres(self, tiles: Tensor) -> Tensor:
         """Centres x, y of tiles in pixels, y counted from the top of the first image. [L] -> [2, L, 1], float64"""
@@ -86,10 +87,34 @@ class Sheet:
         return images.reshape(self.n_tiles, channels, edge * edge)
 
 
+class Scratch:
+    """Memory for the arrays of a batch, used by one batch after the other.
+
+    The allocator returns arrays of megabytes to the system, and getting them back costs more than a pass of
+    arithmetic; making n slices costs as much as a fifth of their arithmetic.
+    """
+
+    def __init__(self, size: int, dtype: torch.dtype) -> None:
+        self.size = size  # of each array, in numbers
+        self.dtype = dtype
+        self._memory: dict[str, Tensor] = {}
+        self._arrays: dict[tuple, tuple[Tensor, tuple[Tensor, ...]]] = {}
+
+    def array(self, name: str, n_tiles: int, n: int, pixels: int) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The memory of a name as [B, n, P] and its n slices [B, P], with whatever was left there."""
+        key = name, n_tiles, n, pixels
+        if key not in self._arrays:
+            if name not in self._memory:
+                self._memory[name] = torch.empty(self.size, dtype=self.dtype)
+            array = self._memory[name][: n_tiles * n * pixels].view(n_tiles, n, pixels)
+            self._arrays[key] = array, array.unbind(1)
+        return self._arrays[key]
+
+
 class Numbers(NamedTuple):
     """What compositing needs of the R = B n splats of a batch: sigma expanded around the centres of their tiles."""
 
-    coefficients: Tensor  # of l / ln 2 in (1, x, y, x^2, xy, y^2). [6, R]
+    coefficients: Tensor  # of l / ln 2 in (1, x, y, x^2 / 2, xy, y^2 / 2). [6, R]
     centres: Tensor  # mx, my. [2, R]
     colors: Tensor  # [B, n, D]
     strong: Tensor  # which of the R can exceed an alpha of 0.999
@@ -106,45 +131,45 @@ class Batch:
 
 
 def pairs_of(lists: TileLists, tiles: Tensor, first: int, n: int) -> Tensor:
-    """The pairs [B, n] of some tiles from depth `first` on; K, one more than the last, where a list is shorter."""
+    """The pairs [B, n] of some tiles from depth `first` on; K, the padding, where a list is shorter."""
     depth = torch.arange(first, first + n)
-    pairs = lists.start.index_select(0, tiles)[:, None] + depth
-    listed = depth < lists.count.index_select(0, tiles)[:, None]
-    return pairs.masked_fill_(~listed, lists.splat.numel())
+    start, count = lists.start.index_select(0, tiles), lists.count.index_select(0, tiles)
+    return torch.where(depth < count[:, None], start[:, None] + depth, lists.n_pairs)
 
 
 def expand(sheet: Sheet, lists: TileLists, centres: Tensor, pairs: Tensor) -> Numbers:
-    """Gather the splats of a batch and expand sigma around the centres of its tiles; padding gets an opacity of 0.
+    """Fetch the splats of a batch and expand sigma around the centres of its tiles.
 
     Args:
         centres: x and y of the tiles' centres in pixels, as columns. [2, B, 1], float64
         pairs: [B, n]
     """
-    n_pairs = lists.splat.numel()
-    splat = lists.splat.index_select(0, pairs.clamp(max=n_pairs - 1).flatten())
-    x, y, a, b, c, log_opacity = (row.index_select(0, splat).view_as(pairs) for row in sheet.shape)
+    splat = lists.splat.index_select(0, pairs.flatten())
+    x, y, a, b, c, log_opacity = sheet.shape.index_select(0, splat).view(*pairs.shape, 6).unbind(-1)
+    looks = sheet.looks.index_select(0, splat)
+
     mx, my = x - centres[0], y - centres[1]
-    gx, gy = a * mx + b * my, b * mx + c * my
-    peak = (log_opacity - 0.5 * (mx * gx + my * gy)).masked_fill_(pairs == n_pairs, NOTHING)
-    dtype = sheet.colors.dtype
-    coefficients = sheet.colors.new_empty(6, *pairs.shape)
-    for row, values in zip(coefficients, (peak, gx, gy, -0.5 * a, -b, -0.5 * c), strict=True):
-        row.copy_(values)
+    gx, gy = torch.addcmul(b * my, a, mx), torch.addcmul(b * mx, c, my)
+    peak = torch.add(log_opacity, torch.addcmul(mx * gx, my, gy), alpha=-0.5)
+    rows = looks.new_empty(8, *pairs.shape)  # the coefficients, then the splat's centre
+    for row, values in zip((0, 1, 2, 6, 7), (peak, gx, gy, mx, my), strict=True):
+        rows[row] = values
+    rows = rows.flatten(1)
+    rows[3:6] = looks[:, :3].t()
     strong = (log_opacity > LOG2_NEARLY_MAX_ALPHA).flatten().nonzero().squeeze(1)
-    colors = sheet.colors.index_select(0, splat).view(*pairs.shape, -1)
-    return Numbers(coefficients.flatten(1), torch.stack([mx, my]).to(dtype).flatten(1), colors, strong)
+    return Numbers(rows[:6], rows[6:], looks[:, 3:].view(*pairs.shape, -1), strong)
 
 
 def similar_tiles(remaining: Tensor, tiles: Tensor, pixels: int) -> list[tuple[Tensor, int]]:
-    """Cut tiles, sorted by falling number of splats, into groups of similar numbers within BATCH_ELEMENTS.
+    """Cut tiles, sorted by falling number of splats, into groups of similar numbers that fit into a batch.
 
     Returns:
         For each group its tiles and the largest of their numbers.
     """
     counts = remaining.tolist()
-    groups, begin = [], 0
+    groups, begin, elements = [], 0, batch_elements()
     while begin < len(counts):
-        end = min(len(counts), begin + max(1, BATCH_ELEMENTS // ((counts[begin] + 1) * pixels)))
+        end = min(len(counts), begin + max(1, elements // ((counts[begin] + 1) * pixels)))
         enough = 0.75 * counts[begin] - 4  # bounds the padding to a quarter, or four splats
         while counts[end - 1] < enough:
             end -= 1

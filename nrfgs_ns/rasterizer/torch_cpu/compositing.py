@@ -12,9 +12,9 @@ that would push T_k to 1e-4 or below ends the pixel: it and all behind it are no
 
 Written around the centre of the pixel's tile, with x the offset from it and m_k = (mx, my) the splat's,
 
-    l_k(x) = [ln o - s] + gx x + gy y - (a/2) x^2 - b xy - (c/2) y^2,     (gx, gy) = Q_k m_k,    s = m_k . (gx, gy) / 2,
+    l_k(x) = [ln o - s] + gx x + gy y - a x^2 / 2 - b xy - c y^2 / 2,    (gx, gy) = Q_k m_k,    s = m_k . (gx, gy) / 2,
 
-which is linear in (1, x, y, x^2, xy, y^2). Those six numbers are the same for every tile, so the l of all splats at
+which is linear in (1, x, y, x^2 / 2, xy, y^2 / 2). Those six are the same for every tile, so the l of all splats at
 all 64 pixels is one matrix product. The six coefficients are formed in float64: they are where a needle far from its
 tile cancels.
 
@@ -86,8 +86,8 @@ class _Blend:
     through: Tensor  # T_0 ... T_n as if no pixel ended. [B, n + 1, P]
     weights: Tensor  # w_k = alpha_k T_{k-1}. [B, n, P]
     last: Tensor  # T behind the slab, 0 in pixels that have ended. [B, P]
-    drawn: Tensor | None  # 1 where splat k is drawn, else 0; None if no pixel ends in this slab. [B, n, P]
-    capped: tuple[Tensor, Tensor] | None  # rows (of B * n) that can exceed 0.999, and their pixels that do
+    ends: Tensor | None  # which pixels end in this slab; None if none does. [B, P]
+    capped: tuple[Tensor, Tensor] | None  # rows (of B * n) that can exceed 0.999, and their pixels that do, if any
 
 
 def _blend(sheet: Sheet, numbers: Numbers, start: Tensor) -> _Blend:
@@ -97,27 +97,31 @@ def _blend(sheet: Sheet, numbers: Numbers, start: Tensor) -> _Blend:
     """
     n_tiles, n = numbers.colors.shape[:2]
     pixels = start.shape[1]
-    alpha, alphas = sheet.buffer("alpha", n_tiles, n, pixels)
+    alpha, alphas = sheet.scratch.array("alpha", n_tiles, n, pixels)
     flat = alpha.view(-1, pixels)
     torch.mm(numbers.coefficients.t(), sheet.basis, out=flat).exp2_()
     F.threshold_(flat, _just_below(MIN_ALPHA, flat.dtype), 0.0)
     capped = None
     if numbers.strong.numel() > 0:
         strong = flat.index_select(0, numbers.strong)
-        capped = numbers.strong, strong > MAX_ALPHA
-        flat.index_copy_(0, numbers.strong, strong.clamp_(max=MAX_ALPHA))
+        beyond = strong > MAX_ALPHA
+        if beyond.any():
+            capped = numbers.strong, beyond
+            flat.index_copy_(0, numbers.strong, strong.clamp_(max=MAX_ALPHA))
 
-    through, steps = sheet.buffer("through", n_tiles, n + 1, pixels)  # T_0 ... T_n
+    through, steps = sheet.scratch.array("through", n_tiles, n + 1, pixels)  # T_0 ... T_n
     steps[0].copy_(start)
     for before, own, after in zip(steps, alphas, steps[1:], strict=False):
         torch.addcmul(before, own, before, value=-1, out=after)  # T_k = T_{k-1} - alpha_k T_{k-1}
 
-    drawn, last = None, F.threshold(steps[-1], MIN_TRANSMITTANCE, 0.0)
-    if last.count_nonzero() < start.count_nonzero():  # T may also have underflowed, so `last` alone does not tell
-        drawn = torch.gt(through[:, 1:], MIN_TRANSMITTANCE, out=sheet.buffer("spare", n_tiles, n, pixels)[0])
+    last = F.threshold(steps[-1], MIN_TRANSMITTANCE, 0.0)
+    ends = (last == 0) & (start > 0)
+    some_end = bool(ends.any())
+    if some_end:
+        drawn = torch.gt(through[:, 1:], MIN_TRANSMITTANCE, out=sheet.scratch.array("spare", n_tiles, n, pixels)[0])
         alpha *= drawn
-    weights = torch.mul(alpha, through[:, :-1], out=sheet.buffer("weights", n_tiles, n, pixels)[0])
-    return _Blend(alpha, alphas, through, weights, last, drawn, capped)
+    weights = torch.mul(alpha, through[:, :-1], out=sheet.scratch.array("weights", n_tiles, n, pixels)[0])
+    return _Blend(alpha, alphas, through, weights, last, ends if some_end else None, capped)
 
 
 @functools.cache
@@ -154,10 +158,9 @@ def _sweep(sheet: Sheet, lists: TileLists, final: Tensor, render: Tensor | None)
             record.append(batch)
             blend = _blend(sheet, numbers, batch.transmittance)
             live.index_copy_(0, tiles, blend.last)
-            if blend.drawn is not None:
-                n_drawn = blend.drawn.sum(1, keepdim=True).long()
-                left = blend.through.gather(1, n_drawn).squeeze(1)
-                ended.index_add_(0, tiles, left.sub_(blend.last))
+            if blend.ends is not None:
+                left = batch.transmittance - blend.weights.sum(1)  # T = 1 - sum of all w
+                ended.index_add_(0, tiles, left.mul_(blend.ends))
             if render is not None:
                 where = lists.tiles.index_select(0, tiles)
                 so_far = render.index_select(0, where)
@@ -185,9 +188,9 @@ def _backward_batch(
     numbers, start = batch.numbers, batch.transmittance
     blend = _blend(sheet, numbers, start)
     n_tiles, n, pixels = blend.alpha.shape
-    worth, each_worth = sheet.buffer("spare", n_tiles, n, pixels)
+    worth, each_worth = sheet.scratch.array("spare", n_tiles, n, pixels)
     torch.bmm(numbers.colors, grad, out=worth)  # e_k
-    beyond, steps = sheet.buffer("through", n_tiles, n + 1, pixels)  # U_0 ... U_n
+    beyond, steps = sheet.scratch.array("through", n_tiles, n + 1, pixels)  # U_0 ... U_n
     steps[-1].copy_(behind)
     for k in range(n - 1, -1, -1):
         torch.lerp(steps[k + 1], each_worth[k], blend.alphas[k], out=steps[k])
@@ -198,26 +201,53 @@ def _backward_batch(
         v[where] *= ~pixels_capped
 
     channels = numbers.colors.shape[-1]
-    v0, vx, vy, vxx, vxy, vyy = sheet.basis @ v.t()
+    v0, vx, vy, vxx, vxy, vyy = sheet.basis @ v.t()  # sums of v, v x, v y, v x^2 / 2, v xy, v y^2 / 2
     mx, my = numbers.centres
-    _, gx, gy, half_a, b, half_c = numbers.coefficients  # peak, gx, gy, -a / 2, -b, -c / 2, all over ln 2
-    a, c = 2 * half_a, 2 * half_c
-    dx, dy = vx - mx * v0, vy - my * v0  # sums of v dx, v dy
-    gradients[:, 0] = -LN_2 * (a * vx + b * vy + gx * v0)
-    gradients[:, 1] = -LN_2 * (b * vx + c * vy + gy * v0)
-    gradients[:, 2] = -0.5 * (vxx - mx * (vx + dx))
-    gradients[:, 3] = my * vx + mx * dy - vxy
-    gradients[:, 4] = -0.5 * (vyy - my * (vy + dy))
-    gradients[:, 5] = v0
+    _, gx, gy, a, b, c = numbers.coefficients  # the conic's with a minus
+    half_x, half_y = torch.addcmul(vx, mx, v0, value=-0.5), torch.addcmul(vy, my, v0, value=-0.5)
+    by_x, by_y, by_a, by_b, by_c, by_log_opacity = gradients[:, :6].t()
+    torch.mul(gx, v0, out=by_x).addcmul_(a, vx).addcmul_(b, vy)
+    torch.mul(gy, v0, out=by_y).addcmul_(b, vx).addcmul_(c, vy)
+    torch.mul(mx, half_x, out=by_a).sub_(vxx)
+    torch.mul(mx, half_y, out=by_b).addcmul_(my, half_x).sub_(vxy)
+    torch.mul(my, half_y, out=by_c).sub_(vyy)
+    by_log_opacity.copy_(v0)
     of_colors = torch.bmm(grad, blend.weights.transpose(1, 2))  # [B, D, n]
     gradients[:, 6 : 6 + channels].view(n_tiles, n, channels).copy_(of_colors.transpose(1, 2))
     if absgrad:
         size = v.abs_()
         for axis, pull in enumerate(([gx, a, b], [gy, b, c])):  # -Q d is linear in the pixel
-            pulls = sheet.buffer("through", n_tiles, n, pixels)[0].view(-1, pixels)
+            pulls = sheet.scratch.array("through", n_tiles, n, pixels)[0].view(-1, pixels)
             torch.mm(torch.stack(pull).t(), sheet.basis[:3], out=pulls)
-            gradients[:, 6 + channels + axis] = LN_2 * pulls.abs_().mul_(size).sum(-1)
+            torch.sum(pulls.abs_().mul_(size), -1, out=gradients[:, 6 + channels + axis])
     return in_front
+
+
+def _backward_block(
+    sheet: Sheet, lists: TileLists, work: list[Batch], grad: Tensor, behind: Tensor, absgrad: bool, n_columns: int
+) -> Tensor:
+    """Gradients of one block with respect to its footprints, in the columns of `_backward_batch`. [F, columns]
+
+    Args:
+        work: the batches of its sweep.
+        grad: dL/dC. [C * tiles, D, P]
+        behind: U behind the last splat; afterwards U in front of the first one. [C * tiles, P]
+    """
+    # Gradients in the order of work, and the row of each slot; pairs that no batch reached share a row of 0.
+    end = sum(batch.pairs.numel() for batch in work)
+    gradients = grad.new_empty(end + 1, n_columns)
+    gradients[end] = 0
+    row_of_slot = torch.full((lists.n_pairs + 1,), end)
+    for batch in reversed(work):
+        where = lists.tiles.index_select(0, batch.tiles)
+        begin = end - batch.pairs.numel()
+        grads = grad.index_select(0, where), behind.index_select(0, where)
+        behind.index_copy_(0, where, _backward_batch(sheet, batch, *grads, absgrad, gradients[begin:end]))
+        slots = lists.slot.index_select(0, batch.pairs.flatten())
+        row_of_slot.index_copy_(0, slots, torch.arange(begin, end))
+        end = begin
+    # Pairs of a splat lie in consecutive slots: one segmented sum, many times faster than a scatter.
+    return F.embedding_bag(row_of_slot[:-1], gradients, lists.splat_start, mode="sum")
 
 
 class _Composite(torch.autograd.Function):
@@ -252,35 +282,15 @@ class _Composite(torch.autograd.Function):
         behind = sheet.tiled(grad_transmittance).squeeze(1).clone()  # U behind the last drawn splat
         channels = colors.shape[1]
         n_columns = 6 + channels + (2 if ctx.absgrad else 0)
-        total = grad.new_zeros(means2d.shape[0], n_columns)
+        drawn = grad.new_zeros(sheet.prints.rows.numel(), n_columns)
         for block, record in zip(ctx.blocks, ctx.records, strict=True):
             if record is None:
                 lists = list_tiles(sheet.prints, block)
                 record = lists, _sweep(sheet, lists, torch.empty_like(sheet.inside), None)
-            lists, work = record
-            # Gradients in the order of work, and the row of each slot; pairs that no batch reached share a row of 0.
-            n_pairs, end = lists.splat.numel(), sum(batch.pairs.numel() for batch in work)
-            gradients = grad.new_empty(end + 1, n_columns)
-            gradients[end] = 0
-            slot = torch.cat([lists.slot, lists.slot.new_tensor([n_pairs])])  # padding has one of its own
-            row_of_slot = torch.full((n_pairs + 1,), end)
-            for batch in reversed(work):
-                where = lists.tiles.index_select(0, batch.tiles)
-                begin = end - batch.pairs.numel()
-                behind[where] = _backward_batch(
-                    sheet,
-                    batch,
-                    grad.index_select(0, where),
-                    behind.index_select(0, where),
-                    ctx.absgrad,
-                    gradients[begin:end],
-                )
-                slots = slot.index_select(0, batch.pairs.flatten())
-                row_of_slot.index_copy_(0, slots, torch.arange(begin, end))
-                end = begin
-            # Pairs of a splat lie in consecutive slots: one segmented sum, many times faster than a scatter.
-            summed = F.embedding_bag(row_of_slot[:n_pairs], gradients, lists.splat_start, mode="sum")
-            total[sheet.prints.rows] += summed
+            drawn += _backward_block(sheet, *record, grad, behind, ctx.absgrad, n_columns)
+        drawn[:, :2] *= -LN_2  # the coefficients are those of l / ln 2
+        drawn[:, 6 + channels :] *= LN_2
+        total = grad.new_zeros(means2d.shape[0], n_columns).index_copy_(0, sheet.prints.rows, drawn)
         if ctx.absgrad:
             means2d.absgrad = total[:, -2:].contiguous()
         grad_opacities = total[:, 5] / opacities.where(opacities > 0, 1.0)

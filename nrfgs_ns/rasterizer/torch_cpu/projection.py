@@ -19,12 +19,18 @@ the rows a_0, a_1 of A they are not:
     det(cov2d)           = |a_0 x a_1|^2
     det(cov2d + eps2d I) = det(cov2d) + eps2d trace(cov2d) + eps2d^2.
 
+Backward, writing g(y) for dL/dy: each equation above, in reverse. The two less usual ones are
+
+    g(a_0) = a_1 x g(n),    g(a_1) = g(n) x a_0         for the cross product n = a_0 x a_1,
+    g(q) = (g(q') - q' (q' . g(q'))) / |q|              for the direction q' = q / |q|.
+
 All arrays hold one row per coordinate and one column per splat: each line below is one pass over memory.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -50,32 +56,28 @@ class _Screen(NamedTuple):
     blurred: tuple[Tensor, Tensor, Tensor]  # xx, xy, yy of cov2d + eps2d I, [n] each
     det: Tensor  # det(cov2d), [n]
     det_blurred: Tensor  # det(cov2d + eps2d I), [n]
+    slopes: tuple[Tensor, Tensor]  # p_x / p_z, p_y / p_z, [n] each
+    held: tuple[Tensor, Tensor]  # u, v, [n] each
+    directions: Tensor  # quaternions of length 1, [4, n]
+    rotations: Tensor  # R_q, [3, 3, n]
+    axes: tuple[Tensor, ...]  # rows of W R_q diag(s), [3, n] each
+    rows: tuple[Tensor, Tensor]  # a_0, a_1, [3, n] each
+    normal: Tensor  # a_0 x a_1, [3, n]
 
 
-class _BoundedSlopeSqrt(torch.autograd.Function):
-    """sqrt(x) whose derivative is 1 / (2 (sqrt(x) + 1e-6)), as in gsplat: finite where a flat splat has x = 0."""
-
-    @staticmethod
-    def forward(ctx, x: Tensor) -> Tensor:
-        root = x.sqrt()
-        ctx.save_for_backward(root)
-        return root
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:
-        (root,) = ctx.saved_tensors
-        return grad * 0.5 / (root + COMPENSATION_EPS)
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices of quaternions (w, x, y, z). [N, 4] -> [3, 3, N]
+def directions(quats: Tensor) -> Tensor:
+    """Quaternions (w, x, y, z) of length 1. [N, 4] -> [4, N]
 
     NaN for a quaternion shorter than MIN_QUATERNION, or so long that its square overflows: it has no direction.
     """
     squared = quats.square().sum(-1, keepdim=True)
     squared = squared.masked_fill((squared < MIN_QUATERNION**2) | squared.isinf(), math.nan)
-    # Not rsqrt, whose derivative is its third power: infinite for a quaternion of length 1e-13 already.
-    w, x, y, z = (quats / squared.sqrt()).t().contiguous()
+    return (quats / squared.sqrt()).t().contiguous()
+
+
+def rotation_matrices(directions: Tensor) -> Tensor:
+    """Rotation matrices of quaternions (w, x, y, z) of length 1. [4, N] -> [3, 3, N]"""
+    w, x, y, z = directions
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -84,7 +86,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(rows).view(3, 3, -1)
 
 
-def _rotate(W: Tensor, rows: Tensor) -> list[Tensor]:
+def _rotate(W: Tensor, rows: Sequence[Tensor] | Tensor) -> list[Tensor]:
     """W times three rows of any shape. Not a call to BLAS, whose precision autocast and global settings lower."""
     return [W[i, 0] * rows[0] + W[i, 1] * rows[1] + W[i, 2] * rows[2] for i in range(3)]
 
@@ -97,21 +99,26 @@ def _to_screen(
     W, t = viewmat[:3, :3], viewmat[:3, 3]
 
     px, py, pz = (p + shift for p, shift in zip(_rotate(W, means.t().contiguous()), t, strict=True))  # each [n]
-    u, v = px / pz, py / pz
-    means2d = torch.stack([fx * u + cx, fy * v + cy])
+    slopes = px / pz, py / pz
+    means2d = torch.stack([fx * slopes[0] + cx, fy * slopes[1] + cy])
 
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
-    u = u.clamp(-(cx / fx + margin_x), (width - cx) / fx + margin_x)
-    v = v.clamp(-(cy / fy + margin_y), (height - cy) / fy + margin_y)
+    u = slopes[0].clamp(-(cx / fx + margin_x), (width - cx) / fx + margin_x)
+    v = slopes[1].clamp(-(cy / fy + margin_y), (height - cy) / fy + margin_y)
 
-    right, down, forward = _rotate(W, rotation_matrices(quats) * scales.t())  # rows of W R_q diag(s), [3, n] each
+    unit = directions(quats)
+    rotations = rotation_matrices(unit)
+    right, down, forward = _rotate(W, rotations * scales.t())
     a0 = (fx / pz) * (right - u * forward)
     a1 = (fy / pz) * (down - v * forward)
 
     xx, xy, yy = (a0 * a0).sum(0), (a0 * a1).sum(0), (a1 * a1).sum(0)
-    det = torch.linalg.cross(a0, a1, dim=0).square().sum(0)
+    normal = torch.linalg.cross(a0, a1, dim=0)
+    det = normal.square().sum(0)
     det_blurred = det + eps2d * (xx + yy) + eps2d**2
-    return _Screen(means2d, pz, (xx + eps2d, xy, yy + eps2d), det, det_blurred)
+    blurred = xx + eps2d, xy, yy + eps2d
+    axes = right, down, forward
+    return _Screen(means2d, pz, blurred, det, det_blurred, slopes, (u, v), unit, rotations, axes, (a0, a1), normal)
 
 
 def _radii(screen: _Screen, min_discriminant: float) -> Tensor:
@@ -120,6 +127,116 @@ def _radii(screen: _Screen, min_discriminant: float) -> Tensor:
     spread = torch.hypot(0.5 * (xx - yy), xy)  # no square, which would overflow from 4e9 pixels
     longest = 0.5 * (xx + yy) + spread.clamp(min=math.sqrt(min_discriminant))
     return (RADIUS_SIGMAS * longest.sqrt()).ceil()
+
+
+def _conics(screen: _Screen) -> Tensor:
+    """Upper triangle of the inverse of the blurred covariance. [n, 3]"""
+    xx, xy, yy = screen.blurred
+    return torch.stack([yy, -xy, xx], dim=-1) / screen.det_blurred[:, None]
+
+
+def _compensations(screen: _Screen) -> Tensor:
+    """sqrt(det / det_blurred). Both overflow for a splat of 1e10 pixels, of which the blur is no part: 1. [n]"""
+    det, det_blurred = (d.clamp(max=torch.finfo(d.dtype).max) for d in (screen.det, screen.det_blurred))
+    return (det / det_blurred).sqrt()
+
+
+class _Project(torch.autograd.Function):
+    """(means, quats, scales, viewmat) of one camera -> ids, radii, and means2d, depths, conics, compensations.
+
+    Visibility is decided for all splats; the backward pass looks at the visible ones only, so that a culled splat can
+    never send a NaN back.
+    """
+
+    @staticmethod
+    def forward(ctx, means, quats, scales, viewmat, K, size: tuple[int, int], eps2d: float, visible):
+        screen = _to_screen(means, quats, scales, viewmat, K, *size, eps2d)
+        radii, ids = visible(screen)
+        ctx.save_for_backward(means, quats, scales, viewmat, K, ids)
+        ctx.size, ctx.eps2d = size, eps2d
+        radii = radii.index_select(0, ids).clamp(max=MAX_RADIUS).to(torch.int32)
+        ctx.mark_non_differentiable(ids, radii)
+        projected = screen.means2d.t(), screen.depths, _conics(screen), _compensations(screen)
+        return ids, radii, *(rows.index_select(0, ids) for rows in projected)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, _ids, _radii, by_means2d, by_depths, by_conics, by_compensations):
+        means, quats, scales, viewmat, K, ids = ctx.saved_tensors
+        seen = [table.index_select(0, ids) for table in (means, quats, scales)]
+        screen = _to_screen(*seen, viewmat, K, *ctx.size, ctx.eps2d)
+        by_position, by_axes = _back_to_camera(screen, K, ctx.eps2d, by_means2d, by_depths, by_conics, by_compensations)
+        W = viewmat[:3, :3]
+        by_means = torch.stack(_rotate(W.t(), by_position), -1)
+        scaled = seen[2].t()
+        by_local = torch.stack(_rotate(W.t(), by_axes))  # of R_q diag(s). [3, 3, n]
+        by_scales = (by_local * screen.rotations).sum(0).t()
+        by_quats = _back_to_quats(screen, by_local * scaled, seen[1])
+        tables = zip((means, quats, scales), (by_means, by_quats, by_scales), strict=True)
+        by_tables = [torch.zeros_like(table).index_copy_(0, ids, rows) for table, rows in tables]
+        by_viewmat = None
+        if ctx.needs_input_grad[3]:
+            by_viewmat = torch.zeros_like(viewmat)
+            local = screen.rotations * scaled
+            for i in range(3):
+                by_viewmat[i, :3] = (by_position[i][:, None] * seen[0]).sum(0) + (by_axes[i] * local).sum((1, 2))
+                by_viewmat[i, 3] = by_position[i].sum()
+        return *by_tables, by_viewmat, None, None, None, None
+
+
+def _back_to_camera(
+    screen: _Screen,
+    K: Tensor,
+    eps2d: float,
+    by_means2d: Tensor,
+    by_depths: Tensor,
+    by_conics: Tensor,
+    by_compensations: Tensor,
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Gradients of the camera-space position p, [n] each, and of the rows of W R_q diag(s), [3, n] each."""
+    fx, fy = K[0, 0], K[1, 1]
+    z, (u, v), (a0, a1) = screen.depths, screen.held, screen.rows
+    right, down, forward = screen.axes
+
+    by_conics = (by_conics / screen.det_blurred[:, None]).t().contiguous()
+    by_yy, by_xy, by_xx = by_conics[0], -by_conics[1], by_conics[2]
+    # The slope of the root is held as in gsplat, 1 / (2 (sqrt(x) + 1e-6)): finite where a flat splat has x = 0.
+    root = _compensations(screen)
+    by_ratio = (by_compensations * 0.5 / (root + COMPENSATION_EPS)) / screen.det_blurred
+    by_det_blurred = -(by_conics * _conics(screen).t()).sum(0) - by_ratio * root * root
+    by_det = by_det_blurred + by_ratio
+    by_xx, by_yy = by_xx + eps2d * by_det_blurred, by_yy + eps2d * by_det_blurred
+
+    by_normal = 2 * by_det * screen.normal
+    by_a0 = torch.linalg.cross(a1, by_normal, dim=0) + 2 * by_xx * a0 + by_xy * a1
+    by_a1 = torch.linalg.cross(by_normal, a0, dim=0) + 2 * by_yy * a1 + by_xy * a0
+    by_z = by_depths - ((by_a0 * a0).sum(0) + (by_a1 * a1).sum(0)) / z
+    by_right, by_down = (fx / z) * by_a0, (fy / z) * by_a1
+    by_forward = -(u * by_right + v * by_down)
+
+    by_slopes = []
+    for axis, (f, held, by_axis) in enumerate(((fx, u, by_right), (fy, v, by_down))):
+        free = held == screen.slopes[axis]
+        by_slopes.append(f * by_means2d[:, axis] - (by_axis * forward).sum(0).where(free, 0.0))
+    by_x, by_y = (by_slope / z for by_slope in by_slopes)
+    by_z = by_z - by_x * screen.slopes[0] - by_y * screen.slopes[1]
+    return (by_x, by_y, by_z), (by_right, by_down, by_forward)
+
+
+def _back_to_quats(screen: _Screen, by_rotations: Tensor, quats: Tensor) -> Tensor:
+    """Gradients of the quaternions [n, 4] from those of their rotation matrices [3, 3, n]."""
+    w, x, y, z = screen.directions
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = by_rotations
+    by_unit = 2 * torch.stack(
+        [
+            x * (r21 - r12) + y * (r02 - r20) + z * (r10 - r01),
+            w * (r21 - r12) + y * (r01 + r10) + z * (r02 + r20) - 2 * x * (r11 + r22),
+            w * (r02 - r20) + x * (r01 + r10) + z * (r12 + r21) - 2 * y * (r00 + r22),
+            w * (r10 - r01) + x * (r02 + r20) + y * (r12 + r21) - 2 * z * (r00 + r11),
+        ]
+    )
+    tangent = by_unit - screen.directions * (screen.directions * by_unit).sum(0)
+    return tangent.t() / quats.norm(dim=-1, keepdim=True)
 
 
 def project(
@@ -141,42 +258,29 @@ def project(
 ) -> Projection:
     """Find the visible splats of each camera and project them; see `nrfgs_ns.rasterizer.project`.
 
-    Visibility is decided first, without gradients, for all splats; the differentiable pass then runs on the visible
-    ones only, so that a culled splat can never send a NaN back. A splat is visible when near <= depth <= far, its
-    radius exceeds `radius_clip`, and its square touches the image. A splat whose projection is not finite (a zero
+    A splat is visible when near <= depth <= far, its radius exceeds `radius_clip`, and its square touches the image. A
+    splat whose projection is not finite (a zero
     quaternion, an infinite scale, a NaN anywhere) fails these comparisons and is invisible, for nothing: here
     `assume_finite` saves no work and changes nothing.
     """
     min_discriminant = MIN_DISCRIMINANT_PACKED if packed else MIN_DISCRIMINANT_DENSE
-    per_camera = []
-    for camera, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
-        with torch.no_grad():
-            screen = _to_screen(means, quats, scales, viewmat, K, width, height, eps2d)
-            radii = _radii(screen, min_discriminant)
-            x, y = screen.means2d
-            visible = (screen.depths >= near_plane) & (screen.depths <= far_plane)
-            visible &= (screen.det_blurred > 0) & (radii > radius_clip) & (radii < LARGEST_RADIUS)
-            visible &= (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
-            ids = visible.nonzero().squeeze(1)
 
-        seen = (table.index_select(0, ids) for table in (means, quats, scales))
-        screen = _to_screen(*seen, viewmat, K, width, height, eps2d)
-        xx, xy, yy = screen.blurred
-        conics = torch.stack([yy, -xy, xx], dim=-1) / screen.det_blurred[:, None]
-        rows = [
-            torch.full_like(ids, camera),
-            ids,
-            radii.index_select(0, ids).clamp(max=MAX_RADIUS).to(torch.int32),
-            screen.means2d.t(),
-            screen.depths,
-            conics,
-        ]
-        if rasterize_mode == "antialiased":
-            # Both overflow for a splat of 1e10 pixels, of which the blur is no part: the factor is 1.
-            det, det_blurred = (d.clamp(max=torch.finfo(d.dtype).max) for d in (screen.det, screen.det_blurred))
-            rows.append(_BoundedSlopeSqrt.apply(det / det_blurred))
-        per_camera.append(rows)
+    def visible(screen: _Screen) -> tuple[Tensor, Tensor]:
+        radii = _radii(screen, min_discriminant)
+        x, y = screen.means2d
+        seen = (screen.depths >= near_plane) & (screen.depths <= far_plane)
+        seen &= (screen.det_blurred > 0) & (radii > radius_clip) & (radii < LARGEST_RADIUS)
+        seen &= (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
+        return radii, seen.nonzero().squeeze(1)
 
-    columns = [torch.cat(column) for column in zip(*per_camera, strict=True)]
-    compensations = columns.pop() if rasterize_mode == "antialiased" else None
-    return Projection(*columns, compensations=compensations, width=width, height=height, n_cameras=len(viewmats))
+    cameras = [
+        _Project.apply(means, quats, scales, viewmat, K, (width, height), eps2d, visible)
+        for viewmat, K in zip(viewmats, Ks, strict=True)
+    ]
+    ids, radii, means2d, depths, conics, compensations = (torch.cat(rows) for rows in zip(*cameras, strict=True))
+    camera_ids = torch.cat([torch.full_like(camera[0], index) for index, camera in enumerate(cameras)])
+    if rasterize_mode != "antialiased":
+        compensations = None
+    return Projection(
+        *(camera_ids, ids, radii, means2d, depths, conics, compensations), width, height, n_cameras=len(viewmats)
+    )

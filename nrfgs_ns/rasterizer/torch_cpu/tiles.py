@@ -9,7 +9,7 @@ pixels, and only where they can matter: alpha = o exp(-sigma) >= 1/255 holds ins
 
 and nowhere else. On the horizontal line dy the ellipse spans
 
-    dx = (-b dy -+ sqrt(2 a s - (a c - b^2) dy^2)) / a,
+    dx = -(b / a) dy -+ sqrt(2 s / a - (a c - b^2) / a^2 dy^2),
 
 and its extreme points lie at dx = -+ sqrt(2 s c / (a c - b^2)), dy = +- (b / c) times that. Within a row of sub-tiles
 the leftmost point is therefore the one on the line nearest to the leftmost extreme, and likewise on the right: each
@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from ..contract import Projection
 
@@ -86,11 +87,16 @@ class TileLists:
     count: Tensor
     """Number of its pairs. [L], int64"""
     splat: Tensor
-    """Footprint of each pair, sorted by sub-tile, then depth. [K], int64"""
+    """Footprint of each pair, sorted by sub-tile, then depth; last F, for a pair K to pad lists with. [K + 1], int64"""
     slot: Tensor
-    """Position of each pair when sorted by splat instead: where its gradient is collected. [K], int64"""
+    """Position of each pair when sorted by splat instead: where its gradient is collected; then K. [K + 1], int64"""
     splat_start: Tensor
     """First slot of each footprint. [F], int64"""
+
+    @property
+    def n_pairs(self) -> int:
+        """K."""
+        return self.splat.numel() - 1
 
 
 def _inclusive_range(low: Tensor, high: Tensor, edge: int) -> tuple[Tensor, Tensor]:
@@ -189,17 +195,21 @@ def list_tiles(prints: Footprints, block: Block) -> TileLists:
     splat = torch.repeat_interleave(n_rows, output_size=total)
     row = torch.arange(total) + (row0 - row_end + n_rows).index_select(0, splat)
 
-    # The interval of columns that the ellipse covers on the pixel rows [y0, y1] of each.
-    x, y, a, b, c, log_opacity = (row.index_select(0, splat) for row in prints.shape)
+    # The interval of columns that the ellipse covers on the pixel rows [y0, y1] of each: on the line dy of a splat,
+    # dx = slope dy -+ sqrt(widest - narrowing dy^2).
+    x, y, a, b, c, log_opacity = prints.shape
     det = a * c - b * b
     reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
+    rightmost = -(b / c) * (reach * c / det).sqrt()
+    ellipse = torch.stack([x, y, rightmost, -b / a, reach / a, det / (a * a)])
+    x, y, rightmost, slope, widest, narrowing = (column.index_select(0, splat) for column in ellipse)
     y0 = (row * edge + 0.5) - y
     y1 = y0 + (edge - 1)
-    rightmost = -(b / c) * (reach * c / det).sqrt()
     ends = []
-    for side, extreme in ((-1, -rightmost), (1, rightmost)):
-        dy = extreme.clamp(y0, y1)
-        ends.append(x + (-b * dy + side * (a * reach - det * dy * dy).clamp(min=0).sqrt()) / a)
+    for side in (-1, 1):
+        dy = (side * rightmost).clamp(y0, y1)
+        half = torch.addcmul(widest, narrowing, dy * dy, value=-1).clamp_(min=0).sqrt_()
+        ends.append(torch.addcmul(x, slope, dy).add_(half, alpha=side))
     first, end = _inclusive_range(*ends, edge)
     first = first.maximum(col0.index_select(0, splat)).long()
     n_cols = (end.minimum(col1.index_select(0, splat)).long() - first).clamp(min=0)
@@ -214,4 +224,5 @@ def list_tiles(prints: Footprints, block: Block) -> TileLists:
     tile, slot = torch.sort(tile.to(torch.int32), stable=True)
     tiles, count = torch.unique_consecutive(tile, return_counts=True)
     splat = splat.index_select(0, entry).index_select(0, slot)
+    splat, slot = F.pad(splat, (0, 1), value=prints.rows.numel()), F.pad(slot, (0, 1), value=slot.numel())
     return TileLists(tiles.long(), count.cumsum(0) - count, count, splat, slot, splat_start)
