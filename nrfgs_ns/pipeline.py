@@ -71,6 +71,10 @@ class NrfgsPipeline(VanillaPipeline):
             loaded_state = {f"_model.{name}": value for name, value in state.items()}
         super().load_pipeline(loaded_state, step)
 
+    def train(self, mode: bool = True):
+        # Nerfstudio asks before every step; to walk through all modules for nothing costs the host time.
+        return self if self.training == self.model.training == mode else super().train(mode)
+
     def get_train_loss_dict(self, step: int):
         """Nerfstudio's step, whose metrics are taken only when they are logged."""
         camera, batch = self.datamanager.next_train(step)
