@@ -15,22 +15,24 @@ from nrfgs_ns.studies.express.study import Express
 from nrfgs_ns.studies.inspect.verb import Inspect
 from nrfgs_ns.studies.tradeoff.verb import Tradeoff
 
+VERBS = {
+    "demo": Demo,
+    "prepare": Prepare,
+    "export": Export,
+    "bench": Bench,
+    "tradeoff": Tradeoff,
+    "express": Express,
+    "inspect": Inspect,
+}
+"""The verbs of `nrfgs`, and the dataclasses that hold their options."""
+
 
 def entrypoint() -> None:
     """The console script `nrfgs VERB`."""
     # Deprecations inside nerfstudio, and a loss that it logs undetached: not the reader's business.
     warnings.simplefilter("ignore", FutureWarning)
     warnings.filterwarnings("ignore", "Converting a tensor with requires_grad=True to a scalar")
-    verbs = {
-        "demo": Demo,
-        "prepare": Prepare,
-        "export": Export,
-        "bench": Bench,
-        "tradeoff": Tradeoff,
-        "express": Express,
-        "inspect": Inspect,
-    }
-    verb = tyro.extras.subcommand_cli_from_dict(verbs, description=__doc__)
+    verb = tyro.extras.subcommand_cli_from_dict(VERBS, description=__doc__)
     try:
         verb.main()
     except (InputError, FileExistsError) as error:

@@ -29,6 +29,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
+from viser.transforms import SO3
 
 from nrfgs_ns.appearance.head import AppearanceHead, Component, SplatAppearance
 from nrfgs_ns.rasterizer import composite
@@ -52,6 +53,8 @@ from the others."""
 FAR_QUANTILE = 0.98
 """Share of the drawn pixels that set the range of depths, so that one floater does not flatten all else."""
 
+STEP_FORWARD = 5.0
+"""In sizes of the little cameras that mark the photographs: those of up to 30 degrees and more are behind."""
 MARKER_COLOR = (255, 211, 105)
 """Of the frustum that stands where the view was frozen: the viewer's yellow."""
 
@@ -249,9 +252,7 @@ class ViewerPanel(ViewerControl):
     def _setup(self, viewer) -> None:
         """Nerfstudio calls this when the viewer has its own controls."""
         super()._setup(viewer)
-        splats = dict(self.model.gauss_params.items())
-        kinds = offered_components(self.model.head, splats)
-        self.legends = {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(self.model.head, splats)}
+        self.legends = self._legends()
         gui = viewer.viser_server.gui
         with gui.add_folder("Appearance", order=viewer.stats_markdown.order + 0.5):
             self.mode = gui.add_dropdown("Show", list(self.legends), initial_value=FULL, hint="What is drawn")
@@ -275,7 +276,46 @@ class ViewerPanel(ViewerControl):
         self.gain.on_update(lambda _: viewer._trigger_rerender())
         self.freeze.on_update(lambda event: self._freeze(event.client))
         self.marker = None
+        self.waiting: list = []  # browsers that came before the scene
+        viewer.viser_server.on_client_connect(self._welcome)
         self.installed = True
+
+    def _welcome(self, client) -> None:
+        """Let a browser begin where the first of the training photographs was taken: nerfstudio's own first view may
+        see nothing at all. A little in front of it, so that the photograph, which hangs there, hides nothing.
+
+        Args:
+            client: who has come.
+        """
+        taken = list(getattr(self.viewer, "camera_handles", {}).values())
+        if not taken:  # the scene is not there yet: the first picture that is asked for is early enough
+            self.waiting.append(client)
+            return
+        first = taken[0]
+        forward = SO3(first.wxyz).as_matrix()[:, 2]
+        with client.atomic():
+            client.camera.position = first.position + STEP_FORWARD * self.viewer.config.camera_frustum_scale * forward
+            client.camera.wxyz = first.wxyz
+
+    def _welcome_waiting(self) -> None:
+        """Try again with those who came too early."""
+        waiting, self.waiting = self.waiting, []
+        for client in waiting:
+            self._welcome(client)
+
+    def _legends(self) -> dict[str, str]:
+        """What the line under the dropdown says in each mode."""
+        splats = dict(self.model.gauss_params.items())
+        kinds = offered_components(self.model.head, splats)
+        return {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(self.model.head, splats)}
+
+    def offer_modes(self) -> None:
+        """Offer what the model's head has to show, after it has become another one."""
+        if self.installed:
+            legends = self._legends()
+            if self.mode.value not in legends:
+                self.mode.value = FULL
+            self.mode.options, self.legends = list(legends), legends
 
     @property
     def shown(self) -> Shown:
@@ -296,6 +336,8 @@ class ViewerPanel(ViewerControl):
         """
         if self.installed and self.count.value != (count := f"{self.model.num_points:,}"):
             self.count.value = count
+        if self.installed:
+            self._welcome_waiting()
         # As in nerfstudio: the viewer's background counts where the configuration leaves it open.
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)

@@ -6,8 +6,11 @@
 
 import threading
 import urllib.request
+from contextlib import nullcontext
 from itertools import combinations
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
@@ -18,6 +21,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from torch.testing import assert_close
+from viser.transforms import SO3
 
 import nrfgs_ns.trainer
 from nrfgs_ns.appearance.gsnb import GsnbConfig
@@ -416,3 +420,22 @@ def test_base_class_shows_what_forward_adds():
     (component,) = head.components(splats, visible, center).values()
     added = head(splats, visible, center).colors - base_colors(splats["features_dc"][visible])
     assert component.kind == "color" and torch.equal(component.values, added) and added.abs().max() > 0.01
+
+
+def test_a_browser_begins_at_the_first_photograph(build):
+    """Near where it was taken, in front of it, looking where it looks; as soon as there are any."""
+    panel = build().model.viewer_panel
+    turned = SO3.from_y_radians(0.5) @ SO3.from_x_radians(-0.3)
+    looks = [turned if i == 0 else turned.inverse() for i in range(4)]
+    taken = [SimpleNamespace(position=np.full(3, 1.0 + i), wxyz=look.wxyz) for i, look in enumerate(looks)]
+    client = SimpleNamespace(camera=SimpleNamespace(position=None, wxyz=None), atomic=nullcontext)
+    panel.viewer, panel.waiting = SimpleNamespace(config=ViewerConfig(), camera_handles={}), []
+    panel._welcome(client)
+    assert client.camera.position is None and panel.waiting == [client]
+    panel.viewer.camera_handles = dict(enumerate(taken))
+    panel._welcome_waiting()
+    assert panel.waiting == []
+    np.testing.assert_array_equal(client.camera.wxyz, turned.wxyz)
+    ahead = turned.inverse() @ (client.camera.position - taken[0].position)
+    # z is forwards; the photograph's plane is at 1.9 sizes for a field of 60 degrees (viser keeps the volume).
+    np.testing.assert_allclose(ahead, [0, 0, 5 * ViewerConfig().camera_frustum_scale], atol=1e-6)

@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nerfbaselines' `Method` around this project's trainer; nothing of nerfbaselines is needed to import it.
+
+A checkpoint is a folder:
+
+    config.yml                    the training's configuration, as nerfstudio writes it
+    world.json                    the way from the data set's world to the model's, and what else the images decide
+    nerfstudio_models/step-*.ckpt parameters, optimisers and generators, as `ns-train` writes them
+
+With the training set a training goes on from it as if it had never stopped; without, it renders.
+"""
+
+import copy
+import dataclasses
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.scripts.train import _set_random_seed
+from nerfstudio.utils import writer
+
+from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.model import NrfgsModel
+from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory
+from nrfgs_ns.studies.run import parse
+from nrfgs_ns.trainer import NrfgsTrainer, NrfgsTrainerConfig
+
+BACKGROUND = "pipeline.model.background_color"
+MODELS = "nerfstudio_models"
+
+
+class Nrfgs:
+    """`ns-train nrfgs`.
+
+    Args:
+        checkpoint: a folder that `save` wrote, to render or to go on from.
+        train_dataset: nerfbaselines' data set with its images; only rendering can do without.
+        config_overrides: options of `ns-train`, with their dots: {"pipeline.model.appearance.latent_dim": 16}. Not
+            read with a checkpoint, which has its own.
+
+    Raises:
+        InputError: an option is unknown or out of range, the data cannot be used, or there is neither data nor
+            checkpoint.
+    """
+
+    method = "nrfgs"
+
+    def __init__(
+        self,
+        *,
+        checkpoint: str | None = None,
+        train_dataset: dict[str, Any] | None = None,
+        config_overrides: dict[str, Any] | None = None,
+    ):
+        if checkpoint is None and train_dataset is None:
+            raise InputError("Give a training data set to train on, or a checkpoint to render from.")
+        allow_nerfstudio_checkpoints()
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self.trainer: NrfgsTrainer | None = None
+        if self.checkpoint is None:
+            self.config = configure(self.method, config_overrides or {}, train_dataset["metadata"])
+            self.world = World.around(train_dataset["cameras"].poses, self.config.pipeline.datamanager.dataparser)
+        else:
+            self.config = _read_config(self.checkpoint)
+            record = json.loads((self.checkpoint / "world.json").read_text(encoding="utf-8"))
+            self.world = World(torch.tensor(record["transform"], dtype=torch.float64), record["scale"])
+        if train_dataset is None:
+            self.record = record
+            self.loaded = torch.load(_checkpoint_file(self.checkpoint), map_location="cpu")
+            self.model = _build_model(copy.deepcopy(self.config), record, self.loaded)
+            self.step = self.loaded["step"] + 1
+        else:
+            self._set_up_training(train_dataset)
+        self.loaded_step = None if self.checkpoint is None else self.step
+
+    def _set_up_training(self, dataset: dict[str, Any]) -> None:
+        """Build the trainer, which loads the checkpoint if there is one."""
+        config = copy.deepcopy(self.config)  # its classes are replaced, which a file should not say
+        hold_in_memory(config.pipeline.datamanager, dataset, self.world)
+        self.folder = tempfile.TemporaryDirectory(prefix="nrfgs-")
+        config.output_dir = Path(self.folder.name)
+        config.load_checkpoint = None if self.checkpoint is None else _checkpoint_file(self.checkpoint)
+        _set_random_seed(config.machine.seed)
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.guard.step = trainer._start_step
+        trainer.guard.check_parameters(trainer.optimizers)
+        if trainer.pace is not None:
+            trainer.pace.start()
+        self.trainer, self.model, self.step = trainer, trainer.pipeline.model, trainer._start_step
+        self.record = {
+            "transform": self.world.transform.tolist(),
+            "scale": self.world.scale,
+            "scene_unit": self.model.scene_unit,
+            "training_images": len(dataset["image_paths"]),
+        }
+
+    @classmethod
+    def get_method_info(cls) -> dict[str, Any]:
+        """What the data must have, and what is rendered."""
+        return {
+            "method_id": cls.method,
+            "required_features": frozenset(("color", "points3D_xyz", "points3D_rgb")),
+            "supported_camera_models": frozenset(("pinhole",)),
+            "supported_outputs": ("color", {"name": "depth", "type": "depth"}, "accumulation"),
+            "can_resume_training": True,
+        }
+
+    def get_info(self) -> dict[str, Any]:
+        """What this training is: steps, checkpoint, and every option that is a number, a string or a truth value."""
+        return {
+            **self.get_method_info(),
+            "num_iterations": self.config.max_num_iterations,
+            "loaded_step": self.loaded_step,
+            "loaded_checkpoint": None if self.checkpoint is None else str(self.checkpoint),
+            "batch_size": 1,
+            "eval_batch_size": 1,
+            "hparams": options_of(self.config),
+        }
+
+    def train_iteration(self, step: int) -> dict[str, float]:
+        """One step.
+
+        Args:
+            step: from 0, or from the loaded step.
+
+        Returns:
+            loss, its terms and metrics, every `logging.steps_per_log` steps; between these nothing, so that nothing
+            waits for a GPU.
+
+        Raises:
+            TrainingStopped: a number is not finite.
+        """
+        if self.trainer is None:
+            raise InputError("This method was loaded without a training data set. Give one to train.")
+        trainer = self.trainer
+        trainer.step = step
+        trainer.pipeline.train()
+        for callback in trainer.callbacks:
+            callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        loss, losses, metrics = trainer.train_iteration(step)
+        for callback in trainer.callbacks:
+            callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        writer.EVENT_STORAGE.clear()  # nobody reads nerfstudio's log
+        self.step = step + 1
+        if step % self.config.logging.steps_per_log != 0:
+            return {}
+        return {name: float(value) for name, value in {**metrics, **losses, "loss": loss}.items()}
+
+    @torch.no_grad()
+    def render(self, camera: Any, *, options: dict[str, Any] | None = None) -> dict[str, np.ndarray]:
+        """Render one camera of the data set's world.
+
+        Args:
+            camera: nerfbaselines' pinhole camera, one.
+            options: "outputs" names what is wanted; all, if it is not there.
+
+        Returns:
+            color [H, W, 3] in [0, 1], depth [H, W] in the data set's unit of length, accumulation [H, W]; float32.
+        """
+        self.model.eval()
+        outputs = self.model.get_outputs_for_camera(self.world.cameras(camera.item()[None]).to(self.model.device))
+        rendered = {
+            "color": outputs["rgb"],
+            "depth": outputs["depth"][..., 0] / self.world.scale,
+            "accumulation": outputs["accumulation"][..., 0],
+        }
+        wanted = (options or {}).get("outputs") or rendered
+        return {name: value.cpu().numpy() for name, value in rendered.items() if name in wanted}
+
+    def get_train_embedding(self, index: int) -> None:
+        """There are no appearance embeddings."""
+
+    def optimize_embedding(self, dataset: dict[str, Any], *, embedding: np.ndarray | None = None) -> dict[str, Any]:
+        """There are no appearance embeddings.
+
+        Raises:
+            NotImplementedError: always, which is how nerfbaselines learns it.
+        """
+        raise NotImplementedError
+
+    def save(self, path: str) -> None:
+        """Write a checkpoint.
+
+        Args:
+            path: the folder, which is made if it is not there.
+        """
+        folder = Path(path)
+        models = folder / MODELS
+        models.mkdir(parents=True, exist_ok=True)
+        (folder / "config.yml").write_text(yaml.dump(self.config), encoding="utf-8")
+        (folder / "world.json").write_text(json.dumps(self.record, indent=1) + "\n", encoding="utf-8")
+        if self.trainer is None:
+            torch.save(self.loaded, models / _checkpoint_file(self.checkpoint).name)
+            return
+        self.trainer.checkpoint_dir = models
+        self.trainer.save_checkpoint(self.step - 1)
+
+    def close(self) -> None:
+        """Remove what is only needed while training."""
+        if self.trainer is not None:
+            self.folder.cleanup()
+
+
+class NrfgsSh(Nrfgs):
+    """`ns-train nrfgs-sh`."""
+
+    method = "nrfgs-sh"
+
+
+class NrfgsVdgs(Nrfgs):
+    """`ns-train nrfgs-vdgs`."""
+
+    method = "nrfgs-vdgs"
+
+
+class NrfgsGsnb(Nrfgs):
+    """`ns-train nrfgs-gsnb`."""
+
+    method = "nrfgs-gsnb"
+
+
+class NrfgsSg(Nrfgs):
+    """`ns-train nrfgs-sg`."""
+
+    method = "nrfgs-sg"
+
+
+def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) -> NrfgsTrainerConfig:
+    """The configuration of a training, read as `ns-train` reads its options.
+
+    Args:
+        overrides: options and their values; a list is several words.
+        metadata: the data set's; its background is taken, unless the overrides name one.
+
+    Raises:
+        InputError: an option is not one, or belongs to a loop that nerfbaselines does not run.
+    """
+    background = background_of(metadata)
+    if background is not None:
+        overrides = {BACKGROUND: background, **overrides}
+    words = []
+    for name, value in overrides.items():
+        values = value if isinstance(value, (list, tuple)) else [value]
+        words += [f"--{name}", *map(str, values)]
+    try:
+        config = parse([method, *words])
+    except SystemExit as error:  # tyro has said on the screen which one, and what there is
+        raise InputError(f"These are not options of ns-train {method}: {overrides}") from error
+    if config.time_budget is not None or config.machine.num_devices > 1:
+        raise InputError("time_budget and machine.num_devices are ns-train's: here nerfbaselines counts the steps.")
+    config.vis, config.logging.profiler, config.logging.local_writer.enable = "", "none", False
+    config.timestamp, config.data = "nerfbaselines", None
+    return config
+
+
+def options_of(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Dotted names and values of a configuration's fields that are numbers, strings, truth values or None."""
+    found: dict[str, Any] = {}
+    if dataclasses.is_dataclass(config):
+        config = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    for name, value in config.items():
+        if (dataclasses.is_dataclass(value) and not isinstance(value, type)) or isinstance(value, dict):
+            found |= options_of(value, f"{prefix}{name}.")
+        elif value is None or isinstance(value, (bool, int, float, str)):
+            found[f"{prefix}{name}"] = value
+    return found
+
+
+def _read_config(checkpoint: Path) -> NrfgsTrainerConfig:
+    """The configuration of a checkpoint, for this machine's device."""
+    if not (checkpoint / "config.yml").is_file() or not (checkpoint / "world.json").is_file():
+        raise InputError(f"{checkpoint} is not a checkpoint of nrfgs: it has no config.yml with a world.json.")
+    config = yaml.load((checkpoint / "config.yml").read_text(encoding="utf-8"), Loader=yaml.Loader)
+    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    return config
+
+
+def _checkpoint_file(checkpoint: Path) -> Path:
+    """The file of parameters in a checkpoint's folder."""
+    files = list((checkpoint / MODELS).glob("*.ckpt"))
+    if len(files) != 1:
+        raise InputError(f"{checkpoint / MODELS} holds {len(files)} checkpoints; it must hold one.")
+    return files[0]
+
+
+def _build_model(config: NrfgsTrainerConfig, record: dict[str, Any], content: dict[str, Any]) -> NrfgsModel:
+    """The model of a checkpoint, without its images."""
+    few = torch.rand(4, 3, generator=torch.Generator().manual_seed(0))  # the checkpoint's splats take their place
+    model = config.pipeline.model.setup(
+        scene_box=SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])),
+        num_train_data=record["training_images"],
+        metadata={"scene_unit": record["scene_unit"]},
+        device=config.machine.device_type,
+        grad_scaler=None,
+        seed_points=(few, 255 * few),
+    )
+    model.update_to_step(content["step"])
+    own = "_model."
+    model.load_state_dict(
+        {name.removeprefix(own): value for name, value in content["pipeline"].items() if name.startswith(own)}
+    )
+    return model.to(config.machine.device_type)

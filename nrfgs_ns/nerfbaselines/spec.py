@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registers the methods with nerfbaselines, which reads this file where it is installed (entry point
+`nerfbaselines.specs`), or where NERFBASELINES_REGISTER names it. Nothing heavy is imported.
+
+There is no recipe for an environment: the methods run in that in which they are installed (`--backend python`).
+"""
+
+from nerfbaselines import register
+
+METHODS = {
+    "nrfgs": ("Nrfgs", "NRF-GS", "A neural residual field adds what depends on the view to base colour and opacity."),
+    "nrfgs-sh": ("NrfgsSh", "NRF-GS host with SH", "The same host with spherical harmonics of degree 3, as in 3DGS."),
+    "nrfgs-vdgs": ("NrfgsVdgs", "NRF-GS host with VDGS", "The same host; opacity depends on the view as in VDGS."),
+    "nrfgs-gsnb": ("NrfgsGsnb", "NRF-GS host with GSNB", "The same host; directions have a learnt basis as in GSNB."),
+    "nrfgs-sg": ("NrfgsSg", "NRF-GS host with SG", "The same host with three spherical Gaussians per splat."),
+}
+"""Method -> its class in `method.py`, its name, and a description."""
+
+for _method, (_class, _name, _description) in METHODS.items():
+    register(
+        {
+            "id": _method,
+            "method_class": f"nrfgs_ns.nerfbaselines.method:{_class}",
+            "backends_order": ["python"],
+            "metadata": {
+                "name": _name,
+                "description": _description,
+                "licenses": [{"name": "Apache 2.0", "url": "https://www.apache.org/licenses/LICENSE-2.0"}],
+            },
+        }
+    )

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nerfstudio's viewer in a headless Chromium: for the viewer's tests, and for the pictures in the docs.
+
+pip install -e '.[browser]'; apt-get install chromium
+"""
+
+import contextlib
+import io
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+TRAIN = "nerfstudio.scripts.train:entrypoint"
+VIEWER = "nerfstudio.scripts.viewer.run_viewer:entrypoint"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+PATIENCE = 300
+"""Seconds in which anything must have happened, on a slow and busy machine."""
+
+
+@contextlib.contextmanager
+def chromium() -> Iterator:
+    """A headless browser, without a GPU.
+
+    Raises:
+        ModuleNotFoundError: there is no playwright.
+        FileNotFoundError: there is no Chromium on the path.
+    """
+    from playwright.sync_api import sync_playwright
+
+    if CHROMIUM is None:
+        raise FileNotFoundError("no Chromium on the path: apt-get install chromium")
+    # Without a GPU WebGL needs Chromium's software renderer.
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+        yield browser
+        browser.close()
+
+
+class Served:
+    """A nerfstudio command that serves the viewer until the block ends, on a CPU, its pictures as PNG.
+
+    Args:
+        entry: TRAIN or VIEWER.
+        log: file for what it says.
+        options: its words.
+        tail: words that come after the viewer's, such as the data set's.
+    """
+
+    def __init__(self, entry: str, log: Path, *options, tail: Sequence = ()):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        viewer = {"websocket-host": "127.0.0.1", "websocket-port": self.port, "image-format": "png"}
+        words = [*(word for name, value in viewer.items() for word in (f"--viewer.{name}", value))]
+        module, function = entry.split(":")
+        code = f"import sys; from {module} import {function}; sys.exit({function}())"
+        self.log = log
+        with log.open("w") as out:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", code, *map(str, [*options, *words, *tail])],
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "CUDA_VISIBLE_DEVICES": ""},
+            )
+
+    def __enter__(self) -> "Served":
+        deadline = time.time() + PATIENCE
+        while time.time() < deadline and self.process.poll() is None:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
+                    return self
+            time.sleep(0.5)
+        self.stop()
+        raise AssertionError(f"the viewer did not start:\n{self.log.read_text()[-3000:]}")
+
+    def __exit__(self, *_) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Ctrl-C."""
+        self.process.send_signal(signal.SIGINT)
+        try:
+            self.process.wait(20)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+class Page:
+    """The viewer's page, in the words of somebody who uses it.
+
+    Args:
+        browser: what `chromium` yields.
+        port: where the viewer is served.
+        width, height: of the window, pixels.
+    """
+
+    def __init__(self, browser, port: int, width: int = 1000, height: int = 800):
+        self.page = browser.new_page(viewport={"width": width, "height": height})
+        self.page.set_default_timeout(1000 * PATIENCE)
+        # Fonts and logos of other sites: their absence is not ours to wait for.
+        self.page.route(re.compile(r"^https?://(?!127\.0\.0\.1)"), lambda route: route.abort())
+        self.page.goto(f"http://127.0.0.1:{port}", wait_until="domcontentloaded")
+        self.page.get_by_text("Residual gain", exact=True).wait_for()
+        self.scene = {"x": 0, "y": 80, "width": width - 360, "height": height - 100}
+
+    def control(self, label: str):
+        """The input in the row of this label."""
+        name = self.page.get_by_text(label, exact=True).first
+        return name.locator("xpath=ancestor::*[.//input][1]").locator("input:not([type=hidden])").last
+
+    def show(self, mode: str) -> None:
+        """Choose one of the panel's modes."""
+        self.control("Show").click()
+        self.page.get_by_role("option", name=mode, exact=True).click()
+
+    def set_gain(self, gain: float) -> None:
+        """Set the residual gain."""
+        self.control("Residual gain").fill(f"{gain:g}")
+        self.control("Residual gain").press("Enter")
+
+    def hide_cameras(self) -> None:
+        """Take the photographs, which hang in the air where they were taken, out of the picture."""
+        self.page.get_by_text("Hide Train Cams").click()
+
+    def come_closer(self, amount: int = 400) -> None:
+        """Turn the mouse's wheel over the scene."""
+        self.page.mouse.move(self.scene["x"] + self.scene["width"] // 2, self.scene["y"] + self.scene["height"] // 2)
+        self.page.mouse.wheel(0, -amount)
+
+    def set_resolution(self, pixels: int) -> None:
+        """The longer side of what is rendered."""
+        self.control("Max res").fill(str(pixels))
+        self.control("Max res").press("Enter")
+
+    def step(self) -> int:
+        """The training step that the page tells."""
+        return self._number("Step")
+
+    def _number(self, label: str) -> int:
+        """The first number after a label and a colon."""
+        return int(re.search(label + r":\s*(\d+)", self.page.inner_text("body")).group(1))
+
+    def turn(self) -> None:
+        """Drag the mouse across the scene."""
+        self.page.mouse.move(250, 450)
+        self.page.mouse.down()
+        self.page.mouse.move(400, 430, steps=8)
+        self.page.mouse.up()
+
+    def shot(self) -> np.ndarray:
+        """What the scene looks like now, [H, W, 3] in 0..255."""
+        png = self.page.screenshot(clip=self.scene)
+        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(np.float32)
+
+    def settled(self, unlike: np.ndarray | None = None) -> np.ndarray:
+        """The picture, as soon as it is one, has not changed for two seconds, and differs from the one given.
+
+        The viewer first renders small, then at full size: two seconds are several times the pause between them.
+        """
+        deadline, since, last = time.time() + PATIENCE, time.time(), self.shot()
+        while time.time() < deadline:
+            time.sleep(0.3)
+            now = self.shot()
+            if different(now, last):
+                since = time.time()
+            last = now
+            there = now.std() > 1 and (unlike is None or different(now, unlike))
+            if there and time.time() - since > 2:
+                return now
+        raise AssertionError("the picture did not change" if unlike is not None else "no picture came to rest")
+
+    def sharp(self, unlike: np.ndarray | None = None) -> np.ndarray:
+        """The settled picture at its full size: on a slow machine the small one stays for long."""
+        wanted = int(self.control("Max res").input_value())
+        deadline = time.time() + PATIENCE
+        while time.time() < deadline:
+            picture = self.settled(unlike)
+            if self._number("Resolution") == wanted:
+                return picture
+        raise AssertionError(f"no picture of {wanted} pixels came")
+
+    def save(self, path: Path, quality: int = 85) -> None:
+        """Write the whole page as a JPEG, without the logo, which comes from another site."""
+        self.page.add_style_tag(content="img { visibility: hidden }")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.page.screenshot(path=path, type="jpeg", quality=quality)
+
+
+def different(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether somebody would see it: at least one pixel in a hundred differs by more than two levels of 256."""
+    return bool((np.abs(one - other).max(axis=-1) > 2).mean() > 0.01)
