@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.reduce import Field, latent_basis, with_diffuse, with_rank
+from nrfgs_ns.appearance.reduce import Field, LatentBasis, latent_basis, with_diffuse, with_rank
 from nrfgs_ns.metrics import psnr
 from nrfgs_ns.residuals import Residuals
 
@@ -37,15 +37,20 @@ class FieldViews:
             truth = model.composite_with_background(model.get_gt_img(batch["image"]), model._get_background_color())
             self.views.append((view, truth, model._mask(batch)))
 
-    @torch.no_grad()
     def psnr(self, field: Field) -> float:
         """Mean over the views, inside masks, dB."""
+        scores = self.scores(field)
+        return sum(scores) / max(len(scores), 1)
+
+    @torch.no_grad()
+    def scores(self, field: Field) -> list[float]:
+        """PSNR of each view inside its mask, dB; views whose mask is empty are left out."""
         scores = []
         for view, truth, mask in self.views:
             appearance = field.head(field.splats, view.visible, view.center)
             score = psnr(self.model.paint(view, appearance)[0]["rgb"], truth, mask)
             scores += [] if score is None else [score]
-        return sum(scores) / max(len(scores), 1)
+        return scores
 
     @torch.no_grad()
     def head_seconds(self, field: Field) -> float:
@@ -90,6 +95,23 @@ def largest_threshold(
     return 0.0
 
 
+def smallest_rank(
+    field: Field,
+    basis: LatentBasis,
+    views: FieldViews,
+    lowest_psnr: float,
+    on_trial: Callable[[str], None] = lambda _: None,
+) -> int:
+    """The fewest principal components of the latents with which the views keep a PSNR (dB); D if none are enough."""
+    low, rank = 1, field.head.config.latent_dim
+    while low < rank:  # the loss falls with the rank, but for rounding: halve the interval
+        middle = (low + rank) // 2
+        on_trial(f"latent rank {middle}")
+        enough = views.psnr(with_rank(field, basis, middle)) >= lowest_psnr
+        low, rank = (low, middle) if enough else (middle + 1, rank)
+    return rank
+
+
 class Slimmed(NamedTuple):
     """A field that is smaller, and by what."""
 
@@ -128,10 +150,5 @@ def slim(
     basis = latent_basis(field, seen.weight if diffuse is None else seen.weight * ~diffuse)
     size = field.head.config.latent_dim
     if rank is None:
-        low, rank = 1, size
-        while low < rank:  # the loss falls with the rank, but for rounding: halve the interval
-            middle = (low + rank) // 2
-            on_trial(f"latent rank {middle}")
-            enough = views.psnr(with_rank(field, basis, middle)) >= lowest_psnr
-            low, rank = (low, middle) if enough else (middle + 1, rank)
+        rank = smallest_rank(field, basis, views, lowest_psnr, on_trial)
     return Slimmed(with_rank(field, basis, rank) if rank < size else field, threshold, rank)

@@ -76,6 +76,9 @@ class Guard:
         self.pipeline = pipeline
         self.step = 0
         self._verdict: _Verdict | None = None
+        # Pinned memory and events are dear to make; one of each will do, for a verdict is read before the next is made.
+        self._in_host_memory: Tensor | None = None
+        self._arrival: torch.cuda.Event | None = None
 
     @property
     def model(self):
@@ -117,16 +120,22 @@ class Guard:
                 optimizer.found_inf = verdict
             self._silence_densification()
             if sizes.is_cuda:
-                self._verdict.sizes = torch.empty_like(sizes, device="cpu", pin_memory=True)
-                self._verdict.sizes.copy_(sizes, non_blocking=True)
-                self._verdict.arrived = torch.cuda.Event()
-                self._verdict.arrived.record()
+                self._send_home(self._verdict)
         else:
             self.settle()
 
     def _share(self, names: list[str], tensors: list[Tensor], sizes: Tensor) -> tuple[list[str], list[Tensor], Tensor]:
         """Here joins in what other devices have found, where there are any (`distributed`)."""
         return names, tensors, sizes
+
+    def _send_home(self, verdict: _Verdict) -> None:
+        """Copy a verdict's sizes to the host without waiting for them."""
+        if self._in_host_memory is None or self._in_host_memory.shape != verdict.sizes.shape:
+            self._in_host_memory = torch.empty_like(verdict.sizes, device="cpu", pin_memory=True)
+            self._arrival = torch.cuda.Event()
+        verdict.sizes = self._in_host_memory.copy_(verdict.sizes, non_blocking=True)
+        verdict.arrived = self._arrival
+        verdict.arrived.record()
 
     def settle(self) -> None:
         """Read the verdict on the step before.
@@ -212,6 +221,13 @@ class WatchedOptimizers(LeanOptimizers):
     def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:
         self.guard.before_optimizers(self, gradients_are_scaled=grad_scaler.is_enabled())
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
+
+    def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
+        """Nerfstudio's; the checkpoint may have brought a smaller head than these were built on."""
+        weights = list(self.guard.model.head.parameters())
+        if weights:
+            self.hold("field", weights, {})
+        super().load_optimizers(loaded_state)
 
 
 def remove_splats(model, optimizers: Mapping[str, torch.optim.Optimizer], bad: Tensor) -> None:

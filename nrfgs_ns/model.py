@@ -22,6 +22,9 @@ from torch.nn import Parameter
 
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.capacity.config import Capacity, CapacitySearch
+from nrfgs_ns.capacity.install import shape_head
+from nrfgs_ns.capacity.schedule import deciding_callbacks
 from nrfgs_ns.checkpoint import check_compatible
 from nrfgs_ns.densification import (
     McmcDensification,
@@ -30,7 +33,7 @@ from nrfgs_ns.densification import (
     Protocol,
     build_densification,
 )
-from nrfgs_ns.diffuse_splats import DiffuseSplats, schedule_for
+from nrfgs_ns.diffuse_splats import DiffuseSplats
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.exported import ExportedTables
 from nrfgs_ns.metrics import ImageMetrics
@@ -71,6 +74,11 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """constants of the densification 'mcmc'"""
     diffuse: DiffuseSplats = field(default_factory=DiffuseSplats)
     """when splats whose residual never matters lose it"""
+    capacity: Capacity = "full"
+    """full: all parts of the appearance head that its options name. auto: those that pay on training views that are set
+    aside for a while (nrfgs alone)"""
+    capacity_search: CapacitySearch = field(default_factory=CapacitySearch)
+    """capacity auto: when and how it is decided"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -85,6 +93,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     """
 
     config: NrfgsModelConfig
+    capacity_found: dict[str, Any] | None = None
+    """what capacity "auto" has decided: "step", "head" (options of the head that it was left with) and "dropped" """
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
 
@@ -170,13 +180,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before_first_step, iters=(0,)),
             *super().get_training_callbacks(attributes),
         ]
-        diffuse = schedule_for(self, attributes.pipeline.datamanager, attributes.pipeline.world_size)
-        if diffuse is not None:
-            after = TrainingCallback(
-                [TrainingCallbackLocation.AFTER_TRAIN_ITERATION], lambda step: diffuse.after_step(self, step)
-            )
-            callbacks.append(after)
-        return callbacks
+        return callbacks + deciding_callbacks(self, attributes)
 
     def step_cb(self, optimizers, step: int) -> None:
         super().step_cb(optimizers, step)
@@ -196,12 +200,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
 
         Terms that are zero in this step are left out. Nothing waits for the GPU.
         """
-        truth = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        rgb = outputs["rgb"]
-        if "mask" in batch:  # what is outside is black in both
-            mask = self._downscale_if_required(batch["mask"]).to(self.device)
-            truth, rgb = truth * mask, rgb * mask
-        losses = {"main_loss": photometric_loss(rgb, truth, self.config.ssim_lambda)}
+        losses = {"main_loss": self.photometric_loss(outputs, batch)}
         if self.config.use_scale_regularization and self.step % 10 == 0:
             scales = self.scales.exp()
             ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
@@ -215,6 +214,15 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")
         return losses
+
+    def photometric_loss(self, outputs, batch) -> Tensor:
+        """Splatfacto's loss of an image against its photograph, a scalar."""
+        truth = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        rgb = outputs["rgb"]
+        if "mask" in batch:  # what is outside is black in both
+            mask = self._downscale_if_required(batch["mask"]).to(self.device)
+            truth, rgb = truth * mask, rgb * mask
+        return photometric_loss(rgb, truth, self.config.ssim_lambda)
 
     def far_from_neutral(
         self, camera: Cameras, weights: list[Parameter]
@@ -282,6 +290,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
         }
+        if self.capacity_found is not None:
+            state["capacity"] = self.capacity_found
         return state if self.pace is None else {**state, "pace": self.pace.state()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -292,6 +302,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
+        self.capacity_found = state.get("capacity")
         if "pace" in state:
             self.pace = self.pace or Pace(state["pace"]["length"])
             self.pace.load_state(state["pace"])
@@ -306,6 +317,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         Raises:
             InputError: the checkpoint belongs to another head, or to another size of this one.
         """
+        shape_head(self, state)
         check_compatible(self, state)
         self.forget_fit()
         for name, parameter in self.gauss_params.items():

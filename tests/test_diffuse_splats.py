@@ -13,7 +13,7 @@ from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT
 from nrfgs_ns.appearance.reduce import Field
 from nrfgs_ns.diffuse_splats import DiffuseSchedule, DiffuseSplats, give_back, make_diffuse, schedule_for
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.field_views import FieldViews
+from nrfgs_ns.field_views import FieldViews, dropped
 from nrfgs_ns.residuals import look_over
 from nrfgs_ns.studies.run import parse, train
 
@@ -69,7 +69,7 @@ def test_some_become_diffuse_and_all_get_back_what_they_had(untrained):
     cameras = data.train_dataset.cameras
     before = {name: value.detach().clone() for name, value in model.gauss_params.items()}
     full = picture(model, cameras[:1])
-    make_diffuse(model, data, BELOW_4)
+    make_diffuse(model, data, BELOW_4, {})
     diffuse, shift = model.densification.state[DIFFUSE], model.densification.state[SHIFT]
     assert 20 < int(diffuse.sum()) < model.num_points - 20
     assert (shift[~diffuse] == 0).all() and shift[diffuse].abs().max() > 1e-3
@@ -90,7 +90,7 @@ def test_some_become_diffuse_and_all_get_back_what_they_had(untrained):
 def test_a_splat_that_starts_to_matter_comes_back(untrained):
     model, data = untrained
     cameras = data.train_dataset.cameras
-    make_diffuse(model, data, BELOW_4)
+    make_diffuse(model, data, BELOW_4, {})
     first = model.densification.state[DIFFUSE].clone()
     give_back(model)
     row, loud = int(first.nonzero()[0]), int(look_over(model, cameras).largest.argmax())
@@ -98,38 +98,63 @@ def test_a_splat_that_starts_to_matter_comes_back(untrained):
     with torch.no_grad():  # it becomes another of those that matter most, at the same place
         for value in model.gauss_params.values():
             value[row] = value[loud]
-    make_diffuse(model, data, BELOW_4)
+    make_diffuse(model, data, BELOW_4, {})
     assert first[row] and not model.densification.state[DIFFUSE][row]
     assert model.densification.state[DIFFUSE].any()
 
 
-def test_a_threshold_is_chosen_by_what_it_costs(untrained):
-    """Nothing at no cost in dB but what does not change a picture; everything where everything may be lost."""
+@pytest.fixture
+def learning(untrained):
+    """The same with an Adam for each group, and two views set aside whose photographs are the model's own pictures, as
+    are all others."""
     model, data = untrained
+    with torch.no_grad():  # residuals of many sizes
+        for branch in (model.head.low, model.head.high):
+            branch[2].weight.mul_(2.0)
+        model.gauss_params["latents"].mul_(10.0)
+        model.gauss_params["opacities"].normal_(0.0, 1.0)
+    for index in range(len(data.train_dataset)):
+        camera, _ = data.train_view(index)
+        data.cached_train[index]["image"] = (picture(model, camera) * 255).round().to(torch.uint8)
+    data.set_views_aside([2, 6])
+    rates = {"latents": 1e-3, "features_dc": 1e-3, "opacities": 1e-3}
+    optimizers = {name: torch.optim.Adam([model.gauss_params[name]], lr=rate) for name, rate in rates.items()}
+    optimizers["field"] = torch.optim.Adam(model.head.parameters(), lr=1e-4)
+    return model, data, optimizers
+
+
+def test_a_threshold_is_chosen_by_what_it_costs(learning):
+    """The more may be lost, the more splats become diffuse: all of them where everything may."""
+    model, data, optimizers = learning
     shares = []
-    for budget in (1e-9, 0.02, 1e3):
-        make_diffuse(model, data, DiffuseSplats(budget=budget, views=3))
+    for budget in (0.0, 10.0, 1e3):
+        make_diffuse(model, data, DiffuseSplats(budget=budget, settle=4), optimizers)
         shares.append(model.densification.state[DIFFUSE].float().mean().item())
         give_back(model)
-    assert shares == sorted(shares) and shares[0] < 0.9 and shares[-1] == 1.0
-    # The views were photographs of another scene than these splats: dropping may gain. A loss is at most the budget.
-    views = FieldViews(model, some_views(data, 3))
-    field = Field(model.head, dict(model.gauss_params.items()))
-    full = views.psnr(field)
-    make_diffuse(model, data, DiffuseSplats(budget=0.02, views=3))
-    assert views.psnr(Field(model.head, model._splats_to_draw())) >= full - 0.02 - 1e-4
+    assert shares == sorted(shares) and shares[0] < 0.7 and shares[0] < shares[1] < shares[2] == 1.0
 
 
-def some_views(data, count: int):
-    """Evenly spaced training views with their images, as a look chooses them."""
-    images, cameras = data.cached_train, data.train_dataset.cameras
-    return [(cameras[i : i + 1], images[i]) for i in (j * len(images) // count for j in range(count))]
+def test_noise_that_was_learnt_does_not_hold_splats(learning):
+    """Residuals fitted to the training views, which say nothing of others, are worth much there, and nothing aside."""
+    model, data, optimizers = learning
+    cameras = data.train_dataset.cameras
+    field = Field(model.head, {name: value.detach() for name, value in model.gauss_params.items()})
+    seen = look_over(model, cameras)
+    mean = dropped(field, seen, float("inf"))
+    for index in data.views_aside:  # there, the scene is what the others see on average
+        view = model.look(cameras[index : index + 1])
+        rgb = model.paint(view, mean.head(mean.splats, view.visible, view.center))[0]["rgb"]
+        data.cached_train[index]["image"] = (rgb * 255).round().to(torch.uint8)
+    others = FieldViews(model, [data.train_view(index) for index in range(8) if index not in data.views_aside])
+    assert others.psnr(field) - others.psnr(mean) > 3.0
+    make_diffuse(model, data, DiffuseSplats(budget=0.0, settle=1), optimizers)
+    assert model.densification.state[DIFFUSE].all()
 
 
 def test_the_head_is_evaluated_for_the_others_only(untrained):
     model, data = untrained
     cameras = data.train_dataset.cameras
-    make_diffuse(model, data, BELOW_4)
+    make_diffuse(model, data, BELOW_4, {})
     diffuse, rows = model.densification.state[DIFFUSE], []
     handle = model.head.low.register_forward_hook(lambda _, inputs, __: rows.append(len(inputs[0])))
     model.train()
@@ -145,7 +170,7 @@ def test_the_head_is_evaluated_for_the_others_only(untrained):
 
 def test_densification_carries_the_tables_along(untrained):
     model, data = untrained
-    make_diffuse(model, data, BELOW_4)
+    make_diffuse(model, data, BELOW_4, {})
     state = model.densification.state
     params = model.gauss_params
     optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
@@ -176,9 +201,10 @@ def test_the_schedule(untrained, monkeypatch):
 
     monkeypatch.setattr("nrfgs_ns.diffuse_splats.make_diffuse", look)
     monkeypatch.setattr("nrfgs_ns.diffuse_splats.give_back", trial)
-    schedule = DiffuseSchedule(DiffuseSplats(start=6, every=10, trial=3, stop=30), data)
+    schedule = DiffuseSchedule(DiffuseSplats(start=6, every=10, trial=3, stop=30), data, {})
     for step in range(60):
         schedule.after_step(model, step)
+    assert schedule.last_decision == 26 and not schedule.is_done(25) and schedule.is_done(26)
     assert done == [("look", 6), ("trial", 13), ("look", 16), ("trial", 23), ("look", 26)]
 
 
@@ -236,6 +262,7 @@ def test_off_is_off(tiny_scene, tmp_path):
         ("nrfgs", {"--pipeline.model.diffuse.threshold": 0.0}, "threshold is 0.0"),
         ("nrfgs", {"--pipeline.model.diffuse.budget": -1}, "budget is -1"),
         ("nrfgs", {"--pipeline.model.diffuse.views": 0}, "views is 0"),
+        ("nrfgs", {"--pipeline.model.diffuse.settle": 0}, "settle is 0"),
     ],
 )
 def test_what_cannot_be_followed_is_refused_before_training(method, more, says, tiny_scene, tmp_path):

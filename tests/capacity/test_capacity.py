@@ -1,0 +1,362 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Capacity "auto": what pays stays, what does not goes, and what is left trains, resumes and loads."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from nerfstudio.utils.eval_utils import eval_setup
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.reduce import Field, latent_basis, with_rank, with_unit_axes
+from nrfgs_ns.capacity.config import CapacitySearch
+from nrfgs_ns.capacity.search import decide
+from nrfgs_ns.capacity.settle import keep_the_mean, lesson_order, settle
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.model import NrfgsModel
+from nrfgs_ns.studies.run import evaluate, parse, train
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+SEARCH = "--pipeline.model.capacity-search"
+
+
+def words(scene: Path, out: Path, method: str = "nrfgs", steps: int = 18, **more) -> list[str]:
+    """A training that splits and prunes every 4th step, and decides after step 9; the field says something at once."""
+    chosen = {
+        "--data": scene,
+        "--output-dir": out,
+        "--max-num-iterations": steps,
+        "--vis": "tensorboard",
+        "--steps-per-eval-image": 1000,
+        "--steps-per-eval-all-images": 1000,
+        "--logging.local-writer.enable": False,
+        "--logging.profiler": "none",
+        "--pipeline.model.warmup-length": 2,
+        "--pipeline.model.refine-every": 4,
+        "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.appearance.output-init": "default",
+        "--pipeline.model.appearance.latent-dim": 6,
+        "--pipeline.model.warmup-steps": 0,
+        "--pipeline.model.capacity": "auto",
+        f"{SEARCH}.step": 9,
+        f"{SEARCH}.settle": 4,
+        f"{SEARCH}.tolerance-db": 100.0,
+        **more,
+    }
+    if chosen.get("--pipeline.model.densification") != "mcmc":
+        chosen |= {"--pipeline.model.reset-alpha-every": 20, "--pipeline.model.stop-split-at": 100}
+    return [method, *(str(word) for option in chosen.items() for word in option if option[1] is not None)]
+
+
+def set_up(scene: Path, out: Path, **more):
+    trainer = parse(words(scene, out, **more)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+@pytest.fixture
+def loud(tiny_scene, tmp_path):
+    """The parts of a training whose field changes a lot with the view, before its first step."""
+    torch.manual_seed(0)
+    trainer = set_up(tiny_scene, tmp_path)
+    model = trainer.pipeline.model
+    with torch.no_grad():
+        for branch in (model.head.low, model.head.high):
+            branch[2].weight.mul_(6.0)
+        model.gauss_params["opacities"].normal_(0.0, 2.0)
+        model.gauss_params["latents"].mul_(20.0)
+    return model, trainer.pipeline.datamanager, trainer.optimizers
+
+
+def photograph(model, data, appearance_of) -> None:
+    """Let the training's photographs be the model's own pictures."""
+    was_training = model.training
+    model.eval()
+    for index in range(len(data.train_dataset)):
+        camera, _ = data.train_view(index)
+        with torch.no_grad():
+            view = model.look(camera)
+            rgb = model.paint(view, appearance_of(view))[0]["rgb"]
+        data.cached_train[index]["image"] = (rgb * 255).round().to(torch.uint8)
+    model.train(was_training)
+
+
+def test_a_scene_that_changes_with_the_view_keeps_what_shows_it(loud):
+    model, data, optimizers = loud
+    photograph(model, data, lambda view: model.head(view.splats, view.visible, view.center))
+    before = {name: value.clone() for name, value in model.state_dict().items() if name != "_extra_state"}
+    decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=12))
+    worth = {trial.part: trial.loss_db for trial in decision.trials}
+    assert worth["high branch"] > 1.0 and worth["opacity residual"] > 1.0
+    assert not {"high branch", "opacity residual"} & set(decision.dropped)
+    for name, value in before.items():  # trying leaves the model as it is
+        assert torch.equal(model.state_dict()[name], value), name
+
+
+def test_a_scene_that_looks_the_same_from_everywhere_keeps_nothing(loud):
+    model, data, optimizers = loud
+    with torch.no_grad():  # the field says little, and all of it is wrong
+        for branch in (model.head.low, model.head.high):
+            branch[2].weight.mul_(0.1)
+            branch[2].bias.zero_()
+    photograph(model, data, lambda view: model.head.base_appearance(view.splats, view.visible))
+    decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=12))
+    assert decision.dropped[:3] == ["high branch", "opacity residual", "distance"]
+    trials = {trial.part: trial for trial in decision.trials}
+    assert all(trial.loss_db <= trial.allowed_db for trial in trials.values() if trial.dropped)
+    head, splats = decision.chosen.field
+    assert head.high is None and not head.config.opacity_residual and not head.config.use_distance
+    assert splats["latents"].shape[1] == head.config.latent_dim < 6
+    assert decision.trials[-1].bytes < decision.trials[0].bytes
+
+
+@pytest.mark.parametrize("part", ["high branch", "opacity residual"])
+def test_what_all_views_see_alike_moves_into_the_base(part, loud):
+    """A part that is dropped takes along less if the base keeps its mean."""
+    from nrfgs_ns.appearance.reduce import without_high_branch, without_opacity_residual
+
+    model, data, _ = loud
+    model.eval()
+    field = Field(model.head, {name: value.detach() for name, value in model.gauss_params.items()})
+    smaller = {"high branch": without_high_branch, "opacity residual": without_opacity_residual}[part](field)
+    views = [data.train_view(index) for index in range(len(data.train_dataset))]
+    kept = keep_the_mean(model, field, smaller, views)
+
+    def error(other: Field) -> float:
+        total = 0.0
+        for camera, _ in views:
+            view = model.look(camera)
+            with torch.no_grad():
+                pictures = [model.paint(view, f.head(f.splats, view.visible, view.center))[0]["rgb"]
+                            for f in (field, other)]  # fmt: skip
+            total += float((pictures[0] - pictures[1]).square().mean())
+        return total
+
+    assert error(kept) < 0.8 * error(smaller)
+
+
+def test_settling_learns_from_the_views_given_and_from_no_other(loud, monkeypatch):
+    model, data, optimizers = loud
+    data.set_views_aside([2, 5])
+    seen = []
+    original = NrfgsModel.photometric_loss
+    monkeypatch.setattr(
+        NrfgsModel,
+        "photometric_loss",
+        lambda self, outputs, batch: seen.append((batch["image_idx"], original(self, outputs, batch))) or seen[-1][1],
+    )
+    order = lesson_order(data, 100)
+    assert sorted(order) == [0, 1, 3, 4, 6, 7] and lesson_order(data, 100) == order and len(lesson_order(data, 4)) == 4
+    field = Field(model.head, {name: value.detach() for name, value in model.gauss_params.items()})
+    settled = settle(model, field, [data.train_view(index) for index in order], 24, optimizers.optimizers)
+    assert [index for index, _ in seen] == order * 4
+    losses = [float(loss) for _, loss in seen]
+    assert sum(losses[-6:]) < sum(losses[:6])
+    assert settled.field.splats["means"].equal(field.splats["means"])
+    for name in ("field", "latents", "features_dc", "opacities"):
+        assert all(state["step"] == 24 for state in settled.moments[name].values())
+
+
+def test_unit_axes_are_the_same_components(loud):
+    model, data, _ = loud
+    field = Field(model.head, {name: value.detach() for name, value in model.gauss_params.items()})
+    basis = latent_basis(field, torch.ones(model.num_points))
+    unit = with_unit_axes(basis)
+    assert_close(unit.axes.norm(dim=0), torch.ones(6, dtype=torch.float64))
+    assert_close(unit.axes @ unit.inverse, torch.eye(6, dtype=torch.float64), rtol=0, atol=1e-6)
+    view = model.eval().look(data.train_view(0)[0])
+    for rank in (2, 6):
+        one, other = (with_rank(field, b, rank) for b in (basis, unit))
+        # The same function; float32 rounds other numbers, 1e-7 of sums around 10 behind slopes of at most 1.
+        for a, b in zip(*(f.head(f.splats, view.visible, view.center) for f in (one, other)), strict=True):
+            assert_close(a, b, rtol=0, atol=2e-5)
+
+
+def checkpoint(config: Path) -> dict:
+    (path,) = (config.parent / "nerfstudio_models").glob("*.ckpt")
+    return torch.load(path, weights_only=True)
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_scene, tmp_path_factory):
+    """config.yml of an unbroken training that drops all it can."""
+    return Path(train(words(tiny_scene, tmp_path_factory.mktemp("whole"))).config_path)
+
+
+def test_the_smaller_model_trains_saves_and_loads(whole, tmp_path):
+    state = checkpoint(whole)
+    found = state["pipeline"]["_model._extra_state"]["capacity"]
+    assert found["step"] == 9
+    assert found["head"] == {"latent_dim": 1, "num_bands": 1, "opacity_residual": False, "use_distance": False}
+    assert state["pipeline"]["_model.gauss_params.latents"].shape[1] == 1
+    assert not any("head.high" in name for name in state["pipeline"])
+    for group in ("latents", "field"):
+        # 4 steps of settling and 8 of training, or none since a split made the row; no state of what is gone.
+        learnt = state["optimizers"][group]["state"]
+        assert len(learnt) == (1 if group == "latents" else 4)
+        assert all(of_one["step"] == 12 and (of_one["exp_avg"] != 0).any() for of_one in learnt.values())
+    report = json.loads((whole.parent / "capacity.json").read_text())
+    assert report["dropped"] == found["dropped"] and len(report["views_aside"]) == 2
+    assert [trial["part"] for trial in report["trials"]][:4] == [
+        "nothing",
+        "high branch",
+        "opacity residual",
+        "distance",
+    ]
+    results = evaluate(whole, tmp_path / "eval.json")
+    _, pipeline, _, _ = eval_setup(whole)
+    model = pipeline.model
+    assert model.head.config.latent_dim == 1 and model.head.high is None
+    assert model.config.appearance.latent_dim == 6, "what the user asked for stays as it was"
+    weights = sum(value.numel() for value in model.head.parameters())
+    assert weights == 64 * (1 + 3 + 1 + 9) + 64 + 3 * 64 + 3
+    assert results["parameter_bytes"] == 4 * (model.num_points * (3 + 3 + 4 + 1 + 3 + 1) + weights)
+
+
+@pytest.mark.parametrize("half", [pytest.param(8, marks=pytest.mark.slow), 13])
+def test_resumed_training_is_the_unbroken_one(half, whole, tiny_scene, tmp_path, monkeypatch):
+    """Cut before and after the decision. A part that begins after it does not decide again."""
+    first = Path(train(words(tiny_scene, tmp_path / "half", steps=half)).config_path)
+    decisions = []
+    monkeypatch.setattr("nrfgs_ns.capacity.schedule.decide", lambda *args: decisions.append(args) or decide(*args))
+    rest = {"--load-dir": first.parent / "nerfstudio_models"}
+    resumed = Path(train(words(tiny_scene, tmp_path / "rest", steps=18 - half, **rest)).config_path)
+    assert len(decisions) == (1 if half == 8 else 0)
+    a, b = checkpoint(whole), checkpoint(resumed)
+    assert a["pipeline"]["_extra_state"]["sampling"]["views_aside"] == []
+    for name, value in a["pipeline"].items():
+        if isinstance(value, torch.Tensor):
+            assert_close(b["pipeline"][name], value, rtol=1e-5, atol=1e-7, msg=name)
+    for group in a["optimizers"]:
+        for key, of_one in a["optimizers"][group]["state"].items():
+            other = b["optimizers"][group]["state"][key]
+            assert_close(other["exp_avg"], of_one["exp_avg"], rtol=1e-5, atol=1e-7, msg=group)
+
+
+def test_a_smaller_checkpoint_goes_on_with_capacity_full(whole, tiny_scene, tmp_path):
+    """What was dropped stays dropped: the checkpoint says what is left."""
+    rest = {"--load-dir": whole.parent / "nerfstudio_models", "--pipeline.model.capacity": "full"}
+    trainer = set_up(tiny_scene, tmp_path, steps=2, **rest)
+    assert trainer.pipeline.model.head.config.latent_dim == 1
+    held = trainer.optimizers.optimizers["field"].param_groups[0]["params"]
+    assert [id(one) for one in held] == [id(one) for one in trainer.pipeline.model.head.parameters()]
+    trainer.train()
+
+
+def test_decisions_are_made_by_views_that_nothing_has_trained_on(tiny_scene, tmp_path, monkeypatch):
+    """Every photograph that a loss has been computed with, in steps and in settling; before the decision and after."""
+    seen, aside = [], []
+    original = NrfgsModel.photometric_loss
+
+    def watch(self, outputs, batch):
+        seen.append(int(batch["image_idx"]))
+        return original(self, outputs, batch)
+
+    def deciding(model, data, *rest):
+        aside.extend(data.views_aside)
+        decision = decide(model, data, *rest)
+        assert not set(seen) & set(aside) and len(seen) > 10
+        seen.clear()
+        return decision
+
+    monkeypatch.setattr(NrfgsModel, "photometric_loss", watch)
+    monkeypatch.setattr("nrfgs_ns.capacity.schedule.decide", deciding)
+    train(words(tiny_scene, tmp_path, steps=26))
+    assert len(aside) == 2 and set(aside) < set(seen) == set(range(8))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("densification", ["original", "mcmc"])
+def test_densification_goes_on(densification, tiny_scene, tmp_path):
+    config = Path(train(words(tiny_scene, tmp_path, **{"--pipeline.model.densification": densification})).config_path)
+    state = checkpoint(config)["pipeline"]
+    latents = state["_model.gauss_params.latents"]
+    assert latents.shape[1] == 1 and len(latents) == len(state["_model.gauss_params.means"]) != 300
+
+
+@pytest.mark.slow
+def test_with_diffuse_splats(tiny_scene, tmp_path):
+    """Some splats are diffuse when it is decided; in the trial after it they come back, with smaller latents."""
+    diffuse = {
+        "--pipeline.model.diffuse.start": 6,
+        "--pipeline.model.diffuse.every": 8,
+        "--pipeline.model.diffuse.trial": 3,
+        "--pipeline.model.diffuse.stop": 16,
+        "--pipeline.model.diffuse.settle": 4,
+        "--pipeline.model.diffuse.budget": 0.5,
+    }
+    config = Path(train(words(tiny_scene, tmp_path, **diffuse)).config_path)
+    extra = checkpoint(config)["pipeline"]
+    assert extra["_model._extra_state"]["capacity"]["head"]["latent_dim"] == 1
+    assert extra["_model._extra_state"]["strategy"][DIFFUSE].any()
+    assert extra["_extra_state"]["sampling"]["views_aside"] == []  # the last look was after step 14
+    _, pipeline, _, _ = eval_setup(config)
+    assert pipeline.model.densification.state[DIFFUSE].any()
+
+
+@pytest.mark.slow
+def test_nothing_dropped_is_nothing_changed(tiny_scene, tmp_path, monkeypatch):
+    trainer = set_up(tiny_scene, tmp_path, steps=12)
+    real = decide
+
+    def nothing(*args):
+        return real(*args)._replace(chosen=None, dropped=[])
+
+    monkeypatch.setattr("nrfgs_ns.capacity.schedule.decide", nothing)
+    head, latents = trainer.pipeline.model.head, trainer.pipeline.model.gauss_params["latents"].shape[1]
+    trainer.train()
+    assert trainer.pipeline.model.head is head and trainer.pipeline.model.gauss_params["latents"].shape[1] == latents
+    assert trainer.pipeline.model.capacity_found["dropped"] == []
+
+
+def test_full_is_full(tiny_scene, tmp_path):
+    trainer = set_up(tiny_scene, tmp_path, steps=12, **{"--pipeline.model.capacity": "full"})
+    assert trainer.pipeline.datamanager.views_aside == []
+    trainer.train()
+    assert trainer.pipeline.model.capacity_found is None
+    assert not (trainer.base_dir / "capacity.json").exists()
+
+
+@pytest.mark.parametrize(
+    "more, says",
+    [
+        ({f"{SEARCH}.step": -1}, "step is -1"),
+        ({f"{SEARCH}.views": 0}, "views is 0"),
+        ({f"{SEARCH}.views": 8}, "sets 8 training views aside, of 8"),
+        ({f"{SEARCH}.settle": 0}, "settle is 0"),
+        ({f"{SEARCH}.tolerance-db": -0.1}, "tolerance_db is -0.1"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_before_training(more, says, tiny_scene, tmp_path):
+    with pytest.raises(InputError, match=says):
+        set_up(tiny_scene, tmp_path, **more)
+
+
+def test_a_head_without_parts_is_refused(tiny_scene, tmp_path):
+    line = ["nrfgs-sh", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "tensorboard"]
+    with pytest.raises(InputError, match="'sh' head has no parts"):
+        parse([*line, "--pipeline.model.capacity", "auto"]).setup(local_rank=0, world_size=1).setup()
+
+
+def test_several_devices_are_refused(tiny_scene, tmp_path):
+    trainer = set_up(tiny_scene, tmp_path)
+    trainer.pipeline.world_size = 2
+    attributes = TrainingCallbackAttributes(trainer.optimizers, trainer.grad_scaler, trainer.pipeline, trainer)
+    with pytest.raises(InputError, match="spread over 2 devices"):
+        trainer.pipeline.model.get_training_callbacks(attributes)
+
+
+def test_a_training_that_has_seen_all_views_is_refused(tiny_scene, tmp_path):
+    full = Path(
+        train(words(tiny_scene, tmp_path / "full", steps=2, **{"--pipeline.model.capacity": "full"})).config_path
+    )
+    with pytest.raises(InputError, match="has trained on all views for 2 steps"):
+        set_up(tiny_scene, tmp_path / "auto", **{"--load-dir": full.parent / "nerfstudio_models"})
+
+
+def test_an_end_before_the_decision_is_told(tiny_scene, tmp_path, capsys):
+    set_up(tiny_scene, tmp_path, steps=5)
+    assert "this training ends at step 4" in " ".join(capsys.readouterr().out.split())
