@@ -71,6 +71,33 @@ def test_rounded_products(precision, repeated):
     assert_near(evaluate(head, *case), exact, limits)
 
 
+@pytest.mark.parametrize("way", [0, 1])
+@pytest.mark.parametrize("repeated", [False, True])
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"num_bands": 1, "latent_dim": 1, "hidden_width": 5},
+        {"num_bands": 2, "latent_dim": 7, "hidden_width": 20},
+        {"num_bands": 5, "latent_dim": 33, "hidden_width": 64},
+        {"num_bands": 7, "latent_dim": 64, "hidden_width": 30},
+        {"hidden_width": 128},
+        {"num_bands": 1, "latent_dim": 16, "hidden_width": 256, "split_bands": False},
+        {"split_bands": False, "opacity_residual": False},
+        {"opacity_bound": "smooth"},
+    ],
+)
+def test_sizes_and_ways(config, repeated, way, monkeypatch):
+    """Every size that the kernels take, launched in the first way and in the one for small cards. Limits: above."""
+    from nrfgs_ns.appearance.fused import launch
+
+    monkeypatch.setitem(launch.LAUNCHES, "bf16", launch.LAUNCHES["bf16"][way:])
+    head, twin = heads("cuda", precision="bf16", **config)
+    case = scene(head, 6000, 5000, repeated)
+    exact = evaluate(rounding(twin, launch.KINDS["bf16"]), *case, dtype=torch.float64)
+    limits = {name: 2.0**-8 if name.startswith("d ") else 2.0**-12 for name in exact}
+    assert_near(evaluate(head, *case), exact, limits)
+
+
 @pytest.mark.parametrize("precision", ["fp32", "tf32", "bf16", "fp16"])
 def test_extremes_stay_finite(precision):
     head, _ = heads("cuda", precision=precision, scale=100.0)

@@ -4,13 +4,19 @@
 Run by test_fused.py in a process of its own: Triton decides when it is imported whether it interprets.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
+import triton
+import triton.language as tl
 from fused_cases import ULP, assert_near, evaluate, float32_tolerance, heads, relative_errors, rounding, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nrfgs_ns.appearance.fused import launch
+from nrfgs_ns.appearance.fused.kernels import _waves
+from nrfgs_ns.errors import InputError
 
 
 def compare(head, twin, case, tolerance) -> None:
@@ -42,10 +48,88 @@ def test_every_switch(num_bands, visible, repeated, **switches):
     compare(head, twin, scene(head, 75, visible, repeated), float32_tolerance(num_bands))
 
 
+@pytest.mark.parametrize("columns", [8, 16])
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {"num_bands": 1, "latent_dim": 1, "hidden_width": 5},
+        {"num_bands": 2, "latent_dim": 7, "hidden_width": 20, "opacity_bound": "logit"},
+        {"num_bands": 3, "latent_dim": 31, "hidden_width": 64, "opacity_bound": "smooth"},
+        {"num_bands": 5, "latent_dim": 17, "hidden_width": 33, "opacity_bound": "clamp"},
+        {"num_bands": 7, "latent_dim": 33, "hidden_width": 9, "split_bands": False},
+    ],
+)
+def test_sizes_beside_powers_of_two(sizes, columns, monkeypatch):
+    """Both ways of giving the output layer to the tensor cores, for every number of tiles and what is padded."""
+    (launches,) = launch.LAUNCHES["fp32"]
+    ours = launch.Launches(replace(launches.forward, columns=columns), replace(launches.backward, columns=columns))
+    monkeypatch.setitem(launch.LAUNCHES, "fp32", (ours,))
+    head, twin = heads(**sizes)
+    compare(head, twin, scene(head, 60, 50, repeated=columns == 8), float32_tolerance(sizes["num_bands"]))
+
+
+@triton.jit
+def waves_kernel(directions, found, N: tl.constexpr, BANDS: tl.constexpr):
+    positions = tl.arange(0, N)[:, None] * 4 + tl.arange(0, 4)[None, :]
+    waves = _waves(tl.load(directions + positions), BANDS)
+    for i in tl.static_range(2 * BANDS):
+        tl.store(found + i * 4 * N + positions, waves[i])
+
+
+def test_bands_by_double_angles():
+    bands, n = 7, 2**14
+    directions = torch.cat([torch.linspace(-1, 1, 4 * n - 4), torch.tensor([0.0, 0.25, -0.5, 1e-6])]).view(n, 4)
+    found = torch.empty(bands, 2, n, 4)
+    waves_kernel[(1,)](directions, found, N=n, BANDS=bands)
+    for k in range(bands):
+        angle = torch.pi * 2.0**k * directions.double()
+        error = (found[k].double() - torch.stack([angle.sin(), angle.cos()])).norm(dim=0).max().item()
+        assert error <= 2.0**k * 4 * ULP  # the kernel derives 2^k 4e-7; the error of band 0 is known, 2.1e-7
+
+
+def test_the_next_way_is_taken_where_the_first_does_not_run(monkeypatch):
+    first, second = launch.LAUNCHES["bf16"]
+    probe, tried = launch.probe, []
+
+    def lacking(packing, launches, options):
+        tried.append(launches)
+        if launches == first:
+            raise RuntimeError("out of resource: shared memory")
+        probe(packing, launches, options)
+
+    monkeypatch.setattr(launch, "probe", lacking)
+    head, twin = heads(precision="bf16")
+    compare(head, rounding(twin, launch.KINDS["bf16"]), scene(head, 150, 140), 2.0**-13)
+    assert tried == [first, second]
+
+
+def test_all_ways_failing_names_the_last_reason(monkeypatch):
+    def lacking(packing, launches, options):
+        raise RuntimeError(f"no room for {launches.backward.block} splats")
+
+    monkeypatch.setattr(launch, "probe", lacking)
+    head, _ = heads(precision="bf16")
+    last = launch.LAUNCHES["bf16"][-1].backward.block
+    with pytest.raises(InputError, match=f"do not run here .RuntimeError: no room for {last} splats"):
+        head(*scene(head, 20, 15))
+
+
 @pytest.mark.parametrize("visible", [0, 1, 64, 65])
 def test_counts_around_a_block(visible):
     head, twin = heads()
     compare(head, twin, scene(head, 100, visible), float32_tolerance())
+
+
+def test_what_is_not_cleared_is_written():
+    """All rows visible to one camera: the tables' gradients begin as anything, here as NaN."""
+    head, twin = heads()
+    case = scene(head, 70, 70)
+    torch.use_deterministic_algorithms(True)  # fills what is allocated without a value
+    try:
+        found = evaluate(head, *case)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert_near(found, evaluate(twin, *case, dtype=torch.float64), float32_tolerance())
 
 
 def test_zero_outputs_add_exactly_nothing():

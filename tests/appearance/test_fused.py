@@ -70,7 +70,7 @@ def test_falling_back_is_logged_once(caplog):
     device = torch.device("cuda")
     # As `takes` would on a GPU, which this machine need not have: sizes are refused before anything is moved there.
     caplog.set_level(logging.WARNING)
-    reasons = [head.fused._packing_on(device) for _ in range(2)]
+    reasons = [head.fused._ready_on(device) for _ in range(2)]
     assert reasons[0] == reasons[1]
     assert len(caplog.records) == 1 and "beyond the kernels'" in caplog.text
 

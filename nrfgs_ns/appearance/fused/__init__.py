@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The field in two Triton kernels, one forward and one backward; PyTorch's twin is `nrf.py`.
 
-`packing.py` says how weights and features lie, `kernels.py` computes, `launch.py` makes a differentiable function of
-it, and this file decides whether it can run. Triton is imported only when it is about to: it is missing on machines
-without CUDA. With TRITON_INTERPRET=1 set before Triton is imported, the same kernels run in Triton's interpreter on
-the CPU: slowly, for tests.
+`packing.py` says how weights and features lie, `kernels.py` computes with what `arithmetic.py` has, `launch.py` makes a
+differentiable function of it, and this file decides whether it can run. Triton is imported only when it is about to: it
+is missing on machines without CUDA. With TRITON_INTERPRET=1 set before Triton is imported, the same kernels run in
+Triton's interpreter on the CPU: slowly, for tests.
 """
 
 import importlib.util
@@ -12,12 +12,16 @@ import logging
 import math
 import os
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.fused.packing import Packing, pack
 from nrfgs_ns.errors import InputError
+
+if TYPE_CHECKING:  # imports Triton
+    from nrfgs_ns.appearance.fused.launch import FieldOptions, Launches
 
 MAX_WIDTH = 64
 """Largest P (packing.py): latents, or features, rounded up to a power of two."""
@@ -40,7 +44,7 @@ class FusedField:
         self.config = config
         self.branches = [branch for branch in (low, high) if branch is not None]
         self.on_cpu = pack(config.latent_dim, config.num_bands, config.use_distance, low, high)
-        self.ready: dict[tuple[torch.device, str], Packing | str] = {}  # by device and precision
+        self.ready: dict[tuple[torch.device, str], tuple[Packing, Launches] | str] = {}  # by device and precision
 
     def takes(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> bool:
         """Whether the kernels are to compute this call.
@@ -66,8 +70,8 @@ class FusedField:
 
         weights = [weight for branch in self.branches for weight in branch.parameters()]
         tables = [splats[name] for name in ("means", "latents", "features_dc", "opacities")]
-        packing = self._packing_on(visible.device)
-        return FusedFunction.apply(packing, self._options(scene_unit), *tables, visible, camera_centers, *weights)
+        ready = self._ready_on(visible.device)
+        return FusedFunction.apply(*ready, self._options(scene_unit), *tables, visible, camera_centers, *weights)
 
     def _why_not(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> str | None:
         """What keeps the kernels from computing this call, or None."""
@@ -82,11 +86,11 @@ class FusedField:
                 return f"{name} is {str(tensor.dtype).removeprefix('torch.')}, and the kernels take float32"
             if tensor.device != device:
                 return f"{name} is on {tensor.device}, and means on {device}"
-        ready = self._packing_on(device)
+        ready = self._ready_on(device)
         return ready if isinstance(ready, str) else None
 
-    def _packing_on(self, device: torch.device) -> Packing | str:
-        """The index maps on `device`, or why the kernels cannot run there: found out once, and said once."""
+    def _ready_on(self, device: torch.device) -> "tuple[Packing, Launches] | str":
+        """What `_prepare` finds on `device`: found out once, and said once."""
         key = device, self.config.precision
         if key not in self.ready:
             self.ready[key] = self._prepare(device)
@@ -94,8 +98,8 @@ class FusedField:
                 logger.warning("The field runs in plain PyTorch on %s: %s.", device, self.ready[key])
         return self.ready[key]
 
-    def _prepare(self, device: torch.device) -> Packing | str:
-        """The index maps on `device`, or why the kernels cannot run there."""
+    def _prepare(self, device: torch.device) -> "tuple[Packing, Launches] | str":
+        """The index maps on `device` and how the kernels are launched there, or why they cannot run there."""
         if importlib.util.find_spec("triton") is None:
             return "Triton is not installed"
         width, hidden = self.on_cpu.width, self.on_cpu.hidden
@@ -106,15 +110,14 @@ class FusedField:
             )
         packing = self.on_cpu.to(device)
         try:
-            from nrfgs_ns.appearance.fused.launch import probe
+            from nrfgs_ns.appearance.fused.launch import first_that_runs
 
-            probe(packing, self._options())
+            return packing, first_that_runs(packing, self._options())
         except Exception as error:  # whatever stops Triton on this machine, PyTorch computes the same
             first_line = next(iter(str(error).splitlines()), "")
             return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
-        return packing
 
-    def _options(self, scene_unit: float = 1.0):
+    def _options(self, scene_unit: float = 1.0) -> "FieldOptions":
         """The configuration as the launcher wants it."""
         from nrfgs_ns.appearance.fused.launch import FieldOptions
 

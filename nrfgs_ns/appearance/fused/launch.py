@@ -2,7 +2,8 @@
 """The kernels as one differentiable function of tables, camera centres and shared weights.
 
 A training step of a small scene is bound by the host, so this is written for few launches: two to pack the weights,
-one forward, one to zero the tables' gradients, one backward, two to sum and unpack the weights' gradients.
+one forward, one to zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the
+weights' gradients.
 """
 
 import math
@@ -12,14 +13,15 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.appearance.fused.kernels import INTERPRETED, backward_kernel, forward_kernel
+from nrfgs_ns.appearance.fused.arithmetic import INTERPRETED
+from nrfgs_ns.appearance.fused.kernels import backward_kernel, forward_kernel
 from nrfgs_ns.appearance.fused.packing import CENTER_SLOTS, Packing
 from nrfgs_ns.appearance.head import SH_C0
 
 
 @dataclass(frozen=True)
 class Launch:
-    """How a kernel is launched."""
+    """How a kernel is compiled and launched."""
 
     block: int
     """visible splats that a program takes at once"""
@@ -29,6 +31,28 @@ class Launch:
     """software pipelining of the loop over blocks; 1 is none"""
     programs_per_sm: int
     """programs for each multiprocessor; a program walks over many blocks"""
+    columns: int
+    """of W2 for the tensor cores: 8, or 16 with zeros behind; with 16, d_W1 is X^T d_pre instead of d_pre^T X"""
+    registers: int | None = None
+    """most registers of a thread, for up to 128 hidden units; None leaves them to the compiler"""
+
+    def options(self, hidden: int) -> dict[str, int]:
+        """What Triton's compiler is told, for H hidden units.
+
+        Four warps keep the activations of 64 splats in H / 2 registers of a thread: more units than 128 do not fit
+        where registers are few, and the compiler gives up. Multiplications are fused with additions, for which Triton
+        must be asked from 3.10 on.
+        """
+        options = {"num_warps": self.warps, "num_stages": self.stages, "enable_fp_fusion": True}
+        return options if self.registers is None or hidden > 128 else {**options, "maxnreg": self.registers}
+
+
+@dataclass(frozen=True)
+class Launches:
+    """How both kernels are launched."""
+
+    forward: Launch
+    backward: Launch
 
 
 KINDS = {
@@ -43,22 +67,39 @@ loss that is a mean over pixels gives them any size down to 1e-10, below what fp
 largest number would cost a reduction over the tile and a multiplication after every product. bf16 has float32's
 range; its rounding is unbiased and averages out over the splats."""
 
-# Chosen by benchmarks/head_gpu.py --sweep on an H200 (tf32, bf16), and by the compiler's account of registers, spills
-# and instructions (fp32). A tensor core's tile has 64 rows. Backward, the weights' gradients and the activations fill
-# the registers (255 a thread, 65,536 a multiprocessor), so that 8 warps run at once. float32's three products take
-# 208 KB of shared memory at 32 splats, of 227 KB on an H100 or H200.
-FORWARD: dict[str, Launch] = {
-    "fp32": Launch(block=64, warps=4, stages=1, programs_per_sm=1),
-    "tf32": Launch(block=64, warps=4, stages=1, programs_per_sm=3),
-    "bf16": Launch(block=64, warps=4, stages=1, programs_per_sm=3),
-    "fp16": Launch(block=64, warps=4, stages=1, programs_per_sm=3),
+# From times on an H200 and the compiler's account of registers, spills and shared memory. A tensor core's tile has 64
+# rows. Forward, 128 registers let four programs of 4 warps run at once (65,536 a multiprocessor). Backward, the
+# weights' gradients and the activations fill all 255 that a thread can have, so that 8 warps run at once: as one
+# program of 128 splats they share the weights' gradients, and nothing is spilled. With tf32, the compiler has no layout
+# for d_pre^T X. float32's three products take 208 KB of shared memory at 32 splats, of 227 KB on an H100 or H200. The
+# second way of the half precisions takes 63 KB, of 99 KB on a GeForce.
+HALF_PRECISION = (
+    Launches(
+        forward=Launch(block=64, warps=4, stages=3, programs_per_sm=4, columns=8, registers=128),
+        backward=Launch(block=128, warps=8, stages=3, programs_per_sm=1, columns=8),
+    ),
+    Launches(
+        forward=Launch(block=64, warps=4, stages=1, programs_per_sm=3, columns=8),
+        backward=Launch(block=64, warps=4, stages=1, programs_per_sm=2, columns=8),
+    ),
+)
+LAUNCHES: dict[str, tuple[Launches, ...]] = {
+    "fp32": (
+        Launches(
+            forward=Launch(block=64, warps=4, stages=3, programs_per_sm=1, columns=16),
+            backward=Launch(block=32, warps=8, stages=1, programs_per_sm=1, columns=16),
+        ),
+    ),
+    "tf32": (
+        Launches(
+            forward=Launch(block=64, warps=4, stages=3, programs_per_sm=3, columns=16),
+            backward=Launch(block=128, warps=8, stages=3, programs_per_sm=1, columns=16),
+        ),
+    ),
+    "bf16": HALF_PRECISION,
+    "fp16": HALF_PRECISION,
 }
-BACKWARD: dict[str, Launch] = {
-    "fp32": Launch(block=32, warps=8, stages=1, programs_per_sm=1),
-    "tf32": Launch(block=128, warps=8, stages=1, programs_per_sm=1),
-    "bf16": Launch(block=64, warps=4, stages=1, programs_per_sm=2),
-    "fp16": Launch(block=64, warps=4, stages=1, programs_per_sm=2),
-}
+"""For each NrfConfig.precision, fastest first: a field takes the first that its device can run at its sizes."""
 INTERPRETER_PROGRAMS = 2
 """Programs in Triton's interpreter: as few as show that programs share the work."""
 
@@ -87,37 +128,37 @@ class FusedFunction(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, packing: Packing, options: FieldOptions, means, latents, features_dc, opacities, visible, centers,
-                *weights):  # fmt: skip
+    def forward(ctx, packing: Packing, launches: Launches, options: FieldOptions, means, latents, features_dc,
+                opacities, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
         visible, centers = _contiguous(visible), _contiguous(centers)
         packed = torch.cat([w.reshape(-1) for w in weights] + [_zero(means.device)]).index_select(0, packing.gather)
         count = len(visible)
         colors, seen = means.new_empty(count, 3), means.new_empty(count)
         if count > 0:
-            how = FORWARD[options.precision]
+            how = launches.forward
             forward_kernel[(_programs(how, count, means.device),)](
                 *tables, visible, centers, packed, colors, seen,
                 count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
-                D=packing.latent_dim, P=packing.width, H=packing.hidden, B=how.block,
+                D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
+                B=how.block, COLUMNS=how.columns,
                 ONE_CENTER=centers.dim() == 1, BOUND=options.bound, KIND=KINDS[options.precision][0],
-                num_warps=how.warps, num_stages=how.stages,
+                **how.options(packing.hidden),
             )  # fmt: skip
         ctx.save_for_backward(*tables, visible, centers, packed)
-        ctx.packing, ctx.options = packing, options
+        ctx.packing, ctx.how, ctx.options = packing, launches.backward, options
         return colors, seen
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_colors, d_opacities):
-        packing, options = ctx.packing, ctx.options
+        packing, how, options = ctx.packing, ctx.how, ctx.options
         *tables, visible, centers, packed = ctx.saved_tensors
         count, rows, device = len(visible), len(tables[0]), visible.device
-        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[7] and options.geometry_gradient
-        d_tables = _zero_tables(rows, packing.latent_dim, device)
+        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[8] and options.geometry_gradient
+        d_tables = _tables(rows, packing.latent_dim, device, zero=not one_center or count < rows)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
         if count > 0:
-            how = BACKWARD[options.precision]
             programs = _programs(how, count, device)
             partials = tables[0].new_empty(programs, packing.size + CENTER_SLOTS)
             kind, gradient_kind = KINDS[options.precision]
@@ -125,10 +166,11 @@ class FusedFunction(torch.autograd.Function):
                 *tables, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
                 count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
-                D=packing.latent_dim, P=packing.width, H=packing.hidden, B=how.block, SLOTS=partials.shape[1],
+                D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
+                B=how.block, COLUMNS=how.columns, SLOTS=partials.shape[1],
                 ONE_CENTER=one_center, BOUND=options.bound, GEOMETRY=options.geometry_gradient, CENTER=wants_center,
                 KIND=kind, GRADIENT_KIND=gradient_kind,
-                num_warps=how.warps, num_stages=how.stages,
+                **how.options(packing.hidden),
             )  # fmt: skip
             sums = partials.sum(dim=0)
         else:
@@ -138,21 +180,34 @@ class FusedFunction(torch.autograd.Function):
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
         d_means = d_tables[0] if options.geometry_gradient else None
-        return None, None, d_means, *d_tables[1:], None, d_centers if wants_center else None, *d_weights
+        return None, None, None, d_means, *d_tables[1:], None, d_centers if wants_center else None, *d_weights
 
 
-def probe(packing: Packing, options: FieldOptions) -> None:
-    """Compile and run both kernels on one splat, for one camera; raise whatever goes wrong.
+def first_that_runs(packing: Packing, options: FieldOptions) -> Launches:
+    """The fastest way to launch the kernels that this device can run at these sizes; else raise what goes wrong.
 
     What can go wrong shows only here: no C compiler for Triton's launcher, or less shared memory than the kernels take.
     """
+    *more, last = LAUNCHES[options.precision]
+    for launches in more:
+        try:
+            probe(packing, launches, options)
+        except Exception:  # whatever it is: if the last way fails too, that one tells
+            continue
+        return launches
+    probe(packing, last, options)
+    return last
+
+
+def probe(packing: Packing, launches: Launches, options: FieldOptions) -> None:
+    """Compile and run both kernels on one splat, for one camera; raise whatever goes wrong."""
     device = packing.gather.device
     with torch.inference_mode(False), torch.enable_grad():
         tables = [torch.zeros(1, n, device=device, requires_grad=True) for n in (3, packing.latent_dim, 3, 1)]
         weights = [torch.zeros(shape, device=device, requires_grad=True) for shape in packing.shapes]
         visible, center = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(3, device=device)
-        colors, opacities = FusedFunction.apply(packing, options, *tables, visible, center, *weights)
-        (colors.sum() + opacities.sum()).backward()
+        outputs = FusedFunction.apply(packing, launches, options, *tables, visible, center, *weights)
+        sum(output.sum() for output in outputs).backward()
 
 
 def _programs(how: Launch, count: int, device: torch.device) -> int:
@@ -164,14 +219,18 @@ def _programs(how: Launch, count: int, device: torch.device) -> int:
     return min(at_once, math.ceil(count / how.block))
 
 
-def _zero_tables(rows: int, latent_dim: int, device: torch.device) -> list[Tensor]:
-    """Zeros [N, 3], [N, D], [N, 3] and [N, 1], cut from one allocation so that one launch clears them.
+def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> list[Tensor]:
+    """Tables [N, 3], [N, D], [N, 3] and [N, 1], cut from one allocation so that one launch clears them.
 
     Each begins at a multiple of 16 bytes whatever N is: Triton compiles another kernel for pointers that do not.
+
+    Args:
+        zero: make them zeros. Not needed if one camera sees every row: then the kernel writes each row, once.
     """
     padded = -(-rows // 4) * 4
     widths = (3, latent_dim, 3, 1)
-    pieces = torch.zeros(padded * sum(widths), device=device).split([padded * width for width in widths])
+    whole = (torch.zeros if zero else torch.empty)(padded * sum(widths), device=device)
+    pieces = whole.split([padded * width for width in widths])
     return [piece[: rows * width].view(rows, width) for piece, width in zip(pieces, widths, strict=True)]
 
 

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the field's weights and features lie in the fused kernels: two index maps, built once.
 
-Kernels' names: D numbers in a latent; R rows of four features, P = 4 R columns of features and of latents, the same
+Kernels' names: D numbers in a latent; R tiles of four features, P = 4 R columns of features and of latents, the same
 power of two for both; H hidden units of both branches side by side, rounded up to a power of two.
 
-- Features, four lanes in a row: row 0 is the direction and the constant 1, whose row of W1 is the first layer's bias;
-  rows 1 + 2k and 2 + 2k are the sines and cosines of band k; row R - 1 is (c, alpha). Lane 3 of row 1 is log r. What
-  is left over has no weights.
-- Inputs X [., 2P]: latent i in column 2i, feature j in column 2j + 1, so that the kernels join two tiles [., P] without
-  moving anything between threads.
+- Features, four lanes in a tile: tile 0 is the direction and the constant 1, whose row of W1 is the first layer's bias;
+  tiles 1 + 2k and 2 + 2k are the sines and cosines of band k; tile R - 1 is (c, alpha). Lane 3 of tile 1 is log r. What
+  is left over has no weights. Lane l of tile i is feature 4 i + l.
+- Latents, four tiles for every sixteen: latent 16 h + 4 l + t is in lane l of tile 4 h + t, that is, four neighbours of
+  the table, which are read at once, in one lane.
+- Inputs X [., 2P]: lane l of tile i of the latents in column 2 (4 i + l), of the features in the one behind. Of every
+  eight columns tensor cores keep two neighbours in a thread: a latent and a feature, of one lane and all tiles.
 - W1 [2P, H]: zero where a branch does not see an input.
-- W2 [H, 16] and b2 [16]: output j of the low branch in column 4j, of the high branch in column 4j + 2. So column 12 is
-  d_alpha, column 14 the gate's logit w, and odd columns are padding: a tensor core sums over 16 at once.
+- W2 [H, 8] and b2 [8]: output j of the low branch in column 2j, of the high branch in column 2j + 1. So column 6 is
+  d_alpha and column 7 the gate's logit w.
 """
 
 from dataclasses import dataclass
@@ -19,7 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-OUTPUT_COLUMNS = 16
+OUTPUT_COLUMNS = 8
 CENTER_SLOTS = 4
 """Numbers kept behind the weights' partial gradients for the camera centre's, 3 and a filler."""
 
@@ -33,8 +35,10 @@ class Packing:
     """P: columns of the latents' tile and of the features' tile."""
     hidden: int
     """H: hidden units, a power of two >= 16."""
+    num_bands: int
+    """K, at least 1."""
     gather: Tensor
-    """[2 P H + 16 H + 16], int64: packed weights = flat[gather], flat being all parameters in a row and then one 0."""
+    """[2 P H + 8 H + 8], int64: packed weights = flat[gather], flat being all parameters in a row and then one 0."""
     scatter: Tensor
     """[number of weights], int64: gradient of the flat parameters = gradient of the packed ones [scatter]."""
     shapes: tuple[torch.Size, ...]
@@ -48,7 +52,7 @@ class Packing:
     def to(self, device: torch.device) -> "Packing":
         """The same with its tensors on `device`."""
         moved = {name: getattr(self, name).to(device) for name in ("gather", "scatter")}
-        return Packing(self.latent_dim, self.width, self.hidden, shapes=self.shapes, **moved)
+        return Packing(self.latent_dim, self.width, self.hidden, self.num_bands, shapes=self.shapes, **moved)
 
 
 def pack(
@@ -68,7 +72,7 @@ def pack(
     hidden_units = [branch[0].out_features for branch in (low, high) if branch is not None]
     hidden = max(16, _power_of_two(sum(hidden_units)))
 
-    latents = [2 * i for i in range(latent_dim)]
+    latents = [_latent_column(i) for i in range(latent_dim)]
     color = [columns[name] for name in ("c0", "c1", "c2")]
     shared = latents + color + ([columns["log_r"]] if use_distance else [])
     low_bands = [columns[name] for name in ("dx", "dy", "dz", *_band(0))]
@@ -87,11 +91,11 @@ def pack(
     unit = 0
     branches = [(low_inputs, positions[:4], 0)]
     if high is not None:
-        branches.append((shared + high_bands, positions[4:], 2))
+        branches.append((shared + high_bands, positions[4:], 1))
     for inputs, (w1, b1, w2, b2), offset in branches:
         units = torch.arange(unit, unit + len(b1))
         unit += len(b1)
-        outputs = 4 * torch.arange(len(b2)) + offset
+        outputs = 2 * torch.arange(len(b2)) + offset
         first[torch.tensor(inputs)[:, None], units] = w1.T
         first[columns["one"], units] = b1
         second[units[:, None], outputs] = w2.T
@@ -99,20 +103,26 @@ def pack(
     gather = torch.cat([first.flatten(), second.flatten(), bias])
     scatter = torch.empty(zero + 1, dtype=torch.int64)
     scatter[gather] = torch.arange(len(gather))
-    return Packing(latent_dim, width, hidden, gather, scatter[:zero].clone(), shapes)
+    return Packing(latent_dim, width, hidden, num_bands, gather, scatter[:zero].clone(), shapes)
 
 
-def _feature_columns(num_bands: int, rows: int) -> dict[str, int]:
+def _feature_columns(num_bands: int, tiles: int) -> dict[str, int]:
     """Each feature's column in X."""
     lanes = {(0, 3): "one", (1, 3): "log_r"}
     for lane, name in enumerate(("dx", "dy", "dz")):
         lanes[0, lane] = name
     for lane, name in enumerate(("c0", "c1", "c2", "alpha")):
-        lanes[rows - 1, lane] = name
+        lanes[tiles - 1, lane] = name
     for k in range(num_bands):
         for i, name in enumerate(_band(k)):
             lanes[1 + 2 * k + i // 3, i % 3] = name
-    return {name: 2 * (4 * row + lane) + 1 for (row, lane), name in lanes.items()}
+    return {name: 2 * (4 * tile + lane) + 1 for (tile, lane), name in lanes.items()}
+
+
+def _latent_column(i: int) -> int:
+    """Latent i's column in X."""
+    lane, tile = i // 4 % 4, i // 16 * 4 + i % 4
+    return 2 * (4 * tile + lane)
 
 
 def _band(k: int) -> list[str]:
