@@ -62,7 +62,7 @@ _BINOMIALS = torch.tensor(
 
 
 @torch.no_grad()
-def relocate(splats: Splats, optimizers: Optimizers, dead: Tensor, min_opacity: float) -> int:
+def relocate(splats: Splats, optimizers: Optimizers, dead: Tensor, min_opacity: float) -> Tensor:
     """Move dead splats onto live ones, drawn in proportion to their opacity; each place is then shared evenly.
 
     As in gsplat, the drawn splats' moments are set to zero, and those of the dead stay what they were.
@@ -74,11 +74,12 @@ def relocate(splats: Splats, optimizers: Optimizers, dead: Tensor, min_opacity: 
         min_opacity: no splat ends below it.
 
     Returns:
-        The number of splats that moved; 0 if none is alive.
+        The row that each row was made from, int64 [N]. If none is alive, all stay as they are.
     """
+    source = torch.arange(len(dead), device=dead.device)
     dead_rows, live_rows = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
     if len(dead_rows) == 0 or len(live_rows) == 0:
-        return 0
+        return source
     chosen, opacities, scales = _shared_places(splats, live_rows, len(dead_rows), min_opacity)
 
     def moved(name: str, old: Tensor) -> Parameter:
@@ -92,18 +93,22 @@ def relocate(splats: Splats, optimizers: Optimizers, dead: Tensor, min_opacity: 
         return old.index_fill(0, chosen, 0.0)
 
     _update_param_with_optimizer(moved, moments, splats, optimizers)
-    return len(dead_rows)
+    source[dead_rows] = chosen
+    return source
 
 
 @torch.no_grad()
-def add_samples(splats: Splats, optimizers: Optimizers, count: int, min_opacity: float) -> None:
+def add_samples(splats: Splats, optimizers: Optimizers, count: int, min_opacity: float) -> Tensor:
     """Add `count` splats onto existing ones, drawn in proportion to their opacity; each place is then shared evenly.
 
     Args: see `relocate`. The new rows come last, with zero moments; the drawn splats keep theirs, as in gsplat.
+
+    Returns:
+        The row that each row was made from, int64 [N + count].
     """
-    if count <= 0:
-        return
     rows = torch.arange(len(splats["means"]), device=splats["means"].device)
+    if count <= 0:
+        return rows
     chosen, opacities, scales = _shared_places(splats, rows, count, min_opacity)
 
     def grown(name: str, old: Tensor) -> Parameter:
@@ -116,6 +121,7 @@ def add_samples(splats: Splats, optimizers: Optimizers, count: int, min_opacity:
         return torch.cat([old, old.new_zeros(count, *old.shape[1:])])
 
     _update_param_with_optimizer(grown, moments, splats, optimizers)
+    return torch.cat([rows, chosen])
 
 
 def _shared_places(splats: Splats, rows: Tensor, count: int, min_opacity: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -133,7 +139,7 @@ def _shared_places(splats: Splats, rows: Tensor, count: int, min_opacity: float)
 
 
 @torch.no_grad()
-def diffuse(splats: Splats, size: float) -> None:
+def diffuse(splats: Splats, size: float, opacities: Tensor) -> None:
     """Add noise to the means, along each splat's own shape: covariance @ N(0, 1) * size * gate(opacity).
 
     The gate, 1 / (1 + exp(100 (opacity - 0.005))), lets only splats explore that cannot be seen.
@@ -141,8 +147,8 @@ def diffuse(splats: Splats, size: float) -> None:
     Args:
         splats: the table; `means` changes in place.
         size: learning rate of the means times the noise's own.
+        opacities: the splats', as they are seen, [N] in [0, 1].
     """
-    opacities = torch.sigmoid(splats["opacities"]).flatten()
     gate = torch.sigmoid(-NOISE_SHARPNESS * (opacities - NOISE_OPACITY))
     noise = torch.randn_like(splats["means"]) * (gate * size)[:, None]
     axes = normalized_quat_to_rotmat(F.normalize(splats["quats"], dim=-1))

@@ -140,7 +140,7 @@ def test_noise_has_the_splats_shape_and_spares_what_is_visible():
         table.set_opacity(row, opacity)
     before = table.splats["means"].detach().clone()
     torch.manual_seed(0)
-    diffuse(table.splats, 0.1)
+    diffuse(table.splats, 0.1, torch.sigmoid(table.splats["opacities"].detach().flatten()))
     moved = table.splats["means"].detach() - before
 
     torch.manual_seed(0)
@@ -171,9 +171,10 @@ def test_relocated_splats_become_copies_of_live_ones():
     dead[::5] = True
     before = {name: value.detach().clone() for name, value in table.splats.items()}
     torch.manual_seed(0)
-    assert relocate(table.splats, table.optimizers, dead, 0.005) == 10
+    source = relocate(table.splats, table.optimizers, dead, 0.005)
     table.check()
     parents = table.splats["latents"][:, 0].long()
+    assert torch.equal(source, parents)
     assert not dead[parents].any(), "a dead splat's latent is left"
     assert torch.equal(parents[~dead], torch.arange(50)[~dead])
     for name, value in table.splats.items():
@@ -193,16 +194,18 @@ def test_relocated_splats_become_copies_of_live_ones():
 def test_nothing_alive_to_move_to():
     table = Table(5)
     before = table.splats["latents"].detach().clone()
-    assert relocate(table.splats, table.optimizers, torch.ones(5, dtype=torch.bool), 0.005) == 0
+    source = relocate(table.splats, table.optimizers, torch.ones(5, dtype=torch.bool), 0.005)
+    assert torch.equal(source, torch.arange(5))
     assert torch.equal(table.splats["latents"].detach(), before)
 
 
 def test_added_splats_are_copies_with_fresh_moments():
     table = Table(50)
     torch.manual_seed(0)
-    add_samples(table.splats, table.optimizers, 20, 0.005)
+    source = add_samples(table.splats, table.optimizers, 20, 0.005)
     table.check()
     assert len(table) == 70
+    assert torch.equal(source, table.splats["latents"][:, 0].long())
     parents = table.splats["latents"][:, 0].long()
     assert torch.equal(parents[:50], torch.arange(50))
     for name, value in table.splats.items():
@@ -297,6 +300,44 @@ def test_the_peak_is_forgotten_at_refinement(name):
     torch.manual_seed(0)
     table.step(rules, REFINES + 100, shown=0.001, seen=slice(7, 8))
     assert 7 not in table.splats["latents"][:, 0].long()
+
+
+def test_noise_spares_what_views_have_lately_shown():
+    """MCMC, a base at which the noise is at its largest: whoever was shown since the relocation before the last holds
+    still, relocated rows included; with "base" all are shaken."""
+    for seen in ("base", "peak"):
+        table = Table(50)
+        for row in range(50):
+            table.set_opacity(row, 0.006)
+        rules = protocol("mcmc", opacity_seen_by_densification=seen, splat_budget=60)
+        torch.manual_seed(0)
+        table.step(rules, REFINES, shown=0.4, seen=slice(0, 40))
+        assert len(table) > 50
+        before = table.splats["means"].detach().clone()
+        parents = table.splats["latents"][:, 0].long()
+        table.step(rules, REFINES + 1, shown=0.4, seen=slice(0, 1))
+        moved = (table.splats["means"].detach() - before).abs().amax(dim=-1)
+        assert moved[parents >= 40].min() > 0
+        assert (moved[parents < 40].max() < 1e-15) == (seen == "peak")  # the gate at 0.4 is exp(-39.5)
+
+
+def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
+    """MCMC: the cameras' mean of (what they show, else the stored opacity) over all splats, and its gradients."""
+    rules = protocol("mcmc")
+    stored = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+    logits = torch.logit(stored)[:, None].requires_grad_()
+    splats = {"opacities": logits, "scales": torch.zeros(4, 3, dtype=torch.float64)}
+    assert_close(rules.regularisation(splats)["mcmc_opacity_reg"], 0.01 * stored.mean())
+    shown = torch.tensor([0.5, 0.6, 0.7], dtype=torch.float64, requires_grad=True)
+    info = {"gaussian_ids": torch.tensor([0, 2, 2]), "n_cameras": 2}  # the first camera sees 0 and 2, the second 2
+    rules.pre_backward(0, info, shown, 4)
+    term = rules.regularisation(splats)["mcmc_opacity_reg"]
+    first, second = [0.5, 0.2, 0.6, 0.4], [0.1, 0.2, 0.7, 0.4]
+    assert_close(term.item(), 0.01 * (sum(first) + sum(second)) / 8)
+    by_logit, by_shown = torch.autograd.grad(term, (logits, shown))
+    assert_close(by_shown, torch.full_like(shown, 0.01 / 8))
+    kept = torch.tensor([1, 2, 0, 2], dtype=torch.float64)  # cameras that do not show it
+    assert_close(by_logit[:, 0], 0.01 / 8 * kept * stored * (1 - stored))
 
 
 def test_the_peak_is_forgotten_at_reset():

@@ -41,7 +41,7 @@ def test_diffuse_is_gsplats_noise():
     }
     results = []
     for move in (
-        lambda splats: diffuse(splats, 0.1),
+        lambda splats: diffuse(splats, 0.1, torch.sigmoid(splats["opacities"].flatten())),
         lambda splats: inject_noise_to_position(splats, {}, {}, scaler=0.1),
     ):
         splats = {name: Parameter(value.cuda()) for name, value in start.items()}

@@ -99,6 +99,7 @@ class ShardedModel(NrfgsModel):
                 "radii": projection.radii,
                 "means2d": projection.means2d,
                 "depths": projection.depths,
+                "n_cameras": len(pinholes),
             }
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.num_points)
             self._correct_colors(outputs, cameras[comm.rank()])
