@@ -368,7 +368,7 @@ def build_densification(config: Any, num_train_images: int, scene_unit: float = 
         raise InputError(
             f"pipeline.model.densification is {config.densification!r}; use one of {', '.join(map(repr, makers))}."
         )
-    if config.opacity_seen_by_densification not in ("base", "peak"):
+    if config.opacity_seen_by_densification not in (None, "base", "peak"):
         raise InputError(
             f"pipeline.model.opacity_seen_by_densification is {config.opacity_seen_by_densification!r}; "
             "use 'base' or 'peak'."
@@ -395,7 +395,7 @@ def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densif
         verbose=True,
     )
     return GradientDensification(
-        "splatfacto", strategy, config.opacity_seen_by_densification, scene_unit, reset_at_start=True
+        "splatfacto", strategy, config.opacity_seen_by_densification or "base", scene_unit, reset_at_start=True
     )
 
 
@@ -417,7 +417,7 @@ def _original(config: Any, num_train_images: int, scene_unit: float) -> Densific
         verbose=True,
     )
     return GradientDensification(
-        "original", strategy, config.opacity_seen_by_densification, scene_unit=None, reset_at_start=False
+        "original", strategy, config.opacity_seen_by_densification or "base", scene_unit=None, reset_at_start=False
     )
 
 
@@ -432,7 +432,7 @@ def _mcmc(config: Any, num_train_images: int, scene_unit: float) -> Densificatio
         budget=config.splat_budget,
         start=config.warmup_length,
         every=config.refine_every,
-        opacity_seen=config.opacity_seen_by_densification,
+        opacity_seen=config.opacity_seen_by_densification or "peak",
         scene_unit=scene_unit,
     )
 

@@ -69,14 +69,14 @@ range; its rounding is unbiased and averages out over the splats."""
 
 # From times on an H200 and the compiler's account of registers, spills and shared memory. A tensor core's tile has 64
 # rows. Forward, 128 registers let four programs of 4 warps run at once (65,536 a multiprocessor). Backward, the
-# weights' gradients and the activations fill all 255 that a thread can have, so that 8 warps run at once: as one
-# program of 128 splats they share the weights' gradients, and nothing is spilled. With tf32, the compiler has no layout
-# for d_pre^T X. float32's three products take 208 KB of shared memory at 32 splats, of 227 KB on an H100 or H200. The
-# second way of the half precisions takes 63 KB, of 99 KB on a GeForce.
+# weights' gradients and the activations fill all 255 that a thread can have, so that 8 warps run at once: as two
+# programs of 64 splats they wait less for each other than as one of 128, at the price of a few spills. With tf32, the
+# compiler has no layout for d_pre^T X. float32's three products take 208 KB of shared memory at 32 splats, of 227 KB on
+# an H100 or H200. The second way of the half precisions takes 63 KB, of 99 KB on a GeForce.
 HALF_PRECISION = (
     Launches(
         forward=Launch(block=64, warps=4, stages=3, programs_per_sm=4, columns=8, registers=128),
-        backward=Launch(block=128, warps=8, stages=3, programs_per_sm=1, columns=8),
+        backward=Launch(block=64, warps=4, stages=3, programs_per_sm=2, columns=8),
     ),
     Launches(
         forward=Launch(block=64, warps=4, stages=1, programs_per_sm=3, columns=8),
@@ -86,14 +86,14 @@ HALF_PRECISION = (
 LAUNCHES: dict[str, tuple[Launches, ...]] = {
     "fp32": (
         Launches(
-            forward=Launch(block=64, warps=4, stages=3, programs_per_sm=1, columns=16),
+            forward=Launch(block=64, warps=4, stages=3, programs_per_sm=2, columns=16),
             backward=Launch(block=32, warps=8, stages=1, programs_per_sm=1, columns=16),
         ),
     ),
     "tf32": (
         Launches(
             forward=Launch(block=64, warps=4, stages=3, programs_per_sm=3, columns=16),
-            backward=Launch(block=128, warps=8, stages=3, programs_per_sm=1, columns=16),
+            backward=Launch(block=128, warps=8, stages=1, programs_per_sm=1, columns=16),
         ),
     ),
     "bf16": HALF_PRECISION,
