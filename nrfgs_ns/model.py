@@ -2,7 +2,7 @@
 """Splatfacto with an appearance head: what is trained, and how. `rendering.py` draws it.
 
 Loss, schedules and crop are nerfstudio's, and so is densification unless another protocol is asked for
-(`densification.py`). What differs: colours and opacities come from the head, for the splats that the camera sees only;
+(`densification/`). What differs: colours and opacities come from the head, for the splats that the camera sees only;
 nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the parameter objects that the optimisers
 hold, so that an interrupted training can go on.
 """

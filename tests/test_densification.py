@@ -15,9 +15,9 @@ from nrfgs_ns.densification import (
     OriginalDensification,
     build_densification,
 )
+from nrfgs_ns.densification.relocation import add_samples, diffuse, relocate, split_evenly
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model import NrfgsModelConfig
-from nrfgs_ns.relocation import add_samples, diffuse, relocate, split_evenly
 from nrfgs_ns.studies.run import parse, train
 
 pytestmark = pytest.mark.usefixtures("no_cuda")

@@ -6,7 +6,7 @@ import torch
 from torch.nn import Parameter
 from torch.testing import assert_close
 
-from nrfgs_ns.relocation import diffuse, split_evenly
+from nrfgs_ns.densification.relocation import diffuse, split_evenly
 
 pytestmark = pytest.mark.gpu
 

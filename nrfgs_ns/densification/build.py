@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a model's configuration to its protocol of densification."""
+
+from typing import Any
+
+from nrfgs_ns.densification.gradient import GradientDensification, OriginalDensification, PruneBySeenOpacity
+from nrfgs_ns.densification.mcmc import Mcmc
+from nrfgs_ns.densification.protocol import Densification
+from nrfgs_ns.errors import InputError
+
+LARGEST_BUDGET = 2**24
+"""`torch.multinomial` draws from no more categories than this."""
+SPLATFACTOS_THRESHOLDS = (
+    "cull_alpha_thresh",
+    "densify_grad_thresh",
+    "densify_size_thresh",
+    "cull_scale_thresh",
+    "use_absgrad",
+    "cull_screen_size",
+    "split_screen_size",
+    "stop_screen_size_at",
+)
+"""Options of the model that only the protocol `splatfacto` reads."""
+
+
+def build_densification(config: Any, num_train_images: int, scene_unit: float = 1.0) -> Densification:
+    """The protocol that a model's configuration asks for.
+
+    Args:
+        config: an NrfgsModelConfig.
+        num_train_images: splatfacto waits for as many steps after a reset.
+        scene_unit: world units in a scene unit, in which the configuration's sizes are.
+
+    Raises:
+        InputError: an option is out of range, or belongs to another protocol.
+    """
+    makers = {"splatfacto": _splatfacto, "original": _original, "mcmc": _mcmc}
+    if config.densification not in makers:
+        raise InputError(
+            f"pipeline.model.densification is {config.densification!r}; use one of {', '.join(map(repr, makers))}."
+        )
+    if config.opacity_seen_by_densification not in (None, "base", "peak"):
+        raise InputError(
+            f"pipeline.model.opacity_seen_by_densification is {config.opacity_seen_by_densification!r}; "
+            "use 'base' or 'peak'."
+        )
+    return makers[config.densification](config, num_train_images, scene_unit)
+
+
+def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densification:
+    strategy = PruneBySeenOpacity(
+        prune_opa=config.cull_alpha_thresh,
+        grow_grad2d=config.densify_grad_thresh,
+        grow_scale3d=config.densify_size_thresh,
+        grow_scale2d=config.split_screen_size,
+        prune_scale3d=config.cull_scale_thresh,
+        prune_scale2d=config.cull_screen_size,
+        refine_scale2d_stop_iter=config.stop_screen_size_at,
+        refine_start_iter=config.warmup_length,
+        refine_stop_iter=config.stop_split_at,
+        reset_every=config.reset_alpha_every * config.refine_every,
+        refine_every=config.refine_every,
+        pause_refine_after_reset=num_train_images + config.refine_every,
+        absgrad=config.use_absgrad,
+        revised_opacity=False,
+        verbose=True,
+    )
+    return GradientDensification(
+        "splatfacto", strategy, config.opacity_seen_by_densification or "base", scene_unit, reset_at_start=True
+    )
+
+
+def _original(config: Any, num_train_images: int, scene_unit: float) -> Densification:
+    _refuse_options(config, SPLATFACTOS_THRESHOLDS)
+    rules: OriginalDensification = config.original
+    strategy = PruneBySeenOpacity(
+        prune_opa=rules.prune_opacity,
+        grow_grad2d=rules.grow_gradient,
+        grow_scale3d=rules.grow_scale,
+        prune_scale3d=rules.prune_scale,
+        refine_scale2d_stop_iter=0,
+        refine_start_iter=config.warmup_length,
+        refine_stop_iter=config.stop_split_at,
+        reset_every=config.reset_alpha_every * config.refine_every,
+        refine_every=config.refine_every,
+        pause_refine_after_reset=0,
+        absgrad=False,
+        verbose=True,
+    )
+    return GradientDensification(
+        "original", strategy, config.opacity_seen_by_densification or "base", scene_unit=None, reset_at_start=False
+    )
+
+
+def _mcmc(config: Any, num_train_images: int, scene_unit: float) -> Densification:
+    _refuse_options(config, (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at"))
+    if not 1 <= config.splat_budget <= LARGEST_BUDGET:
+        raise InputError(
+            f"pipeline.model.splat_budget is {config.splat_budget}; it must lie between 1 and {LARGEST_BUDGET}."
+        )
+    return Mcmc(
+        config.mcmc,
+        budget=config.splat_budget,
+        start=config.warmup_length,
+        every=config.refine_every,
+        opacity_seen=config.opacity_seen_by_densification or "peak",
+        scene_unit=scene_unit,
+    )
+
+
+def _refuse_options(config: Any, names: tuple[str, ...]) -> None:
+    """Raise InputError where an option was set that this protocol does not read: it would be ignored silently."""
+    for name in names:
+        if getattr(config, name) != getattr(type(config), name):
+            protocol = config.densification
+            raise InputError(
+                f"pipeline.model.{name} has no effect with the densification {protocol!r}. Leave it out, or use "
+                f"--pipeline.model.{protocol}.... (see ns-train METHOD --help)."
+            )

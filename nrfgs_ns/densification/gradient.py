@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Growth where screen-space gradients are large: splatfacto's densification, and 3DGS's (Kerbl et al. 2023)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gsplat.strategy import DefaultStrategy
+from gsplat.strategy.ops import remove
+from torch import Tensor
+
+from nrfgs_ns.densification.protocol import Densification, OpacitySeen, Protocol
+
+EXTENT_MARGIN = 1.1
+"""3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
+STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop_iter")
+"""What begins or ends by step number in gsplat's strategy."""
+
+
+@dataclass
+class OriginalDensification:
+    """Thresholds of 3DGS. Its schedule is in the model's warmup_length, refine_every, reset_alpha_every and
+    stop_split_at, whose defaults are those of 3DGS."""
+
+    grow_gradient: float = 2e-4
+    """splats whose mean gradient of the loss by the screen position (normalised to [-1, 1]) is larger grow"""
+    grow_scale: float = 0.01
+    """growing splats up to this size are duplicated, larger ones are split; in extents of the cameras"""
+    prune_opacity: float = 0.005
+    """splats of lower opacity go; a reset brings opacities down to twice this"""
+    prune_scale: float = 0.1
+    """larger splats go, once opacities have been reset; in extents of the cameras"""
+
+
+class PruneBySeenOpacity(DefaultStrategy):
+    """gsplat's strategy with another idea of which opacity counts when splats are pruned."""
+
+    seen_opacity: Any = None
+    """Logits [N, 1] -> opacities [N]; None: the stored ones, as in gsplat."""
+
+    @torch.no_grad()
+    def _prune_gs(self, params, optimizers, state, step) -> int:
+        if self.seen_opacity is None:
+            return super()._prune_gs(params, optimizers, state, step)
+        prune = self.seen_opacity(params["opacities"]) < self.prune_opa
+        if step > self.reset_every:
+            prune |= params["scales"].exp().amax(dim=-1) > self.prune_scale3d * state["scene_scale"]
+            if step < self.refine_scale2d_stop_iter:
+                prune |= state["radii"] > self.prune_scale2d
+        count = int(prune.sum())
+        if count > 0:
+            remove(params, optimizers, state, prune)
+        return count
+
+
+class GradientDensification(Densification):
+    """Growth where screen-space gradients are large, pruning and resetting of opacities: splatfacto's, and 3DGS's.
+
+    Args:
+        name: of the protocol.
+        strategy: gsplat's, with the protocol's thresholds.
+        opacity_seen: which opacity pruning looks at. A reset always acts on the stored one.
+        scene_unit: world units in a scene unit, which sizes are measured in; None: in extents of the cameras.
+        reset_at_start: reset opacities at step 0, too, as gsplat 1.4 does; 3DGS counts its steps from 1.
+    """
+
+    def __init__(
+        self,
+        name: Protocol,
+        strategy: PruneBySeenOpacity,
+        opacity_seen: OpacitySeen,
+        scene_unit: float | None,
+        reset_at_start: bool,
+    ):
+        super().__init__(opacity_seen)
+        self.name = name
+        self.strategy = strategy
+        self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
+        self.absgrad = strategy.absgrad
+        self.measure_by_cameras = scene_unit is None
+        self.reset_at_start = reset_at_start
+        self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
+        if opacity_seen == "peak":
+            strategy.seen_opacity = self.seen_opacity
+
+    def see_cameras(self, centers: Tensor) -> None:
+        if self.measure_by_cameras:
+            spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
+            self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
+
+    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, count: int) -> None:
+        if step < self.strategy.refine_stop_iter:
+            super().pre_backward(step, info, opacities, count)
+        info["means2d"].retain_grad()
+
+    def post_backward(self, step, info, splats, optimizers) -> None:
+        strategy = self.strategy
+        if step == 0 and not self.reset_at_start:
+            strategy._update_state(splats, self.state, info, packed=True)
+            return
+        strategy.step_post_backward(splats, optimizers, self.state, step, info, packed=True)
+        if step % strategy.reset_every == 0 or self._refines(step):
+            self.forget_peak()
+
+    def reschedule(self, step_at: Callable[[float], int]) -> None:
+        for name, step in self.bounds.items():
+            setattr(self.strategy, name, step_at(step) if step > 0 else step)
+
+    def _refines(self, step: int) -> bool:
+        """Whether gsplat's strategy grows and prunes at this step."""
+        strategy = self.strategy
+        return (
+            strategy.refine_start_iter < step < strategy.refine_stop_iter
+            and step % strategy.refine_every == 0
+            and step % strategy.reset_every >= strategy.pause_refine_after_reset
+        )

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""3DGS-MCMC (Kheradmand et al. 2024): nothing is deleted, dead splats move to live ones, noise explores."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from nrfgs_ns.densification.protocol import UNSEEN, Densification, OpacitySeen
+from nrfgs_ns.densification.relocation import add_samples, diffuse, relocate
+
+
+@dataclass
+class McmcDensification:
+    """Constants of 3DGS-MCMC, as in gsplat. Its start and rhythm are the model's warmup_length and refine_every; it
+    starts from the same splats as the other protocols."""
+
+    min_opacity: float = 0.005
+    """splats of this opacity or less are dead and move"""
+    stop_at: int = 25_000
+    """step after which splats neither move to others nor are added"""
+    noise_lr: float = 5e5
+    """size of the noise on positions, times the current learning rate of the means"""
+    opacity_regularisation: float = 0.01
+    """weight of the mean opacity in the loss"""
+    scale_regularisation: float = 0.01
+    """weight of the mean standard deviation, in scene units, in the loss"""
+
+
+class Shown(NamedTuple):
+    """What the views of a step have shown."""
+
+    rows: Tensor
+    """splats, int64 [M]; one that several cameras see is there several times"""
+    opacities: Tensor
+    """theirs, from there, [M] in [0, 1]"""
+    cameras: int
+    """number of cameras"""
+
+
+class Mcmc(Densification):
+    """Relocation, growth to a budget, and noise (`relocation.py`).
+
+    Args:
+        config: the constants.
+        budget: most splats.
+        start, every: first step of, and steps between, relocations.
+        opacity_seen: which opacity decides that a splat is dead and how far noise may move it. What a relocated splat
+            gets is computed from the stored opacities.
+        scene_unit: world units in a scene unit.
+
+    The mean opacity in the loss is that of what the step's cameras are shown, with the stored opacities of all else. If
+    it were that of the stored ones alone, a head that adds to them would be paid for making them small: splats that
+    every view shows would count as dead, and the noise, made for splats that nobody sees, would shake them.
+    """
+
+    name = "mcmc"
+
+    def __init__(
+        self,
+        config: McmcDensification,
+        budget: int,
+        start: int,
+        every: int,
+        opacity_seen: OpacitySeen,
+        scene_unit: float = 1.0,
+    ):
+        super().__init__(opacity_seen)
+        if opacity_seen == "peak":
+            self.state["peak_before"] = None  # between the two last relocations
+        self.shown: Shown | None = None
+        self.scene_unit = scene_unit
+        self.config, self.budget, self.start, self.every = config, budget, start, every
+        self.stop, self.bounds = config.stop_at, (start, config.stop_at)
+
+    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, count: int) -> None:
+        super().pre_backward(step, info, opacities, count)
+        self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
+
+    @torch.no_grad()
+    def post_backward(self, step, info, splats, optimizers) -> None:
+        config, self.shown = self.config, None
+        if self.start < step < self.stop and step % self.every == 0:
+            dead = self.seen_opacity(splats["opacities"]) <= config.min_opacity
+            moved = relocate(splats, optimizers, dead, config.min_opacity)
+            count = len(splats["means"])
+            added = add_samples(
+                splats, optimizers, max(0, min(self.budget, int(1.05 * count)) - count), config.min_opacity
+            )
+            self._begin_another_peak(moved[added])
+        lr = float(optimizers["means"].param_groups[0]["lr"])
+        size = config.noise_lr * lr / self.scene_unit**2  # times a covariance; lr is a length already
+        diffuse(splats, size, self._lately_seen(splats["opacities"]))
+
+    def _lately_seen(self, opacities: Tensor) -> Tensor:
+        """As `seen_opacity`, over the views since the relocation before the last: the noise, which is there in every
+        step, must not take a splat for invisible because no view has come by yet."""
+        base = torch.sigmoid(opacities.detach().flatten())
+        peaks = [self.state[name] for name in ("peak", "peak_before") if self.state.get(name) is not None]
+        if not peaks:
+            return base
+        peak = torch.stack(peaks).amax(dim=0)
+        return torch.where(peak > UNSEEN, peak, base)
+
+    def _begin_another_peak(self, source: Tensor) -> None:
+        """Keep what has been seen until now, each row that of the splat that it was made from, int64 [N']."""
+        if self.state.get("peak") is not None:
+            self.state["peak_before"] = self.state["peak"][source]
+            self.state["peak"] = None  # the rows have changed
+
+    def reschedule(self, step_at: Callable[[float], int]) -> None:
+        self.start, self.stop = (step_at(step) for step in self.bounds)
+
+    def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        base = torch.sigmoid(splats["opacities"]).flatten()
+        mean = base.mean()
+        if self.shown is not None:
+            rows, opacities, cameras = self.shown
+            mean = mean + (opacities - base[rows]).sum() / (cameras * len(base))
+        return {
+            "mcmc_opacity_reg": self.config.opacity_regularisation * mean,
+            "mcmc_scale_reg": self.config.scale_regularisation * splats["scales"].exp().mean() / self.scene_unit,
+        }
