@@ -110,6 +110,14 @@ def test_extremes_stay_finite(precision):
     assert ((found["opacities"] >= 0) & (found["opacities"] <= 1)).all() and (found["colors"] >= 0).all()
 
 
+def test_lengths_are_in_scene_units():
+    head, twin = heads("cuda")
+    splats, visible, centers = scene(head, 3000, 2000)
+    head.scene_unit = twin.scene_unit = 1024.0
+    case = {**splats, "means": 1024.0 * splats["means"]}, visible, 1024.0 * centers
+    compare(head, twin, case, DEVICE_FLOAT32 * float32_tolerance())
+
+
 def test_twice_is_the_same():
     head, _ = heads("cuda")
     case = scene(head, 120_000, 100_000)
