@@ -18,6 +18,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
+from nrfgs_ns.densification import OpacitySeen
 from nrfgs_ns.model import NrfgsModelConfig
 from nrfgs_ns.pipeline import NrfgsPipelineConfig
 from nrfgs_ns.trainer import NrfgsTrainerConfig
@@ -31,13 +32,21 @@ def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str,
     return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay}
 
 
-def method(name: str, appearance: AppearanceHeadConfig, description: str, **optimizers: Any) -> MethodSpecification:
+def method(
+    name: str,
+    appearance: AppearanceHeadConfig,
+    description: str,
+    opacity_seen: OpacitySeen | None = None,
+    **optimizers: Any,
+) -> MethodSpecification:
     """Splatfacto with another appearance head.
 
     Args:
         name: the command, as in `ns-train NAME`.
         appearance: the head.
         description: one line for `ns-train --help`.
+        opacity_seen: by densification; None: the protocol's own. A head whose opacity is the stored one wants "base":
+            the largest that views have shown only lags behind it, and 3DGS-MCMC would not be what it is.
         optimizers: the head's own parameter groups, beside the base colour.
     """
     return MethodSpecification(
@@ -50,7 +59,9 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
             steps_per_eval_all_images=1000,
             mixed_precision=False,
             machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
-            pipeline=NrfgsPipelineConfig(model=NrfgsModelConfig(appearance=appearance)),
+            pipeline=NrfgsPipelineConfig(
+                model=NrfgsModelConfig(appearance=appearance, opacity_seen_by_densification=opacity_seen)
+            ),
             optimizers={
                 "means": adam(1.6e-4, lr_final=1.6e-6),
                 "scales": adam(0.005),
@@ -80,6 +91,7 @@ nrfgs_sh = method(
     "nrfgs-sh",
     ShConfig(),
     "The same model with spherical harmonics: 3DGS as in splatfacto, for comparison.",
+    opacity_seen="base",
     features_rest=adam(0.0025 / 20),
 )
 
@@ -95,6 +107,7 @@ nrfgs_gsnb = method(
     "nrfgs-gsnb",
     GsnbConfig(),
     "The same model with GSNB's head: spherical harmonics, and a learnt basis beside them; for comparison.",
+    opacity_seen="base",
     features_rest=adam(0.0025 / 20),
     # AdamW as its reference has it, with torch's own eps and decay.
     field={"optimizer": AdamOptimizerConfig(_target=torch.optim.AdamW, lr=1e-3, weight_decay=0.01), "scheduler": None},
@@ -104,6 +117,7 @@ nrfgs_sg = method(
     "nrfgs-sg",
     SgConfig(),
     "The same model with three spherical Gaussians on each splat's base colour, for comparison.",
+    opacity_seen="base",
     sg_axes=adam(0.0025),
     sg_sharpness=adam(0.0025),
     sg_colors=adam(0.0025),

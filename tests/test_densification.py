@@ -311,6 +311,12 @@ def test_each_protocol_has_its_own_idea_of_a_dead_splat():
             assert protocol(name, opacity_seen_by_densification=asked).opacity_seen == asked
 
 
+def test_heads_of_stored_opacity_have_3dgs_mcmc_as_it_is():
+    for method, seen in (("nrfgs", "peak"), ("nrfgs-vdgs", "peak"), ("nrfgs-sh", "base"), ("nrfgs-gsnb", "base")):
+        config = parse([method, "--pipeline.model.densification", "mcmc"]).pipeline.model
+        assert build_densification(config, 8).opacity_seen == seen, method
+
+
 def test_noise_spares_what_views_have_lately_shown():
     """MCMC, a base at which the noise is at its largest: whoever was shown since the relocation before the last holds
     still, relocated rows included; with "base" all are shaken."""

@@ -63,7 +63,7 @@ def shape_head(model, state: Mapping[str, Any]) -> None:
         return
     head = config.setup()
     head.scene_unit = model.scene_unit
-    model.head = head.to(model.device)
+    model.head = head.to(model.device).train(model.training)
     # In place: the optimiser of the latents was built on this very parameter.
     latents = model.gauss_params["latents"]
     latents.data = latents.data.new_zeros(len(latents), config.latent_dim)
