@@ -199,7 +199,9 @@ class Guard:
     def _silence_densification(self) -> None:
         """Let a gradient on the image plane that is not finite count as zero in densification's statistics."""
         means2d = getattr(self.model, "info", {}).get("means2d")
-        for gradient in (getattr(means2d, "grad", None), getattr(means2d, "absgrad", None)):
+        if means2d is None or not means2d.retains_grad:  # densification is over, or needs none
+            return
+        for gradient in (means2d.grad, getattr(means2d, "absgrad", None)):
             if gradient is not None:
                 gradient.nan_to_num_(0.0, 0.0, 0.0)
 

@@ -2,8 +2,11 @@
 """The registered methods: configuration only.
 
 Everything but the appearance head is splatfacto's, to the number: learning rates, schedules, densification, steps.
+The two presets of `nrfgs` differ in one thing each; where they lie on the front is in docs/trade-off.md.
 """
 
+from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -18,7 +21,6 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.densification import OpacitySeen
 from nrfgs_ns.model import NrfgsModelConfig
 from nrfgs_ns.pipeline import NrfgsPipelineConfig
 from nrfgs_ns.trainer import NrfgsTrainerConfig
@@ -32,21 +34,13 @@ def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str,
     return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay}
 
 
-def method(
-    name: str,
-    appearance: AppearanceHeadConfig,
-    description: str,
-    opacity_seen: OpacitySeen | None = None,
-    **optimizers: Any,
-) -> MethodSpecification:
+def method(name: str, appearance: AppearanceHeadConfig, description: str, **optimizers: Any) -> MethodSpecification:
     """Splatfacto with another appearance head.
 
     Args:
         name: the command, as in `ns-train NAME`.
         appearance: the head.
         description: one line for `ns-train --help`.
-        opacity_seen: by densification; None: the protocol's own. A head whose opacity is the stored one wants "base":
-            the largest that views have shown only lags behind it, and 3DGS-MCMC would not be what it is.
         optimizers: the head's own parameter groups, beside the base colour.
     """
     return MethodSpecification(
@@ -59,9 +53,7 @@ def method(
             steps_per_eval_all_images=1000,
             mixed_precision=False,
             machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
-            pipeline=NrfgsPipelineConfig(
-                model=NrfgsModelConfig(appearance=appearance, opacity_seen_by_densification=opacity_seen)
-            ),
+            pipeline=NrfgsPipelineConfig(model=NrfgsModelConfig(appearance=appearance)),
             optimizers={
                 "means": adam(1.6e-4, lr_final=1.6e-6),
                 "scales": adam(0.005),
@@ -79,6 +71,23 @@ def method(
     )
 
 
+def preset(name: str, of: MethodSpecification, description: str, model: dict[str, Any], **trainer: Any):
+    """A method with other options.
+
+    Args:
+        name: the command.
+        of: the method.
+        description: one line for `ns-train --help`.
+        model: options of the model.
+        trainer: options of the trainer.
+    """
+    pipeline = replace(of.config.pipeline, model=replace(of.config.pipeline.model, **model))
+    return MethodSpecification(
+        config=replace(deepcopy(of.config), method_name=name, pipeline=deepcopy(pipeline), **trainer),
+        description=description,
+    )
+
+
 nrfgs = method(
     "nrfgs",
     NrfConfig(),
@@ -87,11 +96,26 @@ nrfgs = method(
     field=adam(5e-3, lr_final=5e-4),
 )
 
+nrfgs_fast = preset(
+    "nrfgs-fast",
+    nrfgs,
+    "nrfgs in a third of the steps, its schedules shortened to them.",
+    model={},
+    max_num_iterations=10_000,
+    schedule_steps=STEPS,
+)
+
+nrfgs_best = preset(
+    "nrfgs-best",
+    nrfgs,
+    "nrfgs with the densification of 3DGS, which leaves more splats: slower, and better.",
+    model={"densification": "original"},
+)
+
 nrfgs_sh = method(
     "nrfgs-sh",
     ShConfig(),
     "The same model with spherical harmonics: 3DGS as in splatfacto, for comparison.",
-    opacity_seen="base",
     features_rest=adam(0.0025 / 20),
 )
 
@@ -107,7 +131,6 @@ nrfgs_gsnb = method(
     "nrfgs-gsnb",
     GsnbConfig(),
     "The same model with GSNB's head: spherical harmonics, and a learnt basis beside them; for comparison.",
-    opacity_seen="base",
     features_rest=adam(0.0025 / 20),
     # AdamW as its reference has it, with torch's own eps and decay.
     field={"optimizer": AdamOptimizerConfig(_target=torch.optim.AdamW, lr=1e-3, weight_decay=0.01), "scheduler": None},
@@ -117,7 +140,6 @@ nrfgs_sg = method(
     "nrfgs-sg",
     SgConfig(),
     "The same model with three spherical Gaussians on each splat's base colour, for comparison.",
-    opacity_seen="base",
     sg_axes=adam(0.0025),
     sg_sharpness=adam(0.0025),
     sg_colors=adam(0.0025),

@@ -66,8 +66,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     splat_budget: int = 1_000_000
     """mcmc: the number of splats that it grows to and keeps"""
     opacity_seen_by_densification: OpacitySeen | None = None
-    """which opacity makes a splat die when it depends on the view. base: the stored one. peak: the largest that any
-    view has shown since the last refinement. None: peak for mcmc, base for the others"""
+    """which opacity makes a splat die when it depends on the view. base: the stored one. peak: the largest that a view
+    since the last refinement would show. None: peak for mcmc, base for the others"""
     original: OriginalDensification = field(default_factory=OriginalDensification)
     """thresholds of the densification 'original'"""
     mcmc: McmcDensification = field(default_factory=McmcDensification)

@@ -34,7 +34,8 @@ def pinhole(camera: Cameras, camera_to_world: Tensor, downscale: int) -> Pinhole
     K = camera.get_intrinsics_matrices().reshape(1, 3, 3).to(camera_to_world.device)
     K = K / K.new_tensor([[downscale], [downscale], [1.0]])
     width, height = int(camera.width.item()) // downscale, int(camera.height.item()) // downscale
-    return Pinhole(world_to_camera(camera_to_world), K, width, height, camera_to_world[0, :3, 3])
+    center = camera_to_world[0, :3, 3].contiguous()  # so that no kernel has to copy it
+    return Pinhole(world_to_camera(camera_to_world), K, width, height, center)
 
 
 def world_to_camera(camera_to_world: Tensor) -> Tensor:

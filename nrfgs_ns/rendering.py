@@ -54,13 +54,14 @@ class Rendering:
         risen = self.schedule_step // self.config.resolution_schedule
         return 2 ** max(self.config.num_downscales - risen, 0)
 
-    def look(self, camera: Cameras) -> View:
+    def look(self, camera: Cameras, splats: dict[str, Tensor] | None = None) -> View:
         """Project the splats into one camera.
 
         Args:
             camera: a batch of one camera, [1].
+            splats: another table than the model's own.
         """
-        splats = self._splats_to_draw()
+        splats = self._splats_to_draw() if splats is None else splats
         seen_from = self._pinhole(camera)
         projection = self._project(splats, seen_from.viewmat, seen_from.K, seen_from.width, seen_from.height)
         return View(projection, splats, seen_from.center)
@@ -121,7 +122,7 @@ class Rendering:
         appearance = self.head(view.splats, view.visible, view.center)
         outputs, self.info = self.paint(view, appearance)
         if self.training:
-            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.num_points)
+            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._correct_colors(outputs, camera)
         return outputs
 
@@ -167,21 +168,22 @@ class Rendering:
             As `get_outputs`; and the rasterizer's `info`, for densification.
         """
         with_depth = self.config.output_depth_during_training or not self.training
+        if background is None:
+            background = self._get_background_color()
         render, alpha, info = composite(
             view.projection,
             appearance.colors,
             appearance.opacities,
+            backgrounds=background[None],
             render_mode="RGB+ED" if with_depth else "RGB",
-            absgrad=self.densification.absgrad and self.training,
+            absgrad=self.training and self.densification.needs_absgrad(self.step),
             assume_finite=self.training,
         )
-        render, alpha = render[0], alpha[0]
+        render, alpha = render.squeeze(0), alpha.squeeze(0)  # a view; what [0] sends back is a copy among zeros
         height, width = alpha.shape[:2]
         self.last_size = (height, width)
-        if background is None:
-            background = self._get_background_color()
         outputs = {
-            "rgb": torch.clamp(render[..., :3] + (1 - alpha) * background, 0.0, 1.0),
+            "rgb": torch.clamp(render[..., :3] if with_depth else render, 0.0, 1.0),
             "accumulation": alpha,
             "background": background if self.training else background.expand(height, width, 3),
         }

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nrfgs_ns import ssim
+from nrfgs_ns.triton_launch import Launcher
 
 COLUMNS = 128
 """Numbers of a row that a program takes; a power of two."""
@@ -189,6 +190,9 @@ def backward_kernel(
             tl.store(d_prediction + at, gradient, mask=here)
 
 
+launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
+
+
 class WeightedSum(torch.autograd.Function):
     """l1_weight mean |prediction - truth| + ssim_weight SSIM + constant.
 
@@ -203,12 +207,12 @@ class WeightedSum(torch.autograd.Function):
         border = ssim.WINDOW_SIZE - 1
         l1_scale = l1_weight / (height * width)
         ssim_scale = ssim_weight / ((height - border) * (width - 3 * border))
-        grid = (-(-width // COLUMNS), -(-height // ROWS))
+        grid = (-(-width // COLUMNS), -(-height // ROWS), 1)
         wanted = ctx.needs_input_grad[0]
         slopes = prediction.new_empty(3 * height * width if wanted else 0)
         partials = prediction.new_empty(grid[0] * grid[1])
-        forward_kernel[grid](
-            prediction, truth, slopes, partials, height, width, l1_scale, ssim_scale, constant,
+        launch_forward(
+            grid, prediction, truth, slopes, partials, height, width, l1_scale, ssim_scale, constant,
             COLUMNS=COLUMNS, ROWS=ROWS, SLOPES=wanted, num_warps=WARPS,
         )  # fmt: skip
         ctx.save_for_backward(prediction, truth, slopes)
@@ -221,8 +225,8 @@ class WeightedSum(torch.autograd.Function):
         prediction, truth, slopes = ctx.saved_tensors
         height, width = prediction.shape[0], 3 * prediction.shape[1]
         d_prediction = torch.empty_like(prediction)
-        backward_kernel[ctx.grid](
-            prediction, truth, slopes, d_loss, d_prediction, height, width, *ctx.scales,
+        launch_backward(
+            ctx.grid, prediction, truth, slopes, d_loss, d_prediction, height, width, *ctx.scales,
             COLUMNS=COLUMNS, ROWS=ROWS, num_warps=WARPS,
         )  # fmt: skip
         return d_prediction, None, None, None, None

@@ -48,7 +48,7 @@ class NrfgsTrainerConfig(TrainerConfig):
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"{name} is {value}; it must be positive.")
             if value is not None and kwargs.get("world_size", 1) > 1:
-                raise InputError(f"{name} is for one device. Leave it out, or use --machine.num-devices 1.")
+                raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
         if kwargs.get("world_size", 1) == 1:
             return super().setup(**kwargs)
         from nrfgs_ns.distributed.trainer import ShardedTrainer

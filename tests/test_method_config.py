@@ -3,7 +3,7 @@
 
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.sg import SphericalGaussians
 from nrfgs_ns.appearance.sh import SphericalHarmonics
 from nrfgs_ns.appearance.vdgs import ViewDirectionFactors
-from nrfgs_ns.method_config import nrfgs, nrfgs_gsnb, nrfgs_sg, nrfgs_sh, nrfgs_vdgs
+from nrfgs_ns.method_config import nrfgs, nrfgs_best, nrfgs_fast, nrfgs_gsnb, nrfgs_sg, nrfgs_sh, nrfgs_vdgs
 
 METHODS = {
     "nrfgs": nrfgs,
@@ -41,7 +41,10 @@ OWN_GROUPS = {
 }
 
 
-@pytest.mark.parametrize("name", METHODS)
+PRESETS = {"nrfgs-fast": nrfgs_fast, "nrfgs-best": nrfgs_best}
+
+
+@pytest.mark.parametrize("name", [*METHODS, *PRESETS])
 def test_nerfstudio_finds_the_method(name):
     assert all_methods[name].method_name == name
     assert tyro.cli(AnnotatedBaseConfigUnion, args=[name, "--data", "x"]).method_name == name
@@ -82,6 +85,33 @@ def test_everything_else_is_splatfactos(name):
     datamanager, host_datamanager = ours.pipeline.datamanager, host.pipeline.datamanager
     for field in ("cache_images", "cache_images_type", "camera_res_scale_factor", "train_cameras_sampling_strategy"):
         assert getattr(datamanager, field) == getattr(host_datamanager, field), field
+
+
+@pytest.mark.parametrize(
+    "name, differs",
+    [
+        ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000}),
+        ("nrfgs-best", {"pipeline.model.densification": "original"}),
+    ],
+)
+def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):
+    def flat(config, prefix=""):
+        for field in fields(config):
+            value = getattr(config, field.name)
+            if is_dataclass(value) and not isinstance(value, type):
+                yield from flat(value, f"{prefix}{field.name}.")
+            else:
+                yield f"{prefix}{field.name}", value
+
+    ours, base = dict(flat(PRESETS[name].config)), dict(flat(nrfgs.config))
+    assert ours.keys() == base.keys()
+    changed = {key: ours[key] for key in ours if str(ours[key]) != str(base[key])}
+    assert changed == {"method_name": name, **differs}
+    PRESETS[name].config.pipeline.model.appearance.latent_dim = 8
+    try:
+        assert nrfgs.config.pipeline.model.appearance.latent_dim == 32
+    finally:
+        PRESETS[name].config.pipeline.model.appearance.latent_dim = 32
 
 
 @pytest.mark.parametrize("name", METHODS)

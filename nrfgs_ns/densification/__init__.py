@@ -16,9 +16,10 @@ table, whoever's head it belongs to, and to the optimisers' moments. The model n
 from nrfgs_ns.densification.build import build_densification
 from nrfgs_ns.densification.gradient import GradientDensification, OriginalDensification
 from nrfgs_ns.densification.mcmc import Mcmc, McmcDensification
-from nrfgs_ns.densification.protocol import UNSEEN, Densification, OpacitySeen, Protocol
+from nrfgs_ns.densification.protocol import CHANGE, UNSEEN, Densification, OpacitySeen, Protocol
 
 __all__ = [
+    "CHANGE",
     "UNSEEN",
     "Densification",
     "GradientDensification",

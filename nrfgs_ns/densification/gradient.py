@@ -77,22 +77,24 @@ class GradientDensification(Densification):
         self.name = name
         self.strategy = strategy
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
-        self.absgrad = strategy.absgrad
         self.measure_by_cameras = scene_unit is None
         self.reset_at_start = reset_at_start
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
         if opacity_seen == "peak":
             strategy.seen_opacity = self.seen_opacity
 
+    def needs_absgrad(self, step: int) -> bool:
+        return self.strategy.absgrad and step < self.strategy.refine_stop_iter
+
     def see_cameras(self, centers: Tensor) -> None:
         if self.measure_by_cameras:
             spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
 
-    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, count: int) -> None:
+    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
         if step < self.strategy.refine_stop_iter:
-            super().pre_backward(step, info, opacities, count)
-        info["means2d"].retain_grad()
+            super().pre_backward(step, info, opacities, logits)
+            info["means2d"].retain_grad()
 
     def post_backward(self, step, info, splats, optimizers) -> None:
         strategy = self.strategy
@@ -101,7 +103,7 @@ class GradientDensification(Densification):
             return
         strategy.step_post_backward(splats, optimizers, self.state, step, info, packed=True)
         if step % strategy.reset_every == 0 or self._refines(step):
-            self.forget_peak()
+            self.forget_views()
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         for name, step in self.bounds.items():

@@ -8,8 +8,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from nrfgs_ns.densification.protocol import UNSEEN, Densification, OpacitySeen
+from nrfgs_ns.densification.protocol import CHANGE, UNSEEN, Densification, OpacitySeen, seen_with
 from nrfgs_ns.densification.relocation import add_samples, diffuse, relocate
+
+CHANGE_BEFORE = CHANGE + "_before"
+"""As `CHANGE`, in the window before: `every` steps until the last relocation, or what would be one."""
 
 
 @dataclass
@@ -69,46 +72,49 @@ class Mcmc(Densification):
     ):
         super().__init__(opacity_seen)
         if opacity_seen == "peak":
-            self.state["peak_before"] = None  # between the two last relocations
+            self.state[CHANGE_BEFORE] = None
         self.shown: Shown | None = None
         self.scene_unit = scene_unit
         self.config, self.budget, self.start, self.every = config, budget, start, every
         self.stop, self.bounds = config.stop_at, (start, config.stop_at)
 
-    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, count: int) -> None:
-        super().pre_backward(step, info, opacities, count)
+    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
+        super().pre_backward(step, info, opacities, logits)
         self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
 
     @torch.no_grad()
     def post_backward(self, step, info, splats, optimizers) -> None:
-        config, self.shown = self.config, None
-        if self.start < step < self.stop and step % self.every == 0:
-            dead = self.seen_opacity(splats["opacities"]) <= config.min_opacity
-            moved = relocate(splats, optimizers, dead, config.min_opacity)
-            count = len(splats["means"])
-            added = add_samples(
-                splats, optimizers, max(0, min(self.budget, int(1.05 * count)) - count), config.min_opacity
-            )
-            self._begin_another_peak(moved[added])
+        self.shown = None
+        if step > self.start and step % self.every == 0:
+            if step < self.stop:
+                self._relocate_and_add(splats, optimizers)
+            self._begin_another_window()
         lr = float(optimizers["means"].param_groups[0]["lr"])
-        size = config.noise_lr * lr / self.scene_unit**2  # times a covariance; lr is a length already
+        size = self.config.noise_lr * lr / self.scene_unit**2  # times a covariance; lr is a length already
         diffuse(splats, size, self._lately_seen(splats["opacities"]))
 
-    def _lately_seen(self, opacities: Tensor) -> Tensor:
-        """As `seen_opacity`, over the views since the relocation before the last: the noise, which is there in every
-        step, must not take a splat for invisible because no view has come by yet."""
-        base = torch.sigmoid(opacities.detach().flatten())
-        peaks = [self.state[name] for name in ("peak", "peak_before") if self.state.get(name) is not None]
-        if not peaks:
-            return base
-        peak = torch.stack(peaks).amax(dim=0)
-        return torch.where(peak > UNSEEN, peak, base)
+    def _relocate_and_add(self, splats, optimizers) -> None:
+        """Move the dead and grow by 5 %. A new row has been changed by views as the splat that it was made from: its
+        stored opacity is another, but the head would answer for it much as for that one."""
+        smallest = self.config.min_opacity
+        moved = relocate(splats, optimizers, self.seen_opacity(splats["opacities"]) <= smallest, smallest)
+        count = len(splats["means"])
+        added = add_samples(splats, optimizers, max(0, min(self.budget, int(1.05 * count)) - count), smallest)
+        if self.state.get(CHANGE) is not None:
+            self.state[CHANGE] = self.state[CHANGE][moved[added]]
 
-    def _begin_another_peak(self, source: Tensor) -> None:
-        """Keep what has been seen until now, each row that of the splat that it was made from, int64 [N']."""
-        if self.state.get("peak") is not None:
-            self.state["peak_before"] = self.state["peak"][source]
-            self.state["peak"] = None  # the rows have changed
+    def _begin_another_window(self) -> None:
+        """Keep the changes until now as those before, and begin anew: until the training's end, as the noise acts."""
+        if self.state.get(CHANGE) is not None:
+            self.state[CHANGE_BEFORE] = self.state[CHANGE]
+            self.state[CHANGE] = torch.full_like(self.state[CHANGE], UNSEEN)
+
+    def _lately_seen(self, opacities: Tensor) -> Tensor:
+        """As `seen_opacity`, over the views of the window before, too: the noise, which is there in every step, must
+        not take a splat for invisible because no view has come by yet."""
+        stored = torch.sigmoid(opacities.detach().flatten())
+        changes = [self.state[name] for name in (CHANGE, CHANGE_BEFORE) if self.state.get(name) is not None]
+        return seen_with(stored, torch.stack(changes).amax(dim=0)) if changes else stored
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         self.start, self.stop = (step_at(step) for step in self.bounds)

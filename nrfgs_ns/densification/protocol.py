@@ -15,40 +15,69 @@ from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT
 Protocol = Literal["splatfacto", "original", "mcmc"]
 OpacitySeen = Literal["base", "peak"]
 
-UNSEEN = -1.0
-"""Peak opacity of a splat that no view has shown since then."""
+CHANGE = "opacity_change"
+"""Name, in a protocol's `state`, of the largest change of each splat's opacity by a view, [N]: see `change_of`."""
+UNSEEN = -2.0
+"""Change of a splat that no view has shown since then: less than any change."""
+
+
+def change_of(stored: Tensor, shown: Tensor) -> Tensor:
+    """How views change stored opacities: the amount that they add, or, negative, the share that they take away.
+
+    It grows with the opacity that is shown, and is exactly 0 where that is the stored one. What is taken away counts as
+    a share because no view can take more than there is: a splat of opacity 0.6 that a view shows at 0.3 is not hidden
+    once relocation has left it 0.2.
+
+    Args:
+        stored, shown: opacities in [0, 1] of one shape.
+
+    Returns:
+        Numbers in [-1, 1].
+    """
+    added = shown - stored
+    return torch.where(added < 0, added / stored, added)
+
+
+def seen_with(stored: Tensor, change: Tensor) -> Tensor:
+    """The opacities that views with these changes show, in [0, 1]; the stored ones where the change is `UNSEEN`."""
+    change = torch.where(change > UNSEEN, change, 0.0)
+    return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
 
 
 class Densification(ABC):
     """What the model asks of a protocol. `state` is all that a continued training needs, and goes into checkpoints."""
 
     name: Protocol
-    absgrad: bool = False
-    """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad`."""
     state: dict[str, Any]
     """Numbers, tensors with a row per splat, or None for what the first step has to make."""
 
     def __init__(self, opacity_seen: OpacitySeen):
         self.opacity_seen = opacity_seen
-        self.state = {"peak": None} if opacity_seen == "peak" else {}
+        self.state = {CHANGE: None} if opacity_seen == "peak" else {}
+
+    def needs_absgrad(self, step: int) -> bool:
+        """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
+        return False
 
     def see_cameras(self, centers: Tensor) -> None:  # noqa: B027  (only some protocols measure by the cameras)
         """Tell the protocol where the training cameras are, [V, 3], before the first step."""
 
-    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, count: int) -> None:
+    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
         """Look at a training view before the loss goes backward.
 
         Args:
             step: training step.
             info: the rasterizer's; M rows.
             opacities: what the head said, [M] in [0, 1], before antialiasing compensation.
-            count: number of splats N.
+            logits: the stored opacities of all splats, as logits [N, 1].
         """
         if self.opacity_seen == "peak":
-            if self.state["peak"] is None:
-                self.state["peak"] = torch.full((count,), UNSEEN, device=opacities.device)
-            shown = opacities.detach().to(self.state["peak"].dtype)
-            self.state["peak"].scatter_reduce_(0, info["gaussian_ids"], shown, "amax")
+            rows, logits = info["gaussian_ids"], logits.detach()
+            if self.state[CHANGE] is None:
+                self.state[CHANGE] = logits.new_full((len(logits),), UNSEEN)
+            # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
+            stored = torch.sigmoid(logits.index_select(0, rows)).squeeze(-1)
+            self.state[CHANGE].scatter_reduce_(0, rows, change_of(stored, opacities.detach().to(stored.dtype)), "amax")
 
     @abstractmethod
     def post_backward(
@@ -92,17 +121,18 @@ class Densification(ABC):
     def seen_opacity(self, opacities: Tensor) -> Tensor:
         """The opacities [N] that decide whether a splat is dead.
 
-        "base": the stored ones. "peak": the largest that any view has shown since the last refinement or reset, and the
-        stored one where no view has shown the splat.
+        "base": the stored ones. "peak": the largest that a view since the last refinement or reset would show now, that
+        is the stored ones with the largest change by such a view; unchanged where no view has shown the splat. A head
+        whose opacity is the stored one changes nothing, and "peak" is then "base", bit for bit.
 
         Args:
             opacities: logits [N, 1].
         """
-        base = torch.sigmoid(opacities.detach().flatten())
-        peak = self.state.get("peak")
-        return base if peak is None else torch.where(peak > UNSEEN, peak, base)
+        stored = torch.sigmoid(opacities.detach().flatten())
+        change = self.state.get(CHANGE)
+        return stored if change is None else seen_with(stored, change)
 
-    def forget_peak(self) -> None:
+    def forget_views(self) -> None:
         """Start the running maximum anew."""
-        if self.state.get("peak") is not None:
-            self.state["peak"].fill_(UNSEEN)
+        if self.state.get(CHANGE) is not None:
+            self.state[CHANGE].fill_(UNSEEN)

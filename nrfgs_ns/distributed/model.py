@@ -87,7 +87,7 @@ class ShardedModel(NrfgsModel):
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
         appearance = self.head(splats, projection.gaussian_ids, centers)
 
-        absgrad = self.training and self.densification.absgrad
+        absgrad = self.training and self.densification.needs_absgrad(self.step)
         own, colored = send_to_cameras(projection, appearance, *self.sizes[comm.rank()], absgrad)
         outputs, _ = self.paint(View(own, {}, pinholes[comm.rank()].center), colored)
         if self.training:
@@ -101,7 +101,7 @@ class ShardedModel(NrfgsModel):
                 "depths": projection.depths,
                 "n_cameras": len(pinholes),
             }
-            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.num_points)
+            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._correct_colors(outputs, cameras[comm.rank()])
         return outputs
 

@@ -110,29 +110,33 @@ def composite(
     )
     isect_offsets = isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height)
 
-    renders, alphas = [], None
-    for begin in range(0, colors.shape[-1], CHANNEL_CHUNK):
-        channels = slice(begin, begin + CHANNEL_CHUNK)
-        render, chunk_alphas = rasterize_to_pixels(
+    def blend(colors: Tensor, backgrounds: Tensor | None) -> tuple[Tensor, Tensor]:
+        return rasterize_to_pixels(
             projection.means2d,
             projection.conics,
-            colors[:, channels],
+            colors,
             opacities,
             projection.width,
             projection.height,
             tile_size,
             isect_offsets,
             flatten_ids,
-            backgrounds=None if backgrounds is None else backgrounds[:, channels],
+            backgrounds=backgrounds,
             packed=True,
             absgrad=absgrad,
         )
-        renders.append(render)
-        alphas = chunk_alphas if alphas is None else alphas
+
+    if colors.shape[-1] <= CHANNEL_CHUNK:  # nothing to cut, and nothing to put together
+        render, alphas = blend(colors, backgrounds)
+    else:
+        chunks = colors.split(CHANNEL_CHUNK, dim=-1)
+        behind = [None] * len(chunks) if backgrounds is None else backgrounds.split(CHANNEL_CHUNK, dim=-1)
+        parts = [blend(*part) for part in zip(chunks, behind, strict=True)]
+        render, alphas = torch.cat([part for part, _ in parts], dim=-1), parts[0][1]
     lists = {
         "tiles_per_gauss": tiles_per_gauss,
         "isect_ids": isect_ids,
         "flatten_ids": flatten_ids,
         "isect_offsets": isect_offsets,
     }
-    return torch.cat(renders, dim=-1), alphas, lists
+    return render, alphas, lists

@@ -48,6 +48,7 @@ COLUMNS = (
     Column("L1", _measured("test", "l1"), "{:.4f}", better=-1),
     Column("PSNR", _measured("test", "psnr"), "{:.2f}", better=1),
     Column("FPS", lambda record: record["measured"]["fps"], "{:.1f}", better=1, is_time=True),
+    Column("FPS 1080p", lambda record: record["measured"].get("fps_1080p"), "{:.1f}", better=1, is_time=True),
     Column("MB", lambda record: record["measured"]["parameter_bytes"], "{:.2f}", 1e6, better=-1),
     Column("ckpt MB", lambda record: record["measured"]["checkpoint_bytes"], "{:.2f}", 1e6, better=-1),
     Column("peak MB", lambda record: record["train"].get("peak_memory_bytes"), "{:.1f}", 1e6, better=-1),

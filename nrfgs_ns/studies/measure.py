@@ -11,6 +11,7 @@ from time import perf_counter
 from typing import Any
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
 
 from nrfgs_ns.metrics import METRIC_NAMES, ImageMetrics
@@ -19,6 +20,8 @@ TIMED_CAMERAS = 20
 """Test cameras, evenly spaced, whose rendering is timed."""
 TIMED_SECONDS = 1.0
 """They are rendered in turn for at least this long."""
+FULL_HD = 1920, 1080
+"""A screen's size, at which frames per second are taken beside the photographs' own."""
 
 
 @torch.no_grad()
@@ -31,8 +34,8 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
 
     Returns:
         "test" and "train" (null without views), each with the means of psnr, ssim, ms_ssim, l1, lpips (null where it
-        cannot be had) and "per_image"; "fps"; "splats"; "parameter_bytes" (splats and head in memory);
-        "checkpoint_bytes" (the file, with the optimisers' moments).
+        cannot be had) and "per_image"; "fps" at the photographs' size and "fps_1080p" (null on a CPU); "splats";
+        "parameter_bytes" (splats and head in memory); "checkpoint_bytes" (the file, with the optimisers' moments).
     """
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
     model, data = pipeline.model, pipeline.datamanager
@@ -48,10 +51,14 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
         views = ((cameras[i : i + 1].to(model.device), images[i]) for i in chosen)
         names = [Path(data.train_dataset.image_filenames[i]).name for i in chosen]
         result["train"] = _views(model, metrics, zip(names, views, strict=True))
+    cameras = [camera for camera, _ in test]
     stored = [*model.gauss_params.values(), *(model.head.parameters() if hasattr(model, "head") else ())]
     return {
         **result,
-        "fps": frames_per_second(model, [camera for camera, _ in test]),
+        "fps": frames_per_second(model, cameras),
+        "fps_1080p": frames_per_second(model, [at_size(camera, *FULL_HD) for camera in cameras])
+        if model.device.type == "cuda"
+        else None,
         "splats": int(model.num_points),
         "parameter_bytes": sum(parameter.numel() * parameter.element_size() for parameter in stored),
         "checkpoint_bytes": Path(checkpoint).stat().st_size,
@@ -77,6 +84,15 @@ def _views(model, metrics: ImageMetrics, views: Iterable) -> dict[str, Any]:
         values = [image[metric] for image in per_image if image[metric] is not None]
         means[metric] = sum(values) / len(values) if values else None
     return {**means, "per_image": per_image}
+
+
+def at_size(camera: Cameras, width: int, height: int) -> Cameras:
+    """The camera [1] with another image: of the same vertical angle, and as much to the sides as there is room for."""
+    scale = height / camera.height
+    size = {"width": torch.full_like(camera.width, width), "height": torch.full_like(camera.height, height)}
+    return Cameras(camera.camera_to_worlds, camera.fx * scale, camera.fy * scale, width / 2, height / 2, **size).to(
+        camera.device
+    )
 
 
 def frames_per_second(model, cameras: list) -> float:

@@ -149,7 +149,11 @@ def page() -> str:
         "## All methods: the data set\n\nAfter the word `nrfgs-data`, at the end of the command.\n",
         table(data),
     ]
+    presets = [method for method in others if is_preset(method, first)]
+    parts += ["## Presets\n", *(f"`ns-train {one.config.method_name}`: {one.description}\n" for one in presets)]
     for method in others:
+        if method in presets:
+            continue
         own = list(own_options(method.config.pipeline.model.appearance, APPEARANCE))
         parts += [f"## `ns-train {method.config.method_name}`: the head\n", f"{method.description}\n"]
         parts.append(table(own, APPEARANCE))
@@ -158,6 +162,11 @@ def page() -> str:
         summary = inspect.getdoc(verb).split("\n")[0]
         parts += [f"## `nrfgs {name}`\n", f"{summary}\n", table(list(verb_options(verb)))]
     return "\n".join(parts)
+
+
+def is_preset(method: MethodSpecification, of: MethodSpecification) -> bool:
+    """Whether a method has the same head as another one."""
+    return type(method.config.pipeline.model.appearance) is type(of.config.pipeline.model.appearance)
 
 
 def rates(method: MethodSpecification) -> str:

@@ -8,6 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.densification import CHANGE
 
 
 def checkpoint(folder: str | Path) -> dict:
@@ -67,7 +68,7 @@ def agree_with(content: dict, held: list[dict], rows: list[slice]) -> None:
             assert torch.equal(device["splats"][name], value[part]), name
             (moments,) = content["optimizers"][name]["state"].values()
             assert torch.equal(device["moments"][name], moments["exp_avg_sq"][part]), name
-        for name in ("grad2d", "count", "radii", "peak"):
+        for name in ("grad2d", "count", "radii", CHANGE):
             assert torch.equal(device["statistics"][name], statistics[name][part]), name
         assert device["sampling"] == content["pipeline"]["_extra_state"]["sampling"]["unseen_cameras"]
 

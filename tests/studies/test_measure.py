@@ -5,10 +5,12 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
 
 from nrfgs_ns.studies import bench_run
 from nrfgs_ns.studies.bench_spec import Job, cells_of, command, identity, make_spec
-from nrfgs_ns.studies.measure import evenly_spaced
+from nrfgs_ns.studies.measure import at_size, evenly_spaced
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -78,3 +80,15 @@ def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monke
 )
 def test_evenly_spaced(total, wanted, chosen):
     assert evenly_spaced(total, wanted) == chosen
+
+
+def test_at_size_keeps_the_pose_and_the_vertical_angle():
+    """The middle of the upper edge, and the image's centre, look where they looked."""
+    pose = torch.tensor([[0.0, 0.0, 1.0, 3.0], [1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 1.0]])
+    camera = Cameras(pose[None], fx=300.0, fy=320.0, cx=200.0, cy=100.0, width=400, height=200)
+    wide = at_size(camera, 1920, 1080)
+    assert (wide.width.item(), wide.height.item()) == (1920, 1080)
+    for before, after in (((100, 200), (540, 960)), ((0, 200), (0, 960))):
+        rays = [one.generate_rays(0, coords=torch.tensor(at).float()) for one, at in ((camera, before), (wide, after))]
+        torch.testing.assert_close(rays[0].directions, rays[1].directions)
+        torch.testing.assert_close(rays[0].origins, rays[1].origins)

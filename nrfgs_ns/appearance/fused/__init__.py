@@ -42,7 +42,8 @@ class FusedField:
 
     def __init__(self, config, low: nn.Sequential, high: nn.Sequential | None):
         self.config = config
-        self.branches = [branch for branch in (low, high) if branch is not None]
+        branches = [branch for branch in (low, high) if branch is not None]
+        self.layers = [layer for branch in branches for layer in branch if isinstance(layer, nn.Linear)]
         self.on_cpu = pack(config.latent_dim, config.num_bands, config.use_distance, low, high)
         self.ready: dict[tuple[torch.device, str], tuple[Packing, Launches] | str] = {}  # by device and precision
 
@@ -68,7 +69,7 @@ class FusedField:
         """Colours [M, 3] and opacities [M]: see AppearanceHead.forward, after `takes` said yes."""
         from nrfgs_ns.appearance.fused.launch import FusedFunction
 
-        weights = [weight for branch in self.branches for weight in branch.parameters()]
+        weights = [weight for layer in self.layers for weight in (layer.weight, layer.bias)]
         tables = [splats[name] for name in ("means", "latents", "features_dc", "opacities")]
         ready = self._ready_on(visible.device)
         return FusedFunction.apply(*ready, self._options(scene_unit), *tables, visible, camera_centers, *weights)
@@ -80,7 +81,7 @@ class FusedField:
         demanded = self.config.implementation == "fused"
         if device.type != "cuda" and not (interpreted and demanded):
             return f"the splats are on {device.type}, and the kernels run on CUDA"
-        weight = self.branches[0][0].weight
+        weight = self.layers[0].weight
         for name, tensor in (*splats.items(), ("camera_centers", camera_centers), ("shared weights", weight)):
             if tensor.dtype != torch.float32:
                 return f"{name} is {str(tensor.dtype).removeprefix('torch.')}, and the kernels take float32"

@@ -175,7 +175,7 @@ def _inputs(Z, F, B: tl.constexpr, P: tl.constexpr, KIND: tl.constexpr):
     return tl.reshape(tl.join(operand(Z, KIND), operand(F, KIND)), (B, 2 * P))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def forward_kernel(
     means, latents, features_dc, opacities, visible, centers, packed,
     colors_out, opacities_out,
@@ -220,7 +220,7 @@ def forward_kernel(
         tl.store(opacities_out + items + (lanes - 3), out, mask=valid & (lanes == 3))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def backward_kernel(
     means, latents, features_dc, opacities, visible, centers, packed,
     d_colors, d_opacities,

@@ -6,6 +6,7 @@ one forward, one to zero the tables' gradients unless every splat is visible, on
 weights' gradients.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -17,6 +18,9 @@ from nrfgs_ns.appearance.fused.arithmetic import INTERPRETED
 from nrfgs_ns.appearance.fused.kernels import backward_kernel, forward_kernel
 from nrfgs_ns.appearance.fused.packing import CENTER_SLOTS, Packing
 from nrfgs_ns.appearance.head import SH_C0
+from nrfgs_ns.triton_launch import Launcher
+
+launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
 
 
 @dataclass(frozen=True)
@@ -137,8 +141,8 @@ class FusedFunction(torch.autograd.Function):
         colors, seen = means.new_empty(count, 3), means.new_empty(count)
         if count > 0:
             how = launches.forward
-            forward_kernel[(_programs(how, count, means.device),)](
-                *tables, visible, centers, packed, colors, seen,
+            launch_forward(
+                (_programs(how, count, means.device), 1, 1), *tables, visible, centers, packed, colors, seen,
                 count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
                 D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
                 B=how.block, COLUMNS=how.columns,
@@ -162,8 +166,8 @@ class FusedFunction(torch.autograd.Function):
             programs = _programs(how, count, device)
             partials = tables[0].new_empty(programs, packing.size + CENTER_SLOTS)
             kind, gradient_kind = KINDS[options.precision]
-            backward_kernel[(programs,)](
-                *tables, visible, centers, packed,
+            launch_backward(
+                (programs, 1, 1), *tables, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
                 count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
                 D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
@@ -230,8 +234,10 @@ def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> lis
     padded = -(-rows // 4) * 4
     widths = (3, latent_dim, 3, 1)
     whole = (torch.zeros if zero else torch.empty)(padded * sum(widths), device=device)
-    pieces = whole.split([padded * width for width in widths])
-    return [piece[: rows * width].view(rows, width) for piece, width in zip(pieces, widths, strict=True)]
+    begins = (0, *itertools.accumulate(widths[:-1]))
+    return [
+        whole.as_strided((rows, width), (width, 1), padded * begin) for width, begin in zip(widths, begins, strict=True)
+    ]
 
 
 def _contiguous(x: Tensor) -> Tensor:

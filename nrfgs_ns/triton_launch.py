@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launching a Triton kernel again and again, with less work for the host.
+
+Each `kernel[grid](...)` looks at every argument to find out which of the kernel's compiled variants it asks for: its
+type, whether a pointer is aligned, whether an integer is 1 or a multiple of 16. For thirty arguments that takes the
+host longer than a small kernel takes the GPU. Kernels that are only ever given tensors of the same dtypes, and
+integers that Triton is told not to specialise (`do_not_specialize`), have one variant for each set of constants, as
+long as all pointers are aligned. So the first launch is Triton's own, and the variant it used is launched from then on.
+"""
+
+from typing import Any
+
+import torch
+import triton
+
+ALIGNMENT = 16
+"""Bytes; what Triton tells pointers apart by. PyTorch's allocations are multiples of 512, parts of them may be not."""
+MAX_INT = 2**31 - 1
+"""Beyond it an integer is of another type, and the kernel another variant."""
+KEEPS_CONSTANTS = tuple(int(part) for part in triton.__version__.split(".")[:2]) >= (3, 6)
+"""Whether a compiled kernel takes all of the function's arguments, constants too. Tried from 3.6 on."""
+
+
+class Launcher:
+    """One kernel, for callers that always pass the same dtypes.
+
+    Args:
+        kernel: under `triton.jit`; its plain arguments come before its constants, and integers among them are not
+            specialised.
+    """
+
+    def __init__(self, kernel: Any):
+        self.kernel = kernel
+        self.variants: dict[tuple, tuple[Any, tuple]] = {}
+
+    def __call__(self, grid: tuple[int, int, int], *arguments: torch.Tensor | int | float, **constants: Any) -> None:
+        """Launch it.
+
+        Args:
+            grid: numbers of programs.
+            arguments: the plain ones, the first of them a tensor.
+            constants: the kernel's, and options of the compiler (num_warps, ...).
+        """
+        key = (arguments[0].get_device(), *map(type, arguments), *constants.items())
+        variant = self.variants.get(key)
+        ordinary = all(map(_is_ordinary, arguments))
+        if variant is not None and ordinary:
+            compiled, in_order = variant
+            compiled[grid](*arguments, *in_order)
+            return
+        compiled = self.kernel[grid](*arguments, **constants)
+        if compiled is not None and ordinary and KEEPS_CONSTANTS:  # the interpreter compiles nothing
+            names = self.kernel.arg_names[len(arguments) :]
+            self.variants[key] = compiled, tuple(constants[name] for name in names)
+
+
+def _is_ordinary(argument: torch.Tensor | int | float) -> bool:
+    """Whether it asks for the variant that most launches ask for."""
+    if isinstance(argument, torch.Tensor):
+        return argument.data_ptr() % ALIGNMENT == 0
+    return abs(argument) <= MAX_INT or isinstance(argument, float)

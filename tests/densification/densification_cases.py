@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of splats and small trainings that the tests of densification share."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from torch.nn import Parameter
+
+from nrfgs_ns.densification import build_densification
+from nrfgs_ns.model import NrfgsModelConfig
+from nrfgs_ns.studies.run import parse
+
+PROTOCOLS = ("splatfacto", "original", "mcmc")
+REFINES = 1000
+"""A step at which every protocol refines by default: more than 8 images + 100 steps after the reset at 0."""
+
+
+def logit(value: float) -> float:
+    return torch.logit(torch.tensor(value, dtype=torch.float64)).item()
+
+
+class Table:
+    """`count` splats with Adam's moments; row i has the latent (i, i, i), and means far from all others."""
+
+    def __init__(self, count: int, opacity: float = 0.5, scale: float = 0.001):
+        rows = torch.arange(count, dtype=torch.float32)[:, None]
+        self.splats = torch.nn.ParameterDict(
+            {
+                "means": Parameter(rows * torch.tensor([1.0, 0.0, 0.0])),
+                "scales": Parameter(torch.full((count, 3), scale).log()),
+                "quats": Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)),
+                "opacities": Parameter(torch.full((count, 1), logit(opacity))),
+                "features_dc": Parameter(rows.repeat(1, 3)),
+                "latents": Parameter(rows.repeat(1, 3)),
+            }
+        )
+        self.optimizers = {name: torch.optim.Adam([value], lr=1e-9) for name, value in self.splats.items()}
+        for name, value in self.splats.items():
+            value.grad = torch.ones_like(value)
+            self.optimizers[name].step()
+            self.optimizers[name].zero_grad()
+        self.optimizers["field"] = torch.optim.Adam([Parameter(torch.zeros(4))])
+
+    def __len__(self) -> int:
+        return len(self.splats["means"])
+
+    def set_opacity(self, row: int, opacity: float) -> None:
+        self.splats["opacities"].data[row] = logit(opacity)
+
+    def info(self, gradient: float = 0.0) -> dict:
+        """A 100 x 100 picture that shows every splat, each with this gradient along x in units of half the picture."""
+        means2d = torch.zeros(len(self), 2, requires_grad=True)
+        means2d.grad = torch.tensor([gradient / 50.0, 0.0]).repeat(len(self), 1)
+        means2d.absgrad = means2d.grad.clone()
+        means2d.retain_grad = lambda: None
+        ids = torch.arange(len(self))
+        radii = torch.ones(len(self), dtype=torch.int32)
+        return {
+            "means2d": means2d,
+            "gaussian_ids": ids,
+            "radii": radii,
+            "width": 100,
+            "height": 100,
+            "n_cameras": 1,
+        }
+
+    def step(
+        self,
+        protocol,
+        step: int,
+        gradient: float = 0.0,
+        shown: float | Callable[[torch.Tensor], torch.Tensor] = 0.5,
+        seen: slice | torch.Tensor = slice(None),
+    ) -> None:
+        """One training step; the splats in `seen` have the effective opacity `shown`, or what it makes of the stored
+        ones, which it is given as heads compute them."""
+        info = self.info(gradient)
+        rows = info["gaussian_ids"][seen]
+        logits = self.splats["opacities"]
+        stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
+        opacities = shown(stored) if callable(shown) else torch.full_like(stored, shown)
+        protocol.pre_backward(step, {**info, "gaussian_ids": rows}, opacities, logits)
+        protocol.post_backward(step, info, self.splats, self.optimizers)
+
+    def check(self) -> None:
+        """All tensors and moments have a row per splat, and the optimisers hold the table's parameters."""
+        for name, value in self.splats.items():
+            (held,) = self.optimizers[name].param_groups[0]["params"]
+            assert held is value and len(value) == len(self)
+            state = self.optimizers[name].state[value]
+            assert state["exp_avg"].shape == state["exp_avg_sq"].shape == value.shape
+        assert torch.isfinite(torch.cat([value.detach().flatten() for value in self.splats.values()])).all()
+
+
+def protocol(name: str, images: int = 8, **options):
+    return build_densification(NrfgsModelConfig(densification=name, **options), images)
+
+
+def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **model) -> list[str]:
+    """ns-train's command line: refinement every 4th step."""
+    options = {"densification": densification, "warmup-length": 2, "refine-every": 4, "num-downscales": 0, **model}
+    if densification == "splatfacto":
+        options |= {"densify-grad-thresh": 1e-6, "reset-alpha-every": 6}
+    words = [word for name, value in options.items() for word in (f"--pipeline.model.{name}", str(value))]
+    words += ["--max-num-iterations", str(steps), "--output-dir", str(out), "--vis", "tensorboard"]
+    words += ["--steps-per-eval-image", "1000", "--steps-per-eval-all-images", "1000"]
+    words += ["--logging.local-writer.enable", "False", "--logging.profiler", "none"]
+    return ["nrfgs", "--data", str(scene), *words]
+
+
+def trainer_of(scene: Path, out: Path, densification: str, **model):
+    trainer = parse(arguments(scene, out, densification, **model)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+def one_step(trainer, step: int) -> dict:
+    """What the trainer does in a step; returns the losses."""
+    trainer.pipeline.train()
+    for where in (
+        TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
+        None,
+        TrainingCallbackLocation.AFTER_TRAIN_ITERATION,
+    ):
+        if where is None:
+            losses = trainer.train_iteration(step)[1]
+        else:
+            for callback in trainer.callbacks:
+                callback.run_callback_at_location(step, where)
+    return losses
+
+
+def tensors(tree, prefix="") -> dict:
+    """The tensors of a checkpoint's part, by path."""
+    if isinstance(tree, torch.Tensor):
+        return {prefix: tree}
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, (list, tuple)) else ()
+    return {path: leaf for key, value in items for path, leaf in tensors(value, f"{prefix}/{key}").items()}

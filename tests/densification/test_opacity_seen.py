@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which opacity decides that a splat is dead, how far noise moves it, and what the loss counts."""
+
+import pytest
+import torch
+from densification_cases import PROTOCOLS, REFINES, Table, one_step, protocol, trainer_of
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.gsnb import GsnbConfig
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.sg import SgConfig
+from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.densification import CHANGE, UNSEEN, build_densification
+from nrfgs_ns.densification.protocol import change_of, seen_with
+from nrfgs_ns.studies.run import parse
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_splat_visible_through_its_residual_only(name):
+    """Base below the threshold, effective opacity above: it dies if the base is seen, and lives if the peak is."""
+    left = {}
+    for seen in ("base", "peak"):
+        table = Table(50)
+        table.set_opacity(7, 0.001)
+        rules = protocol(name, opacity_seen_by_densification=seen)
+        table.step(rules, REFINES - 2, shown=0.3)
+        table.step(rules, REFINES - 1, shown=0.001)
+        torch.manual_seed(0)
+        table.step(rules, REFINES, shown=0.002)
+        left[seen] = 7 in table.splats["latents"][:, 0].long()
+    assert left == {"base": False, "peak": True}
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_splat_that_its_residual_hides(name):
+    """Base above the threshold, invisible in all views: the peak sees it. What no view shows is judged by its base."""
+    table = Table(50)
+    rules = protocol(name, opacity_seen_by_densification="peak")
+    torch.manual_seed(0)
+    table.step(rules, REFINES, shown=0.001, seen=slice(0, 10))
+    left = set(table.splats["latents"][:, 0].long().tolist())
+    assert left == set(range(10, 50))
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_the_peak_is_forgotten_at_refinement(name):
+    table = Table(50)
+    table.set_opacity(7, 0.001)
+    rules = protocol(name, opacity_seen_by_densification="peak")
+    table.step(rules, REFINES, shown=0.3)
+    assert 7 in table.splats["latents"][:, 0].long()
+    torch.manual_seed(0)
+    table.step(rules, REFINES + 100, shown=0.001, seen=slice(7, 8))
+    assert 7 not in table.splats["latents"][:, 0].long()
+
+
+def test_each_protocol_has_its_own_idea_of_a_dead_splat():
+    """What was measured to be better (docs/bench.md); asked for, each does the other."""
+    seen = {name: protocol(name).opacity_seen for name in PROTOCOLS}
+    assert seen == {"splatfacto": "base", "original": "base", "mcmc": "peak"}
+    for name in PROTOCOLS:
+        for asked in ("base", "peak"):
+            assert protocol(name, opacity_seen_by_densification=asked).opacity_seen == asked
+
+
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"])
+def test_no_method_needs_an_idea_of_its_own(method):
+    for densification, seen in (("splatfacto", "base"), ("mcmc", "peak")):
+        config = parse([method, "--pipeline.model.densification", densification]).pipeline.model
+        assert config.opacity_seen_by_densification is None
+        assert build_densification(config, 8).opacity_seen == seen
+
+
+# Heads whose opacity is the stored one.
+
+
+@pytest.mark.parametrize("config", [ShConfig(), GsnbConfig(), SgConfig(), NrfConfig(opacity_residual=False)])
+def test_heads_of_stored_opacity_change_nothing(config):
+    """Exactly: 21 of 37 splats, so that they do not lie in the vectors and tails of a loop where the table has them."""
+    torch.manual_seed(0)
+    head = config.setup()
+    logits = 3 * torch.randn(37, 1)
+    splats = {"means": torch.randn(37, 3), "opacities": logits, **head.splat_params(torch.rand(37, 3))}
+    rows = torch.randperm(37)[:21]
+    rules = protocol("mcmc")
+    rules.pre_backward(0, {"gaussian_ids": rows}, head(splats, rows, torch.zeros(3)).opacities, logits)
+    assert (rules.state[CHANGE][rows] == 0.0).all() and (rules.state[CHANGE] == UNSEEN).sum() == 16
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_head_of_stored_opacity_cannot_tell_peak_from_base(name):
+    """Bit for bit, over three refinements, with opacities that wander across the thresholds in each step: 3DGS-MCMC and
+    the others are then what they are."""
+    ends = []
+    for seen in ("base", "peak"):
+        torch.manual_seed(0)
+        table = Table(203)
+        rules = protocol(name, opacity_seen_by_densification=seen, splat_budget=230)
+        table.splats["opacities"].data.uniform_(-7.0, 0.0)
+        for step in (998, 999, 1000, 1001, 1050, 1099, 1100, 1101, 1199, 1200, 1201):
+            table.step(rules, step, shown=lambda stored: stored, seen=torch.randperm(len(table))[:150])
+            table.splats["opacities"].data += torch.randn(len(table), 1)
+        table.check()
+        moments = [table.optimizers[key].state[value]["exp_avg"] for key, value in table.splats.items()]
+        ends.append([*(value.detach() for value in table.splats.values()), *moments])
+    latents = ends[0][5][:, 0].long()
+    assert len(torch.unique(latents)) < 203, "nothing died: the test would prove nothing"
+    for base, peak in zip(*ends, strict=True):
+        assert torch.equal(base, peak)
+
+
+# Heads that change it.
+
+
+def test_what_is_seen_is_what_was_shown():
+    """By the change and the stored opacity from which it came; extremes included. A difference of two numbers up to 1,
+    and a quotient below 1, are each rounded by up to 6e-8, three times in all."""
+    stored = torch.cat([torch.rand(100), torch.tensor([0.0, 0.0, 1.0, 1.0, 1e-30, 1e-30, 0.2])])
+    shown = torch.cat([torch.rand(100), torch.tensor([0.0, 0.2, 0.0, 1.0, 0.0, 0.3, 0.2])])
+    change = change_of(stored, shown)
+    assert change.abs().max() <= 1 and change[-1] == 0
+    assert_close(seen_with(stored, change), shown, rtol=0, atol=2e-7)
+
+
+def test_what_is_seen_follows_the_stored_opacity():
+    """A view's addition stays an amount, what it takes away stays a share; neither leads out of [0, 1]."""
+    table = Table(4, opacity=0.3)
+    table.set_opacity(2, 0.8)
+    rules = protocol("mcmc")
+    for shown, row in ((0.45, 0), (0.35, 0), (0.5, 1), (0.2, 2), (0.4, 2)):
+        table.step(rules, 10, shown=shown, seen=slice(row, row + 1))
+    expected = [0.45, 0.5, 0.4, 0.3]
+    assert_close(rules.seen_opacity(table.splats["opacities"]), torch.tensor(expected))
+    for row, stored in enumerate((0.001, 0.9, 0.1, 0.002)):
+        table.set_opacity(row, stored)
+    expected = [0.001 + 0.15, 1.0, 0.1 / 2, 0.002]
+    assert_close(rules.seen_opacity(table.splats["opacities"]), torch.tensor(expected))
+
+
+def test_noise_spares_what_views_have_lately_shown():
+    """MCMC, a base at which the noise is at its largest: whoever was shown since the relocation before the last holds
+    still, relocated rows included; with "base" all are shaken."""
+    for seen in ("base", "peak"):
+        table = Table(50)
+        for row in range(50):
+            table.set_opacity(row, 0.006)
+        rules = protocol("mcmc", opacity_seen_by_densification=seen, splat_budget=60)
+        torch.manual_seed(0)
+        table.step(rules, REFINES, shown=0.4, seen=slice(0, 40))
+        assert len(table) > 50
+        before = table.splats["means"].detach().clone()
+        parents = table.splats["latents"][:, 0].long()
+        table.step(rules, REFINES + 1, shown=0.4, seen=slice(0, 1))
+        moved = (table.splats["means"].detach() - before).abs().amax(dim=-1)
+        assert moved[parents >= 40].min() > 0
+        assert (moved[parents < 40].max() < 1e-15) == (seen == "peak")  # the gate at 0.4 is exp(-39.5)
+
+
+@pytest.mark.parametrize("shown", [lambda stored: stored + 0.1, lambda stored: stored / 2])
+def test_noise_spares_copies_as_their_source(shown):
+    """MCMC: half of the splats, which views hide, move onto 25 others, whose stored opacity becomes smaller by it: from
+    0.6 to 0.1 and more, for at most 8 in a place (1 - 0.4^(1/8) = 0.108). Halved, it is still far above the noise; if
+    the 0.3 that a view took from the source were taken from its copies, they would count as invisible."""
+    table = Table(50, opacity=0.6)
+    for row in range(25, 50):
+        table.set_opacity(row, 1e-4)
+    rules = protocol("mcmc", splat_budget=50)
+    torch.manual_seed(0)
+    table.step(rules, REFINES, shown=lambda stored: torch.where(stored > 0.5, shown(stored), 0.0))
+    parents = table.splats["latents"][:, 0].long()
+    assert parents.max() < 25 and torch.bincount(parents).max() <= 8  # in a place
+    before = table.splats["means"].detach().clone()
+    table.step(rules, REFINES + 1, seen=slice(0, 0))
+    assert (table.splats["means"].detach() - before).abs().max() < 1e-12  # gate: below exp(-100 (0.054 - 0.005))
+
+
+def test_what_views_have_shown_is_forgotten_after_the_last_relocation_too():
+    """MCMC: noise goes on to the end of the training, and so must the windows of 100 steps that it looks back over."""
+    table = Table(50, opacity=0.001)
+    rules = protocol("mcmc", splat_budget=50)
+    moved = {}
+    for step in (25_050, 25_100, 25_101, 25_199, 25_200, 25_201, 25_300, 30_000):
+        before = table.splats["means"].detach().clone()
+        table.step(rules, step, shown=0.4, seen=slice(0, 50 if step == 25_050 else 0))
+        moved[step] = bool((table.splats["means"].detach() != before).any(dim=-1).all())
+    assert moved == {step: step >= 25_200 for step in moved}
+
+
+def test_checkpoints_of_older_versions_start_anew():
+    """They hold the largest opacities, not changes, under names of their own."""
+    table = Table(50)
+    rules = protocol("mcmc", splat_budget=50)
+    rules.load_state({"peak": torch.rand(50), "peak_before": torch.rand(50)}, torch.device("cpu"))
+    logits = table.splats["opacities"]
+    assert torch.equal(rules.seen_opacity(logits), torch.sigmoid(logits.detach().flatten()))
+    assert not {"peak", "peak_before"} & rules.state.keys()
+    table.step(rules, REFINES, shown=0.7)
+    table.step(rules, REFINES + 100, shown=0.7)
+    assert len(table) == 50
+
+
+def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
+    """MCMC: the cameras' mean of (what they show, else the stored opacity) over all splats, and its gradients."""
+    rules = protocol("mcmc")
+    stored = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+    logits = torch.logit(stored)[:, None].requires_grad_()
+    splats = {"opacities": logits, "scales": torch.zeros(4, 3, dtype=torch.float64)}
+    assert_close(rules.regularisation(splats)["mcmc_opacity_reg"], 0.01 * stored.mean())
+    shown = torch.tensor([0.5, 0.6, 0.7], dtype=torch.float64, requires_grad=True)
+    info = {"gaussian_ids": torch.tensor([0, 2, 2]), "n_cameras": 2}  # the first camera sees 0 and 2, the second 2
+    rules.pre_backward(0, info, shown, logits)
+    term = rules.regularisation(splats)["mcmc_opacity_reg"]
+    first, second = [0.5, 0.2, 0.6, 0.4], [0.1, 0.2, 0.7, 0.4]
+    assert_close(term.item(), 0.01 * (sum(first) + sum(second)) / 8)
+    by_logit, by_shown = torch.autograd.grad(term, (logits, shown))
+    assert_close(by_shown, torch.full_like(shown, 0.01 / 8))
+    kept = torch.tensor([1, 2, 0, 2], dtype=torch.float64)  # cameras that do not show it
+    assert_close(by_logit[:, 0], 0.01 / 8 * kept * stored * (1 - stored))
+
+
+def test_the_peak_is_forgotten_at_reset():
+    """Splatfacto does not refine at a reset: what was seen before it must not keep a splat alive after it."""
+    table = Table(50)
+    rules = protocol("splatfacto", opacity_seen_by_densification="peak")
+    table.step(rules, 2999, shown=0.9)
+    assert_close(rules.state[CHANGE], torch.full((50,), 0.4))
+    table.step(rules, 3000, shown=0.9)
+    assert len(table) == 50 and (rules.state[CHANGE] == UNSEEN).all()
+
+
+def test_the_peak_is_that_of_the_head(tiny_scene, tmp_path):
+    trainer = trainer_of(tiny_scene, tmp_path, "splatfacto", **{"opacity-seen-by-densification": "peak"})
+    model = trainer.pipeline.model
+    model.head.low[-1].bias.data[3] = 100.0  # d_alpha = 0.2 tanh(100) = 0.2
+    one_step(trainer, 1)  # at step 0 splatfacto resets
+    visible = torch.zeros(model.num_points, dtype=torch.bool)
+    visible[model.info["gaussian_ids"]] = True
+    assert visible.any() and not visible.all()
+    change = model.densification.state[CHANGE]
+    assert (change[~visible] == UNSEEN).all()
+    assert_close(change[visible], torch.full_like(change[visible], 0.2))

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Densification protocols: what they delete, copy, move and add, and by which thresholds."""
+
+import pytest
+import torch
+from densification_cases import PROTOCOLS, REFINES, Table, protocol
+from torch.testing import assert_close
+
+from nrfgs_ns.densification import McmcDensification, OriginalDensification, build_densification
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.model import NrfgsModelConfig
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+
+# What happens to the rows.
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_every_tensor_of_the_table_goes_along(name):
+    """Small splats with large gradients are duplicated, large ones split, faint ones pruned or moved."""
+    table = Table(40, scale=0.001)
+    table.splats["scales"].data[10:20] = torch.tensor(0.05).log()
+    for row in range(30, 40):
+        table.set_opacity(row, 0.001)
+    rules = protocol(name, opacity_seen_by_densification="base")
+    torch.manual_seed(0)
+    table.step(rules, REFINES, gradient=1.0)
+    table.check()
+    parents = table.splats["latents"][:, 0].long()
+    assert torch.equal(table.splats["features_dc"].detach(), table.splats["latents"].detach())
+    assert set(parents.tolist()) <= set(range(30)), "a faint splat is left"
+    # A split child lies within a few standard deviations of 0.05 of its parent, the others where it was.
+    assert (table.splats["means"][:, 0] - parents).abs().max() < 0.5
+    if name == "mcmc":
+        assert len(table) == 42  # 5 % more
+    else:
+        counts = torch.bincount(parents, minlength=30)
+        assert (counts == 2).all()
+        assert {len(value) for value in rules.state.values() if isinstance(value, torch.Tensor)} == {len(table)}
+
+
+@pytest.mark.parametrize("budget", [30, 50, 57])
+def test_mcmc_grows_to_its_budget_and_stays_there(budget):
+    table = Table(50)
+    rules = protocol("mcmc", splat_budget=budget)
+    counts = []
+    for step in range(600, 1300, 100):
+        table.step(rules, step, gradient=1.0)
+        table.check()
+        counts.append(len(table))
+    assert max(counts) == counts[-1] == max(budget, 50)
+    assert counts == sorted(counts)
+
+
+def test_mcmc_rests_before_its_start_and_after_its_end():
+    table = Table(50)
+    rules = protocol("mcmc")
+    for step in (0, 500, 599, 25_000, 25_100):
+        table.step(rules, step)
+        assert len(table) == 50
+    table.step(rules, 24_900)
+    assert len(table) == 52
+
+
+# Thresholds.
+
+
+def test_original_measures_by_the_cameras():
+    """3DGS: 1.1 times the largest distance of a camera from the mean of all."""
+    rules = protocol("original")
+    rules.see_cameras(torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0.0], [2.0, -3.0, 0.0]]))
+    assert rules.state["scene_scale"] == pytest.approx(1.1 * 3.0)
+    table = Table(4, scale=0.032)  # 0.01 x 3.3 = 0.033: three are duplicated, the last is split
+    table.splats["scales"].data[3] = torch.tensor(0.034).log()
+    table.step(rules, REFINES, gradient=1.0)
+    kept = torch.bincount(table.splats["scales"].exp().amax(dim=-1).mul(1000).round().long())
+    assert kept[32] == 6 and kept[round(34 / 1.6)] == 2
+    rules.see_cameras(torch.ones(1, 3))
+    assert rules.state["scene_scale"] == 1.0
+
+
+@pytest.mark.parametrize("gradient, count", [(1.9e-4, 10), (2.1e-4, 20)])
+def test_original_grows_above_its_gradient(gradient, count):
+    table = Table(10)
+    table.step(protocol("original"), REFINES, gradient=gradient)
+    assert len(table) == count
+
+
+def test_original_keeps_its_calendar():
+    """No reset before the first step (gsplat 1.4 has one); a reset to 0.01 at 3000, refinement right away after it."""
+    table = Table(10, opacity=0.5)
+    rules = protocol("original", images=500)
+    table.step(rules, 0)
+    assert_close(torch.sigmoid(table.splats["opacities"].detach()), torch.full((10, 1), 0.5))
+    table.step(rules, 3000)
+    assert_close(torch.sigmoid(table.splats["opacities"].detach()), torch.full((10, 1), 0.01))
+    table.step(rules, 3100, gradient=1.0)
+    assert len(table) == 20
+    table.step(rules, 15_000, gradient=1.0)
+    assert len(table) == 20
+
+
+def test_original_prunes_large_splats_after_the_first_reset():
+    for step, left in ((REFINES, 10), (3100, 9)):
+        table = Table(10)
+        table.splats["scales"].data[4] = torch.tensor(0.11).log()
+        table.step(protocol("original"), step)
+        assert len(table) == left
+
+
+def test_constants_are_those_of_the_papers():
+    assert OriginalDensification() == OriginalDensification(2e-4, 0.01, 0.005, 0.1)
+    assert McmcDensification() == McmcDensification(0.005, 25_000, 5e5, 0.01, 0.01)
+
+
+@pytest.mark.parametrize(
+    "options, says",
+    [
+        ({"densification": "sparkle"}, "sparkle"),
+        ({"opacity_seen_by_densification": "sparkle"}, "sparkle"),
+        ({"densification": "mcmc", "splat_budget": 0}, "splat_budget"),
+        ({"densification": "mcmc", "splat_budget": 2**24 + 1}, "splat_budget"),
+        ({"densification": "mcmc", "stop_split_at": 100}, "stop_split_at"),
+        ({"densification": "mcmc", "cull_alpha_thresh": 0.005}, "cull_alpha_thresh"),
+        ({"densification": "original", "densify_grad_thresh": 1e-6}, "densify_grad_thresh"),
+        ({"densification": "original", "use_absgrad": False}, "use_absgrad"),
+    ],
+)
+def test_options_that_cannot_work_are_refused(options, says):
+    with pytest.raises(InputError, match=says):
+        build_densification(NrfgsModelConfig(**options), 8)

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Densification in a training: the losses that it adds, and that a continued training cannot tell."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from densification_cases import arguments, tensors, trainer_of
+from torch.testing import assert_close
+
+from nrfgs_ns.densification import CHANGE, UNSEEN
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.studies.run import parse, train
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+
+def test_mcmc_regularises_the_loss_in_training_only(tiny_scene, tmp_path):
+    trainer = trainer_of(tiny_scene, tmp_path, "mcmc")
+    model = trainer.pipeline.model
+    camera, batch = trainer.pipeline.datamanager.next_train(0)
+    model.step_cb(trainer.optimizers, 0)
+    losses = model.get_loss_dict(model(camera), batch)
+    assert losses["mcmc_opacity_reg"].item() == pytest.approx(0.01 * 0.1, rel=1e-5)  # splats start at 0.1
+    assert losses["mcmc_scale_reg"].item() == pytest.approx(0.01 * model.scales.exp().mean().item(), rel=1e-5)
+    model.eval()
+    assert not any(name.startswith("mcmc") for name in model.get_loss_dict(model(camera), batch))
+
+
+def test_the_extent_is_that_of_the_training_cameras(tiny_scene, tmp_path):
+    trainer = trainer_of(tiny_scene, tmp_path, "original")
+    centers = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
+    expected = 1.1 * (centers - centers.mean(0)).norm(dim=1).max().item()
+    assert trainer.pipeline.model.densification.state["scene_scale"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("densification, seen", [("splatfacto", "peak"), ("original", "base"), ("mcmc", "peak")])
+def test_resumed_training_is_the_unbroken_one(densification, seen, tiny_scene, tmp_path):
+    """26 steps at once, against 14 and 12 more: the checkpoint lies between two refinements, with statistics in flight.
+
+    The same machine adds the same numbers in the same order, so that only a lost state can differ.
+    """
+    model = {"opacity-seen-by-densification": seen}
+    if densification == "mcmc":
+        model["splat-budget"] = 330  # from 300: growth of 5 % at steps 4, 8, ... reaches it in the first half
+
+    def run(name: str, steps: int, *more: str) -> dict:
+        args = arguments(tiny_scene, tmp_path / name, densification, steps, **model)
+        config = Path(train([*args, *more]).config_path)
+        (path,) = (config.parent / "nerfstudio_models").glob("*.ckpt")
+        return torch.load(path, weights_only=True) | {"folder": path.parent}
+
+    whole, half = run("whole", 26), run("half", 14)
+    rest = run("rest", 12, "--load-dir", str(half["folder"]))
+    assert whole["step"] == rest["step"] == 25
+    counts = [len(part["pipeline"]["_model.gauss_params.means"]) for part in (half, whole)]
+    if densification == "mcmc":
+        assert counts == [330, 330]
+    else:
+        assert counts[0] != counts[1], "nothing was densified in the second half: the test would prove nothing"
+    strategy = half["pipeline"]["_model._extra_state"]["strategy"]
+    assert (CHANGE in strategy) == (seen == "peak")
+    if seen == "peak":
+        assert strategy[CHANGE].max() > UNSEEN
+    for part in ("pipeline", "optimizers"):
+        assert_close(tensors(whole[part]), tensors(rest[part]), rtol=0, atol=0)
+
+
+def test_another_protocols_checkpoint_is_refused(tiny_scene, tmp_path):
+    config = Path(train(arguments(tiny_scene, tmp_path / "a", "original", steps=1)).config_path)
+    more = ["--load-dir", str(config.parent / "nerfstudio_models")]
+    trainer = parse([*arguments(tiny_scene, tmp_path / "b", "mcmc"), *more]).setup(local_rank=0, world_size=1)
+    with pytest.raises(InputError, match="densification original"):
+        trainer.setup()
