@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,10 @@ from hypothesis import settings
 # A first example pays for imports and allocations; how long one takes says nothing.
 settings.register_profile("nrfgs", deadline=None)
 settings.load_profile("nrfgs")
+
+# Modules that tests of several folders share. tests/ itself would let its folders pass for packages of their names, and
+# nerfbaselines for installed.
+sys.path.insert(0, str(Path(__file__).resolve().parent / "helpers"))
 
 SCENES = Path(os.environ.get("NRFGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
 
@@ -32,8 +37,6 @@ def tiny_scene(tmp_path_factory) -> Path:
 @pytest.fixture
 def no_cuda(monkeypatch):
     """Make anything that needs CUDA fail: gsplat's compiled kernels, `.cuda()`; and hide a GPU that is there."""
-    import sys
-
     import torch
 
     def refuse(*_, **__):

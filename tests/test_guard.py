@@ -2,10 +2,10 @@
 """The guard: what stops a training, what is said, and what is left on disk."""
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
+from short_trainings import command_line
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.guard import MAX_GRADIENT, PARAMETERS_EVERY, TrainingStopped
@@ -20,21 +20,15 @@ def device(request):
 
 
 NAN, INF = math.nan, math.inf
-
-
-def options(scene: Path, out: Path, *more) -> list[str]:
-    args = ["nrfgs", "--data", scene, "--output-dir", out, "--vis", "tensorboard", "--logging.profiler", "none"]
-    args += ["--steps-per-eval-image", 10**6, "--steps-per-eval-all-images", 10**6, "--max-num-iterations", 10]
-    args += ["--logging.local-writer.enable", False, "--pipeline.model.num-downscales", 0]
-    return [str(word) for word in [*args, *more]]
+FULL_SIZE = {"--pipeline.model.num-downscales": 0}
 
 
 @pytest.fixture
 def start(tiny_scene, tmp_path):
     """A trainer that is ready for its first step; `fused` makes its CPU optimisers skip like those on a GPU."""
 
-    def trainer(fused: bool = False, *more):
-        config = parse(options(tiny_scene, tmp_path, *more))
+    def trainer(*more: dict, steps: int = 10, fused: bool = False):
+        config = parse(command_line("nrfgs", tiny_scene, tmp_path, steps, FULL_SIZE, *more))
         _set_random_seed(config.machine.seed)
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
@@ -103,7 +97,7 @@ def numbers(state) -> dict[str, torch.Tensor]:
     [(False, "means", NAN), (False, "loss", NAN), (True, "latents", INF), (True, "scales", 1e19), (True, "loss", NAN)],
 )
 def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fused, name, value):
-    trainer = start(fused)
+    trainer = start(fused=fused)
     poison(trainer, at=3, name=name, value=value)
     before = {}
     original = trainer.optimizers.optimizer_scaler_step_some
@@ -131,11 +125,11 @@ def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fuse
 
 @pytest.mark.parametrize("fused", [False, True], ids=["on the host", "on the device"])
 def test_training_goes_on_from_where_it_stopped(start, fused):
-    trainer = start(fused)
+    trainer = start(fused=fused)
     poison(trainer, at=3, name="means", value=NAN)
     with pytest.raises(TrainingStopped):
         trainer.train()
-    again = start(False, "--load-dir", trainer.checkpoint_dir)
+    again = start({"--load-dir": trainer.checkpoint_dir})
     assert again._start_step == 4
     again.train()
     assert max(checkpoints(again)) == 13
@@ -143,7 +137,7 @@ def test_training_goes_on_from_where_it_stopped(start, fused):
 
 @pytest.mark.parametrize("fused", [False, True], ids=["on the host", "on the device"])
 def test_a_condemned_last_step_is_reported_too(start, fused):
-    trainer = start(fused)
+    trainer = start(fused=fused)
     poison(trainer, at=9, name="quats", value=INF)
     with pytest.raises(TrainingStopped, match="step 9"):
         trainer.train()
@@ -211,7 +205,7 @@ def test_the_cause_learning_rate(start):
 
 @pytest.mark.parametrize("name", ["means", "quats", "opacities", "latents"])
 def test_a_splat_that_is_not_finite_is_named_and_left_out(start, name):
-    trainer = start(False, "--max-num-iterations", 3)
+    trainer = start(steps=3)
     count = trainer.pipeline.model.num_points
     trainer.pipeline.model.gauss_params[name].data[11] = NAN
     with pytest.raises(TrainingStopped, match=f"gauss_params.{name} has NaN") as stopped:
@@ -221,11 +215,11 @@ def test_a_splat_that_is_not_finite_is_named_and_left_out(start, name):
     found = numbers(state)
     assert len(state["pipeline"]["_model.gauss_params.means"]) == count - 1
     assert all(torch.isfinite(tensor).all() for tensor in found.values())
-    start(False, "--load-dir", trainer.checkpoint_dir).train()
+    start({"--load-dir": trainer.checkpoint_dir}).train()
 
 
 def test_parameters_are_looked_at_now_and_then(start):
-    trainer = start(False, "--max-num-iterations", PARAMETERS_EVERY + 5)
+    trainer = start(steps=PARAMETERS_EVERY + 5)
     trainer.train_iteration(1)
     trainer.pipeline.model.gauss_params["means"].data[2] = NAN
     trainer.train_iteration(2)  # the splat is not drawn, so nothing else becomes NaN
@@ -235,7 +229,7 @@ def test_parameters_are_looked_at_now_and_then(start):
 
 
 def test_shared_weights_that_are_not_finite_are_never_written(start):
-    trainer = start(False, "--max-num-iterations", 2)
+    trainer = start(steps=2)
     trainer.train()
     good = set(checkpoints(trainer))
     trainer.pipeline.model.head.low[0].weight.data[0, 0] = NAN
@@ -246,18 +240,18 @@ def test_shared_weights_that_are_not_finite_are_never_written(start):
 
 @pytest.mark.parametrize("name", ["gauss_params.means", "head.low.0.weight"])
 def test_a_checkpoint_that_is_not_finite_is_refused(start, name):
-    trainer = start(False, "--max-num-iterations", 2)
+    trainer = start(steps=2)
     trainer.train()
     ((step, state),) = checkpoints(trainer).items()
     state["pipeline"][f"_model.{name}"].view(-1)[4] = INF
     torch.save(state, trainer.checkpoint_dir / f"step-{step:09d}.ckpt")
     with pytest.raises(InputError, match=f"'{name}'.*not finite"):
-        start(False, "--load-dir", trainer.checkpoint_dir)
+        start({"--load-dir": trainer.checkpoint_dir})
 
 
 def test_weights_that_overflow_stop_the_training(start):
     """1e20 in both layers: their product is beyond float32. Splats whose colours are NaN are not drawn, but heard."""
-    trainer = start(False, "--pipeline.model.warmup-steps", 0)
+    trainer = start({"--pipeline.model.warmup-steps": 0})
     for layer in (trainer.pipeline.model.head.low[0], trainer.pipeline.model.head.low[2]):
         torch.nn.init.normal_(layer.weight.data)
         layer.weight.data *= 1e20
@@ -285,7 +279,7 @@ def test_on_a_gpu(start, name, value):
     for path in before:
         if "_extra_state" not in path:
             assert torch.equal(after[path], before[path]), path
-    start(False, "--load-dir", trainer.checkpoint_dir).train()
+    start({"--load-dir": trainer.checkpoint_dir}).train()
 
 
 def state_of(trainer) -> dict:

@@ -10,10 +10,10 @@ import yaml
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
-from torch.testing import assert_close
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.studies.run import evaluate, parse, train
+from nrfgs_ns.studies.run import evaluate, parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -47,46 +47,27 @@ STORED = {
 """Colour numbers per splat, and shared weights."""
 
 
-def options(scene: Path, out: Path, method: str = "nrfgs", steps: int = 20, **more) -> list[str]:
-    """A command line for ns-train; `more` maps options, written with underscores for dashes and dots kept."""
-    chosen = {
-        "--data": scene,
-        "--output-dir": out,
-        "--max-num-iterations": steps,
-        "--vis": "tensorboard",
-        "--steps-per-eval-image": 1000,
-        "--steps-per-eval-all-images": 1000,
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
-        **BUSY,
-        **METHODS[method],
-        **more,
-    }
-    return [method, *(str(word) for option in chosen.items() for word in option)]
+def options(scene: Path, out: Path, method: str = "nrfgs", *more: dict, steps: int = 20) -> list[str]:
+    """A command line for ns-train."""
+    return command_line(method, scene, out, steps, BUSY, METHODS[method], *more)
 
 
 @pytest.fixture(scope="module")
-def trained(tiny_scene, tmp_path_factory):
+def finished(tiny_scene, tmp_path_factory):
     """config.yml of a finished 20-step training of each method."""
     done = {}
 
     def config_of(method: str) -> Path:
         if method not in done:
-            record = train(options(tiny_scene, tmp_path_factory.mktemp(method), method))
-            done[method] = Path(record.config_path)
+            done[method] = trained(options(tiny_scene, tmp_path_factory.mktemp(method), method))
         return done[method]
 
     return config_of
 
 
-def checkpoint(config: Path) -> dict:
-    (path,) = (config.parent / "nerfstudio_models").glob("*.ckpt")
-    return torch.load(path, weights_only=True)
-
-
 @pytest.mark.parametrize("method", METHODS)
-def test_train_eval_render(method, trained, tmp_path, tiny_scene):
-    config = trained(method)
+def test_train_eval_render(method, finished, tmp_path, tiny_scene):
+    config = finished(method)
     results = evaluate(config, tmp_path / "eval.json")
     images = results["per_image"]
     assert len(images) == 2
@@ -110,8 +91,8 @@ def test_train_eval_render(method, trained, tmp_path, tiny_scene):
         assert sorted(file.stem for file in folder.rglob("*.png")) == sorted(Path(name).stem for name in names)
 
 
-def test_training_changes_everything_and_densifies(trained, tiny_scene):
-    _, pipeline, _, _ = eval_setup(trained("nrfgs"))
+def test_training_changes_everything_and_densifies(finished, tiny_scene):
+    _, pipeline, _, _ = eval_setup(finished("nrfgs"))
     model = pipeline.model
     points = json.loads((tiny_scene / "scene.json").read_text())["config"]["points"]
     assert model.num_points != points
@@ -129,9 +110,9 @@ def test_training_changes_everything_and_densifies(trained, tiny_scene):
         ("nrfgs-sg", ["sg_axes", "sg_sharpness", "sg_colors"]),
     ],
 )
-def test_all_that_a_head_adds_is_learning(method, groups, trained):
+def test_all_that_a_head_adds_is_learning(method, groups, finished):
     """Adam's running mean of every tensor's gradient has moved, and there is one for each of the tensor's numbers."""
-    state = checkpoint(trained(method))
+    state = checkpoint_of(finished(method))
     for group in groups:
         learning = state["optimizers"][group]["state"]
         assert learning and all((of_one["exp_avg"] != 0).any() for of_one in learning.values()), group
@@ -144,32 +125,20 @@ def test_resumed_training_is_the_unbroken_one(method, tiny_scene, tmp_path):
     """40 steps at once, against 20 and 20 more from the checkpoint.
 
     In both halves splats are split (with random samples), pruned and their Adam state carried along; step 24 resets
-    opacities. The same machine adds the same numbers in the same order, so that only a lost state can differ.
+    opacities.
     """
-    whole = Path(train(options(tiny_scene, tmp_path / "whole", method, steps=40)).config_path)
-    half = Path(train(options(tiny_scene, tmp_path / "half", method, steps=20)).config_path)
-    rest = options(tiny_scene, tmp_path / "rest", method, steps=20, **{"--load-dir": half.parent / "nerfstudio_models"})
-    resumed = Path(train(rest).config_path)
-    a, b = checkpoint(whole), checkpoint(resumed)
-    assert a["step"] == b["step"] == 39
-    counts = [len(checkpoint(run)["pipeline"]["_model.gauss_params.means"]) for run in (half, whole)]
+    whole = trained(options(tiny_scene, tmp_path / "whole", method, steps=40))
+    half = trained(options(tiny_scene, tmp_path / "half", method, steps=20))
+    rest = trained(options(tiny_scene, tmp_path / "rest", method, {"--load-dir": models_of(half)}, steps=20))
+    assert checkpoint_of(rest)["step"] == 39
+    counts = [len(checkpoint_of(run)["pipeline"]["_model.gauss_params.means"]) for run in (half, whole)]
     assert counts[0] != counts[1], "nothing was densified in the second half: the test would prove nothing"
-    for part in ("pipeline", "optimizers"):
-        assert_close(tensors(a[part]), tensors(b[part]), rtol=1e-5, atol=1e-7)
+    assert_same_training(checkpoint_of(rest), checkpoint_of(whole))
 
 
-def tensors(tree, prefix="") -> dict:
-    """The tensors of a checkpoint's part, by path."""
-    if isinstance(tree, torch.Tensor):
-        return {prefix: tree}
-    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, (list, tuple)) else ()
-    return {path: leaf for key, value in items for path, leaf in tensors(value, f"{prefix}/{key}").items()}
-
-
-def test_optimisers_hold_the_loaded_parameters(trained, tiny_scene, tmp_path):
+def test_optimisers_hold_the_loaded_parameters(finished, tiny_scene, tmp_path):
     """The host's way, replacing parameters on load, would leave the optimisers with orphans."""
-    models = trained("nrfgs").parent / "nerfstudio_models"
-    config = parse(options(tiny_scene, tmp_path, **{"--load-dir": models}))
+    config = parse(options(tiny_scene, tmp_path, "nrfgs", {"--load-dir": models_of(finished("nrfgs"))}))
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     for name, parameter in trainer.pipeline.model.gauss_params.items():
@@ -187,9 +156,8 @@ def test_optimisers_hold_the_loaded_parameters(trained, tiny_scene, tmp_path):
         ("nrfgs", {"--pipeline.model.appearance.split-bands": False}, "head."),
     ],
 )
-def test_checkpoint_of_another_head_is_refused(method, more, says, trained, tiny_scene, tmp_path):
-    models = trained("nrfgs").parent / "nerfstudio_models"
-    config = parse(options(tiny_scene, tmp_path, method, **{"--load-dir": models}, **more))
+def test_checkpoint_of_another_head_is_refused(method, more, says, finished, tiny_scene, tmp_path):
+    config = parse(options(tiny_scene, tmp_path, method, {"--load-dir": models_of(finished("nrfgs"))}, more))
     trainer = config.setup(local_rank=0, world_size=1)
     with pytest.raises(InputError, match=says) as error:
         trainer.setup()
@@ -204,13 +172,13 @@ def test_unknown_head_is_refused_before_training(tiny_scene, tmp_path):
 
 
 def test_impossible_setting_is_refused_before_training(tiny_scene, tmp_path):
-    config = parse(options(tiny_scene, tmp_path, **{"--pipeline.model.appearance.num-bands": 0}))
+    config = parse(options(tiny_scene, tmp_path, "nrfgs", {"--pipeline.model.appearance.num-bands": 0}))
     with pytest.raises(ValueError, match="num_bands is 0"):
         config.setup(local_rank=0, world_size=1).setup()
 
 
-def test_saved_config_is_the_run(trained):
-    config = yaml.load(trained("nrfgs").read_text(), Loader=yaml.Loader)
+def test_saved_config_is_the_run(finished):
+    config = yaml.load(finished("nrfgs").read_text(), Loader=yaml.Loader)
     assert config.pipeline.model.appearance.latent_dim == 32
     assert config.machine.device_type == "cpu" or torch.cuda.is_available()
     assert config.pipeline.model.refine_every == BUSY["--pipeline.model.refine-every"]

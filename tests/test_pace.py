@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils.eval_utils import eval_setup
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.optimizers import LeanOptimizers
@@ -161,49 +162,48 @@ def test_learning_rates_are_those_of_the_position():
     assert rates == pytest.approx([0.1 * 0.01 ** (2.5 * step / 100) for step in range(40)])
 
 
-def options(scene: Path, out: Path, method: str, steps: int, *more) -> list[str]:
-    """A short training with everything that has a schedule, laid out for 40 steps."""
-    chosen = {
-        "--data": scene,
-        "--output-dir": out,
-        "--max-num-iterations": steps,
-        "--vis": "tensorboard",
-        "--steps-per-eval-image": 1000,
-        "--steps-per-eval-all-images": 1000,
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
-        "--pipeline.model.warmup-length": 8,
-        "--pipeline.model.refine-every": 2,
-        "--pipeline.model.reset-alpha-every": 100,
-        "--pipeline.model.densify-grad-thresh": 1e-6,
-        "--pipeline.model.resolution-schedule": 10,
-        "--pipeline.model.num-downscales": 1,
-        "--pipeline.model.stop-split-at": 30,
-    }
-    return [method, *(str(word) for option in chosen.items() for word in option), *(str(word) for word in more)]
-
-
-CALM = ("--pipeline.model.refine-every", 1000)
+SCHEDULES = {
+    "--pipeline.model.warmup-length": 8,
+    "--pipeline.model.refine-every": 2,
+    "--pipeline.model.reset-alpha-every": 100,
+    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.resolution-schedule": 10,
+    "--pipeline.model.num-downscales": 1,
+    "--pipeline.model.stop-split-at": 30,
+}
+"""All that has a schedule, laid out for 40 steps."""
+SH = {"--pipeline.model.appearance.degree-interval": 10}
+CALM = {"--pipeline.model.refine-every": 1000}
 """No densification, which every second step would double the splats until a step takes a second."""
-SH = ("--pipeline.model.appearance.degree-interval", 10)
+MCMC = {
+    "--pipeline.model.densification": "mcmc",
+    "--pipeline.model.splat-budget": 400,
+    "--pipeline.model.mcmc.stop-at": 20,
+    "--pipeline.model.reset-alpha-every": None,
+    "--pipeline.model.densify-grad-thresh": None,
+    "--pipeline.model.stop-split-at": None,
+}
+"""MCMC, without the options that it refuses."""
+
+
+def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> list[str]:
+    """A command line for ns-train."""
+    return command_line(method, scene, out, steps, SCHEDULES, *more)
 
 
 @pytest.mark.usefixtures("no_cuda")
 def test_a_stretched_training(tiny_scene, tmp_path):
     """20 steps of the 40: degree 3 is reached at step 15, and its harmonics are there when it is evaluated; splats
     come only before step 15."""
-    stretched = (*SH, "--schedule-steps", 40)
-    whole = train(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, *stretched))
-    _, pipeline, _, step = eval_setup(Path(whole.config_path))
+    whole = trained(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, SH, {"--schedule-steps": 40}))
+    _, pipeline, _, step = eval_setup(whole)
     assert step == 19 and pipeline.model.head.active_degree == 3
     assert pipeline.model.pace.position == 40.0
     # 8 training images hold densification back for 8 + 2 steps after the reset at 0: it acts at steps 10, 12 and 14.
-    short = train(options(tiny_scene, tmp_path / "short", "nrfgs-sh", 12, *SH, "--schedule-steps", 24))
+    short = train(options(tiny_scene, tmp_path / "short", "nrfgs-sh", 12, SH, {"--schedule-steps": 24}))
     assert short.splats[-1][1] > short.splats[0][1] and short.splats[-1][1] < pipeline.model.num_points
-
-    folder = Path(whole.config_path).parent / "nerfstudio_models"
-    state = torch.load(next(folder.glob("*.ckpt")), weights_only=True)
-    assert state["pipeline"]["_model._extra_state"]["pace"] == {"length": 40, "rate": 2.0, "position": 40.0}
+    state = checkpoint_of(whole)["pipeline"]["_model._extra_state"]
+    assert state["pace"] == {"length": 40, "rate": 2.0, "position": 40.0}
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -218,33 +218,20 @@ def test_a_stretched_training_continues_to_the_bit(tiny_scene, tmp_path, monkeyp
             shutil.copytree(trainer.checkpoint_dir, kept)
 
     monkeypatch.setattr(NrfgsTrainer, "_write_checkpoint", keep)
-    stretched = (*SH, "--schedule-steps", 40, "--steps-per-save", 9)
-    whole = train(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, *stretched))
-    rest = train(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 10, *stretched, "--load-dir", kept))
-    one, other = (
-        torch.load(next((Path(record.config_path).parent / "nerfstudio_models").glob("*19.ckpt")), weights_only=True)
-        for record in (whole, rest)
-    )
-    for name, value in one["pipeline"].items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(value, other["pipeline"][name]), name
+    stretched = {"--schedule-steps": 40, "--steps-per-save": 9}
+    whole = trained(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, SH, stretched))
+    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 10, SH, stretched, {"--load-dir": kept}))
+    one, other = checkpoint_of(whole), checkpoint_of(rest)
+    assert one["step"] == 19
+    assert_same_training(one, other, rtol=0, atol=0)
     assert one["schedulers"] == other["schedulers"]
     with pytest.raises(InputError, match="schedule-steps"):
-        train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 10, *SH, "--load-dir", kept))
+        train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 10, SH, {"--load-dir": kept}))
 
 
 @pytest.mark.usefixtures("no_cuda")
 def test_mcmc_begins_and_ends_with_the_pace(tiny_scene, tmp_path):
-    args = options(tiny_scene, tmp_path, "nrfgs", 20, "--schedule-steps", 40)
-    for name in (
-        "--pipeline.model.reset-alpha-every",
-        "--pipeline.model.densify-grad-thresh",
-        "--pipeline.model.stop-split-at",
-    ):
-        at = args.index(name)
-        del args[at : at + 2]
-    more = ("--pipeline.model.densification", "mcmc", "--pipeline.model.splat-budget", "400")
-    record = train([*args, *more, "--pipeline.model.mcmc.stop-at", "20"])
+    record = train(options(tiny_scene, tmp_path, "nrfgs", 20, MCMC, {"--schedule-steps": 40}))
     # Relocations at steps 6 and 8, between 8 / 2 and 20 / 2: 300, 315, 330.
     assert record.splats[-1] == [19, 330]
 
@@ -259,17 +246,16 @@ def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(nrfgs_ns.trainer, "TimedPace", ProcessTime)
 
     def run(name, minutes, *more):
-        record = train(options(tiny_scene, tmp_path / name, "nrfgs", 40, "--time-budget", minutes, *CALM, *more))
-        folder = Path(record.config_path).parent / "nerfstudio_models"
-        (file,) = folder.glob("*.ckpt")
-        state = torch.load(file, weights_only=True)
-        return record.steps, folder, state["step"], state["pipeline"]["_model._extra_state"]["pace"]
+        record = train(options(tiny_scene, tmp_path / name, "nrfgs", 40, CALM, {"--time-budget": minutes}, *more))
+        config = Path(record.config_path)
+        state = checkpoint_of(config)
+        return record.steps, models_of(config), state["step"], state["pipeline"]["_model._extra_state"]["pace"]
 
     steps, folder, last, pace = run("a", 0.05)
     assert last == steps - 1
     assert pace["position"] > 39 and pace["seconds"] == pytest.approx(3.0, rel=0.1)
-    assert run("b", 0.05, "--load-dir", folder)[0] == 0
-    more, _, end, pace = run("c", 0.07, "--load-dir", folder)
+    assert run("b", 0.05, {"--load-dir": folder})[0] == 0
+    more, _, end, pace = run("c", 0.07, {"--load-dir": folder})
     assert more > 0 and end == last + more and pace["seconds"] == pytest.approx(4.2, rel=0.1)
 
 
@@ -282,16 +268,16 @@ class ProcessTime(TimedPace):
 @pytest.mark.usefixtures("no_cuda")
 def test_a_minute_is_a_minute(tiny_scene, tmp_path):
     """By the clock on the wall, which other processes do lengthen: only within a step of 6 s is this fair."""
-    record = train(options(tiny_scene, tmp_path, "nrfgs", 400, "--time-budget", 1, *CALM))
+    record = train(options(tiny_scene, tmp_path, "nrfgs", 400, CALM, {"--time-budget": 1}))
     assert record.seconds == pytest.approx(60.0, rel=0.1)
 
 
-@pytest.mark.parametrize("option", [("--time-budget", "0"), ("--schedule-steps", "-5"), ("--time-budget", "nan")])
-def test_bad_options_are_named(option, tiny_scene, tmp_path):
-    with pytest.raises(InputError, match=option[0][2:].replace("-", "_")):
-        parse(options(tiny_scene, tmp_path, "nrfgs", 5, *option)).setup(local_rank=0, world_size=1)
+@pytest.mark.parametrize("option, bad", [("--time-budget", 0), ("--schedule-steps", -5), ("--time-budget", "nan")])
+def test_bad_options_are_named(option, bad, tiny_scene, tmp_path):
+    with pytest.raises(InputError, match=option[2:].replace("-", "_")):
+        parse(options(tiny_scene, tmp_path, "nrfgs", 5, {option: bad})).setup(local_rank=0, world_size=1)
     with pytest.raises(InputError, match="one device"):
-        parse(options(tiny_scene, tmp_path, "nrfgs", 5, option[0], "5")).setup(local_rank=0, world_size=2)
+        parse(options(tiny_scene, tmp_path, "nrfgs", 5, {option: 5})).setup(local_rank=0, world_size=2)
 
 
 def test_without_them_there_is_no_pace(tiny_scene, tmp_path):

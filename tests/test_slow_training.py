@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
+from short_trainings import command_line, trained
 
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.studies.run import evaluate, train
@@ -18,11 +19,9 @@ from nrfgs_ns.studies.run import evaluate, train
 pytestmark = pytest.mark.slow
 
 
-def psnr(method: str, data: Path, out: Path, steps: int, *options: str) -> float:
-    args = [method, "--data", str(data), "--output-dir", str(out), "--max-num-iterations", str(steps)]
-    args += ["--vis", "tensorboard", "--steps-per-eval-image", "100000", "--steps-per-eval-all-images", "100000"]
-    args += ["--logging.local-writer.enable", "False", "--pipeline.model.num-downscales", "0", *options]
-    return evaluate(Path(train(args).config_path), out / f"{method}.json")["psnr"]
+def psnr(method: str, data: Path, out: Path, steps: int, *options: dict) -> float:
+    args = command_line(method, data, out, steps, {"--pipeline.model.num-downscales": 0}, *options)
+    return evaluate(trained(args), out / f"{method}.json")["psnr"]
 
 
 def test_the_field_carries_what_depends_on_the_view(tmp_path):
@@ -44,15 +43,14 @@ def test_the_field_carries_what_depends_on_the_view(tmp_path):
 @pytest.mark.parametrize("scene", ["fox", "kitchen"])
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
 def test_real_photographs_train(scene, method, captures, tmp_path):
-    scale = ["--pipeline.datamanager.camera-res-scale-factor", "0.125"]
-    assert psnr(method, captures / scene, tmp_path, 300, *scale) > 17
+    scale = {"--pipeline.datamanager.camera-res-scale-factor": 0.125}
+    assert psnr(method, captures / scene, tmp_path, 300, scale) > 17
 
 
 def test_killed_training_goes_on_from_its_checkpoint(tiny_scene, tmp_path):
     """SIGKILL in the middle of `ns-train`; what is left on disk continues."""
-    args = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "100000"]
-    args += ["--vis", "tensorboard", "--steps-per-save", "20", "--steps-per-eval-image", "1000000"]
-    args += ["--steps-per-eval-all-images", "1000000"]
+    usual = {"--steps-per-save": 20, "--logging.local-writer.enable": None, "--logging.profiler": None}
+    args = command_line("nrfgs", tiny_scene, tmp_path, 100_000, usual)
     code = "from nerfstudio.scripts.train import entrypoint; entrypoint()"
     process = subprocess.Popen(
         [sys.executable, "-c", code, *args], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -65,6 +63,5 @@ def test_killed_training_goes_on_from_its_checkpoint(tiny_scene, tmp_path):
     checkpoint = max(tmp_path.rglob("nerfstudio_models/*.ckpt"))
     reached = int(checkpoint.stem.split("-")[1])
     assert reached >= 100
-    args[args.index("--max-num-iterations") + 1] = "3"
-    record = train([*args, "--load-dir", str(checkpoint.parent)])
+    record = train(command_line("nrfgs", tiny_scene, tmp_path, 3, usual, {"--load-dir": checkpoint.parent}))
     assert record.splats[-1][0] == reached + 3

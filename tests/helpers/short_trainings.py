@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trainings of a few steps: the command line that they have in common, what they leave, and whether two are one."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.testing import assert_close
+
+from nrfgs_ns.studies.run import train
+
+QUIET = {
+    "--vis": "tensorboard",
+    "--steps-per-eval-image": 1000,
+    "--steps-per-eval-all-images": 1000,
+    "--logging.local-writer.enable": False,
+    "--logging.profiler": "none",
+}
+"""No viewer, no tables on the console, and no evaluation within a thousand steps."""
+
+
+def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict[str, Any]) -> list[str]:
+    """What follows `ns-train` for a quiet training.
+
+    Args:
+        method: name of a registered method.
+        scene: folder of the data set.
+        out: folder for what the training writes.
+        steps: steps of this training; one that goes on from a checkpoint makes as many more.
+        options: values by option, dashes included. Of several values the last counts, and None takes the option away
+            ("None" is a value).
+    """
+    chosen = {"--data": scene, "--output-dir": out, "--max-num-iterations": steps, **QUIET}
+    for more in options:
+        chosen |= more
+    return [method, *(str(word) for option in chosen.items() if option[1] is not None for word in option)]
+
+
+def trained(args: list[str]) -> Path:
+    """config.yml of a training, when it has ended."""
+    return Path(train(args).config_path)
+
+
+def models_of(config: Path) -> Path:
+    """Where the training with this config.yml has its checkpoints: a folder for --load-dir."""
+    return config.parent / "nerfstudio_models"
+
+
+def checkpoint_of(config: Path) -> dict:
+    """The one checkpoint that the training with this config.yml has kept."""
+    (path,) = models_of(config).glob("*.ckpt")
+    return torch.load(path, weights_only=True)
+
+
+def assert_same_training(one: dict, other: dict, rtol: float = 1e-5, atol: float = 1e-7) -> None:
+    """Two checkpoints were written after the same step and hold the same tensors: parameters, what densification has
+    counted, the optimisers' moments.
+
+    A training that goes on from its checkpoint is the unbroken one: on the same machine both add the same numbers in
+    the same order, so that only a lost state can differ.
+    """
+    assert one["step"] == other["step"], f"after step {one['step']}, and after step {other['step']}"
+    for part in ("pipeline", "optimizers"):
+        assert_close(_tensors(one[part]), _tensors(other[part]), rtol=rtol, atol=atol)
+
+
+def _tensors(tree: Any, prefix: str = "") -> dict[str, torch.Tensor]:
+    """The tensors of a checkpoint's part, by path."""
+    if isinstance(tree, torch.Tensor):
+        return {prefix: tree}
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, (list, tuple)) else ()
+    return {path: leaf for key, value in items for path, leaf in _tensors(value, f"{prefix}/{key}").items()}
