@@ -1,21 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splats that lose their residual while a model trains, and get it back when they start to need it.
 
-From a step on, every splat whose residual changes no training view by a given amount (`residuals.py`), or by less than
-pays on views that nothing was trained on, becomes diffuse: the part of its residual that all views see moves into its
-base colour and base opacity, and the head is no longer evaluated for it. A diffuse splat's latent gets no gradient, so
-that it could never come back by itself. So, some steps before each of the later looks, all splats have their residual
-again, without the part that had moved, and train with it; then it is decided anew.
+From a step on, every splat whose residual changes no training view by a given amount (`residuals.py`), or as many as
+cost nothing on views that nothing was trained on, become diffuse: the part of its residual that all views see moves
+into its base colour and base opacity, and the head is no longer evaluated for it. A diffuse splat's latent gets no
+gradient, so that it could never come back by itself. So, some steps before each of the later looks, all splats have
+their residual again, without the part that had moved, and train with it; then it is decided anew.
 
     step  start             + every - trial     + every           ...
           look, some off    all on, on trial    look, some off
 
 After the last trial the training goes on with what was decided.
 
-What pays is measured as capacity "auto" measures it. Some training views are set aside until the last look. The field
-as it is has to be better on them, by more than the budget, than the field without the residuals in question: at once,
-and after both have settled on the other views (`capacity/settle.py`). Views that the residuals were fitted to cannot
-tell: there, noise that they have learnt looks like something that the scene needs.
+Nothing tells a field to be silent where the base and the geometry could say the same: what is learnt first by either is
+learnt by both, and a look afterwards finds residuals that do much and are not needed. So, until the last look, they
+cost something in the training's loss, their mean length over the visible splats (`residual_cost` of the model).
+
+What pays is measured as capacity "auto" measures it. Some training views are set aside until the last look. The splats
+as they are have to be better on them, by more than the budget, than those without the residuals in question, after both
+have settled on the other views (`capacity/settle.py`). Views that the residuals were fitted
+to cannot tell: there, noise that they have learnt looks like something that the scene needs.
 
 Which splats are diffuse, and what has moved, are two tables among densification's statistics, "diffuse" [N] and
 "diffuse_shift" [N, 4]: they are split, pruned, saved and loaded with the splats.
@@ -24,17 +28,37 @@ Which splats are diffuse, and what has moved, are two tables among densification
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 from torch.optim import Optimizer
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT
-from nrfgs_ns.appearance.reduce import Field
+from nrfgs_ns.appearance.reduce import Field, with_diffuse
+from nrfgs_ns.capacity.report import add_to_report, read_report
 from nrfgs_ns.capacity.settle import lesson_order, settle
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.field_views import THRESHOLDS, FieldViews, dropped, largest_threshold
+from nrfgs_ns.field_views import FieldViews
 from nrfgs_ns.residuals import Residuals, look_over
+
+SHARES = (0.25, 0.5, 0.65, 0.8, 0.9, 0.95, 0.97, 0.98, 0.99, 1.0)
+"""Of the splats, in the order of what their residuals change: how many may be without one."""
+
+
+class Look(NamedTuple):
+    """A share of the splats that was tried."""
+
+    share: float
+    """of the splats, 0 to 1"""
+    loss_db: float
+    """what a field without their residuals lacks on the views set aside, both settled"""
+    error_db: float
+    """standard error of the loss over the views; 0 for a single view"""
+    allowed: bool
+    """whether that is within the budget"""
 
 
 @dataclass
@@ -50,16 +74,17 @@ class DiffuseSplats:
     trial: int | None = None
     """steps before each look but the first in which all splats have their residual. None: one for each training view"""
     threshold: float | None = None
-    """largest change, in 8-bit steps, that a diffuse splat's residual made in any training view. None: the largest of
-    0.25, 0.5, 1, ... 8 and infinity that the budget allows at each look; 0.5 is the one below which a splat by itself
-    cannot be noticed"""
-    budget: float = 0.05
-    """dB that diffuse splats may cost on the views set aside; where no threshold is given"""
+    """largest change, in 8-bit steps, that a diffuse splat's residual made in any training view; 0.5 is the one below
+    which a splat by itself cannot be noticed. None: as many splats as the budget allows at each look, those that change
+    the least of the training views first"""
+    budget: float = 0.1
+    """dB that diffuse splats may cost on the views set aside, right after a look; where no threshold is given. By the
+    end of the training less is left of it (docs/necessity.md)"""
     views: int | None = None
-    """training views, evenly spaced, that are set aside until the last look, to choose a threshold on; where none is
-    given. None: an eighth of all, at least 2 and at most 16"""
+    """training views, evenly spaced, that are set aside until the last look, to choose how many on; where no threshold
+    is given. None: an eighth of all, at least 2 and at most 16"""
     settle: int = 100
-    """steps in which the field with and without some residuals gets used to it before they are compared"""
+    """steps in which the splats with and without some residuals get used to it before they are compared"""
 
 
 class DiffuseSchedule:
@@ -69,13 +94,14 @@ class DiffuseSchedule:
         config: with a start.
         data: the datamanager, with the training views and their images.
         optimizers: the training's, by group.
+        folder: where the evidence goes (capacity.json); None for nowhere.
 
     Raises:
         InputError: an option is out of range.
     """
 
-    def __init__(self, config: DiffuseSplats, data, optimizers: Mapping[str, Optimizer]):
-        self.config, self.data, self.optimizers = config, data, optimizers
+    def __init__(self, config: DiffuseSplats, data, optimizers: Mapping[str, Optimizer], folder: Path | None = None):
+        self.config, self.data, self.optimizers, self.folder = config, data, optimizers, folder
         self.option = "pipeline.model.diffuse without a threshold"
         self.trial = len(data.train_dataset) if config.trial is None else config.trial
         prefix = "pipeline.model.diffuse"
@@ -107,6 +133,19 @@ class DiffuseSchedule:
     def is_done(self, step: int) -> bool:
         return step >= self.last_decision
 
+    def tell(self, model, step: int, looks: list[Look]) -> None:
+        """Write down how many splats are diffuse, and by which evidence."""
+        diffuse = model.densification.state[DIFFUSE]
+        look = {
+            "step": step,
+            "splats": len(diffuse),
+            "diffuse": int(diffuse.sum()),
+            "threshold": self.config.threshold,
+            "budget_db": self.config.budget,
+            "tried": [look._asdict() for look in looks],
+        }
+        add_to_report(self.folder, {"looks": [*read_report(self.folder).get("looks", []), look]})
+
     def after_step(self, model, step: int) -> None:
         """Look at the splats, or begin a trial, if it is time."""
         since = step - self.config.start
@@ -114,13 +153,13 @@ class DiffuseSchedule:
             return
         phase = since % self.config.every
         if phase == 0 and DIFFUSE not in model.densification.state:
-            make_diffuse(model, self.data, self.config, self.optimizers)
+            self.tell(model, step, make_diffuse(model, self.data, self.config, self.optimizers))
         elif phase == self.config.every - self.trial and step <= self.config.stop:
             give_back(model)
 
 
 @torch.no_grad()
-def make_diffuse(model, data, config: DiffuseSplats, optimizers: Mapping[str, Optimizer]) -> None:
+def make_diffuse(model, data, config: DiffuseSplats, optimizers: Mapping[str, Optimizer]) -> list[Look]:
     """Find the splats that need no residual, and let their base have the mean of what the views saw.
 
     Args:
@@ -128,62 +167,63 @@ def make_diffuse(model, data, config: DiffuseSplats, optimizers: Mapping[str, Op
         data: the datamanager; with views set aside, unless a threshold is given.
         config: how to find them.
         optimizers: the training's, by group.
+
+    Returns:
+        The shares that were tried; none where a threshold is given.
     """
     training = model.training
     model.eval()
     data.cached_train  # noqa: B018  (before the cameras: undistortion crops them while it loads the images)
     seen = look_over(model, data.train_dataset.cameras)
-    threshold = config.threshold
-    if threshold is None:
-        threshold = threshold_that_pays(model, data, config, optimizers, seen)
+    looks: list[Look] = []
+    if config.threshold is None:
+        looks = share_that_pays(model, data, config, optimizers, seen)
+        rows = seen.least(max((look.share for look in looks if look.allowed), default=0.0))[:, None]
+        why = f"they cost {config.budget:g} dB or less on the views set aside"
+    else:
+        rows = seen.negligible(config.threshold)[:, None]
+        why = f"their residual changes no training view by {config.threshold:g} 8-bit steps"
     model.train(training)
-    rows = seen.negligible(threshold)[:, None]
     tables = model.gauss_params["features_dc"], model.gauss_params["opacities"]
     shifts = []
     for table, mean in zip(tables, (seen.features_dc, seen.opacities), strict=True):
         shifts.append(torch.where(rows, mean - table, 0.0))
         table.add_(shifts[-1])
     model.densification.state |= {DIFFUSE: rows[:, 0], SHIFT: torch.cat(shifts, dim=1)}
-    CONSOLE.print(
-        f"Step {model.step}: {int(rows.sum()):,} of {len(rows):,} splats are diffuse: their residual changes no "
-        f"training view by {threshold:g} 8-bit steps."
-        if threshold < math.inf
-        else f"Step {model.step}: all {len(rows):,} splats are diffuse: no residual pays.",
-        soft_wrap=True,
-    )
+    CONSOLE.print(f"Step {model.step}: {int(rows.sum()):,} of {len(rows):,} splats are diffuse: {why}.", soft_wrap=True)
+    return looks
 
 
-def threshold_that_pays(
+def share_that_pays(
     model, data, config: DiffuseSplats, optimizers: Mapping[str, Optimizer], seen: Residuals
-) -> float:
-    """The largest of THRESHOLDS that costs no more than the budget on the views set aside; 0 if none does.
+) -> list[Look]:
+    """Which of SHARES cost no more than the budget on the views set aside.
 
-    What costs no more at once, before anything settles, is found without noise: two fields that settle differ a little
-    by chance. Of the larger thresholds, those are allowed that cost no more once both fields have settled.
+    The field with all residuals settles, and so does that without the residuals in question, on the same views in the
+    same order. Found by halving: the loss grows with the share, but for noise.
 
     Args:
         as for `make_diffuse`; seen: the splats from the training views.
     """
-    aside = FieldViews(model, [data.train_view(index) for index in data.views_aside])
+    aside = FieldViews(model, [data.train_view(index) for index in data.views_aside], geometry=True)
     lessons = [data.train_view(index) for index in lesson_order(data, config.settle)]
-    field = Field(model.head, dict(model.gauss_params.items()))
+    field = Field(model.head, {name: value.detach() for name, value in model.gauss_params.items()})
 
-    def settled(some: Field) -> Field:
-        return settle(model, some, lessons, config.settle, optimizers).field
+    def scores(some: Field) -> Tensor:
+        settled = settle(model, some, lessons, config.settle, optimizers)
+        return torch.tensor(aside.scores(settled.field), dtype=torch.float64)
 
-    at_once = largest_threshold(field, seen, aside, aside.psnr(field) - config.budget)
-    if at_once == THRESHOLDS[-1]:
-        return at_once
-    lowest = aside.psnr(settled(field)) - config.budget
-    if aside.psnr(settled(dropped(field, seen, THRESHOLDS[-1]))) >= lowest:
-        return THRESHOLDS[-1]
-    tried = [at_once, *(threshold for threshold in THRESHOLDS[:-1] if threshold > at_once)]
-    allowed, too_many = 0, len(tried)
-    while too_many - allowed > 1:  # the loss grows with the threshold, but for noise: halve the interval
-        middle = (allowed + too_many) // 2
-        enough = aside.psnr(settled(dropped(field, seen, tried[middle]))) >= lowest
-        allowed, too_many = (middle, too_many) if enough else (allowed, middle)
-    return tried[allowed]
+    reference, looks = scores(field), []
+    allowed, too_many = -1, len(SHARES)
+    while too_many - allowed > 1:
+        middle = (allowed + too_many) // 2 if looks else len(SHARES) - 1
+        share = SHARES[middle]
+        losses = reference - scores(with_diffuse(field, seen.least(share), seen.features_dc, seen.opacities))
+        loss = float(losses.mean())
+        error = float(losses.std()) / math.sqrt(len(losses)) if len(losses) > 1 else 0.0
+        looks.append(Look(share, loss, error, loss <= config.budget))
+        allowed, too_many = (middle, too_many) if looks[-1].allowed else (allowed, middle)
+    return looks
 
 
 @torch.no_grad()
@@ -198,7 +238,11 @@ def give_back(model) -> None:
 
 
 def schedule_for(
-    model, data, devices: int, optimizers: Mapping[str, Optimizer] | None = None
+    model,
+    data,
+    devices: int,
+    optimizers: Mapping[str, Optimizer] | None = None,
+    folder: Path | None = None,
 ) -> DiffuseSchedule | None:
     """The schedule that a model's configuration asks for, or None.
 
@@ -207,6 +251,7 @@ def schedule_for(
         data: the datamanager.
         devices: over which the splats are spread.
         optimizers: the training's, by group.
+        folder: where the evidence goes; None for nowhere.
 
     Raises:
         InputError: it cannot be followed by this model.
@@ -224,4 +269,4 @@ def schedule_for(
         )
     if devices > 1:
         raise InputError(f"{option}, but the splats are spread over {devices} devices. Use one, or leave it unset.")
-    return DiffuseSchedule(config, data, optimizers)
+    return DiffuseSchedule(config, data, optimizers, folder)

@@ -79,6 +79,9 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     aside for a while (nrfgs alone)"""
     capacity_search: CapacitySearch = field(default_factory=CapacitySearch)
     """capacity auto: when and how it is decided"""
+    residual_cost: float = 0.05
+    """capacity auto and diffuse splats: weight, until the last decision, of the residuals' mean length in the loss.
+    What does not pay for it falls silent, and colour, opacity and geometry do its work. 0: residuals cost nothing"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -95,6 +98,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     config: NrfgsModelConfig
     capacity_found: dict[str, Any] | None = None
     """what capacity "auto" has decided: "step", "head" (options of the head that it was left with) and "dropped" """
+    residuals_cost: bool = False
+    """whether the residuals' length is part of the training's loss now"""
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
 
@@ -210,6 +215,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params)
+            if self.residuals_cost:
+                losses["residual"] = self.config.residual_cost * self.residual_length
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")

@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 from gsplat.strategy.ops import duplicate, remove, split
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.utils.eval_utils import eval_setup
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT
+from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT, mean_length
+from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.reduce import Field
 from nrfgs_ns.diffuse_splats import DiffuseSchedule, DiffuseSplats, give_back, make_diffuse, schedule_for
 from nrfgs_ns.errors import InputError
@@ -117,13 +119,13 @@ def learning(untrained):
         camera, _ = data.train_view(index)
         data.cached_train[index]["image"] = (picture(model, camera) * 255).round().to(torch.uint8)
     data.set_views_aside([2, 6])
-    rates = {"latents": 1e-3, "features_dc": 1e-3, "opacities": 1e-3}
+    rates = {"latents": 1e-3, "features_dc": 1e-3, "opacities": 1e-3, "means": 1e-5, "scales": 1e-4, "quats": 1e-4}
     optimizers = {name: torch.optim.Adam([model.gauss_params[name]], lr=rate) for name, rate in rates.items()}
     optimizers["field"] = torch.optim.Adam(model.head.parameters(), lr=1e-4)
     return model, data, optimizers
 
 
-def test_a_threshold_is_chosen_by_what_it_costs(learning):
+def test_how_many_is_chosen_by_what_they_cost(learning):
     """The more may be lost, the more splats become diffuse: all of them where everything may."""
     model, data, optimizers = learning
     shares = []
@@ -194,6 +196,7 @@ def test_the_schedule(untrained, monkeypatch):
     def look(model, *_):
         done.append(("look", step))
         model.densification.state[DIFFUSE] = torch.zeros(1)
+        return []
 
     def trial(model):
         done.append(("trial", step))
@@ -217,6 +220,39 @@ def checkpoint(config: Path) -> dict:
 def whole(tiny_scene, tmp_path_factory):
     """config.yml of the unbroken training."""
     return Path(train(words(tiny_scene, tmp_path_factory.mktemp("whole"))).config_path)
+
+
+@pytest.mark.parametrize("start", [0, 23])
+def test_residuals_cost_until_the_last_look(start, tiny_scene, tmp_path):
+    trainer = parse(words(tiny_scene, tmp_path)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer._start_step, model = start, trainer.pipeline.model
+    attributes = TrainingCallbackAttributes(trainer.optimizers, trainer.grad_scaler, trainer.pipeline, trainer)
+    model.config.diffuse.stop = 12  # one more look, after step 14
+    charge = model.get_training_callbacks(attributes)[-2]
+    model.train()
+    camera, batch = trainer.pipeline.datamanager.train_view(0)
+    for step in range(start, 26):
+        losses = model.get_loss_dict(model.get_outputs(camera), batch)
+        assert ("residual" in losses) == (step <= 14), step  # with the cost of the step that the look follows
+        charge.func(step)
+
+
+def test_what_a_residual_costs(untrained):
+    """Three splats: silent; longer by 3-4-12 of 13 parts; diffuse. Only what says something is pulled at."""
+    base = SplatAppearance(torch.full((3, 3), 0.5), torch.full((3,), 0.5))
+    changes = torch.tensor([[0.0, 0, 0, 0], [0.03, 0.04, 0.0, 0.12], [0.0, 0, 0, 0]], requires_grad=True)
+    length = mean_length(base, SplatAppearance(base.colors + changes[:, :3], base.opacities + changes[:, 3]))
+    assert_close(length, torch.tensor(0.13 / 3), rtol=0, atol=1e-4)  # the round corner's size
+    length.backward()
+    assert (changes.grad[[0, 2]] == 0).all()
+    assert_close(changes.grad[1], torch.tensor([3.0, 4.0, 0.0, 12.0]) / 13 / 3, rtol=1e-5, atol=0)
+    assert_close(
+        mean_length(SplatAppearance(*(t[:0] for t in base)), SplatAppearance(*(t[:0] for t in base))) + 1,
+        torch.ones(()),
+        rtol=0,
+        atol=2e-4,
+    )
 
 
 @pytest.mark.parametrize("half", [8, pytest.param(12, marks=pytest.mark.slow)])
@@ -263,6 +299,7 @@ def test_off_is_off(tiny_scene, tmp_path):
         ("nrfgs", {"--pipeline.model.diffuse.budget": -1}, "budget is -1"),
         ("nrfgs", {"--pipeline.model.diffuse.views": 0}, "views is 0"),
         ("nrfgs", {"--pipeline.model.diffuse.settle": 0}, "settle is 0"),
+        ("nrfgs", {"--pipeline.model.residual-cost": -1}, "residual-cost is -1"),
     ],
 )
 def test_what_cannot_be_followed_is_refused_before_training(method, more, says, tiny_scene, tmp_path):

@@ -12,15 +12,14 @@ Capacity = Literal["full", "auto"]
 class CapacitySearch:
     """When and how capacity "auto" finds out what a scene needs."""
 
-    step: int = 7000
-    """step after which it is decided, once; not right after opacities are reset. With stretched schedules, a step of
-    the schedules"""
+    step: int = 20_000
+    """step after which it is decided, once: late, because what is dropped does not come back, and gloss is learnt last;
+    not right after opacities are reset. With stretched schedules, a step of the schedules"""
     views: int | None = None
     """training views, evenly spaced, that are set aside until then, to decide on. None: an eighth of all, at least 2
     and at most 16"""
     settle: int = 100
-    """steps in which each field that is tried, the whole one included, gets used to what it is without: shared
-    weights, latents, base colours and base opacities learn, and geometry stays"""
+    """steps in which each field that is tried, the whole one included, gets used to what it is without"""
     tolerance_db: float = 0.05
     """dB that all that is dropped may cost on the views set aside. High branch, opacity's residual and distance may
     take half of it, the latents' rank what is left"""

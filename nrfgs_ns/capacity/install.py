@@ -9,7 +9,7 @@ import torch
 from torch.nn import Parameter
 
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.capacity.settle import Settled
+from nrfgs_ns.capacity.settle import BASE, Settled
 
 CHANGED = ("latent_dim", "num_bands", "opacity_residual", "use_distance")
 """Fields of NrfConfig that tell a smaller field from the whole one."""
@@ -24,9 +24,9 @@ def head_changes(config: NrfConfig) -> dict[str, Any]:
 def install(model, optimizers, settled: Settled) -> None:
     """Train on with a smaller field.
 
-    Base colours and opacities keep their place and Adam's state: what they are has not changed. Shared weights and
-    latents are other numbers than before, in other coordinates; the old state says nothing of them. They go on with the
-    state of the Adams that have just taught them.
+    The splats' base, geometry included, keeps its place and Adam's state: what it is has not changed. Shared weights
+    and latents are other numbers than before, in other coordinates; the old state says nothing of them. They go on with
+    the state of the Adams that have just taught them.
 
     Args:
         model: an NrfgsModel in training.
@@ -35,7 +35,7 @@ def install(model, optimizers, settled: Settled) -> None:
     """
     head, splats = settled.field
     model.head = head.train(model.training)
-    for name in ("features_dc", "opacities"):
+    for name in BASE:
         model.gauss_params[name].copy_(splats[name])
     latents = Parameter(splats["latents"].detach())
     model.gauss_params["latents"] = latents

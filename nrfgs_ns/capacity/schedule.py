@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """When capacity "auto" decides, and what it leaves behind: a line, a file, and scalars for whatever listens."""
 
-import json
+import math
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -14,12 +14,10 @@ from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.capacity.aside import Decider, ViewsAside
 from nrfgs_ns.capacity.config import CapacitySearch
 from nrfgs_ns.capacity.install import head_changes, install
+from nrfgs_ns.capacity.report import add_to_report
 from nrfgs_ns.capacity.search import Decision, decide
 from nrfgs_ns.diffuse_splats import schedule_for
 from nrfgs_ns.errors import InputError
-
-REPORT = "capacity.json"
-"""Beside config.yml."""
 
 
 class CapacitySchedule:
@@ -93,9 +91,7 @@ class CapacitySchedule:
             "seconds": seconds,
             "trials": decision.evidence,
         }
-        if self.folder is not None:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / REPORT).write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        add_to_report(self.folder, report)
         numbers = {name: float(value) for name, value in self.model.capacity_found["head"].items()}
         numbers |= {f"worth of {trial.part} (dB)": trial.loss_db for trial in decision.trials[1:]}
         for listener in writer.EVENT_WRITERS:
@@ -111,21 +107,33 @@ def deciding_callbacks(model, attributes: TrainingCallbackAttributes) -> list[Tr
     """
     data, trainer = attributes.pipeline.datamanager, attributes.trainer
     start = 0 if trainer is None else trainer._start_step
-    calls, deciders = [], []
+    calls, deciders, lookers = [], [], []
     optimizers = attributes.optimizers
+    folder = None if trainer is None else trainer.base_dir
     diffuse = schedule_for(
-        model, data, attributes.pipeline.world_size, None if optimizers is None else optimizers.optimizers
+        model, data, attributes.pipeline.world_size, None if optimizers is None else optimizers.optimizers, folder
     )
     if diffuse is not None:
         calls.append(lambda step: diffuse.after_step(model, step))
+        lookers.append(diffuse)
         deciders += [diffuse] if diffuse.config.threshold is None else []
     if model.config.capacity not in ("full", "auto"):
         raise InputError(f"pipeline.model.capacity is {model.config.capacity!r}; use 'full' or 'auto'.")
     if model.config.capacity == "auto":
         _check(model, attributes.pipeline.world_size)
-        capacity = CapacitySchedule(model, data, optimizers, None if trainer is None else trainer.base_dir)
+        capacity = CapacitySchedule(model, data, optimizers, folder)
         calls.append(capacity.after_step)
+        lookers.append(capacity)
         deciders.append(capacity)
+    cost = model.config.residual_cost
+    if not 0.0 <= cost < math.inf:
+        raise InputError(f"pipeline.model.residual-cost is {cost}; it must be zero or positive.")
+
+    def charge(step: int) -> None:
+        model.residuals_cost = cost > 0.0 and any(not looker.is_done(step) for looker in lookers)
+
+    charge(start - 1)
+    calls.append(charge)
     calls.append(ViewsAside(data, deciders, start).after_step)
     for decider in deciders if trainer is not None else ():
         if not decider.is_done(start - 1):

@@ -5,7 +5,8 @@ The whole field settles, and so does each smaller one, on the same views (`settl
 views that were set aside. In turn, each on top of what has been dropped before it: the high branch, which is half of
 the head; opacity's residual; the distance; and once more what was kept, if something has gone. They may cost half of
 the tolerance together. Then the latents keep the fewest principal components that cost no more than the rest. What is
-measured is always the whole loss against the whole field, so that small ones do not add up.
+measured is always the whole loss against the whole field, so that small ones do not add up; and where a part did harm,
+so that the field is better without it, against that better one, so that latents are not cut at the price of the gain.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,7 +27,7 @@ from nrfgs_ns.appearance.reduce import (
     without_opacity_residual,
 )
 from nrfgs_ns.capacity.config import CapacitySearch
-from nrfgs_ns.capacity.settle import Settled, keep_the_mean, lesson_order, settle
+from nrfgs_ns.capacity.settle import FIELD, Settled, keep_the_mean, lesson_order, settle
 from nrfgs_ns.field_views import FieldViews, smallest_rank
 from nrfgs_ns.residuals import Residuals, look_over
 
@@ -46,7 +47,7 @@ class Trial:
     psnr: float
     """after it has settled, dB; latents are cut from a field that has"""
     loss_db: float
-    """what that lacks of the whole field"""
+    """what that lacks of the whole field; for latents, of the better of that and the field from which they are cut"""
     error_db: float
     """standard error of the loss over the views; 0 for a single view"""
     allowed_db: float
@@ -96,14 +97,14 @@ def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config:
     """
     was_training = model.training
     model.eval()
-    aside = FieldViews(model, [data.train_view(index) for index in data.views_aside])
+    aside = FieldViews(model, [data.train_view(index) for index in data.views_aside], geometry=True)
     lessons = [data.train_view(index) for index in lesson_order(data, config.settle)]
     cameras = data.train_dataset.cameras
     seen = look_over(model, cameras)  # where cameras are, not what is on their photographs
     field = Field(model.head, {name: value.detach() for name, value in model._splats_to_draw().items()})
 
     def settled(smaller: Field) -> Settled:
-        return settle(model, smaller, lessons, config.settle, optimizers)
+        return settle(model, smaller, lessons, config.settle, optimizers, FIELD)
 
     whole = settled(field)
     reference = aside.scores(whole.field)
@@ -128,7 +129,9 @@ def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config:
     diffuse = field.splats.get(DIFFUSE)
     weight = seen.weight if diffuse is None else seen.weight * ~diffuse
     basis = with_unit_axes(latent_basis(chosen.field, weight))
-    lowest = trials[0].psnr - config.tolerance_db
+    if aside.psnr(chosen.field) > trials[0].psnr:
+        reference = aside.scores(chosen.field)
+    lowest = sum(reference) / max(len(reference), 1) - config.tolerance_db
     rank = smallest_rank(chosen.field, basis, aside, lowest)
     if rank < field.head.config.latent_dim:
         smaller = with_rank(chosen.field, basis, rank)  # of a field that has settled: measured as it is

@@ -3,7 +3,8 @@
 
 A trained part carries more than is needed of it: what all views see alike, and what other parts could say as well. What
 a part is worth is told by the difference between a field with it and one without it after both have learnt a little
-more from the same views in the same order. Geometry stays, so that nothing but the field differs.
+more from the same views in the same order. Geometry learns with them: what a part does for a splat that has the wrong
+place or shape, place and shape can learn to do.
 """
 
 from collections.abc import Mapping
@@ -16,8 +17,10 @@ from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.reduce import Field, build
 from nrfgs_ns.harmonics_fit import OPAQUE, contributions
 
-LEARNING = ("features_dc", "opacities", "latents")
-"""Per-splat tables that settle with the shared weights."""
+BASE = ("means", "scales", "quats", "features_dc", "opacities")
+"""Per-splat tables that settle with the shared weights and the latents."""
+FIELD = ("field", "latents")
+"""Optimiser groups of what a smaller field has in other shapes."""
 
 
 class Settled(NamedTuple):
@@ -41,8 +44,18 @@ def lesson_order(data, steps: int) -> list[int]:
     return [chosen[i] for i in order.tolist()]
 
 
-def settle(model, field: Field, views: list, steps: int, optimizers: Mapping[str, torch.optim.Optimizer]) -> Settled:
+def settle(
+    model,
+    field: Field,
+    views: list,
+    steps: int,
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    fresh: tuple[str, ...] = (),
+) -> Settled:
     """Train a copy of a field on some views; the model's own numbers stay.
+
+    What comes of it is the mean of all numbers over the last half of the steps (Polyak and Juditsky, SIAM Journal on
+    Control and Optimization 30, 1992): at a training's learning rates the last step of two fields differs by chance.
 
     Args:
         model: an NrfgsModel. It renders as in training, at the training's resolution.
@@ -50,22 +63,26 @@ def settle(model, field: Field, views: list, steps: int, optimizers: Mapping[str
         views: pairs of a camera and its batch, taken in turn.
         steps: how many.
         optimizers: the training's, whose current learning rates and constants count.
+        fresh: groups whose Adam starts anew. That of the others goes on from the training's state.
     """
+    tables = (*BASE, "latents")
     weights = dict(field.head.state_dict())
     head = build(field.head.config, {name: value.clone() for name, value in weights.items()}, field.head.scene_unit)
     head.requires_grad_(True)
     splats = {name: value.detach() for name, value in field.splats.items()}
-    for name in LEARNING:
+    for name in tables:
         splats[name] = splats[name].clone().requires_grad_(True)
-    groups = {"field": list(head.parameters()), **{name: [splats[name]] for name in LEARNING}}
-    adams = {name: _adam(parameters, optimizers[name]) for name, parameters in groups.items()}
+    groups = {"field": list(head.parameters()), **{name: [splats[name]] for name in tables}}
+    adams = {name: _adam(parameters, optimizers[name], name not in fresh) for name, parameters in groups.items()}
+    learning = [parameter for group in groups.values() for parameter in group]
+    means = [torch.zeros_like(parameter) for parameter in learning]
+    last_half = steps - steps // 2
     was_training = model.training
     model.train()
     for step in range(steps):
         camera, batch = views[step % len(views)]
-        with torch.no_grad():
-            view = model.look(camera)
         with torch.enable_grad():
+            view = model.look(camera, splats)
             outputs, _ = model.paint(view, head(splats, view.visible, view.center))
             model._correct_colors(outputs, camera)
             loss = model.photometric_loss(outputs, batch)
@@ -74,14 +91,25 @@ def settle(model, field: Field, views: list, steps: int, optimizers: Mapping[str
         loss.backward()
         for adam in adams.values():
             adam.step()
+        if step >= steps // 2:
+            for mean, parameter in zip(means, learning, strict=True):
+                mean.add_(parameter.detach(), alpha=1.0 / last_half)
+    with torch.no_grad():
+        for mean, parameter in zip(means, learning, strict=True):
+            parameter.copy_(mean)
     model.train(was_training)
     moments = {name: dict(adam.state) for name, adam in adams.items()}
     return Settled(Field(head, splats), moments)
 
 
-def _adam(parameters: list[Tensor], like: torch.optim.Optimizer) -> torch.optim.Adam:
+def _adam(parameters: list[Tensor], like: torch.optim.Optimizer, goes_on: bool) -> torch.optim.Adam:
     group = like.param_groups[0]
-    return torch.optim.Adam(parameters, lr=float(group["lr"]), betas=group["betas"], eps=group["eps"])
+    adam = torch.optim.Adam(parameters, lr=float(group["lr"]), betas=group["betas"], eps=group["eps"])
+    for parameter, old in zip(parameters, group["params"], strict=True) if goes_on else ():
+        if old in like.state:
+            adam.state[parameter] = {name: value.clone() for name, value in like.state[old].items()}
+            adam.state[parameter]["step"] = adam.state[parameter]["step"].cpu()  # where one that is not fused keeps it
+    return adam
 
 
 @torch.no_grad()

@@ -3,10 +3,9 @@
 
     python -m nrfgs_ns.studies.necessity --out FOLDER
 
-For each gloss: one training of the full model, which `nrfgs inspect` looks into and `nrfgs export compact` writes;
-trainings in which splats become diffuse, at several thresholds; and one in which capacity is "auto". What is there
-already is not done again. The summary
-goes to FOLDER/necessity.json and FOLDER/necessity.md.
+For each gloss and seed: a training of the full model, the first of which `nrfgs inspect` looks into and `nrfgs export
+compact` writes; one without any residual; some in which splats become diffuse; and one in which capacity is "auto".
+What is there already is not done again. The summary goes to FOLDER/necessity.json and FOLDER/necessity.md.
 """
 
 import json
@@ -19,7 +18,8 @@ import torch
 import tyro
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.capacity.schedule import REPORT
+from nrfgs_ns.appearance.reduce import Field
+from nrfgs_ns.capacity.report import read_report
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.compact.verb import export_compact
 from nrfgs_ns.export import load_model
@@ -39,57 +39,76 @@ class Necessity:
     """gloss of the scenes"""
     thresholds: tuple[float, ...] = ()
     """8-bit steps below which a splat's residual is dropped"""
-    budgets: tuple[float, ...] = (0.05,)
+    budgets: tuple[float, ...] = (0.05, 0.1)
     """dB that a look may cost, where it chooses the threshold"""
     views: int = 96
     """of each scene, an eighth of them for tests. Few views leave nothing to learn of how looks change between them"""
     width: int = 48
     """of the photographs, pixels; three quarters of it high"""
-    points: int = 4000
-    """that a training starts from. It adds none: so short a training would only split"""
-    steps: int = 800
-    """of each training; splats become diffuse, and capacity is decided, after half of them"""
+    samples: int = 4
+    """rays per pixel side of the photographs. With few, textures alias, from each view in another way"""
+    points: int = 1000
+    """that a training starts from. It adds none: so short a training would only split. With more of them than about one
+    for each pixel of a view, splats are smaller than pixels, where no rasteriser draws them as the scene is"""
+    steps: int = 1200
+    """of each training; splats become diffuse after half of them and are looked at once more after three quarters, when
+    capacity is decided"""
     rasterize_mode: Literal["classic", "antialiased"] = "antialiased"
     """classic blurs each splat by 0.3 pixels without dimming it, so that small ones look the brighter the farther away
     they are, whatever the gloss"""
     inspect: bool = True
     """look into the full model and write it as a compact file, too"""
-    seed: int = 42
-    """of the trainings"""
+    seeds: tuple[int, ...] = (42, 43)
+    """of the trainings; the first one's full model is looked into"""
 
     def main(self) -> None:
         for gloss in self.gloss:
-            height = self.width * 3 // 4
-            scene = SceneConfig(gloss=gloss, views=self.views, width=self.width, height=height, points=self.points)
-            data = write_scene(scene, self.out / f"scene-{gloss:g}")
-            full = self.trained(f"{gloss:g}-full", data, {})
-            config = Path(full["config"])
-            if self.inspect and not (self.out / f"{gloss:g}-inspect" / "inspect.json").exists():
-                Inspect(config, self.out / f"{gloss:g}-inspect").main()
-            if self.inspect and not (self.out / f"{gloss:g}-compact.json").exists():
-                report = self.out / f"{gloss:g}-compact.json"
-                export_compact(config, self.out / f"{gloss:g}.nrf", CompactOptions(), True, report)
-            for name, options in self.variants().items():
-                self.trained(f"{gloss:g}-{name}", data, options)
-        summary = {
-            **{key: getattr(self, key) for key in ("views", "width", "points", "steps", "rasterize_mode", "seed")},
-            "machine": machine(),
-            "scenes": list(self.summary()),
-        }
+            data = self.scene(gloss)
+            for seed in self.seeds:
+                full = self.trained(gloss, seed, "full", data, {})
+                if self.inspect and seed == self.seeds[0]:
+                    self.look_into(gloss, Path(full["config"]))
+                for name, options in self.variants().items():
+                    self.trained(gloss, seed, name, data, options)
+        keys = ("views", "width", "samples", "points", "steps", "rasterize_mode", "seeds")
+        summary = {**{key: getattr(self, key) for key in keys}, "machine": machine(), "scenes": list(self.summary())}
         write_whole(self.out / "necessity.json", json.dumps(summary, indent=1) + "\n")
         write_whole(self.out / "necessity.md", table(summary))
+
+    def scene(self, gloss: float) -> Path:
+        """Folder of the photographs, drawn if they are not there."""
+        size = {"width": self.width, "height": self.width * 3 // 4, "samples": self.samples}
+        return write_scene(
+            SceneConfig(gloss=gloss, views=self.views, points=self.points, **size), self.out / f"scene-{gloss:g}"
+        )
+
+    def look_into(self, gloss: float, config: Path) -> None:
+        """What the trained full model could do without, and its compact file."""
+        if not (self.out / f"{gloss:g}-inspect" / "inspect.json").exists():
+            Inspect(config, self.out / f"{gloss:g}-inspect").main()
+        report = self.out / f"{gloss:g}-compact.json"
+        if not report.exists():
+            export_compact(config, self.out / f"{gloss:g}.nrf", CompactOptions(), True, report)
 
     def variants(self) -> dict[str, dict[str, Any]]:
         """Names and options of the trainings that leave something out."""
         option = "--pipeline.model.diffuse"
-        schedule = {f"{option}.start": self.steps // 2, f"{option}.every": self.steps, f"{option}.stop": self.steps}
+        schedule = {
+            f"{option}.start": self.steps // 2,
+            f"{option}.every": self.steps // 4,
+            f"{option}.stop": self.steps * 3 // 4,
+        }
         below = {f"below-{threshold:g}": {f"{option}.threshold": threshold} for threshold in self.thresholds}
         budgets = {f"budget-{budget:g}": {f"{option}.budget": budget} for budget in self.budgets}
-        auto = {"--pipeline.model.capacity": "auto", "--pipeline.model.capacity-search.step": self.steps // 2}
-        return {**{name: {**schedule, **how} for name, how in {**below, **budgets}.items()}, "auto": auto}
+        scale = "--pipeline.model.appearance"
+        none = {f"{scale}.color-scale": 0.0, f"{scale}.opacity-scale": 0.0}
+        auto = {"--pipeline.model.capacity": "auto", "--pipeline.model.capacity-search.step": self.steps * 3 // 4}
+        looks = {name: {**schedule, **how} for name, how in {**below, **budgets}.items()}
+        return {"none": none, **looks, "auto": auto}
 
-    def trained(self, name: str, data: Path, options: dict[str, Any]) -> dict[str, Any]:
+    def trained(self, gloss: float, seed: int, variant: str, data: Path, options: dict[str, Any]) -> dict[str, Any]:
         """Train and evaluate one model, or read what it gave."""
+        name = f"{gloss:g}-{seed}-{variant}"
         path = self.out / f"{name}.json"
         if path.exists():
             return json.loads(path.read_text())
@@ -98,7 +117,7 @@ class Necessity:
             "--output-dir": self.out / "outputs",
             "--experiment-name": name,
             "--max-num-iterations": self.steps,
-            "--machine.seed": self.seed,
+            "--machine.seed": seed,
             "--vis": "tensorboard",
             "--steps-per-eval-image": 10 * self.steps,
             "--steps-per-eval-all-images": 10 * self.steps,
@@ -114,6 +133,7 @@ class Necessity:
         results = evaluate(config, config.parent / "eval.json")
         model = load_model(config, "test").model
         diffuse = model.densification.state.get(DIFFUSE)
+        field = Field(model.head, {name: value.detach() for name, value in model._splats_to_draw().items()})
         result = {
             "config": str(config),
             "seconds": record.seconds,
@@ -121,21 +141,24 @@ class Necessity:
             "psnr": results["psnr"],
             "ssim": results["ssim"],
             "diffuse": 0.0 if diffuse is None else float(diffuse.float().mean()),
-            "bytes": results["parameter_bytes"],
+            "bytes": field.bytes,
         }
-        if model.capacity_found is not None:
-            report = json.loads((config.parent / REPORT).read_text())
-            result["capacity"] = {key: report[key] for key in ("dropped", "head", "trials", "seconds")}
+        report = read_report(config.parent)
+        for key in ("dropped", "head", "trials", "looks"):
+            if key in report:
+                result[key] = report[key]
         write_whole(path, json.dumps(result, indent=1) + "\n")
         return result
 
     def summary(self) -> Iterator[dict[str, Any]]:
-        """What was measured of each scene, without paths."""
+        """What was measured of each scene, without paths: the trainings that are there, by name and seed."""
         for gloss in self.gloss:
-            runs = {}
+            runs: dict[str, dict[int, dict[str, Any]]] = {}
             for name in ("full", *self.variants()):
-                runs[name] = json.loads((self.out / f"{gloss:g}-{name}.json").read_text())
-                runs[name].pop("config")
+                paths = {seed: self.out / f"{gloss:g}-{seed}-{name}.json" for seed in self.seeds}
+                runs[name] = {seed: json.loads(path.read_text()) for seed, path in paths.items() if path.exists()}
+                for run in runs[name].values():
+                    run.pop("config")
             yield {"gloss": gloss, "runs": runs, **(self.looked_into(gloss) if self.inspect else {})}
 
     def looked_into(self, gloss: float) -> dict[str, Any]:
@@ -154,34 +177,22 @@ class Necessity:
 
 
 def table(summary: dict[str, Any]) -> str:
-    """Markdown."""
-    lines = ["| gloss | splats become diffuse below | PSNR (dB) | against full | diffuse | splats | training (s) |"]
-    lines.append("|---|---|---|---|---|---|---|")
+    """Markdown: a row for each training."""
+    lines = ["| gloss | seed | training | PSNR (dB) | against full | diffuse splats | bytes | dropped |"]
+    lines += ["|---|---|---|---|---|---|---|---|"]
+    names = {"full": "full", "none": "no residual at all", "auto": "capacity auto"}
     for scene in summary["scenes"]:
-        full = scene["runs"]["full"]["psnr"]
-        for name, run in scene["runs"].items():
+        for name, runs in scene["runs"].items():
             kind, _, number = name.partition("-")
-            if kind == "auto":
-                continue
-            what = {"full": "(full)", "below": f"{number} steps", "budget": f"what {number} dB allow"}[kind]
-            lines.append(
-                f"| {scene['gloss']:g} | {what} | {run['psnr']:.2f} | {run['psnr'] - full:+.2f} | "
-                f"{100 * run['diffuse']:.0f} % | {run['splats']:,} | {run['seconds']:.0f} |"
-            )
-    lines += [
-        "",
-        "| gloss | PSNR (dB), full | auto | dropped | bytes | worth on the views set aside (dB) |",
-        "|---|---|---|---|---|---|",
-    ]
-    for scene in summary["scenes"]:
-        full, auto = scene["runs"]["full"], scene["runs"]["auto"]
-        found = auto["capacity"]
-        worth = ", ".join(f"{trial['part']} {trial['loss_db']:.3f}" for trial in found["trials"][1:])
-        lines.append(
-            f"| {scene['gloss']:g} | {full['psnr']:.2f} | {auto['psnr']:.2f} "
-            f"| {', '.join(found['dropped']) or 'nothing'} | {100 * (auto['bytes'] / full['bytes'] - 1):+.0f} % "
-            f"| {worth} |"
-        )
+            what = {"below": f"diffuse below {number} steps", "budget": f"diffuse, what {number} dB allow"}.get(kind)
+            for seed, run in runs.items():
+                full = scene["runs"]["full"][seed]
+                lines.append(
+                    f"| {scene['gloss']:g} | {seed} | {what or names[kind]} | {run['psnr']:.2f} "
+                    f"| {run['psnr'] - full['psnr']:+.2f} | {100 * run['diffuse']:.0f} % "
+                    f"| {100 * (run['bytes'] / full['bytes'] - 1):+.0f} % "
+                    f"| {', '.join(run.get('dropped', [])) or '-'} |"
+                )
     if "together" not in summary["scenes"][0]:
         return "\n".join(lines) + "\n"
     lines += [
