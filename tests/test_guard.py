@@ -250,11 +250,13 @@ def test_a_checkpoint_that_is_not_finite_is_refused(start, name):
 
 
 def test_weights_that_overflow_stop_the_training(start):
-    """1e20 in both layers: their product is beyond float32. Splats whose colours are NaN are not drawn, but heard."""
+    """Hidden units that overflow, and second weights of both signs: NaN. Splats whose colours are NaN are not drawn,
+    but heard. (1e20 in both layers is NaN or saturated, by the order in which a machine adds with fused products.)"""
     trainer = start({"--pipeline.model.warmup-steps": 0})
-    for layer in (trainer.pipeline.model.head.low[0], trainer.pipeline.model.head.low[2]):
-        torch.nn.init.normal_(layer.weight.data)
-        layer.weight.data *= 1e20
+    first, second = trainer.pipeline.model.head.low[0], trainer.pipeline.model.head.low[2]
+    for layer, scale in ((first, 1e38), (second, 1.0)):
+        torch.nn.init.uniform_(layer.weight.data, -3.0, 3.0)
+        layer.weight.data *= scale
     with pytest.raises(TrainingStopped, match="Lower --optimizers.field.optimizer.lr"):
         trainer.train()
 
