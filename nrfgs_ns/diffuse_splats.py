@@ -14,7 +14,8 @@ After the last trial the training goes on with what was decided.
 
 Nothing tells a field to be silent where the base and the geometry could say the same: what is learnt first by either is
 learnt by both, and a look afterwards finds residuals that do much and are not needed. So, until the last look, they
-cost something in the training's loss, their mean length over the visible splats (`residual_cost` of the model).
+can be made to cost something in the training's loss, their mean length over the visible splats (`residual_cost` of the
+model). On captures that has cost more than it gave, so by default it is 0.
 
 What pays is measured as capacity "auto" measures it. Some training views are set aside until the last look. The splats
 as they are have to be better on them, by more than the budget, than those without the residuals in question, after both

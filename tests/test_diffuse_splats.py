@@ -224,7 +224,8 @@ def whole(tiny_scene, tmp_path_factory):
 
 @pytest.mark.parametrize("start", [0, 23])
 def test_residuals_cost_until_the_last_look(start, tiny_scene, tmp_path):
-    trainer = parse(words(tiny_scene, tmp_path)).setup(local_rank=0, world_size=1)
+    args = words(tiny_scene, tmp_path, **{"--pipeline.model.residual-cost": 0.05})
+    trainer = parse(args).setup(local_rank=0, world_size=1)
     trainer.setup()
     trainer._start_step, model = start, trainer.pipeline.model
     attributes = TrainingCallbackAttributes(trainer.optimizers, trainer.grad_scaler, trainer.pipeline, trainer)

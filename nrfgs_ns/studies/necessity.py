@@ -56,6 +56,8 @@ class Necessity:
     rasterize_mode: Literal["classic", "antialiased"] = "antialiased"
     """classic blurs each splat by 0.3 pixels without dimming it, so that small ones look the brighter the farther away
     they are, whatever the gloss"""
+    residual_cost: float = 0.05
+    """of the trainings with looks or capacity auto: weight of the residuals' length in the loss"""
     inspect: bool = True
     """look into the full model and write it as a compact file, too"""
     seeds: tuple[int, ...] = (42, 43)
@@ -70,7 +72,7 @@ class Necessity:
                     self.look_into(gloss, Path(full["config"]))
                 for name, options in self.variants().items():
                     self.trained(gloss, seed, name, data, options)
-        keys = ("views", "width", "samples", "points", "steps", "rasterize_mode", "seeds")
+        keys = ("views", "width", "samples", "points", "steps", "rasterize_mode", "residual_cost", "seeds")
         summary = {**{key: getattr(self, key) for key in keys}, "machine": machine(), "scenes": list(self.summary())}
         write_whole(self.out / "necessity.json", json.dumps(summary, indent=1) + "\n")
         write_whole(self.out / "necessity.md", table(summary))
@@ -103,8 +105,9 @@ class Necessity:
         scale = "--pipeline.model.appearance"
         none = {f"{scale}.color-scale": 0.0, f"{scale}.opacity-scale": 0.0}
         auto = {"--pipeline.model.capacity": "auto", "--pipeline.model.capacity-search.step": self.steps * 3 // 4}
-        looks = {name: {**schedule, **how} for name, how in {**below, **budgets}.items()}
-        return {"none": none, **looks, "auto": auto}
+        cost = {"--pipeline.model.residual-cost": self.residual_cost}
+        looks = {name: {**schedule, **cost, **how} for name, how in {**below, **budgets}.items()}
+        return {"none": none, **looks, "auto": {**cost, **auto}}
 
     def trained(self, gloss: float, seed: int, variant: str, data: Path, options: dict[str, Any]) -> dict[str, Any]:
         """Train and evaluate one model, or read what it gave."""
