@@ -8,6 +8,7 @@ import torch
 from gsplat.strategy.ops import duplicate, remove, split
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.utils.eval_utils import eval_setup
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT, mean_length
@@ -17,39 +18,39 @@ from nrfgs_ns.diffuse_splats import DiffuseSchedule, DiffuseSplats, give_back, m
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.field_views import FieldViews, dropped
 from nrfgs_ns.residuals import look_over
-from nrfgs_ns.studies.run import parse, train
+from nrfgs_ns.studies.run import parse
 
 BELOW_4 = DiffuseSplats(threshold=4.0)
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
-def words(scene: Path, out: Path, method: str = "nrfgs", steps: int = 24, **more) -> list[str]:
-    """A training that splits and prunes every 4th step, and in which splats become diffuse after step 6, 14 and 22."""
-    chosen = {
-        "--data": scene,
-        "--output-dir": out,
-        "--max-num-iterations": steps,
-        "--vis": "tensorboard",
-        "--steps-per-eval-image": 1000,
-        "--steps-per-eval-all-images": 1000,
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
-        "--pipeline.model.warmup-length": 2,
-        "--pipeline.model.refine-every": 4,
-        "--pipeline.model.reset-alpha-every": 20,
-        "--pipeline.model.densify-grad-thresh": 1e-6,
-        "--pipeline.model.num-downscales": 0,
-        "--pipeline.model.stop-split-at": 100,
-        "--pipeline.model.appearance.output-init": "default",
-        "--pipeline.model.warmup-steps": 0,
-        "--pipeline.model.appearance.latent-dim": 4,
-        "--pipeline.model.diffuse.start": 6,
-        "--pipeline.model.diffuse.every": 8,
-        "--pipeline.model.diffuse.trial": 3,
-        "--pipeline.model.diffuse.threshold": 4.0,
-        **more,
-    }
-    return [method, *(str(word) for option in chosen.items() for word in option)]
+DIFFUSE_TWICE = {
+    "--pipeline.model.warmup-length": 2,
+    "--pipeline.model.refine-every": 4,
+    "--pipeline.model.reset-alpha-every": 20,
+    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.stop-split-at": 100,
+    "--pipeline.model.appearance.output-init": "default",
+    "--pipeline.model.warmup-steps": 0,
+    "--pipeline.model.appearance.latent-dim": 4,
+    "--pipeline.model.diffuse.start": 6,
+    "--pipeline.model.diffuse.every": 8,
+    "--pipeline.model.diffuse.trial": 3,
+    "--pipeline.model.diffuse.threshold": 4.0,
+}
+"""Splits and prunes every 4th step; splats become diffuse after step 6, 14 and 22."""
+NO_FIELD = dict.fromkeys(name for name in DIFFUSE_TWICE if "appearance" in name or "warmup-steps" in name)
+MCMC = {"--pipeline.model.densification": "mcmc"} | dict.fromkeys(
+    name
+    for name in DIFFUSE_TWICE
+    if name.split(".")[-1] in ("densify-grad-thresh", "reset-alpha-every", "stop-split-at")
+)
+
+
+def words(scene: Path, out: Path, *more: dict, method: str = "nrfgs", steps: int = 24) -> list[str]:
+    """A command line for ns-train."""
+    return command_line(method, scene, out, steps, DIFFUSE_TWICE, *more)
 
 
 @pytest.fixture
@@ -211,20 +212,15 @@ def test_the_schedule(untrained, monkeypatch):
     assert done == [("look", 6), ("trial", 13), ("look", 16), ("trial", 23), ("look", 26)]
 
 
-def checkpoint(config: Path) -> dict:
-    (path,) = (config.parent / "nerfstudio_models").glob("*.ckpt")
-    return torch.load(path, weights_only=True)
-
-
 @pytest.fixture(scope="module")
 def whole(tiny_scene, tmp_path_factory):
     """config.yml of the unbroken training."""
-    return Path(train(words(tiny_scene, tmp_path_factory.mktemp("whole"))).config_path)
+    return trained(words(tiny_scene, tmp_path_factory.mktemp("whole")))
 
 
 @pytest.mark.parametrize("start", [0, 23])
 def test_residuals_cost_until_the_last_look(start, tiny_scene, tmp_path):
-    args = words(tiny_scene, tmp_path, **{"--pipeline.model.residual-cost": 0.05})
+    args = words(tiny_scene, tmp_path, {"--pipeline.model.residual-cost": 0.05})
     trainer = parse(args).setup(local_rank=0, world_size=1)
     trainer.setup()
     trainer._start_step, model = start, trainer.pipeline.model
@@ -259,26 +255,23 @@ def test_what_a_residual_costs(untrained):
 @pytest.mark.parametrize("half", [8, pytest.param(12, marks=pytest.mark.slow)])
 def test_resumed_training_is_the_unbroken_one(half, whole, tiny_scene, tmp_path):
     """Cut while some splats are diffuse (after step 7) and in a trial (after step 11 to 13)."""
-    first = Path(train(words(tiny_scene, tmp_path / "half", steps=half)).config_path)
-    rest = {"--load-dir": first.parent / "nerfstudio_models"}
-    resumed = Path(train(words(tiny_scene, tmp_path / "rest", steps=24 - half, **rest)).config_path)
-    a, b = checkpoint(whole)["pipeline"], checkpoint(resumed)["pipeline"]
-    of_half = checkpoint(first)["pipeline"]["_model._extra_state"]["strategy"]
-    assert (DIFFUSE in of_half) == (half == 8)
-    strategies = [state["_model._extra_state"]["strategy"] for state in (a, b)]
-    count = len(a["_model.gauss_params.means"])
-    assert count != 300 and 0 < int(strategies[0][DIFFUSE].sum()) < count == len(strategies[0][DIFFUSE])
-    for name in (DIFFUSE, SHIFT):
-        assert_close(strategies[1][name], strategies[0][name], rtol=1e-5, atol=1e-7)
-    for name, value in a.items():
-        if isinstance(value, torch.Tensor):
-            assert_close(b[name], value, rtol=1e-5, atol=1e-7, msg=name)
-    _, pipeline, _, _ = eval_setup(resumed)
-    assert (pipeline.model.densification.state[DIFFUSE] == strategies[1][DIFFUSE]).all()
+    first = trained(words(tiny_scene, tmp_path / "half", steps=half))
+    rest = trained(words(tiny_scene, tmp_path / "rest", {"--load-dir": models_of(first)}, steps=24 - half))
+    assert (DIFFUSE in strategy_of(first)) == (half == 8)
+    assert_same_training(checkpoint_of(rest), checkpoint_of(whole))
+    diffuse = strategy_of(rest)[DIFFUSE]
+    assert SHIFT in strategy_of(rest) and len(diffuse) != 300 and 0 < int(diffuse.sum()) < len(diffuse)
+    _, pipeline, _, _ = eval_setup(rest)
+    assert (pipeline.model.densification.state[DIFFUSE] == diffuse).all()
+
+
+def strategy_of(config: Path) -> dict:
+    """What densification carries along, in a training's checkpoint."""
+    return checkpoint_of(config)["pipeline"]["_model._extra_state"]["strategy"]
 
 
 def test_off_is_off(tiny_scene, tmp_path):
-    config = parse(words(tiny_scene, tmp_path, **{"--pipeline.model.diffuse.start": None}))
+    config = parse(words(tiny_scene, tmp_path, {"--pipeline.model.diffuse.start": "None"}))
     assert config.pipeline.model.diffuse.start is None
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
@@ -292,8 +285,8 @@ def test_off_is_off(tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     "method, more, says",
     [
-        ("nrfgs-sh", {}, "'sh' head has no residual"),
-        ("nrfgs", {"--pipeline.model.densification": "mcmc"}, "'mcmc' moves splats"),
+        ("nrfgs-sh", NO_FIELD, "'sh' head has no residual"),
+        ("nrfgs", MCMC, "'mcmc' moves splats"),
         ("nrfgs", {"--pipeline.model.diffuse.start": -1}, "start is -1"),
         ("nrfgs", {"--pipeline.model.diffuse.trial": 8}, "trial is 8 steps"),
         ("nrfgs", {"--pipeline.model.diffuse.threshold": 0.0}, "threshold is 0.0"),
@@ -304,16 +297,6 @@ def test_off_is_off(tiny_scene, tmp_path):
     ],
 )
 def test_what_cannot_be_followed_is_refused_before_training(method, more, says, tiny_scene, tmp_path):
-    line = words(tiny_scene, tmp_path, method, **more)
-    own = ("appearance", "warmup-steps")
-    if method != "nrfgs":
-        line = line[:1] + [
-            w for k, v in zip(line[1::2], line[2::2], strict=True) for w in (k, v) if not any(o in k for o in own)
-        ]
-    if "mcmc" in line:
-        gone = ("densify-grad", "reset-alpha", "stop-split")
-        line = line[:1] + [
-            w for k, v in zip(line[1::2], line[2::2], strict=True) for w in (k, v) if not any(o in k for o in gone)
-        ]
+    line = words(tiny_scene, tmp_path, more, method=method)
     with pytest.raises(InputError, match=says):
         parse(line).setup(local_rank=0, world_size=1).setup()

@@ -8,6 +8,7 @@ import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.utils.eval_utils import eval_setup
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
@@ -24,36 +25,36 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 SEARCH = "--pipeline.model.capacity-search"
 
 
-def words(scene: Path, out: Path, method: str = "nrfgs", steps: int = 18, **more) -> list[str]:
-    """A training that splits and prunes every 4th step, and decides after step 9; the field says something at once."""
-    chosen = {
-        "--data": scene,
-        "--output-dir": out,
-        "--max-num-iterations": steps,
-        "--vis": "tensorboard",
-        "--steps-per-eval-image": 1000,
-        "--steps-per-eval-all-images": 1000,
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
-        "--pipeline.model.warmup-length": 2,
-        "--pipeline.model.refine-every": 4,
-        "--pipeline.model.num-downscales": 0,
-        "--pipeline.model.appearance.output-init": "default",
-        "--pipeline.model.appearance.latent-dim": 6,
-        "--pipeline.model.warmup-steps": 0,
-        "--pipeline.model.capacity": "auto",
-        f"{SEARCH}.step": 9,
-        f"{SEARCH}.settle": 4,
-        f"{SEARCH}.tolerance-db": 100.0,
-        **more,
-    }
-    if chosen.get("--pipeline.model.densification") != "mcmc":
-        chosen |= {"--pipeline.model.reset-alpha-every": 20, "--pipeline.model.stop-split-at": 100}
-    return [method, *(str(word) for option in chosen.items() for word in option if option[1] is not None)]
+DECIDES_AFTER_9 = {
+    "--pipeline.model.warmup-length": 2,
+    "--pipeline.model.refine-every": 4,
+    "--pipeline.model.reset-alpha-every": 20,
+    "--pipeline.model.stop-split-at": 100,
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.appearance.output-init": "default",
+    "--pipeline.model.appearance.latent-dim": 6,
+    "--pipeline.model.warmup-steps": 0,
+    "--pipeline.model.capacity": "auto",
+    f"{SEARCH}.step": 9,
+    f"{SEARCH}.settle": 4,
+    f"{SEARCH}.tolerance-db": 100.0,
+}
+"""Splits and prunes every 4th step, and decides after step 9; the field says something at once."""
+ORIGINAL = {"--pipeline.model.densification": "original"}
+MCMC = {
+    "--pipeline.model.densification": "mcmc",
+    "--pipeline.model.reset-alpha-every": None,
+    "--pipeline.model.stop-split-at": None,
+}
 
 
-def set_up(scene: Path, out: Path, **more):
-    trainer = parse(words(scene, out, **more)).setup(local_rank=0, world_size=1)
+def words(scene: Path, out: Path, *more: dict, steps: int = 18) -> list[str]:
+    """A command line for ns-train."""
+    return command_line("nrfgs", scene, out, steps, DECIDES_AFTER_9, *more)
+
+
+def set_up(scene: Path, out: Path, *more: dict, steps: int = 18):
+    trainer = parse(words(scene, out, *more, steps=steps)).setup(local_rank=0, world_size=1)
     trainer.setup()
     return trainer
 
@@ -179,19 +180,14 @@ def test_unit_axes_are_the_same_components(loud):
             assert_close(a, b, rtol=0, atol=2e-5)
 
 
-def checkpoint(config: Path) -> dict:
-    (path,) = (config.parent / "nerfstudio_models").glob("*.ckpt")
-    return torch.load(path, weights_only=True)
-
-
 @pytest.fixture(scope="module")
 def whole(tiny_scene, tmp_path_factory):
     """config.yml of an unbroken training that drops all it can."""
-    return Path(train(words(tiny_scene, tmp_path_factory.mktemp("whole"))).config_path)
+    return trained(words(tiny_scene, tmp_path_factory.mktemp("whole")))
 
 
 def test_the_smaller_model_trains_saves_and_loads(whole, tmp_path):
-    state = checkpoint(whole)
+    state = checkpoint_of(whole)
     found = state["pipeline"]["_model._extra_state"]["capacity"]
     assert found["step"] == 9
     assert found["head"] == {"latent_dim": 1, "num_bands": 1, "opacity_residual": False, "use_distance": False}
@@ -223,27 +219,19 @@ def test_the_smaller_model_trains_saves_and_loads(whole, tmp_path):
 @pytest.mark.parametrize("half", [pytest.param(8, marks=pytest.mark.slow), 13])
 def test_resumed_training_is_the_unbroken_one(half, whole, tiny_scene, tmp_path, monkeypatch):
     """Cut before and after the decision. A part that begins after it does not decide again."""
-    first = Path(train(words(tiny_scene, tmp_path / "half", steps=half)).config_path)
+    first = trained(words(tiny_scene, tmp_path / "half", steps=half))
     decisions = []
     monkeypatch.setattr("nrfgs_ns.capacity.schedule.decide", lambda *args: decisions.append(args) or decide(*args))
-    rest = {"--load-dir": first.parent / "nerfstudio_models"}
-    resumed = Path(train(words(tiny_scene, tmp_path / "rest", steps=18 - half, **rest)).config_path)
+    rest = trained(words(tiny_scene, tmp_path / "rest", {"--load-dir": models_of(first)}, steps=18 - half))
     assert len(decisions) == (1 if half == 8 else 0)
-    a, b = checkpoint(whole), checkpoint(resumed)
-    assert a["pipeline"]["_extra_state"]["sampling"]["views_aside"] == []
-    for name, value in a["pipeline"].items():
-        if isinstance(value, torch.Tensor):
-            assert_close(b["pipeline"][name], value, rtol=1e-5, atol=1e-7, msg=name)
-    for group in a["optimizers"]:
-        for key, of_one in a["optimizers"][group]["state"].items():
-            other = b["optimizers"][group]["state"][key]
-            assert_close(other["exp_avg"], of_one["exp_avg"], rtol=1e-5, atol=1e-7, msg=group)
+    assert checkpoint_of(whole)["pipeline"]["_extra_state"]["sampling"]["views_aside"] == []
+    assert_same_training(checkpoint_of(rest), checkpoint_of(whole))
 
 
 def test_a_smaller_checkpoint_goes_on_with_capacity_full(whole, tiny_scene, tmp_path):
     """What was dropped stays dropped: the checkpoint says what is left."""
-    rest = {"--load-dir": whole.parent / "nerfstudio_models", "--pipeline.model.capacity": "full"}
-    trainer = set_up(tiny_scene, tmp_path, steps=2, **rest)
+    rest = {"--load-dir": models_of(whole), "--pipeline.model.capacity": "full"}
+    trainer = set_up(tiny_scene, tmp_path, rest, steps=2)
     assert trainer.pipeline.model.head.config.latent_dim == 1
     held = trainer.optimizers.optimizers["field"].param_groups[0]["params"]
     assert [id(one) for one in held] == [id(one) for one in trainer.pipeline.model.head.parameters()]
@@ -273,10 +261,10 @@ def test_decisions_are_made_by_views_that_nothing_has_trained_on(tiny_scene, tmp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("densification", ["original", "mcmc"])
+@pytest.mark.parametrize("densification", [ORIGINAL, MCMC], ids=["original", "mcmc"])
 def test_densification_goes_on(densification, tiny_scene, tmp_path):
-    config = Path(train(words(tiny_scene, tmp_path, **{"--pipeline.model.densification": densification})).config_path)
-    state = checkpoint(config)["pipeline"]
+    config = trained(words(tiny_scene, tmp_path, densification))
+    state = checkpoint_of(config)["pipeline"]
     latents = state["_model.gauss_params.latents"]
     assert latents.shape[1] == 1 and len(latents) == len(state["_model.gauss_params.means"]) != 300
 
@@ -292,8 +280,8 @@ def test_with_diffuse_splats(tiny_scene, tmp_path):
         "--pipeline.model.diffuse.settle": 4,
         "--pipeline.model.diffuse.budget": 0.5,
     }
-    config = Path(train(words(tiny_scene, tmp_path, **diffuse)).config_path)
-    extra = checkpoint(config)["pipeline"]
+    config = trained(words(tiny_scene, tmp_path, diffuse))
+    extra = checkpoint_of(config)["pipeline"]
     assert extra["_model._extra_state"]["capacity"]["head"]["latent_dim"] == 1
     assert extra["_model._extra_state"]["strategy"][DIFFUSE].any()
     assert extra["_extra_state"]["sampling"]["views_aside"] == []  # the last look was after step 14
@@ -317,7 +305,7 @@ def test_nothing_dropped_is_nothing_changed(tiny_scene, tmp_path, monkeypatch):
 
 
 def test_full_is_full(tiny_scene, tmp_path):
-    trainer = set_up(tiny_scene, tmp_path, steps=12, **{"--pipeline.model.capacity": "full"})
+    trainer = set_up(tiny_scene, tmp_path, {"--pipeline.model.capacity": "full"}, steps=12)
     assert trainer.pipeline.datamanager.views_aside == []
     trainer.train()
     assert trainer.pipeline.model.capacity_found is None
@@ -336,7 +324,7 @@ def test_full_is_full(tiny_scene, tmp_path):
 )
 def test_what_cannot_be_done_is_refused_before_training(more, says, tiny_scene, tmp_path):
     with pytest.raises(InputError, match=says):
-        set_up(tiny_scene, tmp_path, **more)
+        set_up(tiny_scene, tmp_path, more)
 
 
 def test_a_head_without_parts_is_refused(tiny_scene, tmp_path):
@@ -354,11 +342,9 @@ def test_several_devices_are_refused(tiny_scene, tmp_path):
 
 
 def test_a_training_that_has_seen_all_views_is_refused(tiny_scene, tmp_path):
-    full = Path(
-        train(words(tiny_scene, tmp_path / "full", steps=2, **{"--pipeline.model.capacity": "full"})).config_path
-    )
+    full = trained(words(tiny_scene, tmp_path / "full", {"--pipeline.model.capacity": "full"}, steps=2))
     with pytest.raises(InputError, match="has trained on all views for 2 steps"):
-        set_up(tiny_scene, tmp_path / "auto", **{"--load-dir": full.parent / "nerfstudio_models"})
+        set_up(tiny_scene, tmp_path / "auto", {"--load-dir": models_of(full)})
 
 
 def test_an_end_before_the_decision_is_told(tiny_scene, tmp_path, capsys):
