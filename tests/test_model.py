@@ -56,6 +56,33 @@ def test_outputs_are_images(build):
     assert all(torch.isfinite(value).all() for value in outputs.values())
 
 
+@pytest.mark.parametrize("training", [True, False])
+def test_background_shows_where_splats_let_it(build, training):
+    """Over a colour: what black gives, and the colour times what is not covered. One rounding each of three terms < 1."""
+    model = build().model.train(training)
+    pose = torch.eye(3, 4)[None] + torch.tensor([0.0, 0.0, 0.0, 1.0])
+    view = model.look(Cameras(pose, fx=40.0, fy=40.0, cx=24.0, cy=18.0, width=48, height=36))
+    appearance = model.head(view.splats, view.visible, view.center)
+    color = torch.tensor([0.9, 0.5, 0.1])
+    black, over = (model.paint(view, appearance, behind)[0] for behind in (torch.zeros(3), color))
+    assert 0.01 < over["accumulation"].mean() < 0.99
+    expected = (black["rgb"] + (1 - over["accumulation"]) * color).clamp(0, 1)
+    assert_close(over["rgb"], expected, rtol=0, atol=3 * 2.0**-23)
+
+
+def test_densification_over_asks_for_no_more_gradients(build):
+    """Gradients on the screen are kept until the last refinement, and no longer."""
+    pipeline = build("nrfgs", "--pipeline.model.stop-split-at", 5, "--pipeline.model.use-absgrad", True)
+    model = pipeline.model.train()
+    camera, batch = pipeline.datamanager.next_train(0)
+    for step in (4, 5):
+        begin_step(model, step)
+        outputs = model.get_outputs(camera)
+        sum(model.get_loss_dict(outputs, batch).values()).backward()
+        means2d = model.info["means2d"]
+        assert means2d.retains_grad == hasattr(means2d, "absgrad") == (step < 5)
+
+
 def test_a_field_that_adds_nothing_renders_its_base_colour(build):
     pipeline = build()
     pipeline.eval()
