@@ -58,7 +58,7 @@ def test_outputs_are_images(build):
 
 @pytest.mark.parametrize("training", [True, False])
 def test_background_shows_where_splats_let_it(build, training):
-    """Over a colour: what black gives, and the colour times what is not covered. One rounding each of three terms < 1."""
+    """Over a colour: what black gives, and the colour times what is not covered. Three roundings of terms below 1."""
     model = build().model.train(training)
     pose = torch.eye(3, 4)[None] + torch.tensor([0.0, 0.0, 0.0, 1.0])
     view = model.look(Cameras(pose, fx=40.0, fy=40.0, cx=24.0, cy=18.0, width=48, height=36))
