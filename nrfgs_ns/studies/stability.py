@@ -229,8 +229,8 @@ CATALOGUE = [
         "low branch, high branch",
         "finite while |z||W|^2 < 1e38",
         "zero output layers: residual exactly 0",
-        "beyond: saturated, or NaN (infinity minus infinity, by the order in which a machine adds); then the guard stops "
-        "the training before the optimisers step and names the learning rate",
+        "beyond: saturated, or NaN (infinity minus infinity, by the order in which a machine adds); then the guard "
+        "stops the training before the optimisers step and names the learning rate",
         (
             f"{HEAD}::test_the_field_agrees_with_float64",
             f"{HEAD}::test_latents_and_weights_together",
