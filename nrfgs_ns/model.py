@@ -99,7 +99,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     config: NrfgsModelConfig
     capacity_found: dict[str, Any] | None = None
     """what capacity "auto" has decided: "step", "head" (options of the head that it was left with) and "dropped" """
-    residuals_cost: bool = False
+    charges_residuals: bool = False
     """whether the residuals' length is part of the training's loss now"""
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
@@ -216,7 +216,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params)
-            if self.residuals_cost:
+            if self.charges_residuals:
                 losses["residual"] = self.config.residual_cost * self.residual_length
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard

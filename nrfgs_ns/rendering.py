@@ -122,7 +122,7 @@ class Rendering:
         appearance = self.head(view.splats, view.visible, view.center)
         outputs, self.info = self.paint(view, appearance)
         if self.training:
-            if self.residuals_cost:
+            if self.charges_residuals:
                 self.residual_length = mean_length(self.head.base_appearance(view.splats, view.visible), appearance)
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._correct_colors(outputs, camera)

@@ -129,11 +129,13 @@ def deciding_callbacks(model, attributes: TrainingCallbackAttributes) -> list[Tr
     if not 0.0 <= cost < math.inf:
         raise InputError(f"pipeline.model.residual-cost is {cost}; it must be zero or positive.")
 
-    def charge(step: int) -> None:
-        model.residuals_cost = cost > 0.0 and any(not looker.is_done(step) for looker in lookers)
+    if cost > 0.0 and lookers:
 
-    charge(start - 1)
-    calls.append(charge)
+        def charge(step: int) -> None:
+            model.charges_residuals = any(not looker.is_done(step) for looker in lookers)
+
+        charge(start - 1)
+        calls.append(charge)
     calls.append(ViewsAside(data, deciders, start).after_step)
     for decider in deciders if trainer is not None else ():
         if not decider.is_done(start - 1):

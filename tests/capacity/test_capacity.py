@@ -14,8 +14,9 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.reduce import Field, latent_basis, with_rank, with_unit_axes
 from nrfgs_ns.capacity.config import CapacitySearch
+from nrfgs_ns.capacity.install import install
 from nrfgs_ns.capacity.search import decide
-from nrfgs_ns.capacity.settle import keep_the_mean, lesson_order, settle
+from nrfgs_ns.capacity.settle import BASE, FIELD, keep_the_mean, lesson_order, settle
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export import Export, read_splats
 from nrfgs_ns.model import NrfgsModel
@@ -100,13 +101,20 @@ def test_a_scene_that_changes_with_the_view_keeps_what_shows_it(loud):
         assert torch.equal(model.state_dict()[name], value), name
 
 
-def test_a_scene_that_looks_the_same_from_everywhere_keeps_nothing(loud):
+@pytest.fixture
+def quiet(loud):
+    """A scene that looks the same from everywhere; the field says little, and all of it is wrong."""
     model, data, optimizers = loud
-    with torch.no_grad():  # the field says little, and all of it is wrong
+    with torch.no_grad():
         for branch in (model.head.low, model.head.high):
             branch[2].weight.mul_(0.1)
             branch[2].bias.zero_()
     photograph(model, data, lambda view: model.head.base_appearance(view.splats, view.visible))
+    return model, data, optimizers
+
+
+def test_a_scene_that_looks_the_same_from_everywhere_keeps_nothing(quiet):
+    model, data, optimizers = quiet
     decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=24))
     assert decision.dropped[:3] == ["high branch", "opacity residual", "distance"]
     trials = {trial.part: trial for trial in decision.trials}
@@ -115,6 +123,15 @@ def test_a_scene_that_looks_the_same_from_everywhere_keeps_nothing(loud):
     assert head.high is None and not head.config.opacity_residual and not head.config.use_distance
     assert splats["latents"].shape[1] == head.config.latent_dim
     assert decision.trials[-1].bytes < decision.trials[0].bytes
+
+
+def test_what_is_gained_by_dropping_parts_is_not_spent_on_latents(quiet):
+    """The field is better without what was wrong; latents are cut from that better field, and measured against it."""
+    model, data, optimizers = quiet
+    trials = decide(model, data, optimizers.optimizers, CapacitySearch(settle=24, tolerance_db=20.0)).trials
+    *_, last_part, latents = trials
+    assert latents.part.startswith("latents") and last_part.dropped and last_part.psnr > trials[0].psnr
+    assert latents.loss_db == pytest.approx(last_part.psnr - latents.psnr)
 
 
 @pytest.mark.parametrize("part", ["high branch", "opacity residual"])
@@ -163,6 +180,58 @@ def test_settling_learns_from_the_views_given_and_from_no_other(loud, monkeypatc
     assert not settled.field.splats["means"].equal(means) and model.gauss_params["means"].equal(means)
     for name in ("field", "latents", "features_dc", "opacities"):
         assert all(state["step"] == 24 for state in settled.moments[name].values())
+
+
+def test_what_settles_is_the_mean_over_the_last_half_geometry_included(loud, monkeypatch):
+    model, data, optimizers = loud
+    steps: dict[int, list[torch.Tensor]] = {}
+
+    class Watched(torch.optim.Adam):
+        def step(self):
+            super().step()
+            value = self.param_groups[0]["params"][0].detach().clone()
+            steps.setdefault(id(self), []).append(value)
+
+    monkeypatch.setattr(torch.optim, "Adam", Watched)
+    for name in ("means", "scales", "quats"):
+        optimizers.optimizers[name].param_groups[0]["lr"] = 1e-3
+    field = Field(model.head, {name: value.detach() for name, value in model.gauss_params.items()})
+    settled = settle(model, field, [data.train_view(index) for index in range(4)], 5, optimizers.optimizers)
+    shared, *tables = steps.values()  # in the order of the groups
+    results = [next(settled.field.head.parameters()), *(settled.field.splats[name] for name in (*BASE, "latents"))]
+    assert len(tables) == 6
+    for seen, result in zip([shared, *tables], results, strict=True):
+        assert len(seen) == 5 and not seen[0].equal(seen[-1])  # all learn
+        assert_close(result.detach(), torch.stack(seen[2:]).mean(0), rtol=1e-6, atol=1e-7)
+
+
+def test_adam_goes_on_but_for_what_has_another_shape(loud):
+    """One step of settling after two of training: the splats' base has made three, shared weights and latents one."""
+    model, data, optimizers = loud
+    for name in ("features_dc", "latents"):
+        for _ in range(2):
+            model.gauss_params[name].grad = torch.ones_like(model.gauss_params[name])
+            optimizers.optimizers[name].step()
+    field = Field(model.head, {name: value.detach() for name, value in model.gauss_params.items()})
+    views = [data.train_view(0)]
+    fresh = settle(model, field, views, 1, optimizers.optimizers, FIELD).moments
+    assert {name: {int(state["step"]) for state in fresh[name].values()} for name in ("features_dc", "latents")} == {
+        "features_dc": {3},
+        "latents": {1},
+    }
+    assert optimizers.optimizers["features_dc"].state[model.gauss_params["features_dc"]]["step"] == 2, "left as it was"
+
+
+def test_what_has_settled_is_what_trains_on(loud):
+    model, data, optimizers = loud
+    for name in ("means", "scales", "quats"):
+        optimizers.optimizers[name].param_groups[0]["lr"] = 1e-3
+    before = {name: model.gauss_params[name].detach().clone() for name in BASE}
+    decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=2, tolerance_db=100.0))
+    install(model, optimizers, decision.chosen)
+    for name in (*BASE, "latents"):
+        assert model.gauss_params[name].equal(decision.chosen.field.splats[name]), name
+    assert all(not model.gauss_params[name].equal(value) for name, value in before.items())
 
 
 def test_unit_axes_are_the_same_components(loud):
