@@ -37,6 +37,9 @@ def entrypoint() -> None:
         verb.main()
     except (InputError, FileExistsError) as error:
         sys.exit(f"nrfgs: {error}")
+    except KeyboardInterrupt:
+        print("nrfgs: stopped", file=sys.stderr)
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ their residual again, without the part that had moved, and train with it; then i
 After the last trial the training goes on with what was decided.
 
 Nothing tells a field to be silent where the base and the geometry could say the same: what is learnt first by either is
-learnt by both, and a look afterwards finds residuals that do much and are not needed. So, until the last look, they
-can be made to cost something in the training's loss, their mean length over the visible splats (`residual_cost` of the
-model). On captures that has cost more than it gave, so by default it is 0.
+learnt by both, and a look afterwards finds residuals that do much and are not needed. So, from the end of densification
+until the last look, they can be made to cost something in the training's loss, their mean length over the visible
+splats (`residual_cost` of the model; `capacity/charge.py`). By default it is 0.
 
 What pays is measured as capacity "auto" measures it. Some training views are set aside until the last look. The splats
 as they are have to be better on them, by more than the budget, than those without the residuals in question, after both
@@ -101,6 +101,8 @@ class DiffuseSchedule:
         InputError: an option is out of range.
     """
 
+    stretched = False
+
     def __init__(self, config: DiffuseSplats, data, optimizers: Mapping[str, Optimizer], folder: Path | None = None):
         self.config, self.data, self.optimizers, self.folder = config, data, optimizers, folder
         self.option = "pipeline.model.diffuse without a threshold"
@@ -115,7 +117,7 @@ class DiffuseSchedule:
             )
         if config.threshold is not None and not config.threshold > 0:
             raise InputError(f"{prefix}.threshold is {config.threshold}; it must be positive.")
-        if config.budget < 0:
+        if not config.budget >= 0:
             raise InputError(f"{prefix}.budget is {config.budget}; it must be zero or positive.")
         for name in ("views", "settle"):
             value = getattr(config, name)
@@ -145,7 +147,8 @@ class DiffuseSchedule:
             "budget_db": self.config.budget,
             "tried": [look._asdict() for look in looks],
         }
-        add_to_report(self.folder, {"looks": [*read_report(self.folder).get("looks", []), look]})
+        earlier = [one for one in read_report(self.folder).get("looks", []) if one["step"] < step]
+        add_to_report(self.folder, {"looks": [*earlier, look]})
 
     def after_step(self, model, step: int) -> None:
         """Look at the splats, or begin a trial, if it is time."""

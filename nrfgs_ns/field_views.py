@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import torch
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.reduce import Field, LatentBasis, latent_basis, with_diffuse, with_rank
 from nrfgs_ns.metrics import psnr
 from nrfgs_ns.residuals import Residuals
@@ -151,8 +150,7 @@ def slim(
         threshold = largest_threshold(field, seen, views, lowest_psnr + (1 - SHARE_FOR_RESIDUALS) * spare, on_trial)
     if threshold > 0:
         field = dropped(field, seen, threshold)
-    diffuse = field.splats.get(DIFFUSE)
-    basis = latent_basis(field, seen.weight if diffuse is None else seen.weight * ~diffuse)
+    basis = latent_basis(field, seen.weight)
     size = field.head.config.latent_dim
     if rank is None:
         rank = smallest_rank(field, basis, views, lowest_psnr, on_trial)

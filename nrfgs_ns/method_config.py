@@ -26,6 +26,8 @@ from nrfgs_ns.pipeline import NrfgsPipelineConfig
 from nrfgs_ns.trainer import NrfgsTrainerConfig
 
 STEPS = 30_000
+AVERAGED = 200
+"""Last steps of the presets, whose mean is the trained model."""
 
 
 def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str, Any]:
@@ -103,6 +105,7 @@ nrfgs_fast = preset(
     model={},
     max_num_iterations=10_000,
     schedule_steps=STEPS,
+    average_steps=AVERAGED,
 )
 
 nrfgs_best = preset(
@@ -110,6 +113,7 @@ nrfgs_best = preset(
     nrfgs,
     "nrfgs with the densification of 3DGS: 1.7 times as many splats, 0.7 dB more on bonsai.",
     model={"densification": "original"},
+    average_steps=AVERAGED,
 )
 
 nrfgs_sh = method(

@@ -22,6 +22,7 @@ from torch.nn import Parameter
 
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.capacity.charge import ResidualCharge
 from nrfgs_ns.capacity.config import Capacity, CapacitySearch
 from nrfgs_ns.capacity.install import shape_head
 from nrfgs_ns.capacity.schedule import deciding_callbacks
@@ -80,9 +81,9 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     capacity_search: CapacitySearch = field(default_factory=CapacitySearch)
     """capacity auto: when and how it is decided"""
     residual_cost: float = 0.0
-    """capacity auto and diffuse splats: weight, until the last decision, of the residuals' mean length in the loss.
-    What does not pay for it falls silent, and colour, opacity and geometry do its work, with more splats. 0.05 did on a
-    matte procedural scene what nothing else did, and cost captures more than it gave"""
+    """capacity auto and diffuse splats: weight of the residuals' mean length in the loss, from the end of densification
+    until the last decision. What does not pay for it falls silent, and colour, opacity and geometry do its work. 0.05
+    did on a matte procedural scene what nothing else did"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -99,8 +100,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     config: NrfgsModelConfig
     capacity_found: dict[str, Any] | None = None
     """what capacity "auto" has decided: "step", "head" (options of the head that it was left with) and "dropped" """
-    charges_residuals: bool = False
-    """whether the residuals' length is part of the training's loss now"""
+    residual_charge: ResidualCharge | None = None
+    """when the residuals' length is part of the training's loss; None: never"""
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
 
@@ -196,6 +197,11 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     def schedule_step(self) -> int:
         """The step that the head and the resolution are scheduled by."""
         return self.step if self.pace is None else int(self.pace.position)
+
+    @property
+    def charges_residuals(self) -> bool:
+        """Whether the residuals' length is part of the training's loss in this step."""
+        return self.residual_charge is not None and self.residual_charge.is_due(self.step)
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step

@@ -14,6 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torchvision.utils import save_image
 
+from nrfgs_ns.averaging import ParameterMean
 from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.compact.decode import model_state
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
@@ -36,7 +37,7 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
     sharding: ShardingConfig = field(default_factory=ShardingConfig)
     """with several devices: how the splats are spread over them, and what a step counts"""
     compact: Path | None = None
-    """a file of `nrfgs export compact` that the model is read from instead of the checkpoint"""
+    """a file of `nrfgs export compact` that the model is read from instead of the checkpoint; not for a training"""
 
 
 class NrfgsPipeline(VanillaPipeline):
@@ -50,9 +51,18 @@ class NrfgsPipeline(VanillaPipeline):
     config: NrfgsPipelineConfig
     images_per_step: int = 1
     """images for which a step counts in the schedules (`distributed.schedules`)"""
+    parameter_mean: ParameterMean | None = None
+    """the trainer's, over the last steps; here because a checkpoint has the pipeline's state. None: there is none"""
+    loaded_mean: dict[str, Any] | None = None
+    """what the checkpoint that was loaded says of such a mean, until the trainer takes it"""
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
         allow_nerfstudio_checkpoints()
+        if test_mode == "val" and config.compact is not None:
+            raise InputError(
+                f"pipeline.compact is {config.compact}, but a training does not begin with a compact file. Leave it "
+                "out; --load-dir goes on from a checkpoint."
+            )
         self.steps_per_log = 1  # the trainer knows better
         super().__init__(config, device, test_mode, **kwargs)
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
@@ -136,16 +146,20 @@ class NrfgsPipeline(VanillaPipeline):
         return result
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What decides the rest of a training beside its parameters: random generators and the order of the cameras.
+        """What decides the rest of a training beside its parameters: random generators, the order of the cameras, and
+        the mean over its last steps, if that has begun.
 
         Plain numbers, strings and tensors only, which torch reads without trusting the file.
         """
-        return {
+        state = {
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
             "python_rng": json.dumps(random.getstate()),
             "sampling": self.datamanager.sampling_state(),
         }
+        if self.parameter_mean is not None and self.parameter_mean.count > 0:
+            state["parameter_mean"] = self.parameter_mean.state()
+        return state
 
     def check_schedules(self, state: dict[str, Any]) -> None:
         """Raise InputError where a training goes on whose step numbers mean another number of images."""
@@ -168,6 +182,7 @@ class NrfgsPipeline(VanillaPipeline):
         version, numbers, gauss_next = json.loads(state["python_rng"])
         random.setstate((version, tuple(numbers), gauss_next))
         self.datamanager.load_sampling_state(state["sampling"])
+        self.loaded_mean = state.get("parameter_mean")
 
 
 def _mean(values: list[float]) -> float | None:

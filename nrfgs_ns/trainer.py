@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's trainer, with checkpoints that are whole or not there, a guard over every number, and a time budget."""
+"""Nerfstudio's trainer, with checkpoints that are whole or not there, a guard over every number, a time budget, and a
+mean over the last steps."""
 
 import gc
 import math
@@ -8,15 +9,17 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_eval_enabled
 from nerfstudio.utils.misc import step_check
 
+from nrfgs_ns.averaging import ParameterMean, tell, tell_why_not
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.optimizers import in_world_units
@@ -36,6 +39,9 @@ class NrfgsTrainerConfig(TrainerConfig):
     schedule_steps: int | None = None
     """steps of the training that learning rates, resolution, harmonics and densification are laid out for; they are
     stretched to the steps that are made. None: not stretched, or with a time budget laid out for max_num_iterations"""
+    average_steps: int = 0
+    """the trained model is the mean of its parameters over the last so many steps, or over those since splats or the
+    field last changed if they are fewer; with a time budget about so many. 0: the last step's numbers"""
 
     def setup(self, **kwargs) -> "NrfgsTrainer":
         """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
@@ -49,6 +55,10 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} is {value}; it must be positive.")
             if value is not None and kwargs.get("world_size", 1) > 1:
                 raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
+        if self.average_steps < 0:
+            raise InputError(f"average_steps is {self.average_steps}; it must be zero or positive.")
+        if self.average_steps > 0 and kwargs.get("world_size", 1) > 1:
+            raise InputError("average_steps is for one device. Set it to 0, or use --machine.num-devices 1.")
         if kwargs.get("world_size", 1) == 1:
             return super().setup(**kwargs)
         from nrfgs_ns.distributed.trainer import ShardedTrainer
@@ -71,9 +81,15 @@ class NrfgsTrainer(Trainer):
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
 
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        super().setup(test_mode)
+        if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
+            self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
+
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard (see `nrfgs_ns.guard`)."""
         self.guard = Guard(self.pipeline)
+        self.pipeline.parameter_mean = ParameterMean() if self.config.average_steps > 0 else None
         every = self.pipeline.steps_per_log = self.config.logging.steps_per_log
         groups = self.pipeline.get_param_groups()
         optimizers = WatchedOptimizers(self.optimizer_configs(), groups, self.guard, every)
@@ -90,7 +106,7 @@ class NrfgsTrainer(Trainer):
         return None if self.config.schedule_steps is None else Pace(length)
 
     def _load_checkpoint(self) -> None:
-        """Nerfstudio's; and the pace goes on from where it was.
+        """Nerfstudio's; and the pace and the mean go on from where they were.
 
         Raises:
             InputError: the checkpoint's schedules were stretched, and this training's are not.
@@ -106,6 +122,9 @@ class NrfgsTrainer(Trainer):
             rate = (self.pace.length - self.pace.position) / max(self.config.max_num_iterations, 1)
             if not math.isclose(rate, self.pace.rate, rel_tol=1e-9):  # the same to the last bit, if it is the same
                 self.pace.rate = max(rate, 1e-9)
+        loaded, self.pipeline.loaded_mean = self.pipeline.loaded_mean, None
+        if self.pipeline.parameter_mean is not None and loaded is not None:
+            self.pipeline.parameter_mean.load_state(loaded, self.pipeline.model, self.optimizers.optimizers)
 
     def optimizer_configs(self) -> dict[str, Any]:
         """The configured optimisers; the means', whose learning rate is a length, in world units."""
@@ -170,10 +189,53 @@ class NrfgsTrainer(Trainer):
             writer.GLOBAL_BUFFER["max_iter"] = step + 1 + self.pace.steps_left  # what the terminal counts towards
         return result
 
+    @property
+    def last_step(self) -> int:
+        """The last step of this training; with a time budget, a number beyond it."""
+        return self._start_step + self.config.max_num_iterations - 1
+
+    def _average(self, step: int) -> None:
+        """Take the step's numbers into the mean, if it is one of the last `average_steps`."""
+        mean, window = self.pipeline.parameter_mean, self.config.average_steps
+        if isinstance(self.pace, TimedPace):
+            left = self.pace.steps_left  # as things look now; to within a step at a constant pace
+            is_of_earlier_steps = left >= 2 * window  # once begun it goes on, unless the end was far from foreseen
+        else:
+            left = self.last_step - step
+            is_of_earlier_steps = mean.count >= window - left  # of a training that was to end before this one does
+        if is_of_earlier_steps:
+            mean.forget()
+        if left < window or mean.count > 0:
+            mean.add(self.pipeline.model, self.optimizers.optimizers)
+
     def _after_train(self) -> None:
-        """Nerfstudio's, whose step number is one too many when it stopped early."""
+        """Nerfstudio's, whose step number is one too many when it stopped early; the model is the mean from here on."""
         self.step = getattr(self, "_last_step", self.step)
+        timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
+        if self.config.average_steps > 0 and self.stop_training and not timed_out:
+            tell_why_not(self.config.average_steps, "the training was stopped before its last step")
+        else:
+            self.take_the_mean()
         super()._after_train()
+
+    def take_the_mean(self) -> None:
+        """Let the model be the mean over the last steps, if one was asked for, and say so; or say why it is not.
+
+        Raises:
+            TrainingStopped: the last step met a number that is not finite; what is good has been written.
+        """
+        mean, window = self.pipeline.parameter_mean, self.config.average_steps
+        if window == 0:
+            return
+        with self._last_good_state_on_disk():
+            self.guard.settle()
+        if mean.count == 0:
+            late = isinstance(self.pace, TimedPace) and self.step >= self._start_step
+            tell_why_not(window, "the time was up sooner than foreseen" if late else "no step was made")
+        else:
+            tell(mean.count, window, mean.began_anew)
+            with self.train_lock:
+                mean.install()
 
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint of finite numbers.

@@ -14,6 +14,7 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT, mean_length
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.reduce import Field
+from nrfgs_ns.capacity.report import read_report
 from nrfgs_ns.diffuse_splats import DiffuseSchedule, DiffuseSplats, give_back, make_diffuse, schedule_for
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.field_views import FieldViews, dropped
@@ -218,21 +219,64 @@ def whole(tiny_scene, tmp_path_factory):
     return trained(words(tiny_scene, tmp_path_factory.mktemp("whole")))
 
 
-@pytest.mark.parametrize("start", [0, 23])
-def test_residuals_cost_until_the_last_look(start, tiny_scene, tmp_path):
-    args = words(tiny_scene, tmp_path, {"--pipeline.model.residual-cost": 0.05})
-    trainer = parse(args).setup(local_rank=0, world_size=1)
+COSTLY = {"--pipeline.model.residual-cost": 0.05, "--pipeline.model.diffuse.stop": 20}
+"""The last look is after step 22."""
+
+
+@pytest.mark.parametrize(
+    "more, charged",
+    [
+        ({"--pipeline.model.stop-split-at": 16}, range(13, 23)),  # splits after step 12, and not after 16 any more
+        ({"--pipeline.model.stop-split-at": 0}, range(23)),
+        ({"--pipeline.model.warmup-length": 240}, range(23)),
+        ({}, range(21, 23)),  # splits after step 20, and would after the training's last one
+        ({"--pipeline.model.stop-split-at": 16, "--schedule-steps": 48}, range(23)),  # step 8: before the first
+        ({"--pipeline.model.stop-split-at": 9, "--schedule-steps": 12}, range(17, 23)),  # step 18
+        ({"--pipeline.model.residual-cost": 0.0, "--pipeline.model.stop-split-at": 0}, range(0)),
+    ],
+)
+def test_residuals_cost_from_the_end_of_densification_until_the_last_look(more, charged, tiny_scene, tmp_path):
+    """While splats are added nothing is charged: gradients on the screen would stay large, and more splats split."""
+    trainer = parse(words(tiny_scene, tmp_path, COSTLY, more)).setup(local_rank=0, world_size=1)
     trainer.setup()
-    trainer._start_step, model = start, trainer.pipeline.model
+    assert charged_steps(trainer, 0) == list(charged)
+
+
+@pytest.mark.parametrize("start, charged", [(8, range(13, 23)), (15, range(15, 23)), (23, range(0))])
+def test_a_continued_training_charges_as_the_unbroken_one(start, charged, tiny_scene, tmp_path):
+    line = words(tiny_scene, tmp_path, COSTLY, {"--pipeline.model.stop-split-at": 16}, steps=24 - start)
+    trainer = parse(line).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer._start_step = start
     attributes = TrainingCallbackAttributes(trainer.optimizers, trainer.grad_scaler, trainer.pipeline, trainer)
-    model.config.diffuse.stop = 12  # one more look, after step 14
-    charge = model.get_training_callbacks(attributes)[-2]
-    model.train()
-    camera, batch = trainer.pipeline.datamanager.train_view(0)
-    for step in range(start, 26):
-        losses = model.get_loss_dict(model.get_outputs(camera), batch)
-        assert ("residual" in losses) == (step <= 14), step  # with the cost of the step that the look follows
-        charge.func(step)
+    trainer.pipeline.model.get_training_callbacks(attributes)
+    assert charged_steps(trainer, start) == list(charged)
+
+
+def charged_steps(trainer, start: int) -> list[int]:
+    """The steps from `start` to 23 in whose loss residuals are; nothing that comes after a step is done."""
+    trainer.pipeline.train()
+    steps = []
+    for step in range(start, 24):
+        trainer.pipeline.model.step = step
+        _, losses, _ = trainer.train_iteration(step)
+        steps += [step] if "residual" in losses else []
+    return steps
+
+
+@pytest.mark.parametrize(
+    "more, told",
+    [
+        ({"--pipeline.model.stop-split-at": 16}, False),
+        ({"--pipeline.model.stop-split-at": 28}, True),
+        ({"--pipeline.model.diffuse.start": None}, True),
+        ({"--pipeline.model.diffuse.start": None, "--pipeline.model.residual-cost": 0.0}, False),
+    ],
+)
+def test_a_cost_that_is_never_charged_is_told(more, told, tiny_scene, tmp_path, capsys):
+    line = words(tiny_scene, tmp_path, COSTLY, {"--pipeline.model.stop-split-at": 16}, more, steps=40)
+    parse(line).setup(local_rank=0, world_size=1).setup()
+    assert ("residual-cost has no effect" in " ".join(capsys.readouterr().out.split())) == told
 
 
 def test_what_a_residual_costs(untrained):
@@ -270,6 +314,24 @@ def strategy_of(config: Path) -> dict:
     return checkpoint_of(config)["pipeline"]["_model._extra_state"]["strategy"]
 
 
+@pytest.mark.parametrize("more, last", [({}, 23), ({"--schedule-steps": 6000}, 23)])
+def test_an_end_before_the_last_look_is_told(more, last, tiny_scene, tmp_path, capsys):
+    """Looks are made at steps of the training, whatever its schedules are stretched to."""
+    beyond = {"--pipeline.model.diffuse.start": 2000, "--pipeline.model.diffuse.threshold": None}
+    parse(words(tiny_scene, tmp_path, beyond, more)).setup(local_rank=0, world_size=1).setup()
+    assert f"this training ends at step {last}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_new_training_begins_a_new_report(tiny_scene, tmp_path):
+    line = words(tiny_scene, tmp_path, {"--timestamp": "again", "--pipeline.model.diffuse.stop": 5}, steps=8)
+    for _ in range(2):
+        config = trained(line)
+        assert [look["step"] for look in read_report(config.parent)["looks"]] == [6]
+    off = parse([*line, "--pipeline.model.diffuse.start", "None"]).setup(local_rank=0, world_size=1)
+    off.setup()
+    assert read_report(config.parent) == {}
+
+
 def test_off_is_off(tiny_scene, tmp_path):
     config = parse(words(tiny_scene, tmp_path, {"--pipeline.model.diffuse.start": "None"}))
     assert config.pipeline.model.diffuse.start is None
@@ -291,6 +353,7 @@ def test_off_is_off(tiny_scene, tmp_path):
         ("nrfgs", {"--pipeline.model.diffuse.trial": 8}, "trial is 8 steps"),
         ("nrfgs", {"--pipeline.model.diffuse.threshold": 0.0}, "threshold is 0.0"),
         ("nrfgs", {"--pipeline.model.diffuse.budget": -1}, "budget is -1"),
+        ("nrfgs", {"--pipeline.model.diffuse.budget": "nan"}, "budget is nan"),
         ("nrfgs", {"--pipeline.model.diffuse.views": 0}, "views is 0"),
         ("nrfgs", {"--pipeline.model.diffuse.settle": 0}, "settle is 0"),
         ("nrfgs", {"--pipeline.model.residual-cost": -1}, "residual-cost is -1"),

@@ -10,10 +10,11 @@ import tyro
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import base_colors
-from nrfgs_ns.appearance.reduce import Field, latent_basis, with_rank
+from nrfgs_ns.appearance.reduce import Field, latent_basis, with_diffuse, with_rank
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.field_views import FieldViews, dropped, slim
 from nrfgs_ns.residuals import EIGHT_BIT_STEP, look_over
+from nrfgs_ns.studies.inspect.ablate import changes, row, together
 from nrfgs_ns.studies.inspect.report import advice
 from nrfgs_ns.studies.inspect.verb import Inspect
 from nrfgs_ns.studies.run import parse, train
@@ -151,9 +152,31 @@ def test_the_verb(tiny_scene, tmp_path, capsys):
         (["--load-config", str(tmp_path / "no.yml")], "no such file"),
         (["--load-config", str(config), "--views", "0"], "at least 1"),
         (["--load-config", str(config), "--budget", "-1"], "zero or positive"),
+        (["--load-config", str(config), "--budget", "nan"], "zero or positive"),
     ):
         with pytest.raises(InputError, match=says):
             tyro.cli(Inspect, args=words).main()
+
+
+def test_latents_of_diffuse_splats_do_not_count(loud, field, seen):
+    """Nobody sees them. Latents of the others lie on a line: one number is enough, whatever those of the rest are."""
+    diffuse = torch.arange(len(field.splats["means"])) % 2 == 0
+    splats = dict(field.splats)
+    line = torch.linspace(-3.0, 3.0, len(diffuse))[:, None] * torch.ones(6)
+    splats["latents"] = torch.where(diffuse[:, None], 9.0 * splats["latents"], line)
+    some = with_diffuse(Field(field.head, splats), diffuse, seen.features_dc, seen.opacities)
+    views = FieldViews(loud.model, loud.datamanager.fixed_indices_eval_dataloader)
+    basis = latent_basis(some, seen.weight)
+    (rank_1,) = [change for name, _, _, change in changes(some, seen, basis) if name == "latent rank 1"]
+    assert views.psnr(some) - views.psnr(rank_1(some)) == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
+
+
+def test_splats_that_are_diffuse_already_are_not_left_out_again(loud, field, seen):
+    every = dropped(field, seen, float("inf"))
+    views = FieldViews(loud.model, loud.datamanager.fixed_indices_eval_dataloader)
+    rows = [row("nothing", "full", every, views, None)]
+    _, left_out = together(every, rows, seen, views, 0.05, lambda _: None)
+    assert left_out == []
 
 
 def test_other_heads_are_refused(tiny_scene, tmp_path):
@@ -165,10 +188,11 @@ def test_other_heads_are_refused(tiny_scene, tmp_path):
 
 def test_advice_names_what_to_leave_out():
     def row(**changes):
-        return {"bytes": 100, "head_seconds": 1.0, "loss_db": 0.0, "threshold": None} | changes
+        return {"bytes": 100, "head_seconds": 1.0, "loss_db": 0.0, "threshold": None, "diffuse": 0.0} | changes
 
     rows = [row(), row(threshold=float("inf"), loss_db=0.7)]
     assert "is worth 0.70 dB" in advice(rows, row(), [], 0.05) and "Every part pays" in advice(rows, row(), [], 0.05)
+    assert "No splat of this model has a residual" in advice([row(diffuse=1.0), *rows[1:]], row(), [], 0.05)
     said = advice(rows, row(bytes=40, head_seconds=0.7, loss_db=0.02), ["distance", "latents beyond rank 4"], 0.05)
     assert (
         "distance, latents beyond rank 4 cost 0.020 dB and save 60 % of the bytes and 30 % of the head's time" in said

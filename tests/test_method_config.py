@@ -90,8 +90,8 @@ def test_everything_else_is_splatfactos(name):
 @pytest.mark.parametrize(
     "name, differs",
     [
-        ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000}),
-        ("nrfgs-best", {"pipeline.model.densification": "original"}),
+        ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200}),
+        ("nrfgs-best", {"average_steps": 200, "pipeline.model.densification": "original"}),
     ],
 )
 def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):

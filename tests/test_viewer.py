@@ -15,21 +15,26 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.scripts.exporter import ExportGaussianSplat
 from nerfstudio.scripts.train import _set_random_seed
+from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from short_trainings import command_line, trained
 from torch.testing import assert_close
 from viser.transforms import SO3
 
 import nrfgs_ns.trainer
+from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.gsnb import GsnbConfig
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
+from nrfgs_ns.export import read_splats
 from nrfgs_ns.studies.run import parse
 from nrfgs_ns.viewer import BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture, scaled_depth, view_dependence
 
@@ -261,6 +266,55 @@ def test_page_is_served_and_every_output_can_be_shown(build, open_viewer, method
         for name, image in outputs.items():
             shown = colormaps.apply_colormap(image=image, colormap_options=viewer.control_panel.colormap_options)
             assert shown.shape[-1] == 3 and torch.isfinite(shown).all(), name
+
+
+def test_ns_viewer_and_ns_export_take_a_reduced_checkpoint(tiny_scene, tmp_path, monkeypatch):
+    """Their own main functions, on what is left of a field of whose splats some are diffuse."""
+    options = {
+        "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.appearance.output-init": "default",
+        "--pipeline.model.warmup-steps": 0,
+        "--pipeline.model.capacity": "auto",
+        "--pipeline.model.capacity-search.step": 2,
+        "--pipeline.model.capacity-search.settle": 2,
+        "--pipeline.model.capacity-search.tolerance-db": 100.0,
+        "--pipeline.model.diffuse.start": 4,
+        "--pipeline.model.diffuse.threshold": 2.0,
+    }
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path, 6, options))
+    opened, seen = [], {}
+
+    def viewer(*args, **more):
+        opened.append(Viewer(*args, **more))
+        return opened[-1]
+
+    def look(_):
+        """Instead of waiting for a browser: be one."""
+        with urllib.request.urlopen(f"http://127.0.0.1:{opened[0].viser_server.get_port()}", timeout=20) as page:
+            assert page.status == 200 and b"<html" in page.read(4096).lower()
+        model, pose = opened[0].pipeline.model, two_cameras(opened[0].pipeline)[0].camera_to_worlds[0]
+        for mode in model.viewer_panel.legends:
+            model.viewer_panel.mode.value = mode
+            seen[mode] = Browser.sees(opened[0], pose)["rgb"]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_viewer, "ViewerState", viewer)
+    monkeypatch.setattr(run_viewer, "time", SimpleNamespace(sleep=look))
+    options = run_viewer.ViewerConfigWithoutNumRays(websocket_host="127.0.0.1")
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_viewer.RunViewer(config, options).main()
+    finally:
+        for one in opened:
+            one.viser_server.stop()
+    assert set(seen) == {FULL, BASE, "residual", VIEW_DEPENDENCE, DEPTH}, "of the branches one is left"
+    assert all(torch.isfinite(rgb).all() for rgb in seen.values()) and seen[FULL].std() > 0.01
+    model = opened[0].pipeline.model
+    assert model.head.high is None and 0 < int(model.densification.state[DIFFUSE].sum()) < model.num_points
+
+    ExportGaussianSplat(load_config=config, output_dir=tmp_path / "ply").main()
+    exported = read_splats(tmp_path / "ply" / "splat.ply")
+    assert 0 < len(exported.means) <= model.num_points and torch.isfinite(exported.features_dc).all()
 
 
 def coarse(rgb: torch.Tensor) -> torch.Tensor:

@@ -134,9 +134,12 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     components are those whose first r predict W z with the least squared error, weighted, for each r.
 
     Args:
-        weight: of each splat, >= 0; all are alike if their sum is 0. [N]
+        weight: of each splat, >= 0; all are alike if their sum is 0. That of a diffuse splat, whose latent nothing
+            reads, does not count. [N]
     """
     latents = field.splats["latents"].detach().double()
+    if DIFFUSE in field.splats:
+        weight = weight * ~field.splats[DIFFUSE]
     if not float(weight.sum()) > 0:
         weight = torch.ones_like(weight)
     weight = (weight / weight.sum()).double()[:, None]

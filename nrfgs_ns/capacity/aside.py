@@ -3,7 +3,12 @@
 
 from typing import Protocol
 
+from nerfstudio.utils.rich_utils import CONSOLE
+
 from nrfgs_ns.errors import InputError
+
+LARGEST_USUAL_SHARE = 0.25
+"""Of the training views: that more are set aside is worth a warning."""
 
 
 class Decider(Protocol):
@@ -13,6 +18,8 @@ class Decider(Protocol):
     """what asks for it, for messages"""
     last_decision: int
     """the step after which it decides for the last time"""
+    stretched: bool
+    """whether that is a step of the schedules, which may be stretched; else one of the training"""
 
     def views_wanted(self) -> int | None:
         """How many views; None: an eighth of the training's, at least 2 and at most 16."""
@@ -44,12 +51,23 @@ class ViewsAside:
                     f"{waiting[0].option} decides by views that the training has not seen, but that of the checkpoint "
                     f"has trained on all views for {start} steps. Leave it out, or train anew."
                 )
-            data.set_views_aside(spread(len(data.train_dataset), waiting))
+            count = len(data.train_dataset)
+            data.set_views_aside(spread(count, waiting))
+            _tell(len(data.views_aside), count, max(decider.last_decision for decider in waiting))
 
     def after_step(self, step: int) -> None:
         """Give the views back when all is decided."""
         if self.data.views_aside and all(decider.is_done(step) for decider in self.deciders):
             self.data.give_back_views()
+
+
+def _tell(number: int, count: int, until: int) -> None:
+    much = number > LARGEST_USUAL_SHARE * count
+    CONSOLE.print(
+        f"{'[bold yellow]' if much else ''}{number} of {count} training views are set aside until step {until}, to "
+        f"decide by them{': that is much, and the others may not be enough to learn from' if much else ''}.",
+        soft_wrap=True,
+    )
 
 
 def spread(count: int, deciders: list[Decider]) -> list[int]:

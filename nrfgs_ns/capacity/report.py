@@ -15,6 +15,12 @@ def read_report(folder: Path | None) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8")) if path is not None and path.exists() else {}
 
 
+def forget_report(folder: Path | None) -> None:
+    """Take away what an earlier training in this folder has decided."""
+    if folder is not None:
+        (folder / REPORT).unlink(missing_ok=True)
+
+
 def add_to_report(folder: Path | None, entries: dict[str, Any]) -> None:
     """Write entries into the report; others stay. Nothing happens without a folder."""
     if folder is None:

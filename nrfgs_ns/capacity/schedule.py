@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """When capacity "auto" decides, and what it leaves behind: a line, a file, and scalars for whatever listens."""
 
-import math
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -12,12 +11,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.capacity.aside import Decider, ViewsAside
+from nrfgs_ns.capacity.charge import charge_for
 from nrfgs_ns.capacity.config import CapacitySearch
 from nrfgs_ns.capacity.install import head_changes, install
-from nrfgs_ns.capacity.report import add_to_report
+from nrfgs_ns.capacity.report import add_to_report, forget_report
 from nrfgs_ns.capacity.search import Decision, decide
 from nrfgs_ns.diffuse_splats import schedule_for
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.pace import TimedPace
 
 
 class CapacitySchedule:
@@ -34,6 +35,7 @@ class CapacitySchedule:
     """
 
     option = "pipeline.model.capacity 'auto'"
+    stretched = True
 
     def __init__(self, model, data, optimizers, folder: Path | None):
         self.model, self.data, self.optimizers, self.folder = model, data, optimizers, folder
@@ -110,6 +112,15 @@ def deciding_callbacks(model, attributes: TrainingCallbackAttributes) -> list[Tr
     calls, deciders, lookers = [], [], []
     optimizers = attributes.optimizers
     folder = None if trainer is None else trainer.base_dir
+    if model.config.capacity not in ("full", "auto"):
+        raise InputError(f"pipeline.model.capacity is {model.config.capacity!r}; use 'full' or 'auto'.")
+    # First: after a step in which both are due, a trial has ended, and all splats have their residual.
+    if model.config.capacity == "auto":
+        _check(model, attributes.pipeline.world_size)
+        capacity = CapacitySchedule(model, data, optimizers, folder)
+        calls.append(capacity.after_step)
+        lookers.append(capacity)
+        deciders.append(capacity)
     diffuse = schedule_for(
         model, data, attributes.pipeline.world_size, None if optimizers is None else optimizers.optimizers, folder
     )
@@ -117,29 +128,13 @@ def deciding_callbacks(model, attributes: TrainingCallbackAttributes) -> list[Tr
         calls.append(lambda step: diffuse.after_step(model, step))
         lookers.append(diffuse)
         deciders += [diffuse] if diffuse.config.threshold is None else []
-    if model.config.capacity not in ("full", "auto"):
-        raise InputError(f"pipeline.model.capacity is {model.config.capacity!r}; use 'full' or 'auto'.")
-    if model.config.capacity == "auto":
-        _check(model, attributes.pipeline.world_size)
-        capacity = CapacitySchedule(model, data, optimizers, folder)
-        calls.append(capacity.after_step)
-        lookers.append(capacity)
-        deciders.append(capacity)
-    cost = model.config.residual_cost
-    if not 0.0 <= cost < math.inf:
-        raise InputError(f"pipeline.model.residual-cost is {cost}; it must be zero or positive.")
-
-    if cost > 0.0 and lookers:
-
-        def charge(step: int) -> None:
-            model.charges_residuals = any(not looker.is_done(step) for looker in lookers)
-
-        charge(start - 1)
-        calls.append(charge)
+    model.residual_charge = charge_for(model, lookers, trainer, start)
     calls.append(ViewsAside(data, deciders, start).after_step)
     for decider in deciders if trainer is not None else ():
         if not decider.is_done(start - 1):
             _warn_of_early_end(decider, trainer, start)
+    if start == 0:
+        forget_report(folder)
     return [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], call) for call in calls]
 
 
@@ -152,7 +147,12 @@ def _check(model, devices: int) -> None:
 
 
 def _warn_of_early_end(decider: Decider, trainer, start: int) -> None:
-    last = start + trainer.config.max_num_iterations - 1 if trainer.pace is None else trainer.pace.length - 1
+    if trainer.pace is not None and decider.stretched:
+        last = trainer.pace.length - 1
+    elif isinstance(trainer.pace, TimedPace):
+        return  # nobody knows the last step yet
+    else:
+        last = start + trainer.config.max_num_iterations - 1
     if decider.last_decision > last:
         CONSOLE.print(
             f"[bold yellow]{decider.option} sets views aside until step {decider.last_decision}, but this training "

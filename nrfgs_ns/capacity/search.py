@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import torch
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.reduce import (
     Field,
     latent_basis,
@@ -126,9 +125,7 @@ def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config:
         if len(dropped) == before:
             break
 
-    diffuse = field.splats.get(DIFFUSE)
-    weight = seen.weight if diffuse is None else seen.weight * ~diffuse
-    basis = with_unit_axes(latent_basis(chosen.field, weight))
+    basis = with_unit_axes(latent_basis(chosen.field, seen.weight))
     if aside.psnr(chosen.field) > trials[0].psnr:
         reference = aside.scores(chosen.field)
     lowest = sum(reference) / max(len(reference), 1) - config.tolerance_db

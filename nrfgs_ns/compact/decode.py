@@ -40,7 +40,9 @@ def decode(path: Path) -> Decoded:
     try:
         if header["format"] != FORMAT:
             raise ValueError(f"it holds {header['format']!r}")
-        return Decoded(_config(header["head"]), _weights(streams), _splats(header, streams), header)
+        config, weights = _config(header["head"]), _weights(streams)
+        _check(header, config, weights)
+        return Decoded(config, weights, _splats(header, streams), header)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         # The checksums hold: it was written like this.
         raise InputError(
@@ -59,6 +61,22 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     config = NrfConfig(**head["config"])
     config.validate()
     return config
+
+
+def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor]) -> None:
+    """Raise ValueError where the header names sizes that the file does not have, or grids that are none."""
+    if config.latent_dim >= weights["low.0.weight"].shape[1]:
+        raise ValueError(
+            f"head.low.0.weight of shape {list(weights['low.0.weight'].shape)} with latents of {config.latent_dim}"
+        )
+    if not isinstance(header["quats_bits"], int) or not 2 <= header["quats_bits"] <= 16:
+        raise ValueError(f"quats_bits is {header['quats_bits']}")
+    columns = {"means": 3, "scales": 3, "opacities": 1, "colors": 3, "latents": config.latent_dim}
+    for name, count in columns.items():
+        for part in ("low", "step"):
+            numbers = np.asarray(header["grids"][name][part])
+            if numbers.shape != (count,) or numbers.dtype.kind not in "if" or not np.isfinite(numbers).all():
+                raise ValueError(f"the {part} of the grid of {name} is not {count} numbers")
 
 
 def _weights(streams: dict[str, np.ndarray]) -> dict[str, Tensor]:

@@ -37,6 +37,8 @@ VERSION = 1
 PREAMBLE = struct.Struct("<8sIIQ")
 CHECKSUM = struct.Struct("<I")
 DTYPES = ("uint8", "uint16", "uint32", "uint64", "float16", "float32")
+ENTRY = {"name": str, "dtype": str, "shape": list, "bytes": int, "crc32": int}
+"""What a stream's entry in the header has."""
 LARGEST_STREAM = 2**36
 """Bytes that a stream may unpack to: 64 GB; more is a broken file."""
 LARGEST_DICTIONARY = 2**26
@@ -111,7 +113,7 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     header_end = first - CHECKSUM.size
     if version < 1 or zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
         raise InputError(f"{path} is damaged: the header's checksum does not hold. {mend}")
-    header = json.loads(data[PREAMBLE.size : header_end])
+    header = _header(path, data[PREAMBLE.size : header_end])
     streams = {}
     for entry in header["streams"]:
         body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
@@ -121,6 +123,29 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     if first != len(data):
         raise InputError(f"{path} has {len(data) - first} bytes after its last stream. {mend}")
     return header, streams
+
+
+def _header(path: Path, text: bytes) -> dict[str, Any]:
+    """The header, whose checksum holds, with a list of streams of which each has what it must."""
+    try:
+        header = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: its header is no JSON ({error}).") from error
+    entries = header.get("streams") if isinstance(header, dict) else None
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: its header has no list of streams.")
+    for entry in entries:
+        if not (isinstance(entry, dict) and all(_is(entry.get(key), kind) for key, kind in ENTRY.items())):
+            raise InputError(f"{path}: its header has a stream {entry!r}, which cannot be.")
+        if entry["dtype"] not in DTYPES or not all(_is(size, int) and size >= 0 for size in entry["shape"]):
+            raise InputError(
+                f"{path}: its stream {entry['name']!r} is {entry['dtype']} {entry['shape']}, which cannot be."
+            )
+    return header
+
+
+def _is(value: Any, kind: type) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def _pack(raw: bytes) -> bytes:
@@ -133,8 +158,6 @@ def _pack(raw: bytes) -> bytes:
 def _unpack(path: Path, entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     """The numbers of one stream whose checksum holds; a file that was made to mislead is refused all the same."""
     count = math.prod(entry["shape"])
-    if entry["dtype"] not in DTYPES or min(entry["shape"], default=0) < 0:
-        raise InputError(f"{path}: its stream {entry['name']!r} is {entry['dtype']} {entry['shape']}, which cannot be.")
     size = np.dtype(entry["dtype"]).itemsize
     if count * size > LARGEST_STREAM:
         raise InputError(f"{path}: its stream {entry['name']!r} would unpack to {count * size} bytes.")

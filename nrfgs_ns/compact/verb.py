@@ -34,6 +34,10 @@ def export_compact(
     options.precision.validate()
     if options.views < 1:
         raise InputError(f"--compact.views is {options.views}; it must be at least 1.")
+    for name in ("budget", "threshold"):
+        value = getattr(options, name)
+        if value is not None and not value >= 0:
+            raise InputError(f"--compact.{name} is {value}; it must be zero or positive.")
     pipeline = load_model(load_config, "test")
     field, threshold = chosen_field(pipeline, load_config, options)
     model = pipeline.model

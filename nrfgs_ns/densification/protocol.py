@@ -101,6 +101,15 @@ class Densification(ABC):
         return {}
 
     @abstractmethod
+    def has_ended(self, step: int, last: float) -> bool:
+        """Whether no step from `step` to `last`, the training's last, moves or adds splats, as things look now.
+
+        Args:
+            step: training step.
+            last: training step; infinity if it is not known.
+        """
+
+    @abstractmethod
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         """Begin and end when the training's pace says (`pace.py`); the steps between two refinements stay.
 

@@ -86,7 +86,10 @@ class Nrfgs:
         hold_in_memory(config.pipeline.datamanager, dataset, self.world)
         self.folder = tempfile.TemporaryDirectory(prefix="nrfgs-")
         config.output_dir = Path(self.folder.name)
-        config.load_checkpoint = None if self.checkpoint is None else _checkpoint_file(self.checkpoint)
+        if self.checkpoint is not None:
+            config.load_checkpoint = _checkpoint_file(self.checkpoint)
+            # Nerfstudio's trainer makes this many steps more, and stretches what is left of the schedules to them.
+            config.max_num_iterations -= _step_of(config.load_checkpoint) + 1
         _set_random_seed(config.machine.seed)
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
@@ -148,6 +151,8 @@ class Nrfgs:
         loss, losses, metrics = trainer.train_iteration(step)
         for callback in trainer.callbacks:
             callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        if step == trainer.last_step:
+            trainer.take_the_mean()
         writer.EVENT_STORAGE.clear()  # nobody reads nerfstudio's log
         self.step = step + 1
         if step % self.config.logging.steps_per_log != 0:
@@ -207,6 +212,18 @@ class Nrfgs:
         """Remove what is only needed while training."""
         if self.trainer is not None:
             self.folder.cleanup()
+
+
+class NrfgsFast(Nrfgs):
+    """`ns-train nrfgs-fast`."""
+
+    method = "nrfgs-fast"
+
+
+class NrfgsBest(Nrfgs):
+    """`ns-train nrfgs-best`."""
+
+    method = "nrfgs-best"
 
 
 class NrfgsSh(Nrfgs):
@@ -289,6 +306,11 @@ def _checkpoint_file(checkpoint: Path) -> Path:
     if len(files) != 1:
         raise InputError(f"{checkpoint / MODELS} holds {len(files)} checkpoints; it must hold one.")
     return files[0]
+
+
+def _step_of(file: Path) -> int:
+    """The last step of a checkpoint."""
+    return int(file.stem.split("-")[1])
 
 
 def _build_model(config: NrfgsTrainerConfig, record: dict[str, Any], content: dict[str, Any]) -> NrfgsModel:

@@ -61,15 +61,15 @@ class Bench:
     work: Path = Path("outputs/bench")
     """folder for checkpoints, pictures and logs"""
     data: tuple[str, ...] = ()
-    """data sets: folders below --scenes"""
+    """data sets: folders below --scenes, read as the file says if it has them"""
     runs: tuple[str, ...] = ()
-    """methods, each METHOD or "NAME=METHOD OPTIONS" """
+    """runs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
     protocols: tuple[str, ...] = ()
     """densification: splatfacto, original, mcmc, mcmc@BUDGET, own"""
     seeds: tuple[int, ...] = ()
     """--machine.seed of each repetition"""
     steps: int | None = None
-    """training steps"""
+    """training steps, but for runs and presets that have their own"""
     options: str | None = None
     """options of ns-train for every run"""
     train_views: int | None = None
@@ -90,11 +90,25 @@ class Bench:
     """put records that were made with other arguments aside, and make them anew"""
 
     def main(self) -> None:
-        from nrfgs_ns.studies.bench_report import report  # matplotlib takes a second; `nrfgs --help` should not
+        asked, whole = self.plans()
+        self.carry_out(asked, whole)
+        self.complain(asked)
 
-        plan = self.plan()
-        parsers = None if self.report_only else self.parsers(plan)
-        stale = self.stale(plan, parsers)
+    def carry_out(self, asked, whole):
+        """Train what is missing of what is asked for, and report.
+
+        Args:
+            asked: a `Spec`.
+            whole: the same with everything else of its file, which is reported as far as it is there.
+
+        Returns:
+            The `Spec` of the report, and name -> difference of the records that it could not use.
+        """
+        from nrfgs_ns.studies.bench_report import report  # matplotlib takes a second; `nrfgs --help` should not
+        from nrfgs_ns.studies.bench_spec import steps_of
+
+        parsers = None if self.report_only else self.parsers(asked)
+        stale = self.stale(asked, parsers)
         if stale and not self.report_only:
             if not self.redo_stale:
                 name, difference = next(iter(stale.items()))
@@ -104,30 +118,64 @@ class Bench:
                 )
             for name in stale:
                 os.replace(self.record(name), self.record(name).with_suffix(".stale"))
-            stale = {}
-        jobs = self.jobs_of(plan, parsers) if parsers else {}
+        jobs = self.jobs_of(asked, parsers) if parsers else {}
         pending = {name: job for name, job in jobs.items() if not self.record(name).exists()}
+        own = [f"{run.name} ({steps_of(asked, run)})" for run in asked.runs if steps_of(asked, run) != asked.steps]
+        if pending and own and self.steps is not None:
+            print(f"--steps does not change runs that have their own: {', '.join(own)}.")
         if pending:
             # A terminated benchmark must not leave its children behind; an exception reaches the `finally` below.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-            self.run_all(pending, plan)
-        report(plan, self.out, self.work, stale)
+            self.run_all(pending, asked)
+        shown = self.shown(asked, whole)
+        stale = self.stale(shown, parsers)
+        report(shown, self.out, self.work, stale)
+        return shown, stale
+
+    def shown(self, asked, whole):
+        """The `Spec` of what a report shows now."""
+        from nrfgs_ns.studies.bench_choice import with_records
+
+        return with_records(whole, asked, lambda name: self.record(name).exists() or self.has_failed(name))
+
+    def complain(self, asked) -> None:
+        """End with status 1 if a training that was asked for has failed."""
+        from nrfgs_ns.studies.bench_spec import cells_of
+
+        failed = [cell.name for cell in cells_of(asked) if self.has_failed(cell.name)]
+        if failed and not self.report_only:
+            sys.exit(f"nrfgs: {len(failed)} of the runs FAILED: {', '.join(failed)}. Logs: {self.work}/NAME.log")
 
     def plan(self):
-        """The `Spec`: the file, with this command's options over it."""
+        """The `Spec` that is asked for: the file, with this command's options over it."""
+        return self.plans()[0]
+
+    def plans(self):
+        """The `Spec` that is asked for, and that with all of its file."""
+        from nrfgs_ns.studies.bench_choice import chosen_runs, chosen_scenes, united
         from nrfgs_ns.studies.bench_spec import load_spec, make_spec
 
-        content = load_spec(self.spec) if self.spec else {}
+        where = str(self.spec or "nrfgs bench")
+        file = load_spec(self.spec) if self.spec else {}
+        given = {"protocols": self.protocols, "seeds": self.seeds, "steps": self.steps, "options": self.options}
+        given |= {"train_views": self.train_views, "jobs": self.jobs, "gpus": self.gpus}
+        asked = {**file, **{key: value for key, value in given.items() if value not in (None, ())}}
         if self.runs:
-            content["runs"] = dict(_named_run(run) for run in self.runs)
-        given = {"scenes": self.data, "protocols": self.protocols, "seeds": self.seeds, "steps": self.steps}
-        given |= {"options": self.options, "train_views": self.train_views, "jobs": self.jobs, "gpus": self.gpus}
-        content |= {key: value for key, value in given.items() if value not in (None, ())}
-        return make_spec(content, str(self.spec or "nrfgs bench"))
+            of_file = file.get("runs") or {}
+            if not isinstance(of_file, dict):
+                raise InputError(f"{where}: runs must map names to methods.")
+            asked["runs"] = chosen_runs(self.runs, {str(name): run for name, run in of_file.items()}, where)
+        if self.data:
+            asked["scenes"] = chosen_scenes(self.data, file.get("scenes") or [])
+        return make_spec(asked, where), make_spec(united(file, asked), where)
 
     def record(self, name: str) -> Path:
         """The file that a finished run leaves."""
         return self.out / "runs" / f"{name}.json"
+
+    def has_failed(self, name: str) -> bool:
+        """Whether a run's last attempt failed."""
+        return failure(self.record(name)).exists() and not self.record(name).exists()
 
     def parsers(self, plan) -> dict:
         """Scene -> the data parser and its options. A data set that cannot be read fails now."""
@@ -154,13 +202,13 @@ class Bench:
 
     def stale(self, plan, parsers: dict | None) -> dict[str, str]:
         """Name -> difference, of the records whose arguments are not those of the plan."""
-        from nrfgs_ns.studies.bench_spec import cells_of, differences, identity
+        from nrfgs_ns.studies.bench_spec import cells_of, differences, identity, read_record
 
         result = {}
         for cell in cells_of(plan):
             if self.record(cell.name).exists():
-                made_with = json.loads(self.record(cell.name).read_text(encoding="utf-8"))["identity"]
-                wanted = identity(plan, cell, parsers[cell.scene] if parsers else None)
+                made_with = read_record(self.record(cell.name))["identity"]
+                wanted = identity(plan, cell, parsers.get(cell.scene) if parsers else None)
                 if difference := differences(made_with, wanted):
                     result[cell.name] = difference
         return result
@@ -179,6 +227,10 @@ class Bench:
         threads = max(1, (os.cpu_count() or 1) // len(slots))
         columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
         with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
+
+            def say(text: str) -> None:
+                progress.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
             bar = progress.add_task("", total=sum(job.steps for job in pending.values()))
             try:
                 while waiting or running:
@@ -188,13 +240,14 @@ class Bench:
                             done.log.close()
                             finished, steps_finished = finished + 1, steps_finished + pending[done.name].steps
                             good = done.process.returncode == 0 and done.record.exists()
-                            progress.console.print(f"{done.name}: {'done' if good else 'FAILED'}", highlight=False)
+                            say(f"{done.name}: {'done' if good else 'FAILED'}")
                             if not good:
                                 note = {"returncode": done.process.returncode, "identity": done.identity}
                                 write_whole(failure(done.record), json.dumps(note, indent=1) + "\n")
-                                progress.console.print(f"  see {done.log.name}", highlight=False, soft_wrap=True)
+                                say(f"  see {done.log.name}")
                         if slot not in running and waiting:
                             running[slot] = self.start(*waiting.pop(0), gpu, threads, queue)
+                            say(f"{running[slot].name}: started")
                     steps = steps_finished + sum(child.steps() for child in running.values())
                     label = f"{finished} of {len(pending)} runs"
                     progress.update(bar, completed=steps, description=label)
@@ -229,20 +282,13 @@ def failure(record: Path) -> Path:
 def gpu_names(count: int) -> list[str]:
     """Values of CUDA_VISIBLE_DEVICES for `count` GPUs, out of those that this process may see.
 
+    An empty one, which hides all GPUs, stays empty.
+
     Raises:
         InputError: it may see fewer.
     """
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    names = visible.split(",") if visible else [str(index) for index in range(count)]
+    names = [str(index) for index in range(count)] if visible is None else visible.split(",")
     if len(names) < count:
-        raise InputError(f"gpus is {count}, but CUDA_VISIBLE_DEVICES shows {visible}. Ask for at most {len(names)}.")
+        raise InputError(f"gpus is {count}, but CUDA_VISIBLE_DEVICES is {visible!r}. Ask for at most {len(names)}.")
     return names[:count]
-
-
-def _named_run(text: str) -> tuple[str, dict]:
-    """A run as the command line gives it: METHOD OPTIONS or NAME=METHOD OPTIONS; options may have "=" too."""
-    name, equals, rest = text.partition("=")
-    if not equals or " -" in name:
-        name, rest = text, text
-    method, _, options = rest.strip().partition(" ")
-    return name.strip(), {"method": method, "options": options}

@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
+from nrfgs_ns.studies.files import whole
+
 VIEWS = 2
 """Views in a sheet if nobody chose them."""
 CROP_FRACTION = 0.3
@@ -34,12 +36,14 @@ def crop_sheet(pictures: dict[str, Path], path: Path, views: list[int] | None = 
         views: numbers of test views; None: those where the runs differ most.
 
     Returns:
-        Whether there was something to show: a run without pictures is left out, and a view that some run lacks.
+        Whether there was something to show: a run without pictures is left out, or with pictures of another size than
+        the first run's, and a view that some run lacks.
     """
     files = {label: numbered(folder) for label, folder in pictures.items()}
     files = {label: found for label, found in files.items() if found}
     if not files:
         return False
+    files = of_one_size(files)
     shared = sorted(set.intersection(*(set(found) for found in files.values())))
     chosen = [view for view in views if view in shared] if views is not None else shared
     places = []
@@ -59,8 +63,8 @@ def crop_sheet(pictures: dict[str, Path], path: Path, views: list[int] | None = 
         ImageDraw.Draw(sheet).text((2, y + 2), f"test view {view}; below: |error| x {ERROR_GAIN:g}", fill="black")
         sheet.paste(part, (0, y + TITLE))
         y += TITLE + part.height + GAP
-    path.parent.mkdir(parents=True, exist_ok=True)
-    sheet.save(path)
+    with whole(path) as aside:
+        sheet.save(aside, format="PNG")
     return True
 
 
@@ -71,6 +75,21 @@ def numbered(folder: Path) -> dict[int, Path]:
         if match := PICTURE.match(file.name):
             found[int(match.group(1))] = file
     return found
+
+
+def of_one_size(files: dict[str, dict[int, Path]]) -> dict[str, dict[int, Path]]:
+    """The runs whose pictures are as large as the first run's: another one may have had scaled photographs."""
+
+    def size(file: Path) -> tuple[int, int]:
+        with Image.open(file) as picture:
+            return picture.size
+
+    first = {view: size(file) for view, file in next(iter(files.values())).items()}
+    return {
+        label: found
+        for label, found in files.items()
+        if all(size(file) == first[view] for view, file in found.items() if view in first)
+    }
 
 
 def read(files: dict[str, dict[int, Path]], view: int) -> tuple[Images, dict[str, Images]]:

@@ -8,9 +8,9 @@ from typing import Any
 from rich.console import Console
 
 from nrfgs_ns.studies.bench_crops import crop_sheet
-from nrfgs_ns.studies.bench_spec import Cell, Spec, cells_of, rows_of
+from nrfgs_ns.studies.bench_spec import Cell, Spec, cells_of, read_record, rows_of
 from nrfgs_ns.studies.bench_table import COLUMNS, Row, as_csv, latex, markdown, with_averages
-from nrfgs_ns.studies.files import write_whole
+from nrfgs_ns.studies.files import whole, write_whole
 
 
 def report(spec: Spec, out: Path, work: Path, stale: dict[str, str]) -> None:
@@ -56,7 +56,7 @@ def rows_from_records(spec: Spec, runs: Path, stale: dict[str, str]) -> list[Row
         if cell.name in stale:
             row.absent[cell.seed] = "stale"
         elif file.exists():
-            row.records[cell.seed] = json.loads(file.read_text(encoding="utf-8"))
+            row.records[cell.seed] = read_record(file)
         else:
             row.absent[cell.seed] = "FAILED" if file.with_suffix(".failed").exists() else "missing"
     return [row.fill() for row in by_place.values()]
@@ -78,6 +78,11 @@ def summary(row: Row) -> dict[str, Any]:
 def label(run: str, protocol: str) -> str:
     """What a run under a protocol is called in pictures."""
     return run if protocol == "own" else f"{run} {protocol}"
+
+
+def plain_label(text: str) -> str:
+    """A name as matplotlib writes it out: `$` begins no formula, and a leading underscore keeps it in the legend."""
+    return ("\N{ZERO WIDTH SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
 def draw_splats(rows: list[Row], out: Path) -> None:
@@ -102,10 +107,13 @@ def draw_splats(rows: list[Row], out: Path) -> None:
                 steps = sorted(set.intersection(*(set(curve) for curve in curves)))
                 counts = [sum(curve[step] for curve in curves) / len(curves) for step in steps]
                 name = label(row.run, row.protocol)
-                panel.plot(steps, counts, label=name, color=f"C{kinds.index(name)}", linewidth=1.2)
-            panel.set(title=scene, xlabel="step", ylabel="splats", ylim=(0, None))
-        panels.flat[0].legend(fontsize=7)
+                panel.plot(steps, counts, label=plain_label(name), color=f"C{kinds.index(name)}", linewidth=1.2)
+            panel.set(title=plain_label(scene), xlabel="step", ylabel="splats", ylim=(0, None))
+        lines = {line.get_label(): line for panel in panels.flat for line in panel.get_lines()}
+        panels.flat[0].legend(lines.values(), lines.keys(), fontsize=7)
         figure.tight_layout()
-        figure.savefig(out / "splats.png", dpi=150, metadata={"Software": None})
-        figure.savefig(out / "splats.svg", metadata={"Date": None})
+        with whole(out / "splats.png") as aside:
+            figure.savefig(aside, format="png", dpi=150, metadata={"Software": None})
+        with whole(out / "splats.svg") as aside:
+            figure.savefig(aside, format="svg", metadata={"Date": None})
         pyplot.close(figure)

@@ -21,8 +21,8 @@ from nrfgs_ns.studies.bench_spec import Job
 from nrfgs_ns.studies.files import write_whole
 from nrfgs_ns.studies.run import TrainRecord, evaluate, host_without_downloads, machine, train
 
-PROGRESS_EVERY = 100
-"""Steps between two notes of how far a training is."""
+PROGRESS_SECONDS = 1.0
+"""Time between two notes of how far a training is."""
 
 
 def read_job(path: Path) -> Job:
@@ -72,9 +72,13 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
     def saved(record: TrainRecord) -> None:
         write_whole(work / "train.json", json.dumps(asdict(record)))
 
+    noted = perf_counter()
+
     def stepped(step: int) -> None:
-        if step % PROGRESS_EVERY == 0:
+        nonlocal noted
+        if perf_counter() - noted >= PROGRESS_SECONDS:
             write_whole(work / "progress.json", json.dumps({"step": step}))
+            noted = perf_counter()
 
     args, earlier = job.args, None
     checkpoint = last_checkpoint(work) if args[0].startswith("nrfgs") else None
@@ -136,7 +140,11 @@ def only_one(lock: Path) -> Iterator[None]:
         except ImportError:  # Windows: the reader must see to it
             pass
         else:
-            fcntl.flock(file, fcntl.LOCK_EX)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                print("Another process works on this run; waiting for it to end.", flush=True)
+                fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 

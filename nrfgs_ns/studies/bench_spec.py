@@ -13,6 +13,7 @@
 All keys of a file are fields of `Spec`.
 """
 
+import json
 import re
 import shlex
 from dataclasses import dataclass, field, fields
@@ -30,6 +31,15 @@ QUIET = (
 """Options that keep evaluation, the viewer and the terminal table out of the timing."""
 OWN = "own"
 """The protocol of a method that is run as it is."""
+PRESET_STEPS = {"nrfgs-fast": 10_000}
+"""Method -> training steps, of methods that are what they are by the number of their steps."""
+SET_HERE = {
+    **dict.fromkeys(("--output-dir", "--experiment-name", "--load-dir"), "leave it out"),
+    **dict.fromkeys(("--max-num-iterations", "--time-budget"), "use steps, of the file or of a run"),
+    "--steps-per-save": "use checkpoint_every",
+    "--machine.seed": "use seeds",
+}
+"""Options of ns-train that a run cannot have, because the benchmark gives them; what to use instead."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,7 @@ class Method:
     protocols: tuple[str, ...] | None = None
     """instead of the benchmark's; a method that is not of this project has `own` only, unless it says otherwise"""
     steps: int | None = None
-    """instead of the benchmark's"""
+    """instead of the benchmark's, or of the preset's"""
 
 
 @dataclass(frozen=True)
@@ -74,7 +84,7 @@ class Spec:
     seeds: list[int] = field(default_factory=lambda: [42])
     """--machine.seed of each repetition"""
     steps: int = 30_000
-    """training steps"""
+    """training steps, but for runs and presets that have their own"""
     options: tuple[str, ...] = ()
     """options of ns-train for every run"""
     train_views: int = 16
@@ -160,9 +170,9 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
         **{
             **content,
             "runs": [_method(name, value, where) for name, value in content["runs"].items()],
-            "scenes": [_scene(value, where) for value in _list(content["scenes"])],
-            "protocols": [str(value) for value in _list(content.get("protocols", [OWN]))],
-            "seeds": _list(content.get("seeds", [42])),
+            "scenes": [_scene(value, where) for value in as_list(content["scenes"])],
+            "protocols": [str(value) for value in as_list(content.get("protocols", [OWN]))],
+            "seeds": as_list(content.get("seeds", [42])),
             "options": _words(content.get("options", ()), f"{where}: options"),
         }
     )
@@ -172,7 +182,9 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     _require(views, f"{where}: crops must map scenes to lists of numbers of test views, such as {{bonsai: [0, 5]}}.")
     for seed in spec.seeds:
         _whole(seed, 0, f"{where}: seeds")
+    _require_free(spec.options, f"{where}: options")
     for run in spec.runs:
+        _require_free(run.options, f"{where}: runs: {run.name}: options")
         for protocol in run.protocols or spec.protocols:
             options = protocol_options(protocol)
             _require(
@@ -208,8 +220,8 @@ def rows_of(spec: Spec) -> list[tuple[str, Method]]:
 
 
 def steps_of(spec: Spec, run: Method) -> int:
-    """Training steps of a run."""
-    return spec.steps if run.steps is None else run.steps
+    """Training steps of a run: its own, those of its preset, or the benchmark's."""
+    return PRESET_STEPS.get(run.method, spec.steps) if run.steps is None else run.steps
 
 
 def protocol_options(protocol: str) -> list[str]:
@@ -277,6 +289,26 @@ def differences(made_with: dict[str, Any], wanted: dict[str, Any]) -> str:
     return "; ".join(words)
 
 
+def read_record(path: Path) -> dict[str, Any]:
+    """What a finished run left.
+
+    Raises:
+        InputError: the file is not a record.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        missing = {"identity", "machine", "jobs", "train", "measured"} - set(record)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path} is not a record of a run ({error}). Remove it to have the run made anew.") from error
+    _require(not missing, f"{path} is no whole record: it lacks {missing}. Remove it to have the run made anew.")
+    return record
+
+
+def scene_name(value: Any) -> str:
+    """The folder of a scene as a file gives it."""
+    return Path(str(value.get("path", value) if isinstance(value, dict) else value)).as_posix()
+
+
 def _method(name: str, value: Any, where: str) -> Method:
     value = {"method": value} if isinstance(value, str) else value
     where = f"{where}: runs: {name}"
@@ -285,7 +317,7 @@ def _method(name: str, value: Any, where: str) -> Method:
     _require(not unknown, f"{where}: unknown key {unknown}. Known are method, options, protocols, steps.")
     if value.get("steps") is not None:
         _whole(value["steps"], 1, f"{where}: steps")
-    protocols = tuple(str(one) for one in _list(value["protocols"])) if "protocols" in value else None
+    protocols = tuple(str(one) for one in as_list(value["protocols"])) if "protocols" in value else None
     options = _words(value.get("options", ()), f"{where}: options")
     return Method(str(name), value["method"], options, protocols, value.get("steps"))
 
@@ -298,11 +330,11 @@ def _scene(value: Any, where: str) -> Scene:
     downscale = value.get("downscale")
     if downscale is not None:
         _whole(downscale, 1, f"{where}: scenes: downscale")
-    name = Path(value["path"]).as_posix()
-    return Scene(name, downscale, _words(value.get("options", ()), f"{where}: scenes: options"))
+    return Scene(scene_name(value), downscale, _words(value.get("options", ()), f"{where}: scenes: options"))
 
 
-def _list(value: Any) -> list:
+def as_list(value: Any) -> list[Any]:
+    """A single value is a list of one."""
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
@@ -312,6 +344,13 @@ def _words(value: Any, where: str) -> tuple[str, ...]:
         return tuple(shlex.split(value)) if isinstance(value, str) else tuple(str(word) for word in value)
     except (TypeError, ValueError) as error:
         raise InputError(f"{where} must be a string or a list of words ({error}).") from error
+
+
+def _require_free(options: tuple[str, ...], where: str) -> None:
+    """Refuse options that the benchmark gives itself: ns-train would take the later one."""
+    for word in options:
+        name = word.partition("=")[0].replace("_", "-")
+        _require(name not in SET_HERE, f"{where}: {name} is given by the benchmark; {SET_HERE.get(name)}.")
 
 
 def _whole(value: Any, least: int, where: str) -> None:

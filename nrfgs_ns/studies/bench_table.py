@@ -3,6 +3,8 @@
 
 import csv
 import io
+import math
+import re
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -77,7 +79,8 @@ class Row:
             values = {}
             for seed, record in self.records.items():
                 value = column.value(record)
-                if value is not None and not (column.is_time and record["jobs"] != 1):
+                is_number = value is not None and math.isfinite(value)
+                if is_number and not (column.is_time and record["jobs"] != 1):
                     values[seed] = value / column.unit
             self.values[column.name] = values
         return self
@@ -182,9 +185,15 @@ def markdown(rows: list[Row]) -> str:
     """The table in Markdown: best bold, second in italics."""
     head = HEAD + [column.name for column in COLUMNS]
     body = cells(rows, lambda text: f"**{text}**", lambda text: f"_{text}_")
+    body = [[*map(plain_markdown, line[: len(HEAD)]), *line[len(HEAD) :]] for line in body]
     lines = [head, ["---"] * len(HEAD) + ["---:"] * len(COLUMNS), *body]
     text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
     return text + "".join(f"\n{note}\n" for note in notes(rows))
+
+
+def plain_markdown(text: str) -> str:
+    """A name as Markdown writes it out, in a cell of a table. An underscore between letters is one."""
+    return re.sub(r"[\\`*|<]|(?<!\w)_|_(?!\w)", r"\\\g<0>", " ".join(text.split()))
 
 
 def latex(rows: list[Row]) -> str:
@@ -202,8 +211,16 @@ def latex(rows: list[Row]) -> str:
     return "\n".join([*lines, "\\hline", "\\end{tabular}"]) + "\n"
 
 
+LATEX = {
+    **{letter: f"\\{letter}" for letter in "_&%#${}"},
+    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
+    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"},
+}
+"""Letter -> what writes it out."""
+
+
 def _escaped(text: str) -> str:
-    return "".join(f"\\{letter}" if letter in "_&%#$" else letter for letter in text)
+    return "".join(LATEX.get(letter, letter) for letter in " ".join(text.split()))
 
 
 def as_csv(rows: list[Row]) -> str:

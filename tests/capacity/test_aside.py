@@ -63,8 +63,10 @@ def test_they_are_part_of_the_sampling_state(tiny_scene, tmp_path):
     assert again.views_aside == []
 
 
-def decider(views=None, until=10):
-    return SimpleNamespace(option="an option", views_wanted=lambda: views, is_done=lambda step: step >= until)
+def decider(views=None, until=9):
+    return SimpleNamespace(
+        option="an option", last_decision=until, views_wanted=lambda: views, is_done=lambda step: step >= until
+    )
 
 
 class Data:
@@ -113,6 +115,16 @@ def test_how_many_and_which(count, views, expected):
     assert len(set(chosen)) == expected and 0 <= min(chosen) and max(chosen) < count
     gaps = [b - a for a, b in zip(chosen[:-1], chosen[1:], strict=True)]
     assert max(gaps) - min(gaps) <= 1
+
+
+@pytest.mark.parametrize("count, warned", [(24, False), (8, False), (7, True), (3, True)])
+def test_how_many_are_set_aside_is_told(count, warned, capsys):
+    data = Data()
+    data.train_dataset = [None] * count
+    ViewsAside(data, [decider()], 0)
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"{len(data.views_aside)} of {count} training views are set aside until step 9" in said
+    assert ("that is much" in said) == warned
 
 
 def test_not_all_views():

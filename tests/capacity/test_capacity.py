@@ -15,7 +15,7 @@ from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.reduce import Field, latent_basis, with_rank, with_unit_axes
 from nrfgs_ns.capacity.config import CapacitySearch
 from nrfgs_ns.capacity.install import install
-from nrfgs_ns.capacity.search import decide
+from nrfgs_ns.capacity.search import Decision, decide
 from nrfgs_ns.capacity.settle import BASE, FIELD, keep_the_mean, lesson_order, settle
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export import Export, read_splats
@@ -356,6 +356,22 @@ def test_with_diffuse_splats(tiny_scene, tmp_path):
     assert extra["_extra_state"]["sampling"]["views_aside"] == []  # the last look was after step 14
     _, pipeline, _, _ = eval_setup(config)
     assert pipeline.model.densification.state[DIFFUSE].any()
+
+
+def test_a_field_is_judged_before_splats_lose_it_after_the_same_step(tiny_scene, tmp_path, monkeypatch):
+    """With the defaults both are due after step 20000, when a trial ends and all splats have their residual: a field
+    that few of them still use would be found to be worth little."""
+    trainer = set_up(tiny_scene, tmp_path, {"--pipeline.model.diffuse.start": 9})
+    model, order = trainer.pipeline.model, []
+    judged = Decision(None, [], [])
+    monkeypatch.setattr("nrfgs_ns.capacity.schedule.decide", lambda *_: order.append("field") or judged)
+    monkeypatch.setattr("nrfgs_ns.diffuse_splats.make_diffuse", lambda *_: order.append("splats") or [])
+    monkeypatch.setattr("nrfgs_ns.diffuse_splats.DiffuseSchedule.tell", lambda *_: None)
+    attributes = TrainingCallbackAttributes(trainer.optimizers, trainer.grad_scaler, trainer.pipeline, trainer)
+    model.step = 9
+    for callback in model.get_training_callbacks(attributes)[-3:]:
+        callback.func(9)
+    assert order == ["field", "splats"]
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from nrfgs_ns.compact.format import read_container, write_container
 from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export import Export
-from nrfgs_ns.studies.run import evaluate, train
+from nrfgs_ns.studies.run import evaluate, parse, train
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -146,12 +146,19 @@ def test_a_field_of_low_rank_is_written_at_its_rank(tmp_path):
         (lambda header, streams: header.update(format="jpeg"), "holds 'jpeg'"),
         (lambda header, streams: header["head"].update(name="sh"), "head named 'sh'"),
         (lambda header, streams: header["head"]["config"].update(shine=1), "unknown option 'shine'"),
-        (lambda header, streams: header["head"]["config"].update(latent_dim=9), "view.latents of shape"),
+        (lambda header, streams: header["head"]["config"].update(latent_dim=9), "grid of latents is not 9 numbers"),
         (lambda header, streams: header["head"]["config"].update(num_bands=0), "num_bands is 0"),
         (lambda header, streams: header["splats"].update(view=1), "view.means"),
         (lambda header, streams: header.pop("grids"), "KeyError"),
         (lambda header, streams: streams.pop("diffuse.colors"), "diffuse.colors"),
         (lambda header, streams: streams["view.quats_largest"].fill(7), "in range"),
+        (lambda header, streams: header.update(quats_bits=0), "quats_bits"),
+        (lambda header, streams: header.update(quats_bits=10**9), "quats_bits"),
+        (lambda header, streams: header.update(quats_bits=2.5), "quats_bits"),
+        (lambda header, streams: header["grids"]["means"].update(low=[0.0]), "grid of means"),
+        (lambda header, streams: header["grids"]["colors"].update(step=["a", 1, 1]), "grid of colors"),
+        (lambda header, streams: header["grids"]["latents"].update(step=1.0), "grid of latents"),
+        (lambda header, streams: header["splats"].update(view=-1), "-1"),
     ],
 )
 def test_files_that_describe_no_field_are_refused(change, says, tmp_path):
@@ -159,6 +166,19 @@ def test_files_that_describe_no_field_are_refused(change, says, tmp_path):
     change(header, streams)
     write_container(tmp_path / "f.nrf", header, streams)
     with pytest.raises(InputError, match=says):
+        decode(tmp_path / "f.nrf")
+
+
+def test_a_misleading_size_allocates_nothing(tmp_path):
+    """Without view-dependent splats no latents are in the file; a header may not make gigabytes of zeros of them."""
+    one = field()
+    one.splats[DIFFUSE][:] = True
+    header, streams = encode(one, Precision(), {})
+    header["head"]["config"]["latent_dim"] = 10**9
+    streams["view.latents"] = np.zeros((10**9, 0), dtype=np.uint8)
+    header["grids"]["latents"] = {"low": [0.0], "step": [1.0]}
+    write_container(tmp_path / "f.nrf", header, streams)
+    with pytest.raises(InputError, match="head.low.0.weight"):
         decode(tmp_path / "f.nrf")
 
 
@@ -220,6 +240,13 @@ def test_the_file_says_which_splats_are_diffuse(exported):
     assert model.config.appearance.latent_dim == numbers["rank"]
 
 
+def test_a_training_does_not_begin_with_a_compact_file(exported, tiny_scene, tmp_path):
+    """It would have been ignored, or taken with the optimisers of other splats."""
+    line = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "tensorboard"]
+    with pytest.raises(InputError, match="pipeline.compact"):
+        parse([*line, "--pipeline.compact", str(exported[1])]).setup(local_rank=0, world_size=1).setup()
+
+
 def test_a_broken_file_stops_ns_eval_with_a_sentence(exported, tmp_path):
     _, file, _ = exported
     whole = file.read_bytes()
@@ -243,6 +270,10 @@ def test_what_is_asked_for_is_written(exported, tmp_path):
     for options, says in (
         (["--compact.rank", "9"], "ranks 1 to 8"),
         (["--compact.views", "0"], "at least 1"),
+        (["--compact.budget", "-1"], "budget is -1"),
+        (["--compact.budget", "nan"], "budget is nan"),
+        (["--compact.threshold", "-1"], "threshold is -1"),
+        (["--compact.threshold", "nan"], "threshold is nan"),
         (["--compact.precision.colors", "0"], "positive"),
     ):
         with pytest.raises(InputError, match=says):

@@ -86,7 +86,13 @@ def rewritten(path, change) -> None:
     _, version, length, _ = PREAMBLE.unpack_from(data)
     header = json.loads(data[PREAMBLE.size : PREAMBLE.size + length])
     version = change(header) or version
-    text = json.dumps(header).encode()
+    write_with(path, json.dumps(header).encode(), version)
+
+
+def write_with(path, text: bytes, version: int = 1) -> None:
+    """Give a file another header."""
+    data = path.read_bytes()
+    _, _, length, _ = PREAMBLE.unpack_from(data)
     body = data[PREAMBLE.size + length + CHECKSUM.size :]
     start = PREAMBLE.pack(MAGIC, version, len(text), PREAMBLE.size + len(text) + CHECKSUM.size + len(body)) + text
     path.write_bytes(start + CHECKSUM.pack(zlib.crc32(start)) + body)
@@ -109,6 +115,34 @@ def test_a_misleading_header_is_refused(change, says, written, tmp_path):
     path.write_bytes(written.read_bytes())
     rewritten(path, change)
     with pytest.raises(InputError, match=says):
+        read_container(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"", b"\xff\xfe", b"{", b"[" * 100_000, b"[]", b"null", b"{}", b'{"streams": 3}', b'{"streams": [3]}'],
+)
+def test_a_header_that_is_none_is_refused(text, written, tmp_path):
+    path = tmp_path / "made.nrf"
+    path.write_bytes(written.read_bytes())
+    write_with(path, text)
+    with pytest.raises(InputError, match="made.nrf"):
+        read_container(path)
+
+
+@pytest.mark.parametrize("key", ["name", "dtype", "shape", "bytes", "crc32"])
+def test_a_stream_with_an_impossible_entry_is_refused(key, written, tmp_path):
+    path = tmp_path / "made.nrf"
+    for value in (None, -1, 2.5, float("nan"), "x", [], {}, [1.5], [None], [-3, -17], [True], 10**30):
+        if (key, value) == ("name", "x"):  # a name like any other
+            continue
+        path.write_bytes(written.read_bytes())
+        rewritten(path, lambda header, value=value: header["streams"][0].update({key: value}))
+        with pytest.raises(InputError, match="made.nrf"):
+            read_container(path)
+    path.write_bytes(written.read_bytes())
+    rewritten(path, lambda header: header["streams"][0].pop(key) and None)
+    with pytest.raises(InputError, match="made.nrf"):
         read_container(path)
 
 

@@ -24,8 +24,9 @@ from torch.testing import assert_close
 import nrfgs_ns.nerfbaselines as package
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.nerfbaselines.method import Nrfgs, configure, options_of
+from nrfgs_ns.nerfbaselines.method import Nrfgs, NrfgsFast, configure, options_of
 from nrfgs_ns.nerfbaselines.photos import World, background_of
+from nrfgs_ns.studies.options import methods
 
 needs_nerfbaselines = pytest.mark.skipif(
     find_spec("nerfbaselines") is None, reason="nerfbaselines is not installed: pip install --no-deps nerfbaselines"
@@ -220,6 +221,65 @@ def test_options_are_typed_as_on_the_command_line():
     assert options["pipeline.model.appearance.latent_dim"] == 16 and options["method_name"] == "nrfgs"
 
 
+@pytest.mark.parametrize(
+    "method, steps, schedule, densification",
+    [("nrfgs", 30_000, None, "splatfacto"), ("nrfgs-fast", 10_000, 30_000, "splatfacto")]
+    + [("nrfgs-best", 30_000, None, "original")],
+)
+def test_presets_are_those_of_ns_train(method, steps, schedule, densification):
+    """The class of a preset trains as `ns-train` does, and says so; options go over it."""
+    (one,) = [cls for cls in (Nrfgs, *Nrfgs.__subclasses__()) if cls.method == method]
+    config = configure(one.method, {}, {})
+    assert (config.max_num_iterations, config.schedule_steps) == (steps, schedule)
+    assert config.pipeline.model.densification == densification and config.method_name == method
+    assert one.get_method_info()["method_id"] == method
+    assert configure(one.method, {"max_num_iterations": 50}, {}).schedule_steps == schedule
+
+
+def test_a_preset_with_a_schedule_goes_on_as_if_it_had_not_stopped(tiny_scene, tmp_path):
+    """`nrfgs-fast`, whose walk through the schedules is part of the checkpoint: three steps for each one of 30,000."""
+    dataset = read(tiny_scene, "train")
+    options = {key: value for key, value in OPTIONS.items() if key != "max_num_iterations"}
+    unbroken = NrfgsFast(train_dataset=dataset, config_overrides=options)
+    assert unbroken.get_info()["num_iterations"] == 10_000
+    train(unbroken, 0, 3)
+    unbroken.save(str(tmp_path / "checkpoint"))
+    assert unbroken.trainer.pace.position == pytest.approx(9.0, abs=1e-9)
+    train(unbroken, 3, 6)
+    continued = NrfgsFast(checkpoint=str(tmp_path / "checkpoint"), train_dataset=dataset)
+    assert continued.get_info()["num_iterations"] == 10_000 and continued.get_info()["loaded_step"] == 3
+    train(continued, 3, 6)
+    camera = read(tiny_scene, "test")["cameras"][0]
+    np.testing.assert_array_equal(continued.render(camera)["color"], unbroken.render(camera)["color"])
+    rates = [one.trainer.optimizers.optimizers["means"].param_groups[0]["lr"] for one in (unbroken, continued)]
+    assert rates[0] == rates[1]
+    for one in (continued, unbroken):
+        one.close()
+
+
+def test_the_last_steps_are_averaged(tiny_scene, tmp_path):
+    """As `ns-train` does it, once nerfbaselines has made the last of the steps; and a continued training as well."""
+    dataset, options = read(tiny_scene, "train"), {**OPTIONS, "max_num_iterations": 6}
+    plain = Nrfgs(train_dataset=dataset, config_overrides=options)
+    means = []
+    for step in range(6):
+        plain.train_iteration(step)
+        means.append(plain.model.means.detach().clone())
+    averaged = Nrfgs(train_dataset=dataset, config_overrides={**options, "average_steps": 3})
+    train(averaged, 0, 5)
+    assert torch.equal(averaged.model.means, means[4])
+    averaged.save(str(tmp_path / "checkpoint"))
+    train(averaged, 5, 6)
+    # Coordinates are less than 4, where floats are 2^-22 apart: three roundings of half of that.
+    expected = torch.stack(means[3:]).double().mean(dim=0)
+    assert_close(averaged.model.means.detach().double(), expected, rtol=0, atol=4e-7)
+    continued = Nrfgs(checkpoint=str(tmp_path / "checkpoint"), train_dataset=dataset)
+    train(continued, 5, 6)
+    assert torch.equal(continued.model.means, averaged.model.means)
+    for one in (plain, averaged, continued):
+        one.close()
+
+
 @needs_nerfbaselines
 def test_registered_methods_are_nerfbaselines_methods(monkeypatch):
     import nerfbaselines
@@ -229,7 +289,9 @@ def test_registered_methods_are_nerfbaselines_methods(monkeypatch):
     if "nrfgs" not in nerfbaselines.get_supported_methods():  # unless the entry point has done it
         for spec in _registry._load_specs_from_environment():
             nerfbaselines.register(spec)
-    for name in ("nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"):
+    registered = [one.config.method_name for one in methods()]
+    assert {"nrfgs", "nrfgs-fast", "nrfgs-best", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"} <= set(registered)
+    for name in registered:  # none that ns-train has and nerfbaselines has not
         spec = nerfbaselines.get_method_spec(name)
         with nerfbaselines.build_method_class(spec, backend="python") as method:
             assert issubclass(method, Nrfgs) and isinstance(method.__new__(method), nerfbaselines.Method)
@@ -238,7 +300,7 @@ def test_registered_methods_are_nerfbaselines_methods(monkeypatch):
 
 @pytest.mark.slow
 @needs_nerfbaselines
-@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-fast", "nrfgs-sh"])
 def test_nerfbaselines_own_test(method, tiny_scene, tmp_path):
     """`nerfbaselines test-method`: train, evaluate, save, load with and without the data, save again, train through
     its own trainer, and evaluate what that wrote. Offline there are no weights of AlexNet: LPIPS is taken for 0.

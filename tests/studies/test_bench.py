@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from nrfgs_ns import cli
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.studies import bench, bench_run
 from nrfgs_ns.studies.bench import Bench, gpu_names
@@ -103,7 +104,8 @@ def test_everything_is_run_once_and_reported(fake, capsys):
 
 def test_failures_are_listed_and_tried_again(fake):
     behave(fake, **{"NRF-own-scene-1": "fails", "NRF-own-scene-2": "silent"})
-    bench_in(fake).main()
+    with pytest.raises(SystemExit, match="2 of the runs FAILED: NRF-own-scene-1, NRF-own-scene-2"):
+        bench_in(fake).main()
     assert "| scene | NRF | own | 0 (2 FAILED) |" in (fake / "out" / "table.md").read_text()
     assert json.loads((fake / "out/runs/NRF-own-scene-1.failed").read_text())["returncode"] == 3
     behave(fake)
@@ -111,6 +113,109 @@ def test_failures_are_listed_and_tried_again(fake):
     assert "| scene | NRF | own | 2 |" in (fake / "out" / "table.md").read_text()
     assert sorted(name for name, *_ in ran(fake)).count("SH-own-scene-1") == 1
     assert not list((fake / "out" / "runs").glob("*.failed"))
+
+
+def test_a_failure_is_shown_whoever_asks(fake, capsys):
+    """Another command of the same file lists it, and is content: it was not asked for it."""
+    file = spec_file(fake, "runs: {SH: nrfgs-sh, NRF: nrfgs}\nscenes: [scene]\nseeds: [1]\nsteps: 100\n")
+    behave(fake, **{"NRF-own-scene-1": "fails"})
+    with pytest.raises(SystemExit):
+        bench_in(fake, spec=file, runs=("NRF",), data=(), seeds=()).main()
+    screen = capsys.readouterr().err
+    assert (
+        "NRF-own-scene-1: started" in screen and "NRF-own-scene-1: FAILED" in screen and "NRF-own-scene-1.log" in screen
+    )
+    bench_in(fake, spec=file, runs=("SH",), data=(), seeds=()).main()
+    table = (fake / "out" / "table.md").read_text()
+    assert "| scene | SH | own | 1 |" in table and "| scene | NRF | own | 0 (1 FAILED) |" in table
+
+
+def test_parts_of_a_file_report_all_that_is_there(fake):
+    """Runs, seeds, scenes and protocols of the same file, asked for one after the other."""
+    (fake / "data" / "other").mkdir()
+    (fake / "data" / "other" / "transforms.json").write_text("{}")
+    file = spec_file(
+        fake,
+        "runs: {no split: {method: nrfgs, options: --x 1}, SH: nrfgs-sh, NRF: nrfgs}\n"
+        "scenes: [scene, {path: other, downscale: 2}]\nseeds: [1, 2]\nsteps: 100\nprotocols: [original, mcmc@9]\n",
+    )
+
+    def rows(**chosen) -> list[list[str]]:
+        bench_in(fake, **{"spec": file, "runs": (), "data": (), "seeds": (), "steps": None, **chosen}).main()
+        return [row[:3] + row[4:5] for row in summaries(fake)]
+
+    assert rows(runs=("NRF",), data=("scene",), seeds=(1,), protocols=("mcmc@9",)) == [["scene", "NRF", "mcmc@9", [1]]]
+    assert rows(runs=("no split",), data=("scene",), seeds=(2,), protocols=("mcmc@9",)) == [
+        ["scene", "no split", "mcmc@9", [2]],
+        ["scene", "NRF", "mcmc@9", [1]],
+    ]
+    shown = rows(runs=("NRF",), data=("other",), seeds=(1,), protocols=("original",))
+    assert [row for row in shown if row[3] and row[0] != "average"] == [
+        ["scene", "no split", "mcmc@9", [2]],
+        ["scene", "NRF", "mcmc@9", [1]],
+        ["other", "NRF", "original", [1]],
+    ]
+    assert all(row[1] != "SH" for row in shown), "a run that nobody asked for and that has left nothing"
+    assert len(ran(fake)) == 3
+    record = json.loads((fake / "out" / "runs" / "NRF-original-other-1.json").read_text())
+    assert record["identity"]["parser"] == ["nrfgs-data", "--downscale-factor", "2"], "read as the file says"
+
+
+def summaries(folder: Path) -> list[list]:
+    """scene, run, protocol, absent, seeds of each row of the report."""
+    rows = json.loads((folder / "out" / "summary.json").read_text())
+    return [[row[key] for key in ("scene", "run", "protocol", "absent", "seeds")] for row in rows]
+
+
+def test_a_report_made_while_another_command_runs(fake):
+    """It has what is there, and the other one's report has all in the end."""
+    file = spec_file(fake, "runs: {SH: nrfgs-sh, NRF: nrfgs}\nscenes: [scene]\nseeds: [1]\nsteps: 100\n")
+    chosen = {"spec": file, "data": (), "seeds": (), "steps": None}
+    bench_in(fake, runs=("SH",), **chosen).main()
+    reports = []
+    other = bench_in(fake, runs=("NRF",), **chosen)
+    wait = other.start
+
+    def start(*job):
+        bench_in(fake, runs=(), report_only=True, **chosen).main()
+        reports.extend(summaries(fake))
+        return wait(*job)
+
+    other.start = start
+    other.main()
+    assert reports == [["scene", "SH", "own", {}, [1]], ["scene", "NRF", "own", {"1": "missing"}, []]]
+    assert summaries(fake) == [["scene", "SH", "own", {}, [1]], ["scene", "NRF", "own", {}, [1]]]
+
+
+def test_a_stopped_benchmark_says_so(fake, monkeypatch, capsys):
+    """Ctrl-C: no traceback, the status of a stopped command, and no child left."""
+    behave(fake, **{"SH-own-scene-1": "hangs"})
+    verb, pid = bench_in(fake, seeds=(1,)), fake / "work" / "SH-own-scene-1" / "pid"
+    monkeypatch.setattr(cli.tyro.extras, "subcommand_cli_from_dict", lambda *_, **__: verb)
+
+    def stop(_):
+        if pid.exists() and pid.read_text():
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench.time, "sleep", stop)
+    with pytest.raises(SystemExit) as ended:
+        cli.entrypoint()
+    assert ended.value.code == 130 and "nrfgs: stopped" in capsys.readouterr().err
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"identity": {}}'])
+def test_a_broken_record_is_named(text, fake):
+    bench_in(fake, seeds=(1,)).main()
+    (fake / "out" / "runs" / "SH-own-scene-1.json").write_text(text)
+    with pytest.raises(InputError, match="SH-own-scene-1.json is no.*Remove it"):
+        bench_in(fake, seeds=(1,)).main()
+
+
+def spec_file(folder: Path, text: str) -> Path:
+    (folder / "spec.yaml").write_text(text)
+    return folder / "spec.yaml"
 
 
 def test_report_only_runs_nothing_and_needs_no_data(fake):
@@ -151,6 +256,8 @@ def test_more_gpus_than_there_are_is_refused(monkeypatch):
     assert gpu_names(1) == ["3"]
     with pytest.raises(InputError, match="at most 1"):
         gpu_names(2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert gpu_names(1) == [""], "GPUs that were hidden stay hidden"
 
 
 def test_a_terminated_benchmark_takes_its_children_along(fake):
@@ -293,11 +400,3 @@ def test_a_finished_run_is_not_repeated_by_a_late_child(tmp_path, trained):
     Path(job.record).write_text("{}")
     bench_run.run(job)
     assert not trained and Path(job.record).read_text() == "{}"
-
-
-def test_runs_on_the_command_line_may_have_names_with_spaces_and_options_with_equals():
-    assert bench._named_run("nrfgs-sh") == ("nrfgs-sh", {"method": "nrfgs-sh", "options": ""})
-    named = ("NRF-GS logit", {"method": "nrfgs", "options": "--pipeline.model.appearance.opacity-bound=logit"})
-    assert bench._named_run("NRF-GS logit=nrfgs --pipeline.model.appearance.opacity-bound=logit") == named
-    plain = "nrfgs --machine.seed=3"
-    assert bench._named_run(plain) == (plain, {"method": "nrfgs", "options": "--machine.seed=3"})

@@ -58,7 +58,8 @@ def ran(folder: Path) -> list[list[str]]:
 def test_one_task_a_run_resumed_and_merged(folder):
     """A run fails and is tried again alone; the table has both."""
     (folder / "fail").touch()
-    bench_in(folder).main()
+    with pytest.raises(SystemExit, match="1 of the runs FAILED: NRF-own-scene-1"):
+        bench_in(folder).main()
     assert [name for name, *_ in ran(folder)] == ["SH-own-scene-1"]
     assert json.loads((folder / "out/runs/NRF-own-scene-1.failed").read_text())["returncode"] == 1
     assert "working on" in (folder / "work" / "NRF-own-scene-1.log").read_text()

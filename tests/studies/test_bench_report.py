@@ -4,6 +4,7 @@
 import csv
 import io
 import json
+import re
 
 import numpy as np
 import pytest
@@ -78,6 +79,41 @@ def test_csv_has_plain_numbers():
     lines = list(csv.DictReader(io.StringIO(as_csv(rows()))))
     assert float(lines[1]["PSNR"]) == 33.0 and float(lines[1]["PSNR deviation"]) == pytest.approx(2**0.5)
     assert float(lines[0]["MB"]) == 2.0 and lines[0]["LPIPS"] == "" and lines[3]["PSNR deviation"] == ""
+
+
+STRANGE = ["a|b", "50%", "_x_", "a & b", "f_1 {2} ~^", "$w^$", "a*b*", "<0.1>", "back\\slash", "two\nlines"]
+
+
+def strange_rows():
+    return [Row("s", name, "own", {1: record(30.0 + i)}).fill() for i, name in enumerate(STRANGE)]
+
+
+def test_strange_names_break_no_table(tmp_path):
+    """Each line has the table's columns, no letter of a name means anything, and the CSV gives the names back."""
+    lines = [line for line in markdown(strange_rows()).splitlines() if line.startswith("|")]
+    assert len(lines) == 2 + len(STRANGE)
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4 + len(COLUMNS) + 1}
+    names = [re.split(r"(?<!\\)\|", line)[2].strip() for line in lines[2:]]
+    assert names == [
+        *(r"a\|b", "50%", r"\_x\_", "a & b", "f_1 {2} ~^", "$w^$", r"a\*b\*", r"\<0.1>", r"back\\slash", "two lines")
+    ]
+    text = latex(strange_rows())
+    for name in (
+        *("a\\textbar{}b", "50\\%", "\\_x\\_", "a \\& b", "f\\_1 \\{2\\} \\textasciitilde{}\\textasciicircum{}"),
+        *("\\$w\\textasciicircum{}\\$", "\\textless{}0.1\\textgreater{}", "back\\textbackslash{}slash", "two lines"),
+    ):
+        assert f"s & {name} & own & " in text
+    assert [line["run"] for line in csv.DictReader(io.StringIO(as_csv(strange_rows())))] == STRANGE
+    draw_splats([*strange_rows(), Row("$^$", "elsewhere", "own", {1: record(30.0)}).fill()], tmp_path)
+    svg = (tmp_path / "splats.svg").read_text()
+    assert "_x_</text>" in svg and ">$w^$</text>" in svg and ">$^$</text>" in svg
+    assert ">elsewhere</text>" in svg, "a run that the first scene lacks is not in the legend"
+
+
+def test_what_is_no_number_is_not_there():
+    rows = [Row("s", "a", "own", {1: record(float("nan"))}).fill(), Row("s", "b", "own", {1: record(30.0)}).fill()]
+    assert rows[0].text(PSNR) == "-" and ranks(rows, PSNR) == {}
+    assert "nan" not in as_csv(rows)
 
 
 def test_ranks_share_and_skip():
@@ -161,6 +197,18 @@ def test_sheet_shows_the_views_where_runs_differ(pictures, tmp_path):
     assert np.array_equal(np.asarray(two)[: one.height], np.asarray(one))
     below = np.asarray(one)[-200:-10, -200:-10]  # inside B's error map: 4 x 50 in the patch, else black
     assert set(np.unique(below)) == {0, 200}
+
+
+def test_pictures_of_another_size_are_left_out(pictures, tmp_path):
+    """A run on photographs scaled down, beside the others."""
+    for file in numbered(pictures["A"]).values():
+        with Image.open(file) as one:
+            small = one.resize((80, 30))
+        (tmp_path / "small").mkdir(exist_ok=True)
+        small.save(tmp_path / "small" / file.name)
+    assert crop_sheet(pictures, tmp_path / "sheet.png")
+    assert crop_sheet({**pictures, "small": tmp_path / "small"}, tmp_path / "more.png")
+    assert (tmp_path / "more.png").read_bytes() == (tmp_path / "sheet.png").read_bytes()
 
 
 def test_no_pictures_no_sheet(tmp_path):

@@ -15,6 +15,7 @@ from PIL import Image
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.studies.bench_data import parser_options
 from nrfgs_ns.studies.bench_spec import (
+    PRESET_STEPS,
     Scene,
     cells_of,
     command,
@@ -23,7 +24,9 @@ from nrfgs_ns.studies.bench_spec import (
     load_spec,
     make_spec,
     rows_of,
+    steps_of,
 )
+from nrfgs_ns.studies.options import methods
 from nrfgs_ns.studies.run import parse
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -84,6 +87,9 @@ def test_methods_of_others_run_as_they_are():
         ({"options": "'open"}, "options"),
         ({"crops": {"bonsai": 3}}, "crops"),
         ({"runs": {"host": {"method": "splatfacto", "protocols": ["original"]}}}, "splatfacto knows no protocol"),
+        ({"runs": {"N": {"method": "nrfgs", "options": "--max-num-iterations 9"}}}, "N: options: --max-num.*use steps"),
+        ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
+        ({"options": "--time_budget 1"}, "--time-budget"),
     ],
 )
 def test_what_is_wrong_is_named(content, says):
@@ -98,6 +104,20 @@ def test_files_that_are_no_mapping_are_named(text, tmp_path):
         file.write_text(text)
     with pytest.raises(InputError, match="bad.yaml"):
         load_spec(file)
+
+
+@pytest.mark.parametrize("given, trained", [({}, 10_000), ({"steps": 77}, 77)])
+def test_a_preset_keeps_its_steps(given, trained):
+    """nrfgs-fast at the benchmark's 30,000 steps would be nrfgs under another name."""
+    plan = spec(runs={"fast": {"method": "nrfgs-fast", **given}, "NRF": "nrfgs"}, steps=30_000)
+    assert [steps_of(plan, run) for run in plan.runs] == [trained, 30_000]
+    fast = command(plan, cells_of(plan)[0], [], Path())
+    assert fast[fast.index("--max-num-iterations") + 1] == str(trained)
+
+
+def test_presets_steps_are_those_of_the_presets():
+    own = {one.config.method_name: one.config.max_num_iterations for one in methods()}
+    assert PRESET_STEPS == {name: steps for name, steps in own.items() if steps != own["nrfgs"]}
 
 
 # Commands.

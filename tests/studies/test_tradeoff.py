@@ -71,6 +71,10 @@ def test_knobs_become_runs():
 def test_gpu_knobs_and_chosen_knobs():
     assert "precision fp32" in [setting.name for setting in planned(cuda=True)[1]]
     assert [setting.name for setting in planned(only=("D",))[1]] == ["default", "D 4", "D 8"]
+    chosen = planned(only=("D 8", "head"))[1]
+    assert [setting.name for setting in chosen] == ["default", "D 8", "head SH", "head one"]
+    with pytest.raises(InputError, match="no knob D 5. It has D, steps, budget, precision, head; a single setting"):
+        planned(only=("D 5",))
 
 
 @pytest.mark.parametrize(
@@ -223,8 +227,27 @@ def test_report_from_records(tmp_path, capsys):
     assert "D 8" in capsys.readouterr().out
 
 
-def test_the_verb_runs_a_benchmark(tmp_path, monkeypatch):
-    """It leaves the benchmark's file, hands it to `nrfgs bench` with its options, and reports what that has left."""
+def test_a_training_without_a_splat_has_no_ratio():
+    empty = record(5.0)
+    empty["measured"]["splats"] = 0
+    rows = [row("default", record(30.0)), row("empty", empty)]
+    assert set(changes(rows, rows[0], BY_NAME["splats"], ratio=True)) == {"default"}
+
+
+def test_strange_names_break_no_table(tmp_path):
+    """A knob whose name means something to Markdown and to matplotlib."""
+    content, settings = bench_plan({**KNOBS, "knobs": {"_a|b $": {"steps": [50]}}}, "knobs.yaml", False)
+    spec = make_spec(content, "bench.yaml")
+    (tmp_path / "runs").mkdir()
+    for cell in cells_of(spec):
+        (tmp_path / "runs" / f"{cell.name}.json").write_text(json.dumps(record(30.0)))
+    report(spec, settings, tmp_path, {})
+    assert r"| \_a\|b $ 50 | 2 |" in (tmp_path / "tradeoff.md").read_text()
+
+
+@pytest.fixture
+def fake_runs(monkeypatch):
+    """Names of the trainings that a benchmark would make; each leaves a record at once."""
     from nrfgs_ns.studies import bench
 
     ran = []
@@ -239,6 +262,12 @@ def test_the_verb_runs_a_benchmark(tmp_path, monkeypatch):
             self.record(name).write_text(json.dumps({**record(30.0), "identity": job.identity}))
 
     monkeypatch.setattr(bench.Bench, "run_all", run_all)
+    return ran
+
+
+def test_the_verb_runs_a_benchmark(tmp_path, fake_runs):
+    """It leaves the benchmark's file, hands it to `nrfgs bench` with its options, and reports what that has left."""
+    ran = fake_runs
     (tmp_path / "knobs.yaml").write_text(yaml.safe_dump({**KNOBS, "knobs": {"D": KNOBS["knobs"]["D"]}}))
     verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", seeds=(7,), cuda=False)
     verb.main()
@@ -248,3 +277,41 @@ def test_the_verb_runs_a_benchmark(tmp_path, monkeypatch):
     ran.clear()
     verb.main()
     assert ran == []
+
+
+def test_rows_with_steps_of_their_own_are_named(tmp_path, fake_runs, capsys):
+    """A file's "a third of the steps" is no third of others."""
+    (tmp_path / "knobs.yaml").write_text(yaml.safe_dump(KNOBS))
+    verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path, work=tmp_path, knobs=("steps", "D"), steps=40, cuda=False)
+    verb.main()
+    assert "--steps does not change runs that have their own: steps 50 (50)." in capsys.readouterr().out
+    with pytest.raises(InputError, match="steps is 0"):
+        Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "none", steps=0).main()
+
+
+def test_parts_of_a_sweep_report_all_that_is_there(tmp_path, fake_runs):
+    """Knobs one after the other, a report without a GPU of what was made with one."""
+    (tmp_path / "knobs.yaml").write_text(
+        yaml.safe_dump({**KNOBS, "scenes": [{"path": "s", "downscale": 2}, "t"]}, sort_keys=False)
+    )
+
+    def sweep(**chosen) -> tuple[list[str], list]:
+        """The rows of the report on the first scene, and its seeds."""
+        verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", data=("s",), **chosen)
+        verb.main()
+        first = json.loads((tmp_path / "out" / "tradeoff.json").read_text())[0]
+        content = yaml.safe_load((tmp_path / "out" / "bench.yaml").read_text())
+        assert list(content["runs"]) == [one["run"] for one in first["settings"]]
+        assert content["scenes"] == [{"path": "s", "downscale": 2}]
+        return list(content["runs"]), content["seeds"]
+
+    assert sweep(knobs=("precision",), seeds=(1,), cuda=True) == (["default", "precision fp32"], [1])
+    assert sweep(knobs=("D 4",), seeds=(1,), cuda=False) == (["default", "D 4", "precision fp32"], [1])
+    assert len(fake_runs) == 3
+    fake_runs.clear()
+    assert sweep(knobs=("D 4",), seeds=(3,), cuda=False) == (["default", "D 4", "precision fp32"], [1, 3])
+    assert fake_runs == ["default-own-s-3", "D_4-own-s-3"]
+    fake_runs.clear()
+    everything = ["default", "D 4", "D 8", "steps 50", "budget mcmc@200", "precision fp32", "head SH", "head one"]
+    assert sweep(report_only=True, cuda=False) == (everything, [1, 2])  # 3 is not in the file
+    assert fake_runs == []

@@ -82,7 +82,6 @@ def changes(field: Field, seen: Residuals, basis: LatentBasis) -> Iterator[tuple
 def row(part: str, group: str, field: Field, views: FieldViews, full: float | None, **extra: Any) -> Row:
     """Measure one field; `full` is the full field's PSNR, None for itself."""
     score = views.psnr(field)
-    diffuse = field.splats.get(DIFFUSE)
     return Row(
         part,
         group,
@@ -90,9 +89,14 @@ def row(part: str, group: str, field: Field, views: FieldViews, full: float | No
         (score if full is None else full) - score,
         field.bytes,
         views.head_seconds(field),
-        0.0 if diffuse is None else float(diffuse.float().mean()),
+        diffuse_splats(field) / len(field.splats["means"]),
         **extra,
     )
+
+
+def diffuse_splats(field: Field) -> int:
+    """How many splats of a field have no residual."""
+    return int(field.splats[DIFFUSE].sum()) if DIFFUSE in field.splats else 0
 
 
 def together(
@@ -118,7 +122,7 @@ def together(
             field = smaller
             left_out.append(candidate.part)
     slimmed = slim(field, seen, views, full - budget, on_trial=on_trial)
-    if slimmed.threshold > 0:
+    if diffuse_splats(slimmed.field) > diffuse_splats(field):
         every = slimmed.threshold == float("inf")
         left_out.append("all residuals" if every else f"residuals below {slimmed.threshold:g} steps")
     if slimmed.rank < whole.head.config.latent_dim and slimmed.threshold != float("inf"):

@@ -54,6 +54,8 @@ def _change(value: float, full: float) -> str:
 def advice(rows: list[dict[str, Any]], together: dict[str, Any], left_out: list[str], budget: float) -> str:
     """One sentence: what this scene does not need, and what that is worth."""
     full = rows[0]
+    if full["diffuse"] == 1.0:
+        return "No splat of this model has a residual: there is nothing left to leave out."
     nothing = next((row for row in rows if row["threshold"] == float("inf")), None)
     worth = "" if nothing is None else f"View dependence is worth {nothing['loss_db']:.2f} dB here. "
     if not left_out:

@@ -40,7 +40,7 @@ class Inspect:
 
         if self.views < 1:
             raise InputError(f"--views is {self.views}; it must be at least 1.")
-        if self.budget < 0:
+        if not self.budget >= 0:
             raise InputError(f"--budget is {self.budget}; it must be zero or positive.")
         pipeline = load_model(self.load_config, "test")
         model = pipeline.model

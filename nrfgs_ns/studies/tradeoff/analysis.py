@@ -91,11 +91,11 @@ def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> d
         rows: those of one scene, the default among them.
         default: the row to compare with.
         column: what is compared. Rows without a value, and a default without one, give no change.
-        ratio: compare as ratios; values must be positive.
+        ratio: compare as ratios, of those values that are positive.
     """
-    samples = {
-        row.run: [math.log(value) if ratio else value for value in row.values[column.name].values()] for row in rows
-    }
+    samples = {row.run: list(row.values[column.name].values()) for row in rows}
+    if ratio:  # a training that lost its last splat has no ratio
+        samples = {run: [math.log(value) for value in values if value > 0] for run, values in samples.items()}
     deviation, freedom = pooled_deviation(list(samples.values()))
     base, result = samples[default.run], {}
     for name, sample in samples.items():

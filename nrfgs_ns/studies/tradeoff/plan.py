@@ -50,7 +50,7 @@ def bench_plan(
         content: keys and values as in the module's docstring.
         where: what error messages call it.
         cuda: keep the knobs that only a GPU has.
-        only: names of the knobs to turn; none for all.
+        only: names of the knobs to turn, or of single settings, as in "steps 7000"; none for all.
 
     Returns:
         What `nrfgs bench` takes as a file, and the settings, the default first, in the order of its runs.
@@ -73,21 +73,23 @@ def bench_plan(
     )
     knobs = content.get("knobs")
     _require(isinstance(knobs, dict) and bool(knobs), f"{where}: knobs is missing or empty. Name at least one.")
-    unknown = sorted(set(only) - set(knobs))
-    _require(not unknown, f"{where} has no knob {', '.join(unknown)}. It has {', '.join(knobs)}.")
-
-    runs, settings = {DEFAULT: dict(default)}, [Setting(DEFAULT, "")]
+    runs, settings, names = {DEFAULT: dict(default)}, [Setting(DEFAULT, "")], {DEFAULT}
     for knob, description in knobs.items():
-        if only and knob not in only:
-            continue
         values = _values(knob, description, f"{where}: knobs: {knob}")
-        if description.get("cuda", False) and not cuda:
-            continue
         for value, changes in values.items():
             setting = Setting(str(knob), value)
-            _require(setting.name not in runs, f"{where}: {setting.name!r} is there twice. Give knobs distinct values.")
-            runs[setting.name] = _run(default, changes)
-            settings.append(setting)
+            _require(setting.name not in names, f"{where}: {setting.name!r} is there twice. Give knobs distinct names.")
+            names.add(setting.name)
+            is_chosen = not only or str(knob) in only or setting.name in only
+            if is_chosen and (cuda or not description.get("cuda", False)):
+                runs[setting.name] = _run(default, changes)
+                settings.append(setting)
+    unknown = sorted(set(only) - names - set(map(str, knobs)))
+    _require(
+        not unknown,
+        f"{where} has no knob {', '.join(unknown)}. It has {', '.join(map(str, knobs))}; "
+        "a single setting is named by its knob and its value, as in 'steps 7000'.",
+    )
     return {**rest, "runs": runs}, settings
 
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from rich.console import Console
 
-from nrfgs_ns.studies.bench_report import rows_from_records
+from nrfgs_ns.studies.bench_report import plain_label, rows_from_records
 from nrfgs_ns.studies.bench_spec import Spec, rows_of
-from nrfgs_ns.studies.bench_table import Row, notes, with_averages
-from nrfgs_ns.studies.files import write_whole
+from nrfgs_ns.studies.bench_table import Row, notes, plain_markdown, with_averages
+from nrfgs_ns.studies.files import whole, write_whole
 from nrfgs_ns.studies.tradeoff.analysis import (
     BY_NAME,
     COSTS,
@@ -54,7 +54,7 @@ def report(spec: Spec, settings: list[Setting], out: Path, stale: dict[str, str]
         default = next(row for row in of_scene if row.run == DEFAULT and row.protocol == default_protocol)
         result = compare(of_scene, default, settings)
         results.append({"scene": scene, **result})
-        texts.append(f"### {scene}\n\n{table(of_scene, default, result)}")
+        texts.append(f"### {plain_markdown(scene)}\n\n{table(of_scene, default, result)}")
     text = "\n".join([*texts, *(f"{note}\n" for note in [*LEGEND, *notes(rows)])])
     write_whole(out / "tradeoff.md", text)
     write_whole(out / "tradeoff.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
@@ -133,7 +133,8 @@ def table(rows: list[Row], default: Row, result: dict[str, Any]) -> str:
             prices = [price_text(plain["prices"].get(cost.title)) for cost in COSTS]
         stars = [" ★" if row.run in result["fronts"][cost.title] else "" for cost in COSTS]
         prices = [(text + star).strip() for text, star in zip(prices, stars, strict=True)]
-        lines.append([f"**{row.run}**" if row is default else row.run, row.seeds, *cells, *prices])
+        name = plain_markdown(row.run)
+        lines.append([f"**{name}**" if row is default else name, row.seeds, *cells, *prices])
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
@@ -182,7 +183,7 @@ def draw(rows: list[Row], settings: list[Setting], path: Path) -> None:
                 for knob in knobs:
                     _points(panel, [row for row in of_scene if knob_of[row.run] == knob], cost, knob, knobs.index(knob))
                 _front(panel, of_scene, cost)
-                panel.set(title=scene, xlabel=cost.column.name, ylabel="PSNR", xscale="log")
+                panel.set(title=plain_label(scene), xlabel=cost.column.name, ylabel="PSNR", xscale="log")
                 panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
                 panel.xaxis.set_major_formatter("{x:g}")
                 panel.xaxis.set_minor_formatter(NullFormatter())
@@ -190,8 +191,8 @@ def draw(rows: list[Row], settings: list[Setting], path: Path) -> None:
         handles, labels = panels[0][0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="lower center", ncols=min(len(labels), 8), fontsize=7)
         figure.tight_layout(rect=(0, 0.5 / size[1] * (1 + len(labels) // 9), 1, 1))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110, metadata={"Software": None})
+        with whole(path) as aside:
+            figure.savefig(aside, format="png", dpi=110, metadata={"Software": None})
         pyplot.close(figure)
 
 
@@ -223,4 +224,4 @@ def _front(panel, rows: list[Row], cost: Cost) -> None:
     xs, ys = [row.mean(cost.column) for row in front], [row.mean(PSNR) for row in front]
     panel.step(xs, ys, where="post", color="grey", linewidth=0.8, zorder=1)
     for x, y, row in zip(xs, ys, front, strict=True):
-        panel.annotate(row.run, (x, y), textcoords="offset points", xytext=(3, 5), fontsize=6, rotation=20)
+        panel.annotate(plain_label(row.run), (x, y), textcoords="offset points", xytext=(3, 5), fontsize=6, rotation=20)

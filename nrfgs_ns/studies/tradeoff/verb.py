@@ -23,13 +23,13 @@ class Tradeoff:
     work: Path = Path("outputs/tradeoff")
     """folder for checkpoints, pictures and logs"""
     data: tuple[str, ...] = ()
-    """data sets: folders below --scenes"""
+    """data sets: folders below --scenes, read as the file says if it has them"""
     knobs: tuple[str, ...] = ()
-    """knobs to turn; none for all of the file"""
+    """knobs to turn, or single settings such as "steps 7000"; none for all of the file"""
     seeds: tuple[int, ...] = ()
     """--machine.seed of each repetition"""
     steps: int | None = None
-    """training steps, but for runs that name their own"""
+    """training steps, but for runs and presets that have their own"""
     jobs: int | None = None
     """runs at once on each GPU, or on the CPU; times are reported only with 1"""
     gpus: int | None = None
@@ -46,38 +46,60 @@ class Tradeoff:
     """put records that were made with other arguments aside, and make them anew"""
 
     def main(self) -> None:
-        import yaml
-
-        from nrfgs_ns.studies.files import write_whole
+        from nrfgs_ns.studies.bench_spec import make_spec
         from nrfgs_ns.studies.tradeoff.report import report
 
-        content, settings = self.plan()
-        file = self.out / "bench.yaml"
-        write_whole(file, yaml.safe_dump(content, sort_keys=False, width=120))
-        bench = self.bench(file)
-        bench.main()
-        plan = bench.plan()
-        report(plan, settings, self.out, bench.stale(plan, None))
+        content, everything, settings = self.plan()
+        bench = self.bench()
+        given = {key: value for key, value in (("jobs", self.jobs), ("gpus", self.gpus)) if value is not None}
+        asked, whole = (make_spec({**plan, **given}, str(self.spec)) for plan in (content, everything))
+        shown, stale = bench.carry_out(asked, whole)
+        self.leave_file(everything, shown)
+        runs = {run.name for run in shown.runs}
+        report(shown, [setting for setting in settings if setting.name in runs], self.out, stale)
+        bench.complain(asked)
 
-    def plan(self) -> tuple[dict[str, Any], list]:
-        """The benchmark as `nrfgs bench` reads it, and the settings behind its runs."""
+    def plan(self) -> tuple[dict[str, Any], dict[str, Any], list]:
+        """The benchmark that is asked for and that with all of the file, as `nrfgs bench` reads them, and the settings
+        behind the runs of the latter."""
+        from nrfgs_ns.studies.bench_choice import chosen_scenes, united
         from nrfgs_ns.studies.bench_spec import load_spec
         from nrfgs_ns.studies.tradeoff.plan import bench_plan
 
-        content = load_spec(self.spec)
-        given = {"scenes": list(self.data), "seeds": list(self.seeds), "steps": self.steps}
-        content |= {key: value for key, value in given.items() if value}
-        return bench_plan(content, str(self.spec), self._has_cuda(), self.knobs)
+        file = load_spec(self.spec)
+        content = file if self.steps is None else {**file, "steps": self.steps}
+        asked, _ = bench_plan(content, str(self.spec), self._has_cuda(), self.knobs)
+        whole, settings = bench_plan(content, str(self.spec), True)
+        if self.data:
+            asked["scenes"] = chosen_scenes(self.data, file.get("scenes") or [])
+        if self.seeds:
+            asked["seeds"] = list(self.seeds)
+        return asked, united(whole, asked), settings
 
-    def bench(self, file: Path) -> Bench:
-        """The benchmark that runs a plan."""
+    def leave_file(self, everything: dict[str, Any], shown) -> None:
+        """Write OUT/bench.yaml: of everything, what a report shows."""
+        import yaml
+
+        from nrfgs_ns.studies.bench_spec import as_list, scene_name
+        from nrfgs_ns.studies.files import write_whole
+
+        runs, scenes = {run.name for run in shown.runs}, {scene.name for scene in shown.scenes}
+        content = {
+            **everything,
+            "scenes": [scene for scene in as_list(everything["scenes"]) if scene_name(scene) in scenes],
+            "seeds": shown.seeds,
+            "runs": {name: run for name, run in everything["runs"].items() if name in runs},
+        }
+        write_whole(self.out / "bench.yaml", yaml.safe_dump(content, sort_keys=False, width=120))
+
+    def bench(self) -> Bench:
+        """What runs a plan."""
         return Bench(
-            spec=file,
+            spec=self.spec,
             scenes=self.scenes,
             out=self.out,
             work=self.work,
-            jobs=self.jobs,
-            gpus=self.gpus,
+            steps=self.steps,
             executor=self.executor,
             slurm=self.slurm,
             report_only=self.report_only,
