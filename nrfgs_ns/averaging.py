@@ -84,6 +84,10 @@ class ParameterMean:
         self._means = {name: mean.to(parameters[name]) for name, mean in state["means"].items()}
         self._of, self._diffuse = parameters, _diffuse(model)
 
+    def is_current(self, model, optimizers: Mapping[str, Optimizer]) -> bool:
+        """Whether rows mean what they meant when it was last added to."""
+        return self._is_of(_parameters(optimizers), _diffuse(model))
+
     def _is_of(self, parameters: Mapping[str, Tensor], diffuse: Tensor | None) -> bool:
         """Whether these very objects are those that it is the mean of."""
         same = self._of.keys() == parameters.keys() and diffuse is self._diffuse

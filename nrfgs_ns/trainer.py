@@ -57,8 +57,6 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
         if self.average_steps < 0:
             raise InputError(f"average_steps is {self.average_steps}; it must be zero or positive.")
-        if self.average_steps > 0 and kwargs.get("world_size", 1) > 1:
-            raise InputError("average_steps is for one device. Set it to 0, or use --machine.num-devices 1.")
         if kwargs.get("world_size", 1) == 1:
             return super().setup(**kwargs)
         from nrfgs_ns.distributed.trainer import ShardedTrainer

@@ -13,13 +13,14 @@ table, whoever's head it belongs to, and to the optimisers' moments. The model n
 `protocol.py` is the interface, `gradient.py` and `mcmc.py` (with `relocation.py`) the protocols, `build.py` the choice.
 """
 
-from nrfgs_ns.densification.build import build_densification
+from nrfgs_ns.densification.build import UNREAD, build_densification
 from nrfgs_ns.densification.gradient import GradientDensification, OriginalDensification
 from nrfgs_ns.densification.mcmc import Mcmc, McmcDensification
 from nrfgs_ns.densification.protocol import CHANGE, UNSEEN, Densification, OpacitySeen, Protocol
 
 __all__ = [
     "CHANGE",
+    "UNREAD",
     "UNSEEN",
     "Densification",
     "GradientDensification",

@@ -21,6 +21,12 @@ SPLATFACTOS_THRESHOLDS = (
     "stop_screen_size_at",
 )
 """Options of the model that only the protocol `splatfacto` reads."""
+UNREAD = {
+    "splatfacto": (),
+    "original": SPLATFACTOS_THRESHOLDS,
+    "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at"),
+}
+"""Options of the model that a protocol does not read, and refuses where they are set."""
 
 
 def build_densification(config: Any, num_train_images: int, scene_unit: float = 1.0) -> Densification:
@@ -71,7 +77,7 @@ def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densif
 
 
 def _original(config: Any, num_train_images: int, scene_unit: float) -> Densification:
-    _refuse_options(config, SPLATFACTOS_THRESHOLDS)
+    _refuse_options(config)
     rules: OriginalDensification = config.original
     strategy = PruneBySeenOpacity(
         prune_opa=rules.prune_opacity,
@@ -93,7 +99,7 @@ def _original(config: Any, num_train_images: int, scene_unit: float) -> Densific
 
 
 def _mcmc(config: Any, num_train_images: int, scene_unit: float) -> Densification:
-    _refuse_options(config, (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at"))
+    _refuse_options(config)
     if not 1 <= config.splat_budget <= LARGEST_BUDGET:
         raise InputError(
             f"pipeline.model.splat_budget is {config.splat_budget}; it must lie between 1 and {LARGEST_BUDGET}."
@@ -108,9 +114,9 @@ def _mcmc(config: Any, num_train_images: int, scene_unit: float) -> Densificatio
     )
 
 
-def _refuse_options(config: Any, names: tuple[str, ...]) -> None:
+def _refuse_options(config: Any) -> None:
     """Raise InputError where an option was set that this protocol does not read: it would be ignored silently."""
-    for name in names:
+    for name in UNREAD[config.densification]:
         if getattr(config, name) != getattr(type(config), name):
             protocol = config.densification
             raise InputError(

@@ -102,7 +102,8 @@ class Densification(ABC):
 
     @abstractmethod
     def has_ended(self, step: int, last: float) -> bool:
-        """Whether no step from `step` to `last`, the training's last, moves or adds splats, as things look now.
+        """Whether no step from `step` to `last`, the training's last, adds splats or moves some onto others, as things
+        look now. The noise of MCMC and resets of opacity go on.
 
         Args:
             step: training step.

@@ -18,7 +18,7 @@ from typing import Any
 
 from torch.optim import Optimizer
 
-from nrfgs_ns.densification import McmcDensification
+from nrfgs_ns.densification import UNREAD, McmcDensification
 
 MODEL_STEPS = (
     "warmup_length",
@@ -50,14 +50,21 @@ def with_fewer_steps(config: Any, devices: int) -> Any:
     head = replace(
         model.appearance, **{name: fewer(getattr(model.appearance, name), devices) for name in steps_of_head}
     )
+    steps_of_model = [name for name in MODEL_STEPS if name not in UNREAD.get(model.densification, ())]
     mcmc: McmcDensification = model.mcmc
     model = replace(
         model,
         appearance=head,
         mcmc=replace(mcmc, stop_at=fewer(mcmc.stop_at, devices)),
-        **{name: fewer(getattr(model, name), devices) for name in MODEL_STEPS},
+        **{name: fewer(getattr(model, name), devices) for name in steps_of_model},
     )
-    names = ("max_num_iterations", "steps_per_save", "steps_per_eval_image", "steps_per_eval_all_images")
+    names = (
+        "max_num_iterations",
+        "average_steps",
+        "steps_per_save",
+        "steps_per_eval_image",
+        "steps_per_eval_all_images",
+    )
     return replace(
         config,
         pipeline=replace(config.pipeline, model=model),

@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from nrfgs_ns.distributed import comm
+from nrfgs_ns.distributed.averaging import ShardedMean
 from nrfgs_ns.distributed.pipeline import ShardedPipeline
 from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import cut_optimizer_state, gather_model_state, gather_optimizer_state
@@ -132,6 +133,7 @@ class ShardedTrainer(NrfgsTrainer):
 
     def setup_optimizers(self) -> Optimizers:
         self.guard = ShardedGuard(self.pipeline)
+        self.pipeline.parameter_mean = ShardedMean() if self.config.average_steps > 0 else None
         every = self.pipeline.steps_per_log = self.config.logging.steps_per_log
         groups = self.pipeline.get_param_groups()
         optimizers = ShardedOptimizers(self.optimizer_configs(), groups, self.guard, every)
@@ -148,6 +150,8 @@ class ShardedTrainer(NrfgsTrainer):
         for name in model.gauss_params:
             content["optimizers"][name] = gather_optimizer_state(content["optimizers"][name], model.counts)
         extra = content["pipeline"]["_extra_state"]
+        if extra.pop("parameter_mean", None) is not None:  # on all devices, or on none
+            extra |= self.pipeline.parameter_mean.whole_state(model, self.optimizers.optimizers)
         own = {name: extra[name] for name in ("torch_rng", "cuda_rng", "python_rng")}
         images = self.world_size if self.count_images else 1
         content["pipeline"]["_extra_state"] = {

@@ -5,11 +5,22 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from device import PLAIN, RICH, one_step, told, train
+from device import PLAIN, RICH, one_step, told, train, trainer_of
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.utils.rich_utils import CONSOLE
 
 MORE = {"--pipeline.sharding.rebalance-at": 1.0}
 """Rows move after each refinement that has left the shards unequal."""
+AVERAGED = {
+    "--average-steps": 10,
+    "--steps-per-save": 7,
+    "--save-only-latest-checkpoint": False,
+    "--pipeline.model.warmup-steps": 0,
+    "--pipeline.model.stop-split-at": 8,
+    "--pipeline.sharding.rebalance-at": 100.0,
+}
+"""Of 12 steps, the mean begins at step 2. The only refinement is at step 4, and leaves the shards as unequal as it
+makes them."""
 
 
 def everything(scene: Path, folder: Path) -> None:
@@ -19,6 +30,7 @@ def everything(scene: Path, folder: Path) -> None:
     fifty_steps(scene, folder)
     there_and_back(scene, folder)
     stops_together(scene, folder)
+    averaged(scene, folder)
 
 
 def unbroken(scene: Path, folder: Path) -> None:
@@ -93,7 +105,7 @@ def holds(trainer) -> dict:
 
 def fits_one_process(scene: Path, folder: Path) -> None:
     """Device 0's image and loss in the first step, and those of one process; in the devices' own precision."""
-    from device import step_alone, step_together, trainer_of
+    from device import step_alone, step_together
 
     world = dist.get_world_size()
     torch.save(step_together(trainer_of(scene, folder / "step", world, **PLAIN)), folder / f"step-{dist.get_rank()}.pt")
@@ -127,3 +139,67 @@ def stops_together(scene: Path, folder: Path) -> None:
     except TrainingStopped as stopped:
         said = str(stopped)
     torch.save(said, folder / f"stopped-{dist.get_rank()}.pt")
+
+
+def averaged(scene: Path, folder: Path) -> None:
+    """12 steps with a mean over the last 10, and the last 4 of them again, from the checkpoint in between. That is
+    also looked at by one process. Then it goes on once more, until the second device has a splat that is NaN."""
+    from nrfgs_ns.guard import TrainingStopped
+
+    world, main = dist.get_world_size(), dist.get_rank() == 0
+    after, counts = [], []
+
+    def note(trainer, then) -> None:
+        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], then))
+
+    def lopsided(trainer) -> None:
+        """Only the second device refines."""
+        strategy = trainer.pipeline.model.densification.strategy
+        strategy.pause_refine_after_reset = 0
+        if main:
+            strategy._grow_gs, strategy._prune_gs = lambda *_: (0, 0), lambda *_: 0
+
+    def watch(trainer) -> None:
+        lopsided(trainer)
+
+        def keep(step: int) -> None:
+            after.append(parameters(trainer))
+            counts.append(trainer.pipeline.parameter_mean.count)
+
+        note(trainer, keep)
+
+    def spoil(trainer) -> None:
+        lopsided(trainer)
+
+        @torch.no_grad()
+        def break_splat(step: int) -> None:
+            if step == 9 and not main:
+                trainer.pipeline.model.means[0] = float("nan")
+
+        note(trainer, break_splat)
+
+    options = {**PLAIN, **AVERAGED}
+    with CONSOLE.capture() as log:
+        trainer = train(scene, folder / "averaged", world, 12, watch=watch, **options)
+    whole, ended = told(trainer), parameters(trainer)
+    from_between = {**options, "--load-step": 7}
+    rest = told(train(scene, folder / "averaged-rest", world, 4, load=whole, watch=lopsided, **from_between))
+    again = {**from_between, "--steps-per-save": 9}
+    try:
+        train(scene, folder / "averaged-nan", world, 4, load=whole, watch=spoil, **again)
+        stopped = False
+    except TrainingStopped:
+        stopped = True
+    result = {"after": after, "counts": counts, "ended": ended, "said": log.get(), "stopped": stopped}
+    if main:
+        alone = trainer_of(scene, folder / "averaged-alone", 1, **from_between, **{"--load-dir": whole})
+        mean = alone.pipeline.parameter_mean
+        result |= {"saved": [str(whole), str(rest)], "alone": mean and mean.state()}
+    torch.save(result, folder / f"averaged-{dist.get_rank()}.pt")
+    dist.barrier()
+
+
+def parameters(trainer) -> dict:
+    """A device's splats and shared weights, now."""
+    named = trainer.pipeline.model.named_parameters()
+    return {name: value.detach().clone() for name, value in named if name.startswith(("gauss_params.", "head."))}

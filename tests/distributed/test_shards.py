@@ -2,6 +2,7 @@
 """Plans that need no second device: who has which rows, who sends how many, what a step number becomes."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nrfgs_ns.densification import build_densification
 from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import rows_of, shard_counts, transfers
 from nrfgs_ns.errors import InputError
@@ -50,9 +52,10 @@ def test_a_step_that_counts_for_other_images_is_not_gone_on_from(written, now):
 
 
 def test_schedules_counted_in_images():
-    config = with_fewer_steps(nrfgs.config, 2)
+    config = with_fewer_steps(replace(nrfgs.config, average_steps=200), 2)
     model, before = config.pipeline.model, nrfgs.config.pipeline.model
     assert (config.max_num_iterations, model.refine_every, model.stop_split_at) == (15_000, 50, 7_500)
+    assert config.average_steps == 100
     assert model.reset_alpha_every == before.reset_alpha_every, "resets are counted in refinements"
     assert (before.refine_every, nrfgs.config.max_num_iterations) == (100, 30_000), "the configuration was changed"
     means, field = config.optimizers["means"], config.optimizers["field"]
@@ -64,3 +67,11 @@ def test_schedules_counted_in_images():
     assert adam.param_groups[0]["betas"] == pytest.approx((0.8, 0.998))
     forget_faster({"means": adam}, 16)
     assert adam.param_groups[0]["betas"][0] == 0.0
+
+
+@pytest.mark.parametrize("protocol", ["splatfacto", "original", "mcmc"])
+def test_no_step_number_is_divided_that_the_densification_refuses(protocol):
+    pipeline = replace(nrfgs.config.pipeline, model=replace(nrfgs.config.pipeline.model, densification=protocol))
+    model = with_fewer_steps(replace(nrfgs.config, pipeline=pipeline), 2).pipeline.model
+    assert build_densification(model, num_train_images=10).name == protocol
+    assert (model.refine_every, model.mcmc.stop_at) == (50, 12_500)
