@@ -102,8 +102,8 @@ nrfgs = method(
 nrfgs_fast = preset(
     "nrfgs-fast",
     nrfgs,
-    "nrfgs in a third of the steps, its schedules shortened to them: a third of the time. 1 dB less on a capture of 255 "
-    "views, 0.8 to 1.2 dB more on three of 21 to 74.",
+    "nrfgs in a third of the steps, its schedules shortened to them: a third of the time. 1 dB less on a capture of "
+    "255 views, 0.8 to 1.2 dB more on three of 21 to 74.",
     model={},
     max_num_iterations=10_000,
     schedule_steps=STEPS,
