@@ -14,7 +14,7 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT, mean_length
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.reduce import Field
-from nrfgs_ns.capacity.report import read_report
+from nrfgs_ns.capacity.report import add_to_report, read_report
 from nrfgs_ns.diffuse_splats import DiffuseSchedule, DiffuseSplats, give_back, make_diffuse, schedule_for
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.field_views import FieldViews, dropped
@@ -253,6 +253,30 @@ def test_a_continued_training_charges_as_the_unbroken_one(start, charged, tiny_s
     assert charged_steps(trainer, start) == list(charged)
 
 
+def test_a_continued_training_keeps_the_evidence_of_its_folder(tiny_scene, tmp_path):
+    trainer = parse(words(tiny_scene, tmp_path)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    attributes = TrainingCallbackAttributes(trainer.optimizers, trainer.grad_scaler, trainer.pipeline, trainer)
+    for start, kept in ((8, {"looks": []}), (0, {})):
+        add_to_report(trainer.base_dir, {"looks": []})
+        trainer._start_step = start
+        trainer.pipeline.model.get_training_callbacks(attributes)
+        assert read_report(trainer.base_dir) == kept
+    # Looks that are made again, from a checkpoint before them, are there once.
+    model = trainer.pipeline.model
+    model.densification.state[DIFFUSE] = torch.zeros(model.num_points, dtype=torch.bool)
+    schedule = schedule_for(model, trainer.pipeline.datamanager, 1, None, trainer.base_dir)
+    for step in (6, 14, 6, 14):
+        schedule.tell(model, step, [])
+    assert [look["step"] for look in read_report(trainer.base_dir)["looks"]] == [6, 14]
+
+
+def test_a_threshold_sets_no_view_aside(tiny_scene, tmp_path):
+    trainer = parse(words(tiny_scene, tmp_path)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    assert trainer.pipeline.datamanager.views_aside == []
+
+
 def charged_steps(trainer, start: int) -> list[int]:
     """The steps from `start` to 23 in whose loss residuals are; nothing that comes after a step is done."""
     trainer.pipeline.train()
@@ -269,6 +293,9 @@ def charged_steps(trainer, start: int) -> list[int]:
     [
         ({"--pipeline.model.stop-split-at": 16}, False),
         ({"--pipeline.model.stop-split-at": 28}, True),
+        ({"--pipeline.model.stop-split-at": 28, "--schedule-steps": 160}, False),  # stretched, it ends at step 7
+        # The last look would be after step 62. Step 24, the last, splits: the end comes before a step that is charged.
+        ({"--pipeline.model.stop-split-at": 28, "--pipeline.model.diffuse.stop": 60, "--max-num-iterations": 25}, True),
         ({"--pipeline.model.diffuse.start": None}, True),
         ({"--pipeline.model.diffuse.start": None, "--pipeline.model.residual-cost": 0.0}, False),
     ],
@@ -314,12 +341,14 @@ def strategy_of(config: Path) -> dict:
     return checkpoint_of(config)["pipeline"]["_model._extra_state"]["strategy"]
 
 
-@pytest.mark.parametrize("more, last", [({}, 23), ({"--schedule-steps": 6000}, 23)])
+@pytest.mark.parametrize("more, last", [({}, 23), ({"--schedule-steps": 6000}, 23), ({"--time-budget": 100}, None)])
 def test_an_end_before_the_last_look_is_told(more, last, tiny_scene, tmp_path, capsys):
-    """Looks are made at steps of the training, whatever its schedules are stretched to."""
+    """Looks are made at steps of the training, whatever its schedules are stretched to. With a time budget nobody knows
+    the last one."""
     beyond = {"--pipeline.model.diffuse.start": 2000, "--pipeline.model.diffuse.threshold": None}
     parse(words(tiny_scene, tmp_path, beyond, more)).setup(local_rank=0, world_size=1).setup()
-    assert f"this training ends at step {last}" in " ".join(capsys.readouterr().out.split())
+    said = " ".join(capsys.readouterr().out.split())
+    assert (f"this training ends at step {last}:" in said) == ("this training ends" in said) == (last is not None)
 
 
 def test_a_new_training_begins_a_new_report(tiny_scene, tmp_path):

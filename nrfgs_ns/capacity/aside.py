@@ -19,7 +19,7 @@ class Decider(Protocol):
     last_decision: int
     """the step after which it decides for the last time"""
     stretched: bool
-    """whether that is a step of the schedules, which may be stretched; else one of the training"""
+    """whether that is a step of the schedules, which are stretched; else it is one of the training"""
 
     def views_wanted(self) -> int | None:
         """How many views; None: an eighth of the training's, at least 2 and at most 16."""
@@ -53,7 +53,7 @@ class ViewsAside:
                 )
             count = len(data.train_dataset)
             data.set_views_aside(spread(count, waiting))
-            _tell(len(data.views_aside), count, max(decider.last_decision for decider in waiting))
+            _tell(len(data.views_aside), count, waiting)
 
     def after_step(self, step: int) -> None:
         """Give the views back when all is decided."""
@@ -61,10 +61,14 @@ class ViewsAside:
             self.data.give_back_views()
 
 
-def _tell(number: int, count: int, until: int) -> None:
+def _tell(number: int, count: int, waiting: list[Decider]) -> None:
+    latest: dict[bool, int] = {}
+    for decider in waiting:
+        latest[decider.stretched] = max(decider.last_decision, latest.get(decider.stretched, 0))
+    until = " and ".join(f"step {step}{' of the schedules' if stretched else ''}" for stretched, step in latest.items())
     much = number > LARGEST_USUAL_SHARE * count
     CONSOLE.print(
-        f"{'[bold yellow]' if much else ''}{number} of {count} training views are set aside until step {until}, to "
+        f"{'[bold yellow]' if much else ''}{number} of {count} training views are set aside until {until}, to "
         f"decide by them{': that is much, and the others may not be enough to learn from' if much else ''}.",
         soft_wrap=True,
     )

@@ -10,6 +10,7 @@ import math
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.pace import TimedPace
 
 OPTION = "pipeline.model.residual-cost"
 
@@ -31,8 +32,9 @@ class ResidualCharge:
 
     def is_due(self, step: int) -> bool:
         """Whether residuals are charged in this step."""
-        pace = self.model.pace
-        last = self.end if pace is None else pace.step_at(pace.length, step)
+        pace, last = self.model.pace, self.end
+        if isinstance(pace, TimedPace):  # as things look now; the schedules are through behind the last step
+            last = max(pace.step_at(pace.length, step) - 1, step)
         undecided = any(not decider.is_done(step - 1) for decider in self.deciders)
         return undecided and self.model.densification.has_ended(step, last)
 

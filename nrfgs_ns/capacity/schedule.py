@@ -35,7 +35,6 @@ class CapacitySchedule:
     """
 
     option = "pipeline.model.capacity 'auto'"
-    stretched = True
 
     def __init__(self, model, data, optimizers, folder: Path | None):
         self.model, self.data, self.optimizers, self.folder = model, data, optimizers, folder
@@ -48,6 +47,10 @@ class CapacitySchedule:
     @property
     def last_decision(self) -> int:
         return self.config.step
+
+    @property
+    def stretched(self) -> bool:
+        return self.model.pace is not None
 
     def views_wanted(self) -> int | None:
         return self.config.views
@@ -147,15 +150,16 @@ def _check(model, devices: int) -> None:
 
 
 def _warn_of_early_end(decider: Decider, trainer, start: int) -> None:
-    if trainer.pace is not None and decider.stretched:
+    if decider.stretched:
         last = trainer.pace.length - 1
     elif isinstance(trainer.pace, TimedPace):
         return  # nobody knows the last step yet
     else:
         last = start + trainer.config.max_num_iterations - 1
     if decider.last_decision > last:
+        kind = " of the schedules" if decider.stretched else ""
         CONSOLE.print(
-            f"[bold yellow]{decider.option} sets views aside until step {decider.last_decision}, but this training "
-            f"ends at step {last:g}: they are never trained on. Let it decide earlier, or leave it out.",
+            f"[bold yellow]{decider.option} sets views aside until step {decider.last_decision}{kind}, but this "
+            f"training ends at step {last:g}{kind}: they are never trained on. Let it decide earlier, or leave it out.",
             soft_wrap=True,
         )

@@ -91,7 +91,10 @@ class AveragingStudy:
         if not isinstance(config, NrfgsTrainerConfig):
             raise InputError(f"--method is {self.method}; it must be one of this project's.")
         if config.average_steps > 0:
-            raise InputError("--options has --average-steps, which would average before this study does. Leave it out.")
+            raise InputError(
+                f"{self.method} with these options averages over its last {config.average_steps} steps itself, before "
+                'this study does. Leave --average-steps out of --options, or for a preset add "--average-steps 0".'
+            )
         config.save_config()
         _set_random_seed(config.machine.seed)
         trainer = config.setup(local_rank=0, world_size=1)
@@ -103,7 +106,7 @@ class AveragingStudy:
 
         def after(step: int) -> None:
             for window, mean in means.items():
-                if step >= self.steps - window:
+                if step > trainer.last_step - window:
                     mean.add(trainer.pipeline.model, trainer.optimizers.optimizers)
 
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after))

@@ -63,9 +63,13 @@ def test_they_are_part_of_the_sampling_state(tiny_scene, tmp_path):
     assert again.views_aside == []
 
 
-def decider(views=None, until=9):
+def decider(views=None, until=9, stretched=False):
     return SimpleNamespace(
-        option="an option", last_decision=until, views_wanted=lambda: views, is_done=lambda step: step >= until
+        option="an option",
+        last_decision=until,
+        stretched=stretched,
+        views_wanted=lambda: views,
+        is_done=lambda step: step >= until,
     )
 
 
@@ -125,6 +129,18 @@ def test_how_many_are_set_aside_is_told(count, warned, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert f"{len(data.views_aside)} of {count} training views are set aside until step 9" in said
     assert ("that is much" in said) == warned
+
+
+def test_until_when_is_told_in_the_deciders_own_steps(capsys):
+    ViewsAside(Data(), [decider(until=9), decider(until=7), decider(until=300, stretched=True)], 0)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "are set aside until step 9 and step 300 of the schedules, to decide" in said
+
+
+def test_who_has_decided_asks_for_no_view():
+    data = Data()
+    ViewsAside(data, [decider(6, until=-1), decider(2)], 0)
+    assert len(data.views_aside) == 2
 
 
 def test_not_all_views():

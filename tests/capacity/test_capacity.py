@@ -437,6 +437,20 @@ def test_an_end_before_the_decision_is_told(tiny_scene, tmp_path, capsys):
     assert "this training ends at step 4" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.parametrize(
+    "schedule, decides, told",
+    [(None, 4, False), (None, 5, True), (40, 39, False), (40, 40, True)],
+)
+def test_a_decision_in_the_last_step_is_in_time(schedule, decides, told, tiny_scene, tmp_path, capsys):
+    """The last of five steps is step 4; that of schedules of 40 steps, which are stretched to them, is step 39."""
+    stretched = {} if schedule is None else {"--schedule-steps": schedule}
+    set_up(tiny_scene, tmp_path, {f"{SEARCH}.step": decides, **stretched}, steps=5)
+    kind = "" if schedule is None else " of the schedules"
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"views are set aside until step {decides}{kind}, to decide" in said
+    assert (f"but this training ends at step {(schedule or 5) - 1}{kind}: they are never" in said) == told
+
+
 def test_what_is_left_is_drawn_and_exported(whole, tmp_path):
     """A viewer's way to a model and both formats of `nrfgs export`, from the checkpoint of a smaller field."""
     _, pipeline, _, _ = eval_setup(whole, test_mode="inference")

@@ -153,9 +153,19 @@ def test_a_field_of_low_rank_is_written_at_its_rank(tmp_path):
         (lambda header, streams: streams.pop("diffuse.colors"), "diffuse.colors"),
         (lambda header, streams: streams["view.quats_largest"].fill(7), "in range"),
         (lambda header, streams: header.update(quats_bits=0), "quats_bits"),
+        (
+            lambda header, streams: header["head"]["config"].update(latent_dim=streams["head.low.0.weight"].shape[1]),
+            "head.low.0.weight",  # it has inputs beside the latents
+        ),
+        (lambda header, streams: header.update(quats_bits=1), "quats_bits is 1"),
+        (lambda header, streams: header.update(quats_bits=17), "quats_bits is 17"),
         (lambda header, streams: header.update(quats_bits=10**9), "quats_bits"),
         (lambda header, streams: header.update(quats_bits=2.5), "quats_bits"),
         (lambda header, streams: header["grids"]["means"].update(low=[0.0]), "grid of means"),
+        (
+            lambda header, streams: header["grids"]["means"].update(low=[[0.0], [0.0], [0.0]]),
+            "low of the grid of means",
+        ),
         (lambda header, streams: header["grids"]["colors"].update(step=["a", 1, 1]), "grid of colors"),
         (lambda header, streams: header["grids"]["latents"].update(step=1.0), "grid of latents"),
         (lambda header, streams: header["splats"].update(view=-1), "-1"),
@@ -166,6 +176,16 @@ def test_files_that_describe_no_field_are_refused(change, says, tmp_path):
     change(header, streams)
     write_container(tmp_path / "f.nrf", header, streams)
     with pytest.raises(InputError, match=says):
+        decode(tmp_path / "f.nrf")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_grid_that_is_not_finite_is_refused(value, tmp_path, monkeypatch):
+    """JSON as others write it may say NaN, or 1e999; `write_container` does not."""
+    header, streams = encode(field(), Precision(), {})
+    header["grids"]["scales"]["step"][1] = value
+    monkeypatch.setattr("nrfgs_ns.compact.decode.read_container", lambda path: (header, streams))
+    with pytest.raises(InputError, match="step of the grid of scales"):
         decode(tmp_path / "f.nrf")
 
 

@@ -106,6 +106,8 @@ def write_with(path, text: bytes, version: int = 1) -> None:
         (lambda header: header["streams"][0].update(shape=[3, 16]), "does not hold 48 numbers"),
         (lambda header: header["streams"][0].update(shape=[2**40]), "would unpack to"),
         (lambda header: header["streams"][0].update(dtype="object"), "which cannot be"),
+        (lambda header: header["streams"][0].update(shape=[True, 51]), "which cannot be"),
+        (lambda header: header["streams"][0].update(bytes=True), "has a stream"),
         (lambda header: header["streams"][0].update(crc32=1), "checksum of its stream"),
         (lambda header: header["streams"].pop() and None, "after its last stream"),
     ],

@@ -40,7 +40,8 @@ def test_windows_of_one_training(tiny_scene, tmp_path, capsys):
     "wrong, message",
     [
         ({"method": "splatfacto"}, "one of this project's"),
-        ({"options": "--average-steps 5"}, "Leave it out"),
+        ({"options": "--average-steps 5"}, "over its last 5 steps itself"),
+        ({"method": "nrfgs-fast"}, 'add "--average-steps 0"'),
         ({"windows": (-1, 3)}, "zero or more"),
     ],
 )

@@ -5,8 +5,8 @@ import pytest
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.studies.bench import Bench
-from nrfgs_ns.studies.bench_choice import named_run
-from nrfgs_ns.studies.bench_spec import cells_of, identity
+from nrfgs_ns.studies.bench_choice import named_run, united, with_records
+from nrfgs_ns.studies.bench_spec import cells_of, identity, make_spec
 
 FILE = """
 runs:
@@ -52,6 +52,50 @@ def test_a_chosen_run_is_the_one_of_the_whole_file(file):
     (cell,) = cells_of(part)
     assert cell == cells_of(whole)[0] and cell.scene.downscale == 4
     assert identity(part, cell, None) == identity(whole, cell, None)
+
+
+def test_everything_of_a_file_and_what_is_asked_for():
+    """What is asked for comes behind the file's, in place of what has its name; the rest is the command's."""
+    file = {"runs": {"a": "nrfgs", 5: "nrfgs-sh"}, "scenes": [{"path": "s/", "downscale": 2}, "t"], "steps": 9}
+    asked = {"runs": {"a": "nrfgs-sg", "b": "nrfgs"}, "scenes": ["u", {"path": "s", "downscale": 2}], "steps": 3}
+    both = united(file, asked)
+    assert both["runs"] == {"a": "nrfgs-sg", "5": "nrfgs-sh", "b": "nrfgs"} and list(both["runs"]) == ["a", "5", "b"]
+    assert both["scenes"] == [{"path": "s", "downscale": 2}, "t", "u"]
+    assert both["steps"] == 3 and "seeds" not in both and "protocols" not in both
+    # A file without seeds or protocols has the defaults of a benchmark.
+    more = united(file, {**asked, "seeds": [7, 42], "protocols": ["mcmc"]})
+    assert more["seeds"] == [42, 7] and more["protocols"] == ["own", "mcmc"]
+    more = united({**file, "seeds": 1, "protocols": "original"}, {**asked, "seeds": [7], "protocols": ["mcmc"]})
+    assert more["seeds"] == [1, 7] and more["protocols"] == ["original", "mcmc"]
+    assert united({}, asked) == asked
+
+
+def test_scenes_are_chosen_however_their_path_is_written(file):
+    (scene,) = Bench(spec=file, data=("./garden/",)).plan().scenes
+    assert (scene.name, scene.downscale) == ("garden", 4)
+
+
+def test_a_report_has_what_is_asked_for_and_what_is_there():
+    content = {
+        "runs": {"a": "nrfgs", "b": "nrfgs", "c": "nrfgs"},
+        "scenes": ["s", "t", "u"],
+        "protocols": ["splatfacto", "original", "mcmc"],
+        "seeds": [1, 2, 3],
+    }
+    whole = make_spec(content, "file")
+    asked = make_spec({"runs": {"b": "nrfgs"}, "scenes": "t", "protocols": "original", "seeds": 2}, "file")
+
+    def shown(*there):
+        spec = with_records(whole, asked, lambda name: name in there)
+        return [run.name for run in spec.runs], [one.name for one in spec.scenes], spec.protocols, spec.seeds
+
+    assert shown() == (["b"], ["t"], ["original"], [2])
+    (name,) = (
+        cell.name
+        for cell in cells_of(whole)
+        if (cell.run.name, cell.scene.name) == ("c", "s") and (cell.protocol, cell.seed) == ("mcmc", 1)
+    )
+    assert shown(name) == (["b", "c"], ["s", "t"], ["original", "mcmc"], [1, 2])
 
 
 def test_runs_on_the_command_line_may_have_names_with_spaces_and_options_with_equals():

@@ -229,3 +229,7 @@ def test_report_of_hand_made_records(tmp_path, pictures, capsys):
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [row["PSNR"] for row in summary] == [[30.0, None], [31.0, None]]
     assert "**31.00**" in capsys.readouterr().out
+    # Pictures of records that are not to be used are not shown beside the others.
+    (tmp_path / "out" / "crops" / "x_s.png").unlink()
+    report(spec, tmp_path / "out", tmp_path / "work", {cell.name: "other options" for cell in cells_of(spec)})
+    assert not (tmp_path / "out" / "crops" / "x_s.png").exists()

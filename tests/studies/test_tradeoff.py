@@ -3,11 +3,13 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.text import Text
 from scipy.stats import t as student
 
 from nrfgs_ns.errors import InputError
@@ -25,7 +27,8 @@ from nrfgs_ns.studies.tradeoff.analysis import (
     pooled_deviation,
     price,
 )
-from nrfgs_ns.studies.tradeoff.plan import bench_plan
+from nrfgs_ns.studies.tradeoff.figure import best_place, draw
+from nrfgs_ns.studies.tradeoff.plan import Setting, bench_plan
 from nrfgs_ns.studies.tradeoff.report import report
 from nrfgs_ns.studies.tradeoff.verb import Tradeoff
 
@@ -225,6 +228,90 @@ def test_report_from_records(tmp_path, capsys):
     assert "| D 4 | 2 | -1.00 |" in text and "| D 8 | 2 | (+0.01) |" in text and "2 FAILED" in text
     assert (tmp_path / "tradeoff.png").stat().st_size > 5000
     assert "D 8" in capsys.readouterr().out
+
+
+def test_costs_are_absolute_where_the_default_has_none(tmp_path, capsys):
+    """The default shared its GPU on scene t, whose other times are known all the same. On s there are factors, and a
+    footnote only where a reader meets such a number."""
+    knobs = {**KNOBS, "scenes": ["s", "t"], "seeds": [1], "knobs": {"D": {"option": D, "values": [4, 8]}}}
+    content, settings = bench_plan(knobs, "knobs.yaml", False)
+    spec = make_spec(content, "bench.yaml")
+    (tmp_path / "runs").mkdir()
+    for cell in cells_of(spec):
+        is_shared = cell.scene.name == "t" and cell.run.name != "D 4"
+        made = record(30.0, seconds=269.94, fps=459.23, jobs=3 if is_shared else 1)
+        (tmp_path / "runs" / f"{cell.name}.json").write_text(json.dumps(made))
+
+    def lines(scene):
+        """Run -> its cells; the head is that of no name."""
+        part = (tmp_path / "tradeoff.md").read_text().split(f"### {scene}\n\n")[1].split("\n\n")[0]
+        words = [[word.strip("* ") for word in line.split("|")[1:]] for line in part.splitlines()]
+        return {name: cells for name, *cells in words}
+
+    report(spec, settings, tmp_path, {})
+    time, fps = lines("s")[""].index("training time"), lines("s")[""].index("FPS")
+    assert [lines("s")[run][time] for run in ("default", "D 4")] == ["269.9", "[x 1.00]"]
+    assert [lines("t")[run][time] for run in ("default", "D 4", "D 8")] == ["-", "269.9 s", "-"]
+    assert [lines("t")[run][fps] for run in ("default", "D 4", "D 8")] == ["-", "459.2 FPS", "-"]
+    assert lines("average")["D 4"][time] == "269.9 s"
+    footnote = "Numbers with a unit"
+    assert footnote in (tmp_path / "tradeoff.md").read_text()
+    report(replace(spec, scenes=spec.scenes[:1]), settings, tmp_path, {})
+    assert footnote not in (tmp_path / "tradeoff.md").read_text()
+
+
+@pytest.mark.parametrize("count", [1, 2, 12])
+def test_names_keep_inside_the_frame_and_apart(tmp_path, monkeypatch, count):
+    """On a front of as many settings with long names, the last of them at the upper right; one knob has no point."""
+    from matplotlib import pyplot
+
+    names = [Setting("default", ""), *(Setting("a long knob", f"at value {i}") for i in range(1, count))]
+    rows = [row(one.name, record(20.0 + i, 10.0 * 1.1**i, 50.0 / 1.1**i, 1e6 * 1.1**i)) for i, one in enumerate(names)]
+    empty = Setting("fewer steps", "5")
+    monkeypatch.setattr(pyplot, "close", lambda figure: None)
+    try:
+        draw([*rows, Row("s", empty.name, "own").fill()], [*names, empty], tmp_path / "figure.png")
+        figure = pyplot.gcf()
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["default", "a long knob"][:count]
+        for panel in figure.axes:
+            assert {text.get_text() for text in panel.texts} == {one.name for one in names}
+            boxes = [Text.get_window_extent(text) for text in panel.texts]
+            for i, box in enumerate(boxes):
+                assert panel.bbox.x0 <= box.x0 and box.x1 <= panel.bbox.x1
+                assert panel.bbox.y0 <= box.y0 and box.y1 <= panel.bbox.y1
+                assert not any(box.overlaps(other) for other in boxes[:i])
+    finally:
+        monkeypatch.undo()
+        pyplot.close(pyplot.gcf())
+
+
+def test_a_name_goes_where_it_disturbs_least():
+    """A name of 20 x 10 pixels at a point in the middle of a panel of 100 x 100, at one pixel for a point of type."""
+    middle, size, frame = (50.0, 50.0), (20.0, 10.0), (0.0, 0.0, 100.0, 100.0)
+    disturbed, (x, y), box = best_place(middle, size, frame, [], 1.0)
+    assert disturbed == 0 and x > -10 and y > 0 and box == (50 + x, 50 + y, 70 + x, 60 + y)
+    right = [(50.0, 0.0, 100.0, 100.0)]
+    disturbed, (x, y), _ = best_place(middle, size, frame, right, 1.0)
+    assert disturbed == 0 and x <= -20
+    # With everything taken, it lies over 20 x 10 pixels of that, and not outside, where nothing is taken.
+    disturbed, _, box = best_place((98.0, 98.0), size, frame, [frame], 1.0)
+    assert disturbed == pytest.approx(200) and box[2] <= 100 and box[3] <= 100
+
+
+def test_names_off_the_front_need_room(tmp_path, monkeypatch):
+    """Sixty settings in one place: the one on the front has its name, and of the others not all."""
+    from matplotlib import pyplot
+
+    names = [Setting("default", ""), *(Setting("knob", f"at quite a long value {i}") for i in range(60))]
+    rows = [row(one.name, record(20.0 - (i > 0), 10.0 + 1e-4 * i)) for i, one in enumerate(names)]
+    monkeypatch.setattr(pyplot, "close", lambda figure: None)
+    try:
+        draw(rows, names, tmp_path / "figure.png")
+        shown = [text.get_text() for text in pyplot.gcf().axes[0].texts]
+        assert "default" in shown and 1 < len(shown) < len(names)
+    finally:
+        monkeypatch.undo()
+        pyplot.close(pyplot.gcf())
 
 
 def test_a_training_without_a_splat_has_no_ratio():

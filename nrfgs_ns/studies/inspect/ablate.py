@@ -89,7 +89,7 @@ def row(part: str, group: str, field: Field, views: FieldViews, full: float | No
         (score if full is None else full) - score,
         field.bytes,
         views.head_seconds(field),
-        diffuse_splats(field) / len(field.splats["means"]),
+        diffuse_splats(field) / max(len(field.splats["means"]), 1),
         **extra,
     )
 

@@ -8,24 +8,25 @@ from typing import Any
 
 from rich.console import Console
 
-from nrfgs_ns.studies.bench_report import plain_label, rows_from_records
+from nrfgs_ns.studies.bench_report import rows_from_records
 from nrfgs_ns.studies.bench_spec import Spec, rows_of
 from nrfgs_ns.studies.bench_table import Row, notes, plain_markdown, with_averages
-from nrfgs_ns.studies.files import whole, write_whole
+from nrfgs_ns.studies.files import write_whole
 from nrfgs_ns.studies.tradeoff.analysis import (
     BY_NAME,
     COSTS,
-    PSNR,
     Change,
-    Cost,
     changes,
     front_of,
     price,
 )
+from nrfgs_ns.studies.tradeoff.figure import draw
 from nrfgs_ns.studies.tradeoff.plan import DEFAULT, Setting
 
 HEAD = ["", "seeds", "PSNR", "SSIM", "LPIPS", "training time", "FPS", "MB", "peak memory", "splats"]
 RATIOS = ("time s", "FPS", "MB", "peak MB", "splats")
+UNITS = {"time s": " s", "FPS": " FPS", "MB": " MB", "peak MB": " MB"}
+"""What follows a number that stands where others are changes."""
 WORDS = {
     "same": "unclear",
     "noise": "PSNR unclear",
@@ -48,14 +49,16 @@ def report(spec: Spec, settings: list[Setting], out: Path, stale: dict[str, str]
     rows = with_averages(rows_from_records(spec, out / "runs", stale))
     scenes = list(dict.fromkeys(row.scene for row in rows))
     default_protocol = next(protocol for protocol, run in rows_of(spec) if run.name == DEFAULT)
-    results, texts = [], []
+    results, texts, legend = [], [], list(LEGEND)
     for scene in scenes:
         of_scene = ordered([row for row in rows if row.scene == scene], settings)
         default = next(row for row in of_scene if row.run == DEFAULT and row.protocol == default_protocol)
         result = compare(of_scene, default, settings)
         results.append({"scene": scene, **result})
         texts.append(f"### {plain_markdown(scene)}\n\n{table(of_scene, default, result)}")
-    text = "\n".join([*texts, *(f"{note}\n" for note in [*LEGEND, *notes(rows)])])
+        if ABSOLUTE not in legend and any(is_absolute(row, default, name) for row in of_scene for name in UNITS):
+            legend.append(ABSOLUTE)
+    text = "\n".join([*texts, *(f"{note}\n" for note in [*legend, *notes(rows)])])
     write_whole(out / "tradeoff.md", text)
     write_whole(out / "tradeoff.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
     if any(row.records for row in rows):
@@ -71,6 +74,8 @@ LEGEND = (
     "dB per doubling: what PSNR a doubling of that cost buys, or a halving loses. Unclear: not told from the default. "
     "★: on the Pareto front of the means, which knows no noise.",
 )
+
+ABSOLUTE = "Numbers with a unit are no factors: they stand as measured, where the default has none to compare with."
 
 
 def ordered(rows: list[Row], settings: list[Setting]) -> list[Row]:
@@ -129,13 +134,23 @@ def table(rows: list[Row], default: Row, result: dict[str, Any]) -> str:
             cells = [row.text(BY_NAME[name]) for name in ("PSNR", "SSIM", "LPIPS", *RATIOS)]
             prices = [""] * len(COSTS)
         else:
-            cells = [change_text(plain["changes"][name], name) for name in ("PSNR", "SSIM", "LPIPS", *RATIOS)]
+            cells = [
+                row.text(BY_NAME[name]) + UNITS[name]
+                if is_absolute(row, default, name)
+                else change_text(plain["changes"][name], name)
+                for name in ("PSNR", "SSIM", "LPIPS", *RATIOS)
+            ]
             prices = [price_text(plain["prices"].get(cost.title)) for cost in COSTS]
         stars = [" ★" if row.run in result["fronts"][cost.title] else "" for cost in COSTS]
         prices = [(text + star).strip() for text, star in zip(prices, stars, strict=True)]
         name = plain_markdown(row.run)
         lines.append([f"**{name}**" if row is default else name, row.seeds, *cells, *prices])
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def is_absolute(row: Row, default: Row, name: str) -> bool:
+    """Whether a cost is shown as measured: it is known, and there is none of the default to compare it with."""
+    return name in UNITS and default.mean(BY_NAME[name]) is None and row.mean(BY_NAME[name]) is not None
 
 
 def change_text(change: dict[str, Any] | None, name: str) -> str:
@@ -155,73 +170,3 @@ def price_text(priced: tuple[str, float | None] | None) -> str:
         return "-"
     kind, number = priced
     return f"{number:.2f}" if number is not None else WORDS[kind]
-
-
-def draw(rows: list[Row], settings: list[Setting], path: Path) -> None:
-    """PSNR against each cost, a line of panels for each scene; the front as a staircase, its settings by name.
-
-    Args:
-        rows: of all scenes.
-        settings: in the order of the legend.
-        path: where the PNG goes.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    scenes = list(dict.fromkeys(row.scene for row in rows))
-    knobs = list(dict.fromkeys(setting.knob for setting in settings))
-    knob_of = {setting.name: setting.knob for setting in settings}
-    with pyplot.rc_context({"font.size": 8}):
-        size = (4.2 * len(COSTS), 3.2 * len(scenes) + 0.5)
-        figure, panels = pyplot.subplots(len(scenes), len(COSTS), figsize=size, squeeze=False)
-        for line, scene in zip(panels, scenes, strict=True):
-            of_scene = [row for row in rows if row.scene == scene]
-            for panel, cost in zip(line, COSTS, strict=True):
-                for knob in knobs:
-                    _points(panel, [row for row in of_scene if knob_of[row.run] == knob], cost, knob, knobs.index(knob))
-                _front(panel, of_scene, cost)
-                panel.set(title=plain_label(scene), xlabel=cost.column.name, ylabel="PSNR", xscale="log")
-                panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-                panel.xaxis.set_major_formatter("{x:g}")
-                panel.xaxis.set_minor_formatter(NullFormatter())
-                panel.grid(alpha=0.3, which="both", linewidth=0.4)
-        handles, labels = panels[0][0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="lower center", ncols=min(len(labels), 8), fontsize=7)
-        figure.tight_layout(rect=(0, 0.5 / size[1] * (1 + len(labels) // 9), 1, 1))
-        with whole(path) as aside:
-            figure.savefig(aside, format="png", dpi=110, metadata={"Software": None})
-        pyplot.close(figure)
-
-
-MARKERS = "*osD^v<>phX"
-
-
-def _points(panel, rows: list[Row], cost: Cost, knob: str, number: int) -> None:
-    """A knob's settings, with their deviation over seeds; an empty series where there is no number, for the legend."""
-    rows = [row for row in rows if row.mean(PSNR) is not None and row.mean(cost.column) is not None]
-    panel.errorbar(
-        [row.mean(cost.column) for row in rows],
-        [row.mean(PSNR) for row in rows],
-        xerr=[row.deviation(cost.column) or 0.0 for row in rows],
-        yerr=[row.deviation(PSNR) or 0.0 for row in rows],
-        label=knob,
-        color="black" if knob == DEFAULT else f"C{(number - 1) % 10}",
-        marker=MARKERS[number % len(MARKERS)],
-        markersize=10 if knob == DEFAULT else 4,
-        elinewidth=0.6,
-        linestyle="none",
-        zorder=3 if knob == DEFAULT else 2,
-    )
-
-
-def _front(panel, rows: list[Row], cost: Cost) -> None:
-    """The front, and the names on it."""
-    by_name = {row.run: row for row in rows}
-    front = [by_name[name] for name in front_of(rows, cost)]
-    xs, ys = [row.mean(cost.column) for row in front], [row.mean(PSNR) for row in front]
-    panel.step(xs, ys, where="post", color="grey", linewidth=0.8, zorder=1)
-    for x, y, row in zip(xs, ys, front, strict=True):
-        panel.annotate(plain_label(row.run), (x, y), textcoords="offset points", xytext=(3, 5), fontsize=6, rotation=20)
