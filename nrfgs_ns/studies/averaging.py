@@ -21,15 +21,10 @@ from rich.progress import track
 from nrfgs_ns.averaging import ParameterMean
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.metrics import METRIC_NAMES
+from nrfgs_ns.studies.bench_spec import QUIET
 from nrfgs_ns.studies.files import write_whole
 from nrfgs_ns.studies.run import machine, parse
 from nrfgs_ns.trainer import NrfgsTrainer, NrfgsTrainerConfig
-
-QUIET = (
-    "--vis tensorboard --steps-per-eval-image 1000000 --steps-per-eval-all-images 1000000 "
-    "--logging.local-writer.enable False --logging.profiler none"
-)
-"""No viewer, no tables on the console, and no evaluation while it trains."""
 
 
 @dataclass
@@ -87,7 +82,7 @@ class AveragingStudy:
             "--machine.seed": self.seed,
         }
         words = [str(word) for option in own.items() for word in option]
-        config = parse([self.method, *words, *QUIET.split(), *self.options.split()])
+        config = parse([self.method, *words, *QUIET, *self.options.split()])
         if not isinstance(config, NrfgsTrainerConfig):
             raise InputError(f"--method is {self.method}; it must be one of this project's.")
         if config.average_steps > 0:
