@@ -20,6 +20,7 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter
 
+from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.capacity.charge import ResidualCharge
@@ -160,9 +161,16 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
 
     @property
     def parameter_bytes(self) -> int:
-        """Bytes of all that a renderer needs: the splats' parameters and the head's shared weights."""
+        """Bytes of all that a renderer needs: the splats' parameters, but the latents of diffuse ones, and the head."""
         stored = [*self.gauss_params.values(), *self.head.parameters()]
-        return sum(parameter.numel() * parameter.element_size() for parameter in stored)
+        whole = sum(parameter.numel() * parameter.element_size() for parameter in stored)
+        return whole - self.num_diffuse * (self.gauss_params["latents"][0].nbytes if self.num_diffuse else 0)
+
+    @property
+    def num_diffuse(self) -> int:
+        """How many splats have no residual."""
+        diffuse = self.densification.state.get(DIFFUSE)
+        return 0 if diffuse is None else int(diffuse.sum())
 
     # Training.
 

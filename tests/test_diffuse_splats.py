@@ -157,9 +157,12 @@ def test_noise_that_was_learnt_does_not_hold_splats(learning):
 
 def test_the_head_is_evaluated_for_the_others_only(untrained):
     model, data = untrained
-    cameras = data.train_dataset.cameras
+    cameras, all_bytes = data.train_dataset.cameras, model.parameter_bytes
+    assert model.num_diffuse == 0
     make_diffuse(model, data, BELOW_4, {})
     diffuse, rows = model.densification.state[DIFFUSE], []
+    assert model.num_diffuse == diffuse.sum() > 0
+    assert model.parameter_bytes == all_bytes - 4 * model.gauss_params["latents"].shape[1] * model.num_diffuse
     handle = model.head.low.register_forward_hook(lambda _, inputs, __: rows.append(len(inputs[0])))
     model.train()
     model.step = 0

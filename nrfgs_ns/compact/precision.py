@@ -10,8 +10,9 @@ from nrfgs_ns.errors import InputError
 class Precision:
     """Steps of the grids. No number is off by more than half of its step."""
 
-    means: float = 0.125
-    """largest step of a coordinate, in standard deviations of the median splat; 10 to 21 bits for each axis"""
+    means: float = 0.03125
+    """largest step of a coordinate, in standard deviations of the median splat; 10 to 21 bits for each axis. Finer than
+    the others, because a splat smaller than the median suffers more, and pixels notice places first"""
     quats: int = 8
     """bits of each of a rotation's three smaller components"""
     scales: float = 0.0625

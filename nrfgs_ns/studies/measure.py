@@ -34,8 +34,8 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
 
     Returns:
         "test" and "train" (null without views), each with the means of psnr, ssim, ms_ssim, l1, lpips (null where it
-        cannot be had) and "per_image"; "fps" at the photographs' size and "fps_1080p" (null on a CPU); "splats";
-        "parameter_bytes" (splats and head in memory); "checkpoint_bytes" (the file, with the optimisers' moments).
+        cannot be had) and "per_image"; "fps" at the photographs' size and "fps_1080p" (null on a CPU); "splats",
+        of which "diffuse" have no residual; "parameter_bytes" (what a renderer needs); "checkpoint_bytes" (the file, with the optimisers' moments).
     """
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
     model, data = pipeline.model, pipeline.datamanager
@@ -52,7 +52,6 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
         names = [Path(data.train_dataset.image_filenames[i]).name for i in chosen]
         result["train"] = _views(model, metrics, zip(names, views, strict=True))
     cameras = [camera for camera, _ in test]
-    stored = [*model.gauss_params.values(), *(model.head.parameters() if hasattr(model, "head") else ())]
     return {
         **result,
         "fps": frames_per_second(model, cameras),
@@ -60,7 +59,9 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
         if model.device.type == "cuda"
         else None,
         "splats": int(model.num_points),
-        "parameter_bytes": sum(parameter.numel() * parameter.element_size() for parameter in stored),
+        "diffuse": getattr(model, "num_diffuse", 0),
+        "parameter_bytes": getattr(model, "parameter_bytes", None)  # nerfstudio's own have splats and no more
+        or sum(parameter.numel() * parameter.element_size() for parameter in model.gauss_params.values()),
         "checkpoint_bytes": Path(checkpoint).stat().st_size,
     }
 

@@ -71,6 +71,7 @@ def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monke
     mean = sum(image["psnr"] for image in measured["train"]["per_image"]) / 3
     assert measured["train"]["psnr"] == pytest.approx(mean)
     assert measured["parameter_bytes"] == record["eval"]["parameter_bytes"] == 4 * (measured["splats"] * 46 + 6664)
+    assert record["capacity"] == {} and measured["diffuse"] == 0, "nothing was decided"
     assert measured["fps"] > 0 and measured["checkpoint_bytes"] > measured["parameter_bytes"]
     assert len(list((tmp_path / "work" / "pictures").glob("eval_img_*.png"))) == 2
 
