@@ -3,13 +3,18 @@
 
     python benchmarks/head_gpu.py --out docs/results/head_gpu.json
     python benchmarks/head_gpu.py --sizes 1000000 --sweep               # launch constants of the fused kernels
-    TRITON_INTERPRET=1 python benchmarks/head_gpu.py --device cpu --sizes 200 --rounds 1 --repeats 1   # try the script
+    python benchmarks/head_gpu.py --sizes --out docs/results/head_gpu_diffuse.json     # diffuse splats alone
+    TRITON_INTERPRET=1 python benchmarks/head_gpu.py --device cpu --sizes 200 --diffuse-sizes 200 --rounds 1 --repeats 1
 
 A table of N splats of which M are visible, from one camera; M = N ("all"), and M = N / 2 picked at random ("half").
 Times are medians over rounds in which the variants take turns; a round is `repeats` calls between two CUDA events.
 A call is the head's forward, or forward and backward of a random weighting of colours and opacities with gradients to
 every table and weight. Peak memory is what one such call adds. Errors are norms relative to PyTorch's float64 head on
-100,000 splats. A variant that fails is listed with its error.
+100,000 splats. A variant that fails is listed with its error. The last line above tries the script.
+
+With diffuse splats, half of the table is visible, and they are its last rows, as in a training. "mask": the kernels are
+told which they are. "others only": kernels that know no mask compute the others, which PyTorch picks, and whose answers
+it puts among the base appearances of all. "no mask": all have their residual.
 """
 
 import itertools
@@ -30,6 +35,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from nrfgs_ns.appearance.diffuse import DIFFUSE, Others  # noqa: E402
 from nrfgs_ns.appearance.nrf import NrfConfig  # noqa: E402
 from nrfgs_ns.appearance.sh import ShConfig  # noqa: E402
 
@@ -44,6 +50,8 @@ class Variant:
     run: Callable[[], tuple[Tensor, ...]]
     leaves: list[Tensor]
     weights: tuple[Tensor, ...] = ()
+    waits: bool = False
+    """whether it waits for the device, so that it cannot be captured"""
 
     def forward(self) -> None:
         with torch.no_grad():
@@ -66,6 +74,10 @@ class HeadBenchmark:
     """JSON file for the results"""
     sizes: tuple[int, ...] = (100_000, 300_000, 1_000_000, 3_000_000)
     """visible splats M"""
+    diffuse_sizes: tuple[int, ...] = (300_000, 1_000_000)
+    """visible splats M, some of them diffuse"""
+    diffuse_shares: tuple[float, ...] = (0.0, 0.5, 0.8, 0.95)
+    """of the splats: how many are diffuse"""
     rounds: int = 7
     """rounds in which the variants take turns"""
     repeats: int = 20
@@ -91,11 +103,14 @@ class HeadBenchmark:
         if self.sweep:
             self.save(self.sweep_launches())
             return
-        errors, times = self.errors(), []
+        results: dict[str, list[dict]] = {"errors": self.errors() if self.sizes else [], "times": [], "diffuse": []}
         for visible, share in itertools.product(self.sizes, ("all", "half")):
-            times += self.times(visible, share)
-            self.save({"errors": errors, "times": times})  # what is cut short keeps what it has
-        self.show(times)
+            results["times"] += self.times(visible, share)
+            self.save(results)  # what is cut short keeps what it has
+        for visible, share in itertools.product(self.diffuse_sizes, self.diffuse_shares):
+            results["diffuse"] += self.diffuse_times(visible, share)
+            self.save(results)
+        self.show(results["times"] + results["diffuse"])
 
     def save(self, results: dict[str, list[dict]]) -> None:
         if self.out is not None:
@@ -175,12 +190,38 @@ class HeadBenchmark:
         chosen["sh kernel"] = harmonics_kernel
         return chosen
 
+    def diffuse_variants(
+        self, splats: dict[str, Tensor], rows: Tensor, center: Tensor, share: float
+    ) -> dict[str, Callable[[], Variant]]:
+        """The default head where the last `share` of the splats are diffuse."""
+        tables = {name: splats[name] for name in ("means", "opacities", "features_dc", "latents")}
+        count = len(splats["means"])
+        mask = torch.arange(count, device=self.device) >= round((1.0 - share) * count)
+
+        def variant(run: Callable, waits: bool = False) -> Variant:
+            head = self.field(implementation="fused")
+            return Variant(lambda: tuple(run(head)), [*tables.values(), *head.parameters()], waits=waits)
+
+        def others_only(head):
+            others = Others({**tables, DIFFUSE: mask}, rows, center)
+            return others.over(head.base_appearance(tables, rows), head(*others.arguments))
+
+        return {
+            "no mask": lambda: variant(lambda head: head(tables, rows, center)),
+            "mask": lambda: variant(lambda head: head({**tables, DIFFUSE: mask}, rows, center)),
+            "others only": lambda: variant(others_only, waits=True),
+        }
+
     # Timing.
 
     def times(self, visible: int, share: str) -> list[dict]:
         count = visible if share == "all" else 2 * visible
         labels = {"visible": visible, "share": share}
         return self.take_turns(self.variants(*self.scene(count, visible)), labels, memory=True)
+
+    def diffuse_times(self, visible: int, share: float) -> list[dict]:
+        labels = {"visible": visible, "share": "half", "diffuse": share}
+        return self.take_turns(self.diffuse_variants(*self.scene(2 * visible, visible), share), labels, memory=True)
 
     def take_turns(self, builders: dict[str, Callable[[], Variant]], labels: dict, memory: bool = False) -> list[dict]:
         """A row of medians for each variant: "forward_ms", "both_ms" and their spread, "gpu_ms", or "error".
@@ -215,6 +256,8 @@ class HeadBenchmark:
 
     def replayed(self, variant: Variant) -> float | None:
         """Median milliseconds of forward and backward without the host, or None."""
+        if variant.waits:
+            return None
         for leaf in variant.leaves:
             leaf.grad = None
         try:
@@ -331,7 +374,8 @@ class HeadBenchmark:
         for row in rows:
             numbers = [f"{row[key]:.3f}" if row.get(key) else "-" for key in ("forward_ms", "both_ms", "gpu_ms")]
             peak = f"{row['peak_mib']:.0f}" if "peak_mib" in row else "-"
-            table.add_row(row["variant"], f"{row['visible']:,}", row.get("share", "all"), *numbers, peak)
+            name = row["variant"] + (f", {row['diffuse']:.0%} diffuse" if "diffuse" in row else "")
+            table.add_row(name, f"{row['visible']:,}", row.get("share", "all"), *numbers, peak)
         Console().print(table)
         for row in rows:
             if "error" in row:

@@ -23,7 +23,8 @@ have settled on the other views (`capacity/settle.py`). Views that the residuals
 to cannot tell: there, noise that they have learnt looks like something that the scene needs.
 
 Which splats are diffuse, and what has moved, are two tables among densification's statistics, "diffuse" [N] and
-"diffuse_shift" [N, 4]: they are split, pruned, saved and loaded with the splats.
+"diffuse_shift" [N, 4]: they are split, pruned, saved and loaded with the splats. In a training, diffuse splats are the
+table's last rows.
 """
 
 import math
@@ -41,6 +42,7 @@ from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT
 from nrfgs_ns.appearance.reduce import Field, with_diffuse
 from nrfgs_ns.capacity.report import add_to_report, read_report
 from nrfgs_ns.capacity.settle import lesson_order, settle
+from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.field_views import FieldViews
 from nrfgs_ns.residuals import Residuals, look_over
@@ -105,6 +107,7 @@ class DiffuseSchedule:
 
     def __init__(self, config: DiffuseSplats, data, optimizers: Mapping[str, Optimizer], folder: Path | None = None):
         self.config, self.data, self.optimizers, self.folder = config, data, optimizers, folder
+        self.in_order: Tensor | None = None
         self.option = "pipeline.model.diffuse without a threshold"
         self.trial = len(data.train_dataset) if config.trial is None else config.trial
         prefix = "pipeline.model.diffuse"
@@ -160,6 +163,14 @@ class DiffuseSchedule:
             self.tell(model, step, make_diffuse(model, self.data, self.config, self.optimizers))
         elif phase == self.config.every - self.trial and step <= self.config.stop:
             give_back(model)
+        self.keep_order(model)
+
+    def keep_order(self, model) -> None:
+        """Move diffuse splats to the table's end, if some have become diffuse or densification has put others there."""
+        diffuse = model.densification.state.get(DIFFUSE)
+        if diffuse is not self.in_order:  # another tensor whenever there are other rows
+            put_diffuse_last(model, self.optimizers)
+            self.in_order = model.densification.state.get(DIFFUSE)
 
 
 @torch.no_grad()
@@ -228,6 +239,22 @@ def share_that_pays(
         looks.append(Look(share, loss, error, loss <= config.budget))
         allowed, too_many = (middle, too_many) if looks[-1].allowed else (allowed, middle)
     return looks
+
+
+def put_diffuse_last(model, optimizers: Mapping[str, Optimizer]) -> None:
+    """Reorder the splats so that diffuse ones come last, each kind in the order that it had. Nothing is touched where
+    they do already, or where none is known to be diffuse.
+
+    Args:
+        model: an NrfgsModel.
+        optimizers: the training's, by group.
+    """
+    diffuse = model.densification.state.get(DIFFUSE)
+    if diffuse is None or not (diffuse[:-1] & ~diffuse[1:]).any():
+        return
+    # A camera sees splats in the table's order, and the fused head works on blocks of neighbours: what it saves is the
+    # network of blocks in which all are diffuse, of which there are next to none where both kinds are mixed.
+    take_rows(model, optimizers, diffuse.to(torch.uint8).argsort(stable=True))
 
 
 @torch.no_grad()

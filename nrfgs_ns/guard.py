@@ -27,6 +27,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.guard_report import Finding, report
 from nrfgs_ns.optimizers import LeanOptimizers, parameters_of
 
@@ -240,15 +241,7 @@ def remove_splats(model, optimizers: Mapping[str, torch.optim.Optimizer], bad: T
         optimizers: by group; those of `gauss_params` among them.
         bad: bool [N].
     """
-    from gsplat.strategy.ops import remove
-
-    per_splat = {
-        name: value
-        for name, value in model.densification.state.items()
-        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == len(bad)
-    }
-    remove(model.gauss_params, {name: optimizers[name] for name in model.gauss_params}, per_splat, bad)
-    model.densification.state.update(per_splat)
+    take_rows(model, optimizers, (~bad).nonzero()[:, 0])
 
 
 def _bad_rows(tensor: Tensor) -> Tensor:

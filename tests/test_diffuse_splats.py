@@ -15,7 +15,14 @@ from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT, mean_length
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.reduce import Field
 from nrfgs_ns.capacity.report import add_to_report, read_report
-from nrfgs_ns.diffuse_splats import DiffuseSchedule, DiffuseSplats, give_back, make_diffuse, schedule_for
+from nrfgs_ns.diffuse_splats import (
+    DiffuseSchedule,
+    DiffuseSplats,
+    give_back,
+    make_diffuse,
+    put_diffuse_last,
+    schedule_for,
+)
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.field_views import FieldViews, dropped
 from nrfgs_ns.residuals import look_over
@@ -194,13 +201,71 @@ def test_densification_carries_the_tables_along(untrained):
     assert 0 < state[DIFFUSE].sum() < len(state[DIFFUSE])
 
 
+def everything(model, optimizers) -> dict[str, torch.Tensor]:
+    """All that has a row for each splat: parameters, moments, statistics."""
+    tables = {f"parameter {name}": value.detach().clone() for name, value in model.gauss_params.items()}
+    for name, optimizer in optimizers.items():
+        (parameter,) = optimizer.param_groups[0]["params"]
+        assert parameter is model.gauss_params[name]
+        moments = optimizer.state[parameter]
+        assert float(moments["step"]) == 1
+        tables |= {f"{moment} {name}": moments[moment].clone() for moment in ("exp_avg", "exp_avg_sq")}
+    return tables | {name: value.clone() for name, value in model.densification.state.items() if torch.is_tensor(value)}
+
+
+def test_diffuse_splats_come_last_with_all_that_is_theirs(untrained):
+    model, data = untrained
+    params, state = model.gauss_params, model.densification.state
+    optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in params.items()}
+    for name, value in params.items():
+        value.grad = torch.randn_like(value)
+        optimizers[name].step()
+        value.grad = None
+    state |= {name: torch.rand(model.num_points) for name in ("grad2d", "count", "radii")}
+    put_diffuse_last(model, optimizers)  # none is: nothing happens
+    make_diffuse(model, data, BELOW_4, {})
+    camera = data.train_dataset.cameras[:1]
+    before, drawn = everything(model, optimizers), picture(model, camera)
+    diffuse = before[DIFFUSE]
+    assert (diffuse[:-1] & ~diffuse[1:]).any()
+    put_diffuse_last(model, optimizers)
+    after = everything(model, optimizers)
+    order = torch.cat([(~diffuse).nonzero()[:, 0], diffuse.nonzero()[:, 0]])
+    assert after.keys() == before.keys() and len(after) == 3 * len(params) + 5
+    for name, value in before.items():
+        assert torch.equal(after[name], value[order]), name
+    assert isinstance(state["scene_scale"], float)
+    assert_close(picture(model, camera), drawn, rtol=0, atol=1e-6)  # splats of one depth may be blended in turn
+    held = list(params.values())
+    put_diffuse_last(model, optimizers)  # they do: the optimisers keep what they have
+    assert all(value is old for value, old in zip(params.values(), held, strict=True))
+    give_back(model)
+    model.train()
+    model.get_outputs(camera)["rgb"].sum().backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+
+
+def test_the_schedule_moves_what_densification_has_put_behind(untrained, tmp_path):
+    model, data = untrained
+    params, state = model.gauss_params, model.densification.state
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
+    schedule = DiffuseSchedule(DiffuseSplats(start=6, every=20, trial=3, threshold=4.0), data, optimizers, tmp_path)
+    for step in range(6, 9):
+        schedule.after_step(model, step)
+        count, diffuse = model.num_points, state[DIFFUSE]
+        assert len(diffuse) == count and torch.equal(diffuse, diffuse.sort().values) and 0 < diffuse.sum() < count
+        duplicate(params, optimizers, state, ~diffuse & (torch.arange(count) < 10))
+        assert not state[DIFFUSE][-1]
+
+
 def test_the_schedule(untrained, monkeypatch):
     model, data = untrained
     done = []
 
     def look(model, *_):
         done.append(("look", step))
-        model.densification.state[DIFFUSE] = torch.zeros(1)
+        model.densification.state[DIFFUSE] = torch.zeros(1, dtype=torch.bool)
         return []
 
     def trial(model):
@@ -335,6 +400,7 @@ def test_resumed_training_is_the_unbroken_one(half, whole, tiny_scene, tmp_path)
     assert_same_training(checkpoint_of(rest), checkpoint_of(whole))
     diffuse = strategy_of(rest)[DIFFUSE]
     assert SHIFT in strategy_of(rest) and len(diffuse) != 300 and 0 < int(diffuse.sum()) < len(diffuse)
+    assert torch.equal(diffuse, diffuse.sort().values)
     _, pipeline, _, _ = eval_setup(rest)
     assert (pipeline.model.densification.state[DIFFUSE] == diffuse).all()
 

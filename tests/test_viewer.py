@@ -279,7 +279,7 @@ def test_ns_viewer_and_ns_export_take_a_reduced_checkpoint(tiny_scene, tmp_path,
         "--pipeline.model.capacity-search.settle": 2,
         "--pipeline.model.capacity-search.tolerance-db": 100.0,
         "--pipeline.model.diffuse.start": 4,
-        "--pipeline.model.diffuse.threshold": 2.0,
+        "--pipeline.model.diffuse.threshold": 1.0,
     }
     config = trained(command_line("nrfgs", tiny_scene, tmp_path, 6, options))
     opened, seen = [], {}

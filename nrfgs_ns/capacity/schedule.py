@@ -43,6 +43,11 @@ class CapacitySchedule:
             value = getattr(self.config, name)
             if value is not None and not value >= least:
                 raise InputError(f"pipeline.model.capacity-search.{name} is {value}; it must be at least {least}.")
+        if self.config.settle_most < self.config.settle:
+            raise InputError(
+                f"pipeline.model.capacity-search.settle-most is {self.config.settle_most}; it must be at least as many "
+                f"steps as pipeline.model.capacity-search.settle, {self.config.settle}."
+            )
 
     @property
     def last_decision(self) -> int:
@@ -78,13 +83,13 @@ class CapacitySchedule:
             f"Step {step}: {len(self.data.views_aside)} views set aside say that the field needs no "
             f"{', no '.join(decision.dropped)}."
             if decision.dropped
-            else f"Step {step}: every part of the field pays more than {tolerance:g} dB; it stays whole.",
+            else f"Step {step}: every part of the field pays; it stays whole.",
             soft_wrap=True,
         )
         for trial in decision.trials[1:]:
             CONSOLE.print(
-                f"  {'dropped' if trial.dropped else 'kept'}: {trial.part}, worth {trial.loss_db:.3f} dB "
-                f"(standard error {trial.error_db:.3f}; up to {trial.allowed_db:g} may go)",
+                f"  {'dropped' if trial.dropped else 'kept'}: {trial.part}, worth {trial.loss_db:.3f} dB after "
+                f"{trial.steps} steps (standard error {trial.error_db:.3f}; up to {trial.limit_db:.3g} may go)",
                 soft_wrap=True,
             )
         names = [Path(name).name for name in self.data.train_dataset.image_filenames]

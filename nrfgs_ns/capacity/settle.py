@@ -4,7 +4,8 @@
 A trained part carries more than is needed of it: what all views see alike, and what other parts could say as well. What
 a part is worth is told by the difference between a field with it and one without it after both have learnt a little
 more from the same views in the same order. Geometry learns with them: what a part does for a splat that has the wrong
-place or shape, place and shape can learn to do.
+place or shape, place and shape can learn to do. How much is a little is not known beforehand: a field that has grown up
+with a part needs long to learn to do without, the longer the fewer views there are. So settling can go on.
 """
 
 from collections.abc import Mapping
@@ -14,11 +15,14 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import SH_C0
+from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.reduce import Field, build
 from nrfgs_ns.harmonics_fit import OPAQUE, contributions
 
 BASE = ("means", "scales", "quats", "features_dc", "opacities")
 """Per-splat tables that settle with the shared weights and the latents."""
+TABLES = (*BASE, "latents")
+"""All that settle."""
 FIELD = ("field", "latents")
 """Optimiser groups of what a smaller field has in other shapes."""
 
@@ -28,7 +32,10 @@ class Settled(NamedTuple):
 
     field: Field
     moments: dict[str, dict[Tensor, dict[str, Any]]]
-    """Adam's state by optimiser group ("field", or the table's name) and parameter"""
+    """Adam's state by optimiser group ("field", or the table's name) and parameter. It is not a copy: if the settling
+    goes on, it does, too"""
+    steps: int
+    """in which it has settled"""
 
 
 def lesson_order(data, steps: int) -> list[int]:
@@ -44,6 +51,92 @@ def lesson_order(data, steps: int) -> list[int]:
     return [chosen[i] for i in order.tolist()]
 
 
+class Settling:
+    """Trains a copy of a field on some views, in rounds; the model's own numbers stay, as do the random generators.
+
+    The first round has as many steps as asked for, and each further one as many as all before it, so that the steps
+    double. What comes of a round is the mean of all numbers over the last half of the steps so far (Polyak and
+    Juditsky, SIAM Journal on Control and Optimization 30, 1992): at a training's learning rates the last step of two
+    fields differs by chance. It is what as many steps at one go would have given; the learning goes on from the last
+    step, not from the mean.
+
+    Args:
+        model: an NrfgsModel. It renders as in training, at the training's resolution.
+        field: what starts; it is left as it is.
+        views: pairs of a camera and its batch, taken in turn.
+        steps: of the first round.
+        optimizers: the training's, whose current learning rates and constants count.
+        fresh: groups whose Adam starts anew. That of the others goes on from the training's state.
+    """
+
+    def __init__(
+        self,
+        model,
+        field: Field,
+        views: list,
+        steps: int,
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        fresh: tuple[str, ...] = (),
+    ):
+        self.model, self.views = model, views
+        self.first, self.steps = steps, 0
+        self.head = _copy(field.head)
+        self.splats = {name: value.detach() for name, value in field.splats.items()}
+        for name in TABLES:
+            self.splats[name] = self.splats[name].clone().requires_grad_(True)
+        groups = _groups(self.head, self.splats)
+        self.adams = {name: _adam(group, optimizers[name], name not in fresh) for name, group in groups.items()}
+
+    def advance(self) -> Settled:
+        """One more round.
+
+        Returns:
+            The mean over its half of the steps so far, in tensors of its own, with Adam's state after the last step.
+        """
+        until = 2 * self.steps or self.first
+        learning = _groups(self.head, self.splats)
+        means = {name: [torch.zeros_like(parameter) for parameter in group] for name, group in learning.items()}
+        counted = until - until // 2
+        device, was_training = self.model.device, self.model.training
+        self.model.train()
+        with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+            for step in range(self.steps, until):
+                torch.manual_seed(step)  # backgrounds are random by default: fields to be compared see the same ones
+                self._learn(*self.views[step % len(self.views)])
+                for name, group in learning.items() if step >= until // 2 else ():
+                    for mean, parameter in zip(means[name], group, strict=True):
+                        mean.add_(parameter.detach(), alpha=1.0 / counted)
+        self.model.train(was_training)
+        self.steps = until
+        return self._settled(means)
+
+    def _learn(self, camera, batch: dict[str, Any]) -> None:
+        """One step on one view."""
+        with torch.enable_grad():
+            view = self.model.look(camera, self.splats)
+            outputs, _ = self.model.paint(view, self.head(self.splats, view.visible, view.center))
+            self.model._correct_colors(outputs, camera)
+            loss = self.model.photometric_loss(outputs, batch)
+        loss.backward()
+        for adam in self.adams.values():
+            adam.step()
+            adam.zero_grad(set_to_none=True)  # between rounds none need memory
+
+    @torch.no_grad()
+    def _settled(self, means: dict[str, list[Tensor]]) -> Settled:
+        """A field with these numbers, by group."""
+        head = _copy(self.head)
+        for parameter, mean in zip(head.parameters(), means["field"], strict=True):
+            parameter.copy_(mean)
+        splats = {**self.splats, **{name: means[name][0] for name in TABLES}}
+        learnt, moments = _groups(self.head, self.splats), {}
+        for name, group in _groups(head, splats).items():
+            state = self.adams[name].state
+            pairs = zip(group, learnt[name], strict=True)
+            moments[name] = {mean: state[parameter] for mean, parameter in pairs if parameter in state}
+        return Settled(Field(head, splats), moments, self.steps)
+
+
 def settle(
     model,
     field: Field,
@@ -52,54 +145,22 @@ def settle(
     optimizers: Mapping[str, torch.optim.Optimizer],
     fresh: tuple[str, ...] = (),
 ) -> Settled:
-    """Train a copy of a field on some views; the model's own numbers stay.
-
-    What comes of it is the mean of all numbers over the last half of the steps (Polyak and Juditsky, SIAM Journal on
-    Control and Optimization 30, 1992): at a training's learning rates the last step of two fields differs by chance.
+    """A field that has settled in one round.
 
     Args:
-        model: an NrfgsModel. It renders as in training, at the training's resolution.
-        field: what starts; it is left as it is.
-        views: pairs of a camera and its batch, taken in turn.
-        steps: how many.
-        optimizers: the training's, whose current learning rates and constants count.
-        fresh: groups whose Adam starts anew. That of the others goes on from the training's state.
+        as for `Settling`.
     """
-    tables = (*BASE, "latents")
-    weights = dict(field.head.state_dict())
-    head = build(field.head.config, {name: value.clone() for name, value in weights.items()}, field.head.scene_unit)
-    head.requires_grad_(True)
-    splats = {name: value.detach() for name, value in field.splats.items()}
-    for name in tables:
-        splats[name] = splats[name].clone().requires_grad_(True)
-    groups = {"field": list(head.parameters()), **{name: [splats[name]] for name in tables}}
-    adams = {name: _adam(parameters, optimizers[name], name not in fresh) for name, parameters in groups.items()}
-    learning = [parameter for group in groups.values() for parameter in group]
-    means = [torch.zeros_like(parameter) for parameter in learning]
-    last_half = steps - steps // 2
-    was_training = model.training
-    model.train()
-    for step in range(steps):
-        camera, batch = views[step % len(views)]
-        with torch.enable_grad():
-            view = model.look(camera, splats)
-            outputs, _ = model.paint(view, head(splats, view.visible, view.center))
-            model._correct_colors(outputs, camera)
-            loss = model.photometric_loss(outputs, batch)
-        for adam in adams.values():
-            adam.zero_grad(set_to_none=True)
-        loss.backward()
-        for adam in adams.values():
-            adam.step()
-        if step >= steps // 2:
-            for mean, parameter in zip(means, learning, strict=True):
-                mean.add_(parameter.detach(), alpha=1.0 / last_half)
-    with torch.no_grad():
-        for mean, parameter in zip(means, learning, strict=True):
-            parameter.copy_(mean)
-    model.train(was_training)
-    moments = {name: dict(adam.state) for name, adam in adams.items()}
-    return Settled(Field(head, splats), moments)
+    return Settling(model, field, views, steps, optimizers, fresh).advance()
+
+
+def _copy(head: NeuralResidualField) -> NeuralResidualField:
+    weights = {name: value.clone() for name, value in head.state_dict().items()}
+    return build(head.config, weights, head.scene_unit).requires_grad_(True)
+
+
+def _groups(head: NeuralResidualField, splats: Mapping[str, Tensor]) -> dict[str, list[Tensor]]:
+    """What learns, by optimiser group."""
+    return {"field": list(head.parameters()), **{name: [splats[name]] for name in TABLES}}
 
 
 def _adam(parameters: list[Tensor], like: torch.optim.Optimizer, goes_on: bool) -> torch.optim.Adam:

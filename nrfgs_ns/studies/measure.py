@@ -34,8 +34,9 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
 
     Returns:
         "test" and "train" (null without views), each with the means of psnr, ssim, ms_ssim, l1, lpips (null where it
-        cannot be had) and "per_image"; "fps" at the photographs' size and "fps_1080p" (null on a CPU); "splats",
-        of which "diffuse" have no residual; "parameter_bytes" (what a renderer needs); "checkpoint_bytes" (the file, with the optimisers' moments).
+        cannot be had) and "per_image"; "fps" at the photographs' size and "fps_1080p" (null on a CPU); "splats", of
+        which "diffuse" have no residual; "parameter_bytes" (what a renderer needs); "checkpoint_bytes" (the file, with
+        the optimisers' moments).
     """
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
     model, data = pipeline.model, pipeline.datamanager

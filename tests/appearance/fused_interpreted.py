@@ -10,10 +10,21 @@ import pytest
 import torch
 import triton
 import triton.language as tl
-from fused_cases import ULP, assert_near, evaluate, float32_tolerance, heads, relative_errors, rounding, scene
+from fused_cases import (
+    ULP,
+    assert_near,
+    evaluate,
+    float32_tolerance,
+    heads,
+    relative_errors,
+    rounding,
+    scene,
+    some_diffuse,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.fused import launch
 from nrfgs_ns.appearance.fused.kernels import _waves
 from nrfgs_ns.errors import InputError
@@ -42,10 +53,13 @@ def test_values_and_gradients(opacity_bound, repeated):
     hidden_width=st.sampled_from([3, 16, 40]),
     visible=st.integers(0, 70),
     repeated=st.booleans(),
+    diffuse=st.sampled_from([None, 0.5, 1.0]),
 )
-def test_every_switch(num_bands, visible, repeated, **switches):
+def test_every_switch(num_bands, visible, repeated, diffuse, **switches):
     head, twin = heads(num_bands=num_bands, **switches)
-    compare(head, twin, scene(head, 75, visible, repeated), float32_tolerance(num_bands))
+    case = scene(head, 75, visible, repeated)
+    case = case if diffuse is None else some_diffuse(case, diffuse, last=repeated)
+    compare(head, twin, case, float32_tolerance(num_bands))
 
 
 @pytest.mark.parametrize("columns", [8, 16])
@@ -91,11 +105,11 @@ def test_the_next_way_is_taken_where_the_first_does_not_run(monkeypatch):
     first, second = launch.LAUNCHES["bf16"]
     probe, tried = launch.probe, []
 
-    def lacking(packing, launches, options):
+    def lacking(packing, launches, options, some_diffuse):
         tried.append(launches)
         if launches == first:
             raise RuntimeError("out of resource: shared memory")
-        probe(packing, launches, options)
+        probe(packing, launches, options, some_diffuse)
 
     monkeypatch.setattr(launch, "probe", lacking)
     head, twin = heads(precision="bf16")
@@ -104,7 +118,7 @@ def test_the_next_way_is_taken_where_the_first_does_not_run(monkeypatch):
 
 
 def test_all_ways_failing_names_the_last_reason(monkeypatch):
-    def lacking(packing, launches, options):
+    def lacking(packing, launches, options, some_diffuse):
         raise RuntimeError(f"no room for {launches.backward.block} splats")
 
     monkeypatch.setattr(launch, "probe", lacking)
@@ -200,6 +214,112 @@ def test_float16_saturates():
     case[0]["latents"] *= 1e6
     colors, opacities = evaluate(head, *case)["colors"], evaluate(head, *case)["opacities"]
     assert torch.isfinite(colors).all() and ((opacities >= 0) & (opacities <= 1)).all()
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize("opacity_bound", ["clamp", "straight-through", "logit", "smooth"])
+def test_diffuse_splats(opacity_bound, last, repeated, monkeypatch):
+    """Mixed with others in every block, and last in the table, where four of seven blocks have no others."""
+    head, twin = heads(opacity_bound=opacity_bound)
+    case = some_diffuse(scene(head, 230 if not repeated else 60, 200, repeated), 0.6, last)
+    exact = evaluate(twin, *case, dtype=torch.float64)
+    monkeypatch.setattr("nrfgs_ns.appearance.nrf.Others", None)
+    found = evaluate(head, *case)
+    assert_near(found, exact, float32_tolerance())
+    splats, visible, _ = case
+    diffuse, base = splats[DIFFUSE], head.base_appearance(splats, visible)
+    is_diffuse = diffuse[visible]
+    assert 0 < is_diffuse.sum() < 200
+    assert (found["d latents"][diffuse] == 0).all() and (found["d means"][diffuse] == 0).all()
+    # As where nothing is added: test_zero_outputs_add_exactly_nothing.
+    assert (found["colors"] - base.colors)[is_diffuse].abs().max() <= 2 * ULP
+    assert (found["opacities"] - base.opacities)[is_diffuse].abs().max() <= 4 * ULP
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16", "fp16"])
+@pytest.mark.parametrize("last", [False, True])
+def test_nothing_but_the_base_of_a_diffuse_splat_is_looked_at(last, precision):
+    head, _ = heads(precision=precision)
+    splats, visible, centers = some_diffuse(scene(head, 150, 140), 0.5, last)
+    expected = evaluate(head, splats, visible, centers)
+    for name in ("latents", "means"):
+        splats[name][splats[DIFFUSE]] = torch.nan
+    found = evaluate(head, splats, visible, centers)
+    assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_a_diffuse_splat_with_a_base_that_is_not_finite_spoils_nothing_else():
+    head, twin = heads()
+    splats, visible, centers = some_diffuse(scene(head, 150, 150), 0.5, last=False)
+    row = int(splats[DIFFUSE].nonzero()[3])
+    for name in ("features_dc", "opacities"):
+        splats[name][row] = torch.nan
+    found, exact = evaluate(head, splats, visible, centers), evaluate(twin, splats, visible, centers, torch.float64)
+    for name in ("colors", "opacities", "d features_dc", "d opacities"):
+        rows = torch.isfinite(exact[name])
+        assert torch.equal(rows, torch.isfinite(found[name])), name
+        found[name], exact[name] = found[name][rows], exact[name][rows]
+    assert_near(found, exact, float32_tolerance())
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_without_others_there_is_no_network(repeated):
+    """All splats diffuse and visible; shared weights of NaN would show. Gradients begin as anything, here as NaN."""
+    head, _ = heads()
+    for weight in head.parameters():
+        weight.data.fill_(torch.nan)
+    splats, visible, centers = some_diffuse(scene(head, 150, 150, repeated), 1.1, last=True)
+    torch.use_deterministic_algorithms(True)  # fills what is allocated without a value
+    try:
+        found = evaluate(head, splats, visible, centers)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert all(torch.isfinite(value).all() for value in found.values())
+    for name, value in found.items():
+        if name.startswith("d "):
+            assert (value != 0).any() == (name in ("d features_dc", "d opacities")), name
+    # Beside others, in blocks that have a network: the same numbers.
+    sound, _ = heads()
+    mixed = some_diffuse((splats, visible, centers), 0.5, last=False)[0]
+    beside, here = evaluate(sound, mixed, visible, centers), mixed[DIFFUSE][visible]
+    for name in ("colors", "opacities"):
+        assert torch.equal(beside[name][here], found[name][here])
+    for name in ("d features_dc", "d opacities") if not repeated else ():  # those of a row's copies are added in turn
+        assert torch.equal(beside[name][mixed[DIFFUSE]], found[name][mixed[DIFFUSE]])
+
+
+@pytest.mark.parametrize("precision", ["fp32", "fp16"])
+@pytest.mark.parametrize("repeated", [False, True])
+def test_none_diffuse_is_no_entry(repeated, precision):
+    head, _ = heads(precision=precision)
+    splats, visible, centers = some_diffuse(scene(head, 230, 200, repeated), 0.0, last=True)
+    found = evaluate(head, splats, visible, centers)
+    splats.pop(DIFFUSE)
+    expected = evaluate(head, splats, visible, centers)
+    assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_kernels_without_a_mask_are_given_the_others(monkeypatch):
+    head, twin = heads()
+    assert [twin.fused.takes_masks(torch.device(device)) for device in ("cpu", "cuda")] == [True, False], "fp32"
+    assert heads(precision="bf16")[0].fused.takes_masks(torch.device("cuda"))
+    case = some_diffuse(scene(head, 150, 140), 0.5, last=False)
+    given_rows, run = [], launch.launch_forward
+    monkeypatch.setattr(head.fused, "takes_masks", lambda device: False)
+    monkeypatch.setattr(
+        launch, "launch_forward", lambda *args, **how: (given_rows.append(len(args[6])), run(*args, **how))
+    )
+    compare(head, twin, case, float32_tolerance())
+    splats, visible, _ = case
+    assert given_rows[-1] == int((~splats[DIFFUSE][visible]).sum()), "after the probes"
+
+
+def test_a_mask_that_is_not_bool_is_named():
+    head, _ = heads()
+    splats, visible, centers = some_diffuse(scene(head, 20, 15), 0.5, last=True)
+    with pytest.raises(InputError, match="diffuse is uint8, and the kernels take bool"):
+        head({**splats, DIFFUSE: splats[DIFFUSE].to(torch.uint8)}, visible, centers)
 
 
 def test_tiny_gradients_survive_half_precision():

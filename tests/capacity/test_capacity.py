@@ -16,7 +16,7 @@ from nrfgs_ns.appearance.reduce import Field, latent_basis, with_rank, with_unit
 from nrfgs_ns.capacity.config import CapacitySearch
 from nrfgs_ns.capacity.install import install
 from nrfgs_ns.capacity.search import Decision, decide
-from nrfgs_ns.capacity.settle import BASE, FIELD, keep_the_mean, lesson_order, settle
+from nrfgs_ns.capacity.settle import BASE, FIELD, TABLES, Settling, keep_the_mean, lesson_order, settle
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export import Export, read_splats
 from nrfgs_ns.model import NrfgsModel
@@ -76,6 +76,12 @@ def loud(tiny_scene, tmp_path):
     return model, trainer.pipeline.datamanager, trainer.optimizers
 
 
+def learn_gently(optimizers, share: float) -> None:
+    """A tenth or so of the usual rates: after few steps with an Adam that starts anew, a score says little else."""
+    for name in ("field", "latents", "features_dc", "opacities"):
+        optimizers.optimizers[name].param_groups[0]["lr"] *= share
+
+
 def photograph(model, data, appearance_of) -> None:
     """Let the training's photographs be the model's own pictures."""
     was_training = model.training
@@ -92,11 +98,14 @@ def photograph(model, data, appearance_of) -> None:
 def test_a_scene_that_changes_with_the_view_keeps_what_shows_it(loud):
     model, data, optimizers = loud
     photograph(model, data, lambda view: model.head(view.splats, view.visible, view.center))
+    learn_gently(optimizers, 0.1)
     before = {name: value.clone() for name, value in model.state_dict().items() if name != "_extra_state"}
-    decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=24))
+    decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=8))
     worth = {trial.part: trial.loss_db for trial in decision.trials}
     assert worth["high branch"] > 1.0 and worth["opacity residual"] > 1.0
     assert not {"high branch", "opacity residual"} & set(decision.dropped)
+    assert all(loss > 1.0 for trial in decision.trials[1:3] for _, loss, _ in trial.rounds)
+    assert {len(trial.rounds) for trial in decision.trials} == {2}  # the gap does not close
     for name, value in before.items():  # trying leaves the model as it is
         assert torch.equal(model.state_dict()[name], value), name
 
@@ -110,15 +119,16 @@ def quiet(loud):
             branch[2].weight.mul_(0.1)
             branch[2].bias.zero_()
     photograph(model, data, lambda view: model.head.base_appearance(view.splats, view.visible))
+    learn_gently(optimizers, 0.3)
     return model, data, optimizers
 
 
 def test_a_scene_that_looks_the_same_from_everywhere_keeps_nothing(quiet):
     model, data, optimizers = quiet
-    decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=24))
+    decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=4))
     assert decision.dropped[:3] == ["high branch", "opacity residual", "distance"]
     trials = {trial.part: trial for trial in decision.trials}
-    assert all(trial.loss_db <= trial.allowed_db for trial in trials.values() if trial.dropped)
+    assert all(trial.loss_db <= trial.limit_db for trial in trials.values() if trial.dropped)
     head, splats = decision.chosen.field
     assert head.high is None and not head.config.opacity_residual and not head.config.use_distance
     assert splats["latents"].shape[1] == head.config.latent_dim
@@ -128,7 +138,7 @@ def test_a_scene_that_looks_the_same_from_everywhere_keeps_nothing(quiet):
 def test_what_is_gained_by_dropping_parts_is_not_spent_on_latents(quiet):
     """The field is better without what was wrong; latents are cut from that better field, and measured against it."""
     model, data, optimizers = quiet
-    trials = decide(model, data, optimizers.optimizers, CapacitySearch(settle=24, tolerance_db=20.0)).trials
+    trials = decide(model, data, optimizers.optimizers, CapacitySearch(settle=4, tolerance_db=20.0)).trials
     *_, last_part, latents = trials
     assert latents.part.startswith("latents") and last_part.dropped and last_part.psnr > trials[0].psnr
     assert latents.loss_db == pytest.approx(last_part.psnr - latents.psnr)
@@ -205,6 +215,33 @@ def test_what_settles_is_the_mean_over_the_last_half_geometry_included(loud, mon
         assert_close(result.detach(), torch.stack(seen[2:]).mean(0), rtol=1e-6, atol=1e-7)
 
 
+def test_a_later_round_is_what_as_many_steps_at_one_go_give(loud):
+    """To the bit, and looking at a round changes neither those after it nor, later, itself."""
+    model, data, optimizers = loud
+    for name in ("means", "scales", "quats"):
+        optimizers.optimizers[name].param_groups[0]["lr"] = 1e-3
+    field = Field(model.head, {name: value.detach() for name, value in model.gauss_params.items()})
+    views = [data.train_view(index) for index in range(3)]
+    settling = Settling(model, field, views, 3, optimizers.optimizers, FIELD)
+    assert model.config.background_color == "random"
+    generator = torch.get_rng_state()
+    rounds = [settling.advance() for _ in range(3)]
+    assert generator.equal(torch.get_rng_state())
+    torch.rand(1)
+    assert [settled.steps for settled in rounds] == [3, 6, 12]
+    for settled in rounds:
+        straight = settle(model, field, views, settled.steps, optimizers.optimizers, FIELD)
+        for one, other in zip(settled.field.head.parameters(), straight.field.head.parameters(), strict=True):
+            assert one.equal(other) and one.requires_grad
+        for name in TABLES:
+            assert settled.field.splats[name].equal(straight.field.splats[name]), name
+    for name, group in straight.moments.items():  # of twelve steps, as those of the last round
+        for one, other in zip(rounds[-1].moments[name].values(), group.values(), strict=True):
+            assert all(one[key].equal(other[key]) for key in ("step", "exp_avg", "exp_avg_sq")), name
+    held = rounds[-1].field.splats["latents"]
+    assert set(rounds[-1].moments["latents"]) == {held} and held.equal(straight.field.splats["latents"])
+
+
 def test_adam_goes_on_but_for_what_has_another_shape(loud):
     """One step of settling after two of training: the splats' base has made three, shared weights and latents one."""
     model, data, optimizers = loud
@@ -275,6 +312,8 @@ def test_the_smaller_model_trains_saves_and_loads(whole, tmp_path):
         "opacity residual",
         "distance",
     ]
+    assert [trial["rounds"][0][0] for trial in report["trials"]] == [trial["steps"] for trial in report["trials"]]
+    assert {trial["steps"] for trial in report["trials"]} == {4}, "all is dropped after the first round"
     results = evaluate(whole, tmp_path / "eval.json")
     _, pipeline, _, _ = eval_setup(whole)
     model = pipeline.model
@@ -404,6 +443,7 @@ def test_full_is_full(tiny_scene, tmp_path):
         ({f"{SEARCH}.views": 0}, "views is 0"),
         ({f"{SEARCH}.views": 8}, "sets 8 training views aside, of 8"),
         ({f"{SEARCH}.settle": 0}, "settle is 0"),
+        ({f"{SEARCH}.settle-most": 3}, "settle-most is 3; it must be at least .*settle, 4"),
         ({f"{SEARCH}.tolerance-db": -0.1}, "tolerance_db is -0.1"),
     ],
 )

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The field in two Triton kernels, one forward and one backward; PyTorch's twin is `nrf.py`.
 
+Splats that are diffuse (`diffuse.py`) are told to the kernels by the table's mask; they cost next to nothing where they
+are the table's last rows.
+
 `packing.py` says how weights and features lie, `kernels.py` computes with what `arithmetic.py` has, `launch.py` makes a
 differentiable function of it, and this file decides whether it can run. Triton is imported only when it is about to: it
 is missing on machines without CUDA. With TRITON_INTERPRET=1 set before Triton is imported, the same kernels run in
@@ -17,6 +20,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.fused.packing import Packing, pack
 from nrfgs_ns.errors import InputError
 
@@ -27,6 +31,10 @@ MAX_WIDTH = 64
 """Largest P (packing.py): latents, or features, rounded up to a power of two."""
 MAX_WEIGHTS = 128 * 128
 """Most numbers in the first layer, padded. Their gradients are kept in registers, and the layer in shared memory."""
+
+MASKED = ("bf16", "fp16")
+"""Precisions whose kernels are told on a GPU which splats are diffuse. On an H200, with Triton 3.6, those of fp32 did
+not agree with PyTorch's field within what float32 explains; why is not known (docs/necessity.md)."""
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +53,8 @@ class FusedField:
         branches = [branch for branch in (low, high) if branch is not None]
         self.layers = [layer for branch in branches for layer in branch if isinstance(layer, nn.Linear)]
         self.on_cpu = pack(config.latent_dim, config.num_bands, config.use_distance, low, high)
-        self.ready: dict[tuple[torch.device, str], tuple[Packing, Launches] | str] = {}  # by device and precision
+        # By device, precision, and whether some splats are diffuse.
+        self.ready: dict[tuple[torch.device, str, bool], tuple[Packing, Launches] | str] = {}
 
     def takes(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> bool:
         """Whether the kernels are to compute this call.
@@ -63,6 +72,10 @@ class FusedField:
             )
         return reason is None
 
+    def takes_masks(self, device: torch.device) -> bool:
+        """Whether the kernels may be told which splats are diffuse; else they are given the others only."""
+        return device.type != "cuda" or self.config.precision in MASKED
+
     def __call__(
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float = 1.0
     ) -> tuple[Tensor, Tensor]:
@@ -71,8 +84,10 @@ class FusedField:
 
         weights = [weight for layer in self.layers for weight in (layer.weight, layer.bias)]
         tables = [splats[name] for name in ("means", "latents", "features_dc", "opacities")]
-        ready = self._ready_on(visible.device)
-        return FusedFunction.apply(*ready, self._options(scene_unit), *tables, visible, camera_centers, *weights)
+        diffuse = splats.get(DIFFUSE)
+        ready = self._ready_on(visible.device, diffuse is not None)
+        options = self._options(scene_unit)
+        return FusedFunction.apply(*ready, options, *tables, diffuse, visible, camera_centers, *weights)
 
     def _why_not(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> str | None:
         """What keeps the kernels from computing this call, or None."""
@@ -83,23 +98,25 @@ class FusedField:
             return f"the splats are on {device.type}, and the kernels run on CUDA"
         weight = self.layers[0].weight
         for name, tensor in (*splats.items(), ("camera_centers", camera_centers), ("shared weights", weight)):
-            if tensor.dtype != torch.float32:
-                return f"{name} is {str(tensor.dtype).removeprefix('torch.')}, and the kernels take float32"
+            taken = torch.bool if name == DIFFUSE else torch.float32
+            if tensor.dtype != taken:
+                found, wanted = (str(dtype).removeprefix("torch.") for dtype in (tensor.dtype, taken))
+                return f"{name} is {found}, and the kernels take {wanted}"
             if tensor.device != device:
                 return f"{name} is on {tensor.device}, and means on {device}"
-        ready = self._ready_on(device)
+        ready = self._ready_on(device, DIFFUSE in splats)
         return ready if isinstance(ready, str) else None
 
-    def _ready_on(self, device: torch.device) -> "tuple[Packing, Launches] | str":
+    def _ready_on(self, device: torch.device, some_diffuse: bool = False) -> "tuple[Packing, Launches] | str":
         """What `_prepare` finds on `device`: found out once, and said once."""
-        key = device, self.config.precision
+        key = device, self.config.precision, some_diffuse
         if key not in self.ready:
-            self.ready[key] = self._prepare(device)
+            self.ready[key] = self._prepare(device, some_diffuse)
             if isinstance(self.ready[key], str) and self.config.implementation == "auto":
                 logger.warning("The field runs in plain PyTorch on %s: %s.", device, self.ready[key])
         return self.ready[key]
 
-    def _prepare(self, device: torch.device) -> "tuple[Packing, Launches] | str":
+    def _prepare(self, device: torch.device, some_diffuse: bool) -> "tuple[Packing, Launches] | str":
         """The index maps on `device` and how the kernels are launched there, or why they cannot run there."""
         if importlib.util.find_spec("triton") is None:
             return "Triton is not installed"
@@ -113,7 +130,7 @@ class FusedField:
         try:
             from nrfgs_ns.appearance.fused.launch import first_that_runs
 
-            return packing, first_that_runs(packing, self._options())
+            return packing, first_that_runs(packing, self._options(), some_diffuse)
         except Exception as error:  # whatever stops Triton on this machine, PyTorch computes the same
             first_line = next(iter(str(error).splitlines()), "")
             return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"

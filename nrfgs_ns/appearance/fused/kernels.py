@@ -19,6 +19,8 @@ The kernels are bound by the number of instructions and by threads that wait for
   cores have the splat's row, and its latents and features as well (`tiles.py`);
 - loads of the next blocks are on their way while one is computed.
 
+Diffuse splats have zeros where the network has its inputs and outputs, and blocks of them have no network (`base.py`).
+
 Rows are gathered with 64-bit offsets: 2^26 splats with 32 latents each pass 2^31 numbers.
 """
 
@@ -26,11 +28,13 @@ import triton
 import triton.language as tl
 
 from nrfgs_ns.appearance.fused.arithmetic import dot, operand, sigmoid, sin_half_turns, tanh
+from nrfgs_ns.appearance.fused.base import backward_base, base_of, forward_base
 from nrfgs_ns.appearance.fused.tiles import (
     deal,
     give,
     give_latents,
     last,
+    load_flags,
     load_four,
     load_latents,
     load_three,
@@ -47,12 +51,6 @@ LOGIT_SLOPE = tl.constexpr(4.0)  # opacity_bound.LOGIT_SLOPE
 
 
 # Tiles [B, 4].
-
-
-@triton.jit
-def _base(stored, lanes, sh_c0):
-    """(c, alpha) from what is stored: features_dc, and the logit in lane 3."""
-    return tl.where(lanes < 3, 0.5 + sh_c0 * stored, sigmoid(stored))
 
 
 @triton.jit
@@ -175,15 +173,23 @@ def _inputs(Z, F, B: tl.constexpr, P: tl.constexpr, KIND: tl.constexpr):
     return tl.reshape(tl.join(operand(Z, KIND), operand(F, KIND)), (B, 2 * P))
 
 
+@triton.jit
+def _silenced(X, is_diffuse, B: tl.constexpr, P: tl.constexpr):
+    """X with zeros for diffuse splats, whatever theirs are: 0 times NaN would be NaN in the weights' gradients."""
+    lanes = tl.reshape(X, (B, P // 4, 4, 2))
+    return tl.reshape(tl.where(is_diffuse[:, None, :, None], 0.0, lanes), (B, 2 * P))
+
+
 @triton.jit(do_not_specialize=["count"])
 def forward_kernel(
-    means, latents, features_dc, opacities, visible, centers, packed,
+    means, latents, features_dc, opacities, diffuse, visible, centers, packed,
     colors_out, opacities_out,
     count, eps_squared, log_unit, color_scale, opacity_scale, sh_c0,
     D: tl.constexpr, P: tl.constexpr, H: tl.constexpr, BANDS: tl.constexpr, B: tl.constexpr, COLUMNS: tl.constexpr,
-    ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, KIND: tl.constexpr,
+    ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, KIND: tl.constexpr, DIFFUSE: tl.constexpr,
 ):  # fmt: skip
-    """Colours [count, 3] and opacities [count] of the splats in rows `visible`."""
+    """Colours [count, 3] and opacities [count] of the splats in rows `visible`. Without DIFFUSE, `diffuse` is not
+    read."""
     lanes = tl.arange(0, 4)[None, :]
     outputs = tl.arange(0, COLUMNS)
     units = tl.arange(0, H)
@@ -195,8 +201,14 @@ def forward_kernel(
     W2 = operand(W2, KIND)
     b2 = tl.load(second + H * OUTPUTS + outputs, mask=real, other=0.0)
 
+    blocks = tl.cdiv(count, B)
+    if DIFFUSE:
+        blocks = forward_base(
+            features_dc, opacities, diffuse, visible, colors_out, opacities_out, count, sh_c0, lanes, B
+        )  # fmt: skip
+
     # What is hoisted out of the loop lives in registers that its inside lacks.
-    for block in tl.range(tl.program_id(0), tl.cdiv(count, B), tl.num_programs(0), disable_licm=True):
+    for block in tl.range(tl.program_id(0), blocks, tl.num_programs(0), disable_licm=True):
         items = block * B + tl.arange(0, B)[:, None]
         valid = items < count
         items = tl.minimum(items, count - 1).to(tl.int64)  # the last block repeats the last splat, and keeps it back
@@ -205,16 +217,21 @@ def forward_kernel(
         d, log_r, _, _ = _view(means, centers, rows, items, lanes, eps_squared, log_unit, B, ONE_CENTER)
         stored = load_four(features_dc, opacities, rows, rows >= 0, lanes, B)
 
-        base = _base(stored, lanes, sh_c0)
+        base = base_of(stored, lanes, sh_c0)
         F = _features(d, base, log_r, _waves(d, BANDS), lanes, B, P // 4, BANDS)
         pre = dot(_inputs(Z, F, B, P, KIND), W1, tl.zeros((B, H), tl.float32), KIND)
         hidden = operand(tl.maximum(pre, 0.0, propagate_nan=tl.PropagateNan.ALL), KIND)
         Y = dot(hidden, W2, tl.zeros((B, COLUMNS), tl.float32), KIND) + b2[None, :]
         _, _, seen = _outputs(Y, lanes, B, COLUMNS)
         t = tanh(seen)
+        if DIFFUSE:
+            is_diffuse = load_flags(diffuse, rows, B)
+            t = tl.where(is_diffuse, 0.0, t)
 
         color = tl.maximum(base + color_scale * t, 0.0, propagate_nan=tl.PropagateNan.ALL)
         opacity, _, _ = _bounded_opacity(stored, base, t, opacity_scale, BOUND)
+        if DIFFUSE:
+            opacity = tl.where(is_diffuse, base, opacity)  # without residual, too, the smooth bound is another number
         out = deal(tl.where(lanes < 3, color, opacity), B)
         tl.store(colors_out + items * 3 + lanes, out, mask=valid & (lanes < 3))
         tl.store(opacities_out + items + (lanes - 3), out, mask=valid & (lanes == 3))
@@ -222,19 +239,19 @@ def forward_kernel(
 
 @triton.jit(do_not_specialize=["count"])
 def backward_kernel(
-    means, latents, features_dc, opacities, visible, centers, packed,
+    means, latents, features_dc, opacities, diffuse, visible, centers, packed,
     d_colors, d_opacities,
     d_means, d_latents, d_features_dc, d_logits, d_centers, partials,
     count, eps_squared, log_unit, color_scale, opacity_scale, sh_c0,
     D: tl.constexpr, P: tl.constexpr, H: tl.constexpr, BANDS: tl.constexpr, B: tl.constexpr, COLUMNS: tl.constexpr,
     SLOTS: tl.constexpr, ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, GEOMETRY: tl.constexpr, CENTER: tl.constexpr,
-    KIND: tl.constexpr, GRADIENT_KIND: tl.constexpr,
+    KIND: tl.constexpr, GRADIENT_KIND: tl.constexpr, DIFFUSE: tl.constexpr,
 ):  # fmt: skip
     """Gradients of everything, from those of colours and opacities.
 
-    Rows of the tables' gradients that no block visits are left as they are. Each program writes its sum of the packed
-    weights' gradients, and of one shared camera centre's, to its row of `partials` [programs, SLOTS]: no atomics, so
-    the result is the same every time. A d_x here is the loss's derivative by x.
+    Rows of the tables' gradients that no block visits are left as they are; with DIFFUSE, so may be what is 0. Each
+    program writes its sum of the packed weights' gradients, and of one shared camera centre's, to its row of `partials`
+    [programs, SLOTS]: no atomics, so the result is the same every time. A d_x here is the loss's derivative by x.
     """
     lanes = tl.arange(0, 4)[None, :]
     outputs = tl.arange(0, COLUMNS)
@@ -259,8 +276,14 @@ def backward_kernel(
     d_b2_low = tl.zeros((B, 4), tl.float32)
     d_b2_high = tl.zeros((B, 4), tl.float32)
     d_center = tl.zeros((B, 4), tl.float32)
+    blocks = tl.cdiv(count, B)
+    if DIFFUSE:
+        blocks = backward_base(
+            features_dc, opacities, diffuse, visible, d_colors, d_opacities, d_features_dc, d_logits, count, sh_c0,
+            lanes, B, ONE_CENTER,
+        )  # fmt: skip
 
-    for block in tl.range(tl.program_id(0), tl.cdiv(count, B), tl.num_programs(0), disable_licm=True):
+    for block in tl.range(tl.program_id(0), blocks, tl.num_programs(0), disable_licm=True):
         items = block * B + tl.arange(0, B)[:, None]
         valid = items < count
         items = tl.minimum(items, count - 1).to(tl.int64)  # the last block repeats the last splat, and keeps it back
@@ -271,23 +294,33 @@ def backward_kernel(
         d_out = load_four(d_colors, d_opacities, items, valid, lanes, B)
 
         # Forward again.
-        base = _base(stored, lanes, sh_c0)
+        base = base_of(stored, lanes, sh_c0)
         waves = _waves(d, BANDS)
         F = _features(d, base, log_r, waves, lanes, B, P // 4, BANDS)
         X = _inputs(Z, F, B, P, KIND)
+        if DIFFUSE:
+            is_diffuse = load_flags(diffuse, rows, B)
+            X = _silenced(X, is_diffuse, B, P)
         pre = tl.maximum(dot(X, W1, tl.zeros((B, H), tl.float32), KIND), 0.0, propagate_nan=tl.PropagateNan.ALL)
         hidden = operand(pre, KIND)
         Y = dot(hidden, W2, tl.zeros((B, COLUMNS), tl.float32), KIND) + b2[None, :]
         if KIND != GRADIENT_KIND:
             X = _inputs(Z, F, B, P, GRADIENT_KIND)
+            if DIFFUSE:
+                X = _silenced(X, is_diffuse, B, P)
             hidden = operand(pre, GRADIENT_KIND)
         high, gate, seen = _outputs(Y, lanes, B, COLUMNS)
         t = tanh(seen)
+        if DIFFUSE:
+            t = tl.where(is_diffuse, 0.0, t)
 
         # Outputs.
         d_color = tl.where(base + color_scale * t >= 0.0, d_out, 0.0)
         _, logit_slope, t_slope = _bounded_opacity(stored, base, t, opacity_scale, BOUND)
         d_low = tl.where(lanes < 3, color_scale * d_color, d_out * t_slope) * (1.0 - t * t)
+        if DIFFUSE:
+            logit_slope = tl.where(is_diffuse, base * (1.0 - base), logit_slope)
+            d_low = tl.where(is_diffuse, 0.0, d_low)
         d_gate = gate * (1.0 - gate) * tl.sum(tl.where(lanes < 3, d_low * high, 0.0), axis=1)[:, None]
         d_high = tl.where(lanes < 3, gate * d_low, d_gate)
         d_b2_low += d_low
@@ -320,6 +353,8 @@ def backward_kernel(
             radial = tl.sum(tl.where(lanes < 3, -d_view * d, d_view), axis=1)[:, None]
             radial = tl.where(above, radial, 0.0)
             d_v = inverse * (d_view + radial * d)
+            if DIFFUSE:
+                d_v = tl.where(is_diffuse, 0.0, d_v)
             mask = valid & (lanes < 3)
             give(d_means + rows * 3 + lanes, deal(-d_v, B), mask, ONE_CENTER)
             if CENTER and ONE_CENTER:

@@ -3,7 +3,7 @@
 
 A training step of a small scene is bound by the host, so this is written for few launches: two to pack the weights,
 one forward, one to zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the
-weights' gradients.
+weights' gradients. Where splats are diffuse, the tables' gradients are always zeroed.
 """
 
 import itertools
@@ -128,12 +128,12 @@ class FusedFunction(torch.autograd.Function):
     """(tables, visible rows, camera centres, shared weights) -> colours [M, 3], opacities [M].
 
     Camera centres [3] promise that no row of `visible` repeats. All tensors are float32 on one device; `visible` is
-    int64.
+    int64, and `diffuse` bool [N], or None where no splat is diffuse: those are other kernels, which do not ask.
     """
 
     @staticmethod
     def forward(ctx, packing: Packing, launches: Launches, options: FieldOptions, means, latents, features_dc,
-                opacities, visible, centers, *weights):  # fmt: skip
+                opacities, diffuse, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
         visible, centers = _contiguous(visible), _contiguous(centers)
         packed = torch.cat([w.reshape(-1) for w in weights] + [_zero(means.device)]).index_select(0, packing.gather)
@@ -142,14 +142,16 @@ class FusedFunction(torch.autograd.Function):
         if count > 0:
             how = launches.forward
             launch_forward(
-                (_programs(how, count, means.device), 1, 1), *tables, visible, centers, packed, colors, seen,
+                (_programs(how, count, means.device), 1, 1), *tables, _bytes(diffuse, visible), visible, centers,
+                packed, colors, seen,
                 count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
                 D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
                 B=how.block, COLUMNS=how.columns,
                 ONE_CENTER=centers.dim() == 1, BOUND=options.bound, KIND=KINDS[options.precision][0],
+                DIFFUSE=diffuse is not None,
                 **how.options(packing.hidden),
             )  # fmt: skip
-        ctx.save_for_backward(*tables, visible, centers, packed)
+        ctx.save_for_backward(*tables, diffuse, visible, centers, packed)
         ctx.packing, ctx.how, ctx.options = packing, launches.backward, options
         return colors, seen
 
@@ -157,23 +159,26 @@ class FusedFunction(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, d_colors, d_opacities):
         packing, how, options = ctx.packing, ctx.how, ctx.options
-        *tables, visible, centers, packed = ctx.saved_tensors
+        *tables, diffuse, visible, centers, packed = ctx.saved_tensors
         count, rows, device = len(visible), len(tables[0]), visible.device
-        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[8] and options.geometry_gradient
-        d_tables = _tables(rows, packing.latent_dim, device, zero=not one_center or count < rows)
+        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[9] and options.geometry_gradient
+        zero = not one_center or count < rows or diffuse is not None
+        d_tables = _tables(rows, packing.latent_dim, device, zero)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
+        if diffuse is not None and not one_center:
+            d_centers.zero_()
         if count > 0:
             programs = _programs(how, count, device)
             partials = tables[0].new_empty(programs, packing.size + CENTER_SLOTS)
             kind, gradient_kind = KINDS[options.precision]
             launch_backward(
-                (programs, 1, 1), *tables, visible, centers, packed,
+                (programs, 1, 1), *tables, _bytes(diffuse, visible), visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
                 count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
                 D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
                 B=how.block, COLUMNS=how.columns, SLOTS=partials.shape[1],
                 ONE_CENTER=one_center, BOUND=options.bound, GEOMETRY=options.geometry_gradient, CENTER=wants_center,
-                KIND=kind, GRADIENT_KIND=gradient_kind,
+                KIND=kind, GRADIENT_KIND=gradient_kind, DIFFUSE=diffuse is not None,
                 **how.options(packing.hidden),
             )  # fmt: skip
             sums = partials.sum(dim=0)
@@ -184,33 +189,38 @@ class FusedFunction(torch.autograd.Function):
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
         d_means = d_tables[0] if options.geometry_gradient else None
-        return None, None, None, d_means, *d_tables[1:], None, d_centers if wants_center else None, *d_weights
+        d_centers = d_centers if wants_center else None
+        return None, None, None, d_means, *d_tables[1:], None, None, d_centers, *d_weights
 
 
-def first_that_runs(packing: Packing, options: FieldOptions) -> Launches:
+def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool) -> Launches:
     """The fastest way to launch the kernels that this device can run at these sizes; else raise what goes wrong.
+
+    Args:
+        some_diffuse: those for tables with diffuse splats.
 
     What can go wrong shows only here: no C compiler for Triton's launcher, or less shared memory than the kernels take.
     """
     *more, last = LAUNCHES[options.precision]
     for launches in more:
         try:
-            probe(packing, launches, options)
+            probe(packing, launches, options, some_diffuse)
         except Exception:  # whatever it is: if the last way fails too, that one tells
             continue
         return launches
-    probe(packing, last, options)
+    probe(packing, last, options, some_diffuse)
     return last
 
 
-def probe(packing: Packing, launches: Launches, options: FieldOptions) -> None:
+def probe(packing: Packing, launches: Launches, options: FieldOptions, some_diffuse: bool) -> None:
     """Compile and run both kernels on one splat, for one camera; raise whatever goes wrong."""
     device = packing.gather.device
     with torch.inference_mode(False), torch.enable_grad():
         tables = [torch.zeros(1, n, device=device, requires_grad=True) for n in (3, packing.latent_dim, 3, 1)]
         weights = [torch.zeros(shape, device=device, requires_grad=True) for shape in packing.shapes]
         visible, center = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(3, device=device)
-        outputs = FusedFunction.apply(packing, launches, options, *tables, visible, center, *weights)
+        diffuse = torch.zeros(1, dtype=torch.bool, device=device) if some_diffuse else None
+        outputs = FusedFunction.apply(packing, launches, options, *tables, diffuse, visible, center, *weights)
         sum(output.sum() for output in outputs).backward()
 
 
@@ -229,7 +239,8 @@ def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> lis
     Each begins at a multiple of 16 bytes whatever N is: Triton compiles another kernel for pointers that do not.
 
     Args:
-        zero: make them zeros. Not needed if one camera sees every row: then the kernel writes each row, once.
+        zero: make them zeros. Not needed if one camera sees every row: then the kernel writes each row, once, unless
+            splats are diffuse.
     """
     padded = -(-rows // 4) * 4
     widths = (3, latent_dim, 3, 1)
@@ -243,6 +254,11 @@ def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> lis
 def _contiguous(x: Tensor) -> Tensor:
     """x without gradient, dense."""
     return x.detach().contiguous()
+
+
+def _bytes(diffuse: Tensor | None, instead: Tensor) -> Tensor:
+    """Which splats are diffuse, as bytes; where none is, any tensor for the kernels, which do not look at it then."""
+    return instead if diffuse is None else diffuse.contiguous().view(torch.uint8)
 
 
 _ZEROS: dict[torch.device, Tensor] = {}

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which splats a model's table has, and in which order: all that has a row for each of them follows."""
+
+from collections.abc import Mapping
+
+import torch
+from gsplat.strategy.ops import _update_param_with_optimizer
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
+
+
+@torch.no_grad()
+def take_rows(model, optimizers: Mapping[str, Optimizer], rows: Tensor) -> None:
+    """Let the given rows, in this order, be the splats: parameters, optimisers' moments, densification's statistics.
+
+    Args:
+        model: an NrfgsModel; entries of its `gauss_params` are replaced.
+        optimizers: by group; those of `gauss_params` among them.
+        rows: of the table, int64.
+    """
+    count, state = len(model.gauss_params["means"]), model.densification.state
+    _update_param_with_optimizer(
+        lambda _, old: Parameter(old.detach()[rows]), lambda _, old: old[rows], model.gauss_params, optimizers
+    )
+    for name, value in state.items():
+        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count:
+            state[name] = value[rows]
