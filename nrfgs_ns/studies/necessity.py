@@ -58,6 +58,8 @@ class Necessity:
     they are, whatever the gloss"""
     residual_cost: float = 0.05
     """of the trainings with looks or capacity auto: weight of the residuals' length in the loss"""
+    average_steps: int = 50
+    """last steps of every training, whose mean is its model: so that what auto installs, a mean too, has no lead"""
     inspect: bool = True
     """look into the full model and write it as a compact file, too"""
     seeds: tuple[int, ...] = (42, 43)
@@ -72,7 +74,17 @@ class Necessity:
                     self.look_into(gloss, Path(full["config"]))
                 for name, options in self.variants().items():
                     self.trained(gloss, seed, name, data, options)
-        keys = ("views", "width", "samples", "points", "steps", "rasterize_mode", "residual_cost", "seeds")
+        keys = (
+            "views",
+            "width",
+            "samples",
+            "points",
+            "steps",
+            "rasterize_mode",
+            "residual_cost",
+            "average_steps",
+            "seeds",
+        )
         summary = {**{key: getattr(self, key) for key in keys}, "machine": machine(), "scenes": list(self.summary())}
         write_whole(self.out / "necessity.json", json.dumps(summary, indent=1) + "\n")
         write_whole(self.out / "necessity.md", table(summary))
@@ -120,6 +132,7 @@ class Necessity:
             "--output-dir": self.out / "outputs",
             "--experiment-name": name,
             "--max-num-iterations": self.steps,
+            "--average-steps": self.average_steps,
             "--machine.seed": seed,
             "--vis": "tensorboard",
             "--steps-per-eval-image": 10 * self.steps,
