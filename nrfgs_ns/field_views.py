@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """How good a field is on some views, and how small it can be made within a loss."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from time import perf_counter, process_time
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
+from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.reduce import Field, LatentBasis, latent_basis, with_diffuse, with_rank
 from nrfgs_ns.metrics import psnr
 from nrfgs_ns.residuals import Residuals
@@ -58,9 +60,19 @@ class FieldViews:
 
     @torch.no_grad()
     def head_seconds(self, field: Field) -> float:
-        """Mean over the views of what the head takes for one."""
-        views = self.views
-        return sum(fastest(lambda v=v: field.head(field.splats, v.visible, v.center)) for v, _, _ in views) / len(views)
+        """Mean over the views of what the head takes for one; diffuse splats last, as in a training and in a file."""
+        seconds = []
+        for view, _, _ in self.views:
+            rows = diffuse_last(field.splats, view.visible)
+            seconds.append(fastest(lambda rows=rows, center=view.center: field.head(field.splats, rows, center)))
+        return sum(seconds) / len(seconds)
+
+
+def diffuse_last(splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:
+    """The visible rows, those of diffuse splats behind the others."""
+    if DIFFUSE not in splats:
+        return visible
+    return visible[splats[DIFFUSE][visible].to(torch.uint8).argsort(stable=True)]
 
 
 def fastest(work: Callable[[], object]) -> float:

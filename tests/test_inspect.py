@@ -171,6 +171,21 @@ def test_latents_of_diffuse_splats_do_not_count(loud, field, seen):
     assert views.psnr(some) - views.psnr(rank_1(some)) == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
 
 
+def test_the_head_is_timed_with_diffuse_splats_last(loud, field, seen, monkeypatch):
+    """The fused kernels save the network of whole blocks: in the order of an untrained mask they would have none."""
+    camera, batch = next(iter(loud.datamanager.fixed_indices_eval_dataloader))
+    views = FieldViews(loud.model, [(camera, batch)])
+    diffuse = torch.rand(len(field.splats["means"]), generator=torch.Generator().manual_seed(0)) < 0.5
+    some = with_diffuse(field, diffuse, seen.features_dc, seen.opacities)
+    given = []
+    monkeypatch.setattr(type(some.head), "forward", lambda self, splats, visible, center: given.append(visible))
+    assert views.head_seconds(some) >= 0
+    visible = views.views[0][0].visible
+    assert torch.equal(given[0].sort().values, visible) and (diffuse[given[0]].int().diff() >= 0).all()
+    views.head_seconds(field)
+    assert torch.equal(given[-1], visible)
+
+
 def test_splats_that_are_diffuse_already_are_not_left_out_again(loud, field, seen):
     every = dropped(field, seen, float("inf"))
     views = FieldViews(loud.model, loud.datamanager.fixed_indices_eval_dataloader)
