@@ -41,7 +41,7 @@ from torch.optim import Optimizer
 from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT
 from nrfgs_ns.appearance.reduce import Field, with_diffuse
 from nrfgs_ns.capacity.report import add_to_report, read_report
-from nrfgs_ns.capacity.settle import lesson_order, settle
+from nrfgs_ns.capacity.settle import Lessons, settle
 from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.field_views import FieldViews
@@ -221,7 +221,7 @@ def share_that_pays(
         as for `make_diffuse`; seen: the splats from the training views.
     """
     aside = FieldViews(model, [data.train_view(index) for index in data.views_aside], geometry=True)
-    lessons = [data.train_view(index) for index in lesson_order(data, config.settle)]
+    lessons = Lessons(data, config.settle)
     field = Field(model.head, {name: value.detach() for name, value in model.gauss_params.items()})
 
     def scores(some: Field) -> Tensor:

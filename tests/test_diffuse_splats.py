@@ -399,6 +399,7 @@ def test_resumed_training_is_the_unbroken_one(half, whole, tiny_scene, tmp_path)
     assert (DIFFUSE in strategy_of(first)) == (half == 8)
     assert_same_training(checkpoint_of(rest), checkpoint_of(whole))
     diffuse = strategy_of(rest)[DIFFUSE]
+    assert [look["step"] for look in read_report(rest.parent)["looks"]] == [6, 14, 22]
     assert SHIFT in strategy_of(rest) and len(diffuse) != 300 and 0 < int(diffuse.sum()) < len(diffuse)
     assert torch.equal(diffuse, diffuse.sort().values)
     _, pipeline, _, _ = eval_setup(rest)

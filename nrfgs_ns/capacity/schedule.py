@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """When capacity "auto" decides, and what it leaves behind: a line, a file, and scalars for whatever listens."""
 
+import math
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -14,7 +15,7 @@ from nrfgs_ns.capacity.aside import Decider, ViewsAside
 from nrfgs_ns.capacity.charge import charge_for
 from nrfgs_ns.capacity.config import CapacitySearch
 from nrfgs_ns.capacity.install import head_changes, install
-from nrfgs_ns.capacity.report import add_to_report, forget_report
+from nrfgs_ns.capacity.report import add_to_report, continue_report, forget_report
 from nrfgs_ns.capacity.search import Decision, decide
 from nrfgs_ns.diffuse_splats import schedule_for
 from nrfgs_ns.errors import InputError
@@ -79,14 +80,16 @@ class CapacitySchedule:
     def tell(self, decision: Decision, step: int, seconds: float) -> None:
         """Log what was decided, and by which evidence."""
         tolerance = self.config.tolerance_db
-        CONSOLE.print(
-            f"Step {step}: {len(self.data.views_aside)} views set aside say that the field needs no "
-            f"{', no '.join(decision.dropped)}."
-            if decision.dropped
-            else f"Step {step}: every part of the field pays; it stays whole.",
-            soft_wrap=True,
-        )
-        for trial in decision.trials[1:]:
+        measured = [trial for trial in decision.trials[1:] if math.isfinite(trial.loss_db)]
+        if decision.dropped:
+            aside = f"{len(self.data.views_aside)} views set aside"
+            found = f"{aside} say that the field needs no {', no '.join(decision.dropped)}."
+        elif measured:
+            found = "every part of the field pays; it stays whole."
+        else:
+            found = "the views set aside have no pixel inside their masks, and say nothing; the field stays whole."
+        CONSOLE.print(f"Step {step}: {found}", soft_wrap=True)
+        for trial in measured:
             CONSOLE.print(
                 f"  {'dropped' if trial.dropped else 'kept'}: {trial.part}, worth {trial.loss_db:.3f} dB after "
                 f"{trial.steps} steps (standard error {trial.error_db:.3f}; up to {trial.limit_db:.3g} may go)",
@@ -143,6 +146,9 @@ def deciding_callbacks(model, attributes: TrainingCallbackAttributes) -> list[Tr
             _warn_of_early_end(decider, trainer, start)
     if start == 0:
         forget_report(folder)
+    elif trainer.config.load_dir is not None or trainer.config.load_checkpoint is not None:
+        models = trainer.config.load_dir or Path(trainer.config.load_checkpoint).parent
+        continue_report(folder, Path(models).parent, start)
     return [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], call) for call in calls]
 
 

@@ -32,7 +32,7 @@ from nrfgs_ns.appearance.reduce import (
     without_opacity_residual,
 )
 from nrfgs_ns.capacity.config import CapacitySearch
-from nrfgs_ns.capacity.settle import FIELD, Settled, Settling, keep_the_mean, lesson_order
+from nrfgs_ns.capacity.settle import FIELD, Lessons, Settled, Settling, keep_the_mean
 from nrfgs_ns.field_views import FieldViews, smallest_rank
 from nrfgs_ns.residuals import Residuals, look_over
 
@@ -111,7 +111,7 @@ def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config:
     was_training = model.training
     model.eval()
     aside = FieldViews(model, [data.train_view(index) for index in data.views_aside], geometry=True)
-    lessons = [data.train_view(index) for index in lesson_order(data, config.settle_most)]
+    lessons = Lessons(data, config.settle_most)
     cameras = data.train_dataset.cameras
     seen = look_over(model, cameras)  # where cameras are, not what is on their photographs
     field = Field(model.head, {name: value.detach() for name, value in model._splats_to_draw().items()})
@@ -124,14 +124,18 @@ def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config:
     # Each part is taken from the field as it was trained: what is kept has not settled twice.
     trials, kept, dropped = [], field, []
     chosen: Settled | None = None
+    gone_when_tried: dict[str, int] = {}
     lost = 0.0
     allowed = SHARE_FOR_PARTS * config.tolerance_db
     for _ in range(ROUNDS):
         before = len(dropped)
         for part, without in parts_of(kept, seen):
+            if gone_when_tried.get(part) == len(dropped):
+                continue  # the same field has been tried
+            gone_when_tried[part] = len(dropped)
             smaller = keep_the_mean(model, kept, without(kept), lessons)
-            learning = settling(smaller, config.settle)
-            trial, candidate = try_without(part, smaller, learning, whole, aside, allowed, config.settle_most)
+            learning, least = settling(smaller, config.settle), 0 if chosen is None else chosen.steps
+            trial, candidate = try_without(part, smaller, learning, whole, aside, allowed, config.settle_most, least)
             del learning  # a trial's copies go before those of the next are made
             trials.append(trial)
             if candidate is not None:
@@ -219,7 +223,14 @@ class Whole:
 
 
 def try_without(
-    part: str, smaller: Field, settling: Settling, whole: Whole, aside: FieldViews, allowed: float, most: int
+    part: str,
+    smaller: Field,
+    settling: Settling,
+    whole: Whole,
+    aside: FieldViews,
+    allowed: float,
+    most: int,
+    least: int = 0,
 ) -> tuple[Trial, Settled | None]:
     """Let a smaller field settle until it may take the place of the whole one, or does not come nearer.
 
@@ -231,6 +242,8 @@ def try_without(
         aside: views that it is measured on.
         allowed: what it may cost, dB, besides the standard error.
         most: steps of settling.
+        least: steps of settling before it is given up: as many as it took for what has gone before it, which its loss
+            contains.
 
     Returns:
         The evidence, and the field after its last round; None if it does not take the place.
@@ -243,7 +256,7 @@ def try_without(
         rounds.append((candidate.steps, loss, error))
         limit = allowed + error
         may_go = loss <= limit
-        closing = len(rounds) == 1 or loss <= (1.0 - CLOSING) * rounds[-2][1]
+        closing = len(rounds) == 1 or candidate.steps < least or loss <= (1.0 - CLOSING) * rounds[-2][1]
         if may_go or not closing or 2 * candidate.steps > most:
             break
         del candidate  # before there is another

@@ -51,6 +51,22 @@ def lesson_order(data, steps: int) -> list[int]:
     return [chosen[i] for i in order.tolist()]
 
 
+class Lessons:
+    """The training views on which fields settle, in their order: pairs of a camera and its batch.
+
+    Each is fetched when its turn comes: in one go, the photographs of a large data set would not fit on the device.
+    """
+
+    def __init__(self, data, steps: int):
+        self.data, self.order = data, lesson_order(data, steps)
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    def __getitem__(self, position: int) -> tuple[Any, dict[str, Any]]:
+        return self.data.train_view(self.order[position])
+
+
 class Settling:
     """Trains a copy of a field on some views, in rounds; the model's own numbers stay, as do the random generators.
 
@@ -117,7 +133,8 @@ class Settling:
             outputs, _ = self.model.paint(view, self.head(self.splats, view.visible, view.center))
             self.model._correct_colors(outputs, camera)
             loss = self.model.photometric_loss(outputs, batch)
-        loss.backward()
+        # Of nothing else: poses and bilateral grids have the training's gradients.
+        loss.backward(inputs=[one for adam in self.adams.values() for one in adam.param_groups[0]["params"]])
         for adam in self.adams.values():
             adam.step()
             adam.zero_grad(set_to_none=True)  # between rounds none need memory

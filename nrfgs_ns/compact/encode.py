@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
@@ -115,7 +116,12 @@ def means_grid(means: np.ndarray, log_scales: np.ndarray, precision: float) -> G
         grid = grid_with_bits(means, bits)
         extent = means.max(axis=0) > means.min(axis=0)
         if (grid.step[extent] <= wanted).all():
-            break
+            return grid
+    CONSOLE.print(
+        f"[bold yellow]Some splats are so far from the others that {MOST_BITS} bits are too few for a coordinate: "
+        f"means are rounded to {float(grid.step.max()):.3g} units instead of {wanted:.3g}.",
+        soft_wrap=True,
+    )
     return grid
 
 

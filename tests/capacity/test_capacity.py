@@ -15,6 +15,7 @@ from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.reduce import Field, latent_basis, with_rank, with_unit_axes
 from nrfgs_ns.capacity.config import CapacitySearch
 from nrfgs_ns.capacity.install import install
+from nrfgs_ns.capacity.report import add_to_report, continue_report, read_report
 from nrfgs_ns.capacity.search import Decision, decide
 from nrfgs_ns.capacity.settle import BASE, FIELD, TABLES, Settling, keep_the_mean, lesson_order, settle
 from nrfgs_ns.errors import InputError
@@ -324,6 +325,21 @@ def test_the_smaller_model_trains_saves_and_loads(whole, tmp_path):
     assert results["parameter_bytes"] == 4 * (model.num_points * (3 + 3 + 4 + 1 + 3 + 1) + weights)
 
 
+def test_evidence_goes_on_with_a_training(tmp_path):
+    """But for what was decided after the checkpoint was written, which is decided anew."""
+    earlier, later = tmp_path / "earlier", tmp_path / "later"
+    add_to_report(earlier, {"looks": [{"step": 6}, {"step": 14}], "step": 9, "dropped": [], "trials": [float("nan")]})
+    continue_report(later, tmp_path / "nowhere", 10)
+    continue_report(None, earlier, 10)
+    assert read_report(later) == {}
+    continue_report(later, earlier, 14)
+    assert read_report(later) == {"looks": [{"step": 6}], "step": 9, "dropped": [], "trials": [None]}
+    continue_report(later, earlier, 20)
+    assert len(read_report(later)["looks"]) == 1, "its own"
+    continue_report(tmp_path / "before", earlier, 9)
+    assert read_report(tmp_path / "before") == {"looks": [{"step": 6}]}
+
+
 @pytest.mark.parametrize("half", [pytest.param(8, marks=pytest.mark.slow), 13])
 def test_resumed_training_is_the_unbroken_one(half, whole, tiny_scene, tmp_path, monkeypatch):
     """Cut before and after the decision. A part that begins after it does not decide again."""
@@ -332,6 +348,9 @@ def test_resumed_training_is_the_unbroken_one(half, whole, tiny_scene, tmp_path,
     monkeypatch.setattr("nrfgs_ns.capacity.schedule.decide", lambda *args: decisions.append(args) or decide(*args))
     rest = trained(words(tiny_scene, tmp_path / "rest", {"--load-dir": models_of(first)}, steps=18 - half))
     assert len(decisions) == (1 if half == 8 else 0)
+    assert read_report(rest.parent)["step"] == read_report(whole.parent)["step"], (
+        "told, too"
+    )
     assert checkpoint_of(whole)["pipeline"]["_extra_state"]["sampling"]["views_aside"] == []
     assert_same_training(checkpoint_of(rest), checkpoint_of(whole))
 

@@ -118,8 +118,8 @@ KEPT = (1000.0, 0.0)
 @pytest.mark.parametrize(
     "losses, dropped, steps, rest",
     [
-        # high branch; opacity's residual and distance; those two once more; latents
-        ([KEPT, (900.0, 0.0), (300.0, 400.0), *[KEPT] * 8, (899.0, 0.0)], "high branch", [8, 8, 4, 4, 4, 4, 8], 900.0),
+        # high branch; opacity's residual and distance, for as many steps; latents
+        ([KEPT, (900.0, 0.0), (300.0, 400.0), *[KEPT] * 6, (899.0, 0.0)], "high branch", [8] * 5, 900.0),
         ([*[KEPT] * 6, (999.0, 0.0)], None, [4, 4, 4, 4, 4], 1000.0),
     ],
     ids=["after three rounds", "nothing"],
@@ -155,6 +155,54 @@ def test_latents_are_cut_from_the_last_round_and_settle_as_long(
     assert first == [2] * (len(steps) - 1) + [steps[-1]]
     latents = found.chosen.field.splats["latents"]
     assert found.chosen.steps == steps[-1] and found.chosen.moments["latents"][latents]["step"] == steps[-1]
+
+
+@pytest.mark.parametrize(
+    "losses, parts, steps",
+    [
+        # What still lacks the high branch lacks more at first, and is not given up before it has caught up.
+        ([0.16, 0.08, 0.02, *[0.16, 0.15, 0.02], *[0.16, 0.15, 0.02]], "hod", [400, 400, 400]),
+        # After the distance has gone, the two others are tried once more; after nothing has, nothing is.
+        ([*[1.0] * 2, *[1.0] * 2, 0.02, *[1.0] * 2, *[1.0] * 2], "hodho", [200, 200, 100, 200, 200]),
+        # Opacity's residual went last: the distance has been tried without it, the high branch has not.
+        ([*[1.0] * 2, 0.02, *[1.0] * 2, *[1.0] * 2], "hodh", [200, 100, 200, 200]),
+        ([1.0] * 6, "hod", [200, 200, 200]),
+    ],
+)
+@pytest.mark.usefixtures("no_cuda")
+def test_what_is_tried_and_how_long(losses, parts, steps, tiny_scene, tmp_path, monkeypatch):
+    options = {"--pipeline.model.capacity": "auto", "--pipeline.model.appearance.latent-dim": 6}
+    trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, 2, options)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    told = iter([*losses, 9.0])
+    monkeypatch.setattr(search, "loss_of", lambda *_: (next(told, 9.0), 0.0))
+    monkeypatch.setattr(Settling, "_learn", lambda *_: None)
+    model, data = trainer.pipeline.model, trainer.pipeline.datamanager
+    found = decide(model, data, trainer.optimizers.optimizers, CapacitySearch())
+    tried = [trial for trial in found.trials[1:] if not trial.part.startswith("latents")]
+    assert "".join(trial.part[0] for trial in tried) == parts and [trial.steps for trial in tried] == steps
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_settling_leaves_no_gradients_and_holds_no_photographs(tiny_scene, tmp_path, monkeypatch):
+    """Poses would have them added to those of the training; of a large data set not all fit on the device."""
+    options = {"--pipeline.model.camera-optimizer.mode": "SO3xR3", "--pipeline.model.capacity": "auto"}
+    trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, 2, options)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    model, data = trainer.pipeline.model, trainer.pipeline.datamanager
+    given, most, view = weakref.WeakSet(), [], data.train_view
+
+    def watched(index: int):
+        camera, batch = view(index)
+        batch = {**batch, "image": batch["image"].clone()}
+        given.add(batch["image"])
+        most.append(len(given))
+        return camera, batch
+
+    monkeypatch.setattr(data, "train_view", watched)
+    decide(model, data, trainer.optimizers.optimizers, CapacitySearch(settle=4, settle_most=8))
+    assert len(most) > 8 and max(most) <= len(data.views_aside) + 2
+    assert all(parameter.grad is None for parameter in model.parameters())
 
 
 def test_what_is_told(capsys):

@@ -19,7 +19,7 @@ from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import Field, latent_basis, with_diffuse, with_rank
 from nrfgs_ns.compact.decode import decode
-from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode
+from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode, means_grid
 from nrfgs_ns.compact.format import read_container, write_container
 from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.errors import InputError
@@ -298,3 +298,12 @@ def test_what_is_asked_for_is_written(exported, tmp_path):
     ):
         with pytest.raises(InputError, match=says):
             tyro.cli(Export, args=[*words, *options]).main()
+
+
+def test_means_too_far_apart_for_their_bits_are_told(capsys):
+    means = np.random.default_rng(0).normal(size=(1000, 3))
+    means_grid(means, np.full((1000, 3), np.log(0.004)), 1 / 32)
+    assert "bits" not in capsys.readouterr().out
+    means[0] = 3000.0
+    means_grid(means, np.full((1000, 3), np.log(0.004)), 1 / 32)
+    assert "21 bits are too few" in capsys.readouterr().out
