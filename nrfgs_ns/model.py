@@ -84,7 +84,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     residual_cost: float = 0.0
     """capacity auto and diffuse splats: weight of the residuals' mean length in the loss, from the end of densification
     until the last decision. What does not pay for it falls silent, and colour, opacity and geometry do its work. 0.05
-    did on a matte procedural scene what nothing else did"""
+    makes more splats diffuse, at a price in quality"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -164,7 +164,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         """Bytes of all that a renderer needs: the splats' parameters, but the latents of diffuse ones, and the head."""
         stored = [*self.gauss_params.values(), *self.head.parameters()]
         whole = sum(parameter.numel() * parameter.element_size() for parameter in stored)
-        return whole - self.num_diffuse * (self.gauss_params["latents"][0].nbytes if self.num_diffuse else 0)
+        diffuse = self.num_diffuse
+        return whole - diffuse * self.gauss_params["latents"][0].nbytes if diffuse else whole
 
     @property
     def num_diffuse(self) -> int:

@@ -3,16 +3,17 @@
 
 The whole field settles, and so does each smaller one, on the same views (`settle.py`). Both are then measured on the
 views that were set aside. In turn, each on top of what has been dropped before it: the high branch, which is half of
-the head; opacity's residual; the distance; and once more what was kept, if something has gone. They may cost half of
-the tolerance together: what is measured is the whole loss against the whole field, so that small ones do not add up.
+the head; opacity's residual; the distance; and once more what was kept, if something has gone since. They may cost half
+of the tolerance together: what is measured is the whole loss against the whole field, so that small ones do not add up.
 Then the latents keep the fewest principal components that cost no more than the rest, against the field from which they
 are cut: where a part did harm, so that the field is better without it, latents are not cut at the price of the gain.
 
 A field that has grown up with a part is worse at once without it, whether the scene needs the part or not. So both
 settle for twice as many steps, and again, while that brings the smaller one nearer; they are compared after as many
-steps each. The burden of proof is on the part: it goes unless its worth is above what is allowed by more than one
-standard error over the views, the one-standard-error rule of Breiman, Friedman, Olshen and Stone (Classification and
-Regression Trees, 1984). Few views cannot tell a small worth from none, and are those to which a field over-fits.
+steps each. What comes later is given as many steps as those before it took, which its loss contains. The burden of
+proof is on the part: it goes unless its worth is above what is allowed by more than one standard error over the views,
+the one-standard-error rule of Breiman, Friedman, Olshen and Stone (Classification and Regression Trees, 1984). Few
+views cannot tell a small worth from none, and are those to which a field over-fits.
 """
 
 from collections.abc import Callable, Mapping
