@@ -135,12 +135,11 @@ class NeuralResidualField(AppearanceHead):
         return {**super().splat_params(rgb), "latents": latents}
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        fused = self.fused.takes(splats, camera_centers)
-        if DIFFUSE in splats and not (fused and self.fused.takes_masks(visible.device)):
+        if self.fused.takes(splats, camera_centers):
+            return SplatAppearance(*self.fused(splats, visible, camera_centers, self.scene_unit))
+        if DIFFUSE in splats:
             others = Others(splats, visible, camera_centers)
             return others.over(self.base_appearance(splats, visible), self.forward(*others.arguments))
-        if fused:
-            return SplatAppearance(*self.fused(splats, visible, camera_centers, self.scene_unit))
         color, logit = self._base(splats, visible)
         d_color, d_alpha = self._residual(splats, visible, camera_centers, color, logit)
         if d_alpha is None:

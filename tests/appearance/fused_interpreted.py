@@ -7,6 +7,7 @@ Run by test_fused.py in a process of its own: Triton decides when it is imported
 from dataclasses import replace
 
 import pytest
+import quick_interpreter  # noqa: F401
 import torch
 import triton
 import triton.language as tl
@@ -298,21 +299,6 @@ def test_none_diffuse_is_no_entry(repeated, precision):
     splats.pop(DIFFUSE)
     expected = evaluate(head, splats, visible, centers)
     assert all(torch.equal(found[name], value) for name, value in expected.items())
-
-
-def test_kernels_without_a_mask_are_given_the_others(monkeypatch):
-    head, twin = heads()
-    assert [twin.fused.takes_masks(torch.device(device)) for device in ("cpu", "cuda")] == [True, False], "fp32"
-    assert heads(precision="bf16")[0].fused.takes_masks(torch.device("cuda"))
-    case = some_diffuse(scene(head, 150, 140), 0.5, last=False)
-    given_rows, run = [], launch.launch_forward
-    monkeypatch.setattr(head.fused, "takes_masks", lambda device: False)
-    monkeypatch.setattr(
-        launch, "launch_forward", lambda *args, **how: (given_rows.append(len(args[6])), run(*args, **how))
-    )
-    compare(head, twin, case, float32_tolerance())
-    splats, visible, _ = case
-    assert given_rows[-1] == int((~splats[DIFFUSE][visible]).sum()), "after the probes"
 
 
 def test_a_mask_that_is_not_bool_is_named():

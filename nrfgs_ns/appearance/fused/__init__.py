@@ -32,10 +32,6 @@ MAX_WIDTH = 64
 MAX_WEIGHTS = 128 * 128
 """Most numbers in the first layer, padded. Their gradients are kept in registers, and the layer in shared memory."""
 
-MASKED = ("bf16", "fp16")
-"""Precisions whose kernels are told on a GPU which splats are diffuse. On an H200, with Triton 3.6, those of fp32 did
-not agree with PyTorch's field within what float32 explains; why is not known (docs/necessity.md)."""
-
 logger = logging.getLogger(__name__)
 
 
@@ -71,10 +67,6 @@ class FusedField:
                 "Set --pipeline.model.appearance.implementation auto or torch."
             )
         return reason is None
-
-    def takes_masks(self, device: torch.device) -> bool:
-        """Whether the kernels may be told which splats are diffuse; else they are given the others only."""
-        return device.type != "cuda" or self.config.precision in MASKED
 
     def __call__(
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float = 1.0

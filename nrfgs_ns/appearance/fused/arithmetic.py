@@ -49,8 +49,11 @@ def operand(x, KIND: tl.constexpr):
         else:
             return x.to(tl.bfloat16)
     elif KIND == "tf32":
-        bits = (x.to(tl.int32, bitcast=True) + 0x1000) & -0x2000
-        return tl.where(x - x == 0.0, bits.to(tl.float32, bitcast=True), x)  # NaN and infinity stay
+        # NaN and infinity stay. They are told by their bits: where x is a product, fused multiply-add takes x - x for
+        # the product's rounding error, which is not 0.
+        bits = x.to(tl.int32, bitcast=True)
+        rounded = (bits + 0x1000) & -0x2000
+        return tl.where((bits & 0x7F800000) == 0x7F800000, x, rounded.to(tl.float32, bitcast=True))
     else:
         return x
 

@@ -34,7 +34,7 @@ def _all_diffuse(diffuse, visible, block, count, B: tl.constexpr):
     """Whether every splat of a block is diffuse; no for negative blocks, of which there are none."""
     items = tl.minimum(block * B + tl.arange(0, B), count - 1).to(tl.int64)
     rows = tl.load(visible + items, mask=items >= 0, other=0)
-    return tl.min(tl.load(diffuse + rows, mask=items >= 0, other=0).to(tl.int32), axis=0) > 0
+    return tl.min(tl.load(diffuse + rows, mask=items >= 0, other=0), axis=0) > 0
 
 
 @triton.jit

@@ -138,20 +138,23 @@ class FusedFunction(torch.autograd.Function):
         visible, centers = _contiguous(visible), _contiguous(centers)
         packed = torch.cat([w.reshape(-1) for w in weights] + [_zero(means.device)]).index_select(0, packing.gather)
         count = len(visible)
+        # Triton lays out a product's factors by the narrowest number that they are computed from: for bytes, it took
+        # more columns to a thread than d_Y has, and float32's d_hidden was wrong.
+        flags = None if diffuse is None else diffuse.to(torch.int32)
         colors, seen = means.new_empty(count, 3), means.new_empty(count)
         if count > 0:
             how = launches.forward
             launch_forward(
-                (_programs(how, count, means.device), 1, 1), *tables, _bytes(diffuse, visible), visible, centers,
+                (_programs(how, count, means.device), 1, 1), *tables, _or(flags, visible), visible, centers,
                 packed, colors, seen,
                 count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
                 D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
                 B=how.block, COLUMNS=how.columns,
                 ONE_CENTER=centers.dim() == 1, BOUND=options.bound, KIND=KINDS[options.precision][0],
-                DIFFUSE=diffuse is not None,
+                DIFFUSE=flags is not None,
                 **how.options(packing.hidden),
             )  # fmt: skip
-        ctx.save_for_backward(*tables, diffuse, visible, centers, packed)
+        ctx.save_for_backward(*tables, flags, visible, centers, packed)
         ctx.packing, ctx.how, ctx.options = packing, launches.backward, options
         return colors, seen
 
@@ -159,26 +162,26 @@ class FusedFunction(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, d_colors, d_opacities):
         packing, how, options = ctx.packing, ctx.how, ctx.options
-        *tables, diffuse, visible, centers, packed = ctx.saved_tensors
+        *tables, flags, visible, centers, packed = ctx.saved_tensors
         count, rows, device = len(visible), len(tables[0]), visible.device
         one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[9] and options.geometry_gradient
-        zero = not one_center or count < rows or diffuse is not None
+        zero = not one_center or count < rows or flags is not None
         d_tables = _tables(rows, packing.latent_dim, device, zero)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
-        if diffuse is not None and not one_center:
+        if flags is not None and not one_center:
             d_centers.zero_()
         if count > 0:
             programs = _programs(how, count, device)
             partials = tables[0].new_empty(programs, packing.size + CENTER_SLOTS)
             kind, gradient_kind = KINDS[options.precision]
             launch_backward(
-                (programs, 1, 1), *tables, _bytes(diffuse, visible), visible, centers, packed,
+                (programs, 1, 1), *tables, _or(flags, visible), visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
                 count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
                 D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
                 B=how.block, COLUMNS=how.columns, SLOTS=partials.shape[1],
                 ONE_CENTER=one_center, BOUND=options.bound, GEOMETRY=options.geometry_gradient, CENTER=wants_center,
-                KIND=kind, GRADIENT_KIND=gradient_kind, DIFFUSE=diffuse is not None,
+                KIND=kind, GRADIENT_KIND=gradient_kind, DIFFUSE=flags is not None,
                 **how.options(packing.hidden),
             )  # fmt: skip
             sums = partials.sum(dim=0)
@@ -256,9 +259,9 @@ def _contiguous(x: Tensor) -> Tensor:
     return x.detach().contiguous()
 
 
-def _bytes(diffuse: Tensor | None, instead: Tensor) -> Tensor:
-    """Which splats are diffuse, as bytes; where none is, any tensor for the kernels, which do not look at it then."""
-    return instead if diffuse is None else diffuse.contiguous().view(torch.uint8)
+def _or(flags: Tensor | None, instead: Tensor) -> Tensor:
+    """Which splats are diffuse; where none is, any tensor for the kernels, which do not look at it then."""
+    return instead if flags is None else flags
 
 
 _ZEROS: dict[torch.device, Tensor] = {}

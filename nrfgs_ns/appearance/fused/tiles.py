@@ -75,7 +75,7 @@ def load_four(threes, ones, rows, mask, lanes, B: tl.constexpr):
 
 @triton.jit
 def load_flags(flags, rows, B: tl.constexpr):
-    """Rows [B, 1] of a table of bytes: whether they are not 0, the same in all lanes."""
+    """Rows [B, 1] of a table of int32: whether they are not 0, the same in all lanes."""
     return regroup(tl.broadcast_to(tl.load(flags + rows), (B, 4)), B) != 0
 
 
