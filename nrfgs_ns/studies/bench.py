@@ -6,6 +6,7 @@ is not repeated, what was cut off goes on from its checkpoint, what failed is tr
 as FAILED until then. A record that was made with other arguments is never mixed in: the benchmark stops and names it.
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -22,7 +23,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.studies.bench_executor import Queue, Submitted
-from nrfgs_ns.studies.files import write_whole
+from nrfgs_ns.studies.files import only_one, write_whole
 
 CHILD = (sys.executable, "-m", "nrfgs_ns.studies.bench_run")
 """The command that does a job; the file that describes the job is appended."""
@@ -117,7 +118,8 @@ class Bench:
                     f"{difference}. Give --redo-stale to put them aside and run them again, or another --out."
                 )
             for name in stale:
-                os.replace(self.record(name), self.record(name).with_suffix(".stale"))
+                with contextlib.suppress(FileNotFoundError):  # another command has done it
+                    os.replace(self.record(name), self.record(name).with_suffix(".stale"))
         jobs = self.jobs_of(asked, parsers) if parsers else {}
         pending = {name: job for name, job in jobs.items() if not self.record(name).exists()}
         own = [f"{run.name} ({steps_of(asked, run)})" for run in asked.runs if steps_of(asked, run) != asked.steps]
@@ -127,9 +129,11 @@ class Bench:
             # A terminated benchmark must not leave its children behind; an exception reaches the `finally` below.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
             self.run_all(pending, asked)
-        shown = self.shown(asked, whole)
-        stale = self.stale(shown, parsers)
-        report(shown, self.out, self.work, stale)
+        # Another command may end at this moment: whoever reports last must have read the records of both.
+        with only_one(self.out / ".lock", "Another command reports here; waiting for it to end."):
+            shown = self.shown(asked, whole)
+            stale = self.stale(shown, parsers)
+            report(shown, self.out, self.work, stale)
         return shown, stale
 
     def shown(self, asked, whole):
@@ -288,7 +292,15 @@ def gpu_names(count: int) -> list[str]:
         InputError: it may see fewer.
     """
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    names = [str(index) for index in range(count)] if visible is None else visible.split(",")
+    if visible is not None:
+        names, limit = visible.split(","), f"CUDA_VISIBLE_DEVICES is {visible!r}"
+    elif count > 1:
+        import torch  # takes seconds, and one may be asked for where there is none: then the CPU trains
+
+        names = [str(index) for index in range(torch.cuda.device_count())]
+        limit = f"this machine has {len(names)}"
+    else:
+        return ["0"]
     if len(names) < count:
-        raise InputError(f"gpus is {count}, but CUDA_VISIBLE_DEVICES is {visible!r}. Ask for at most {len(names)}.")
+        raise InputError(f"gpus is {count}, but {limit}. Ask for at most {max(1, len(names))}.")
     return names[:count]

@@ -22,13 +22,15 @@ CROP_PIXELS = 220
 ERROR_GAIN = 4.0
 """How much the error maps are amplified."""
 TITLE, GAP = 16, 4
+ACROSS = 8
+"""Crops side by side, the truth's among them; more go below."""
 PICTURE = re.compile(r"eval_img_(\d{4})")
 
 Images = npt.NDArray[np.float32]
 
 
 def crop_sheet(pictures: dict[str, Path], path: Path, views: list[int] | None = None) -> bool:
-    """Write a sheet: two lines for each view, renderings and |error| x 4, the whole truth on the left.
+    """Write a sheet: for each view lines of renderings and below them |error| x 4, the whole truth on the left.
 
     Args:
         pictures: label -> folder of ns-eval's pictures of a run.
@@ -125,7 +127,7 @@ def largest_disagreement(truth: Images, renders: list[Images], side: int) -> tup
 
 
 def _view(truth: Images, renders: dict[str, Images], top: int, left: int) -> Image.Image:
-    """One view's two lines."""
+    """One view's lines: up to `ACROSS` crops, and below each its error."""
     side = crop_side(*truth.shape[:2])
     box = slice(top, top + side), slice(left, left + side)
     scale = (2 * CROP_PIXELS + GAP) / truth.shape[0]
@@ -134,15 +136,18 @@ def _view(truth: Images, renders: dict[str, Images], top: int, left: int) -> Ima
     ImageDraw.Draw(whole).rectangle(corners, outline="red", width=2)
     columns = {"truth": truth, **renders}
     step = CROP_PIXELS + GAP
-    result = Image.new("RGB", (whole.width + GAP + step * len(columns), TITLE + whole.height), "white")
+    lines, across = -(-len(columns) // ACROSS), min(ACROSS, len(columns))
+    size = whole.width + GAP + step * across, lines * (TITLE + whole.height + GAP) - GAP
+    result = Image.new("RGB", size, "white")
     result.paste(whole, (0, TITLE))
     draw = ImageDraw.Draw(result)
     for number, (label, image) in enumerate(columns.items()):
-        x = whole.width + GAP + number * step
-        draw.text((x + 2, 2), label, fill="black")
-        result.paste(_enlarged(image[box]), (x, TITLE))
+        line, column = divmod(number, ACROSS)
+        x, y = whole.width + GAP + column * step, line * (TITLE + whole.height + GAP)
+        draw.text((x + 2, y + 2), label, fill="black")
+        result.paste(_enlarged(image[box]), (x, y + TITLE))
         if label != "truth":
-            result.paste(_enlarged(ERROR_GAIN * np.abs(image - truth)[box]), (x, TITLE + step))
+            result.paste(_enlarged(ERROR_GAIN * np.abs(image - truth)[box]), (x, y + TITLE + step))
     return result
 
 

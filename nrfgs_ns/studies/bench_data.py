@@ -7,13 +7,14 @@
   into the work folder, with lists of names that say which image is what; the data set itself is not touched.
 """
 
+import struct
 from pathlib import Path
 
 from PIL import Image
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.studies.bench_spec import Scene
-from nrfgs_ns.studies.files import write_whole
+from nrfgs_ns.studies.files import whole, write_whole
 
 TEST_EVERY = 8
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
@@ -53,7 +54,7 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     return [
         *("colmap", "--data", str(mirror), "--colmap-path", model),
         *("--downscale-factor", str(factor)),
-        *(["--downscale-rounding-mode", rounding(folder, factor)] if factor > 1 else []),
+        *(["--downscale-rounding-mode", rounding(folder, factor, model)] if factor > 1 else []),
         *scene.options,
     ]
 
@@ -67,48 +68,64 @@ def colmap_model(folder: Path) -> str | None:
 
 
 def image_names(model: Path) -> list[str]:
-    """Names of a reconstruction's images, sorted. As nerfstudio does, text is read if both are there."""
+    """Names of a reconstruction's images, sorted. As nerfstudio does, text is read if both are there.
+
+    Raises:
+        InputError: the list of images is missing or torn.
+    """
     from nerfstudio.data.utils.colmap_parsing_utils import read_images_binary, read_images_text
 
     text = (model / "cameras.txt").is_file()
-    images = read_images_text(model / "images.txt") if text else read_images_binary(model / "images.bin")
+    file = model / ("images.txt" if text else "images.bin")
+    try:
+        images = read_images_text(file) if text else read_images_binary(file)
+    except (OSError, ValueError, IndexError, struct.error) as error:
+        raise InputError(
+            f"{file} cannot be read as COLMAP's ({error}). Restore it, or export the model anew."
+        ) from error
     return sorted(image.name for image in images.values())
 
 
 def mirror_with_split(folder: Path, model: str, mirror: Path) -> None:
-    """Link everything in `folder` into `mirror`, and put lists of training and test images beside it."""
+    """Link everything in `folder` into `mirror`, and put lists of training and test images beside it.
+
+    Links that an earlier benchmark made to another place are replaced.
+    """
     names = image_names(folder / model)
     if len(names) < 2:
         raise InputError(f"{folder / model} has {len(names)} images; one to train on and one to test are needed.")
     mirror.mkdir(parents=True, exist_ok=True)
     test = names[::TEST_EVERY]
     lists = {"train": sorted(set(names) - set(test)), "val": test, "test": test}
-    for entry in folder.iterdir():
-        link = mirror / entry.name
-        if entry.name not in {f"{split}_list.txt" for split in lists} and not link.is_symlink():
-            link.symlink_to(entry.resolve(), target_is_directory=entry.is_dir())
+    targets = {entry.name: entry.resolve() for entry in folder.iterdir()}
+    for name in [f"{split}_list.txt" for split in lists]:
+        targets.pop(name, None)
+    for name, target in targets.items():
+        link = mirror / name
+        if not link.is_symlink() or link.readlink() != target:
+            with whole(link) as aside:
+                aside.symlink_to(target, target_is_directory=target.is_dir())
     for split, members in lists.items():
         write_whole(mirror / f"{split}_list.txt", "".join(f"{name}\n" for name in members))
 
 
-def rounding(folder: Path, factor: int) -> str:
-    """How the sides of the images in images_FACTOR were rounded."""
+def rounding(folder: Path, factor: int, model: str) -> str:
+    """How the sides of the images in images_FACTOR were rounded, from the first image of the reconstruction."""
     originals, smaller = folder / "images", folder / f"images_{factor}"
     if not smaller.is_dir():
         raise InputError(
             f"{smaller} is missing. Downscale the images into it, or choose a factor that is there (scenes: downscale)."
         )
-    original = next((path for path in sorted(originals.rglob("*")) if path.is_file()), None)
-    same = smaller / original.relative_to(originals) if original else None
-    if same is None or not same.is_file():
-        raise InputError(
-            f"{smaller} and {originals} must hold images of the same names; {same or originals} is missing."
-        )
+    name = image_names(folder / model)[0]
+    original, same = originals / name, smaller / name
+    for file in (original, same):
+        if not file.is_file():
+            raise InputError(f"{smaller} and {originals} must hold images of the same names; {file} is missing.")
     with Image.open(original) as large, Image.open(same) as small:
         sizes = large.size, small.size
-    for name, rounded in ROUNDINGS.items():
+    for mode, rounded in ROUNDINGS.items():
         if tuple(rounded(side, factor) for side in sizes[0]) == sizes[1]:
-            return name
+            return mode
     raise InputError(
         f"{same} is {sizes[1][0]} x {sizes[1][1]}, which is not {sizes[0][0]} x {sizes[0][1]} / {factor} however "
         "rounded. Downscale the images again."

@@ -7,9 +7,9 @@ from typing import Any
 
 from rich.console import Console
 
-from nrfgs_ns.studies.bench_crops import crop_sheet
-from nrfgs_ns.studies.bench_spec import Cell, Spec, cells_of, read_record, rows_of
-from nrfgs_ns.studies.bench_table import COLUMNS, Row, as_csv, latex, markdown, with_averages
+from nrfgs_ns.studies.bench_crops import crop_sheet, numbered
+from nrfgs_ns.studies.bench_spec import Cell, Scene, Spec, cells_of, read_record, rows_of
+from nrfgs_ns.studies.bench_table import COLUMNS, FAILED, MISSING, STALE, Row, as_csv, latex, markdown, with_averages
 from nrfgs_ns.studies.files import whole, write_whole
 
 
@@ -34,16 +34,30 @@ def report(spec: Spec, out: Path, work: Path, stale: dict[str, str]) -> None:
     if any(row.records for row in rows):
         draw_splats(rows, out)
     for scene in spec.scenes:
-        pictures = {}
-        for protocol, run in rows_of(spec):
-            cell = Cell(run, protocol, scene, spec.seeds[0])
-            if cell.name not in stale and (out / "runs" / f"{cell.name}.json").exists():
-                pictures[label(run.name, protocol)] = work / cell.name / "pictures"
-        views = spec.crops.get(scene.name)
         path = out / "crops" / f"{scene.name.replace('/', '_')}.png"
-        crop_sheet(pictures, path, views)
+        try:
+            crop_sheet(pictures_of(spec, scene, out / "runs", work, stale), path, spec.crops.get(scene.name))
+        except OSError as error:
+            print(f"No crops of {scene.name}: {error}")
     Console(soft_wrap=True, markup=False, highlight=False).print(table)
     print(f"Report: {out}")
+
+
+def pictures_of(spec: Spec, scene: Scene, runs: Path, work: Path, stale: dict[str, str]) -> dict[str, Path]:
+    """Label -> folder of ns-eval's pictures of each run on a scene, of its first seed that has some.
+
+    The labels name the seeds if the runs have not all the same one.
+    """
+    found = []
+    for protocol, run in rows_of(spec):
+        for seed in spec.seeds:
+            name = Cell(run, protocol, scene, seed).name
+            folder = work / name / "pictures"
+            if name not in stale and (runs / f"{name}.json").exists() and numbered(folder):
+                found.append((label(run.name, protocol), seed, folder))
+                break
+    several = len({seed for _, seed, _ in found}) > 1
+    return {f"{text}, seed {seed}" if several else text: folder for text, seed, folder in found}
 
 
 def rows_from_records(spec: Spec, runs: Path, stale: dict[str, str]) -> list[Row]:
@@ -54,11 +68,11 @@ def rows_from_records(spec: Spec, runs: Path, stale: dict[str, str]) -> list[Row
         row = by_place.setdefault(place, Row(*place))
         file = runs / f"{cell.name}.json"
         if cell.name in stale:
-            row.absent[cell.seed] = "stale"
+            row.absent[cell.seed] = STALE
         elif file.exists():
             row.records[cell.seed] = read_record(file)
         else:
-            row.absent[cell.seed] = "FAILED" if file.with_suffix(".failed").exists() else "missing"
+            row.absent[cell.seed] = FAILED if file.with_suffix(".failed").exists() else MISSING
     return [row.fill() for row in by_place.values()]
 
 
@@ -86,34 +100,58 @@ def plain_label(text: str) -> str:
 
 
 def draw_splats(rows: list[Row], out: Path) -> None:
-    """Number of splats over training steps, mean over seeds: OUT/splats.png and .svg, one panel for each scene."""
+    """Number of splats over training steps: OUT/splats.png and .svg, one panel for each scene and protocol.
+
+    A line is the mean over seeds, on a band from the smallest to the largest.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    scenes = list(dict.fromkeys(row.scene for row in rows))
-    kinds = list(dict.fromkeys(label(row.run, row.protocol) for row in rows))
-    across = min(3, len(scenes))
-    down = -(-len(scenes) // across)
+    scenes = list(dict.fromkeys(row.scene for row in rows if row.records))
+    protocols = list(dict.fromkeys(row.protocol for row in rows if row.records))
+    runs = list(dict.fromkeys(row.run for row in rows if row.records))
+    places = [(scene, protocol) for scene in scenes for protocol in protocols]
+    across = min(3, len(scenes)) if len(protocols) == 1 else len(protocols)
+    down = -(-len(places) // across)
     # Text as text keeps the SVG small; a fixed salt gives the same file for the same numbers.
     with pyplot.rc_context({"svg.fonttype": "none", "svg.hashsalt": "nrfgs", "font.size": 8}):
-        figure, panels = pyplot.subplots(down, across, figsize=(3.6 * across, 2.6 * down), squeeze=False)
-        for panel in panels.flat[len(scenes) :]:
+        size = 3.6 * across, 2.6 * down + 0.3
+        figure, panels = pyplot.subplots(down, across, figsize=size, squeeze=False, layout="constrained")
+        for panel in panels.flat[len(places) :]:
             panel.set_visible(False)
-        for panel, scene in zip(panels.flat, scenes, strict=False):
-            for row in (row for row in rows if row.scene == scene and row.records):
-                curves = [dict(map(tuple, record["train"]["splats"])) for record in row.records.values()]
-                steps = sorted(set.intersection(*(set(curve) for curve in curves)))
-                counts = [sum(curve[step] for curve in curves) / len(curves) for step in steps]
-                name = label(row.run, row.protocol)
-                panel.plot(steps, counts, label=plain_label(name), color=f"C{kinds.index(name)}", linewidth=1.2)
-            panel.set(title=plain_label(scene), xlabel="step", ylabel="splats", ylim=(0, None))
+        for panel, (scene, protocol) in zip(panels.flat, places, strict=False):
+            for row in rows:
+                if (row.scene, row.protocol) == (scene, protocol) and row.records:
+                    draw_counts(panel, row, runs.index(row.run))
+            panel.set(title=plain_label(label(scene, protocol)), xlabel="step", ylabel="splats", ylim=(0, None))
+            panel.yaxis.set_major_formatter("{x:,.0f}")
         lines = {line.get_label(): line for panel in panels.flat for line in panel.get_lines()}
-        panels.flat[0].legend(lines.values(), lines.keys(), fontsize=7)
-        figure.tight_layout()
+        ordered = [plain_label(run) for run in runs if plain_label(run) in lines]
+        figure.legend([lines[name] for name in ordered], ordered, loc="outside lower center", ncols=min(5, 2 * across))
         with whole(out / "splats.png") as aside:
             figure.savefig(aside, format="png", dpi=150, metadata={"Software": None})
         with whole(out / "splats.svg") as aside:
             figure.savefig(aside, format="svg", metadata={"Date": None})
         pyplot.close(figure)
+
+
+STYLES = "-", "--", ":", "-."
+"""Of lines: the next one when the ten colours are used up."""
+
+
+def draw_counts(panel, row: Row, number: int) -> None:
+    """One row's numbers of splats over steps, in the colour and style of its run's number."""
+    told = [record["train"].get("splats") for record in row.records.values()]
+    curves = [dict(map(tuple, pairs)) for pairs in told if pairs]
+    if not curves:
+        return
+    steps = sorted(set.intersection(*(set(curve) for curve in curves)))
+    counts = [[curve[step] for curve in curves] for step in steps]
+    colour, style = f"C{number % 10}", STYLES[number // 10 % len(STYLES)]
+    means = [sum(of_step) / len(curves) for of_step in counts]
+    panel.plot(steps, means, label=plain_label(row.run), color=colour, linestyle=style, linewidth=1.2)
+    least, most = list(map(min, counts)), list(map(max, counts))
+    if least != most:
+        panel.fill_between(steps, least, most, color=colour, alpha=0.2, linewidth=0)

@@ -11,7 +11,6 @@ import contextlib
 import json
 import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
@@ -19,7 +18,7 @@ from typing import Any
 
 from nrfgs_ns.capacity.report import read_report
 from nrfgs_ns.studies.bench_spec import Job
-from nrfgs_ns.studies.files import write_whole
+from nrfgs_ns.studies.files import only_one, write_whole
 from nrfgs_ns.studies.run import TrainRecord, evaluate, host_without_downloads, machine, train
 
 PROGRESS_SECONDS = 1.0
@@ -35,7 +34,8 @@ def run(job: Job) -> None:
     """Do the job, or what is left of it."""
     work, record_path = Path(job.work), Path(job.record)
     work.mkdir(parents=True, exist_ok=True)
-    with only_one(work / "lock"):
+    # A benchmark that was killed may have left its children behind: the next one must not train into their folders.
+    with only_one(work / "lock", "Another process works on this run; waiting for it to end."):
         if record_path.exists():
             return
         forget_other_arguments(work, job.identity)
@@ -79,7 +79,8 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
     def stepped(step: int) -> None:
         nonlocal noted
         if perf_counter() - noted >= PROGRESS_SECONDS:
-            write_whole(work / "progress.json", json.dumps({"step": step}))
+            with contextlib.suppress(OSError):  # a note that cannot be written is no reason to end a training
+                write_whole(work / "progress.json", json.dumps({"step": step}))
             noted = perf_counter()
 
     args, earlier = job.args, None
@@ -102,10 +103,11 @@ def last_checkpoint(work: Path) -> Path | None:
 
 
 def record_until(path: Path, checkpoint: Path) -> TrainRecord | None:
-    """The training's record as it was when a checkpoint was saved; None if there is none."""
-    if not path.exists():
+    """The training's record as it was when a checkpoint was saved; None if there is none that can be read."""
+    try:
+        record = TrainRecord(**json.loads(path.read_text(encoding="utf-8")))
+    except (FileNotFoundError, ValueError, TypeError):  # an earlier version's has other fields
         return None
-    record = TrainRecord(**json.loads(path.read_text(encoding="utf-8")))
     step = int(checkpoint.stem.split("-")[1])
     seconds = [seconds for at, seconds in record.saved if at == step]
     if not seconds:
@@ -120,34 +122,15 @@ def record_until(path: Path, checkpoint: Path) -> TrainRecord | None:
 def forget_other_arguments(work: Path, identity: dict[str, Any]) -> None:
     """Clear a work folder that belongs to other arguments, so that nothing of theirs is continued."""
     note = work / "identity.json"
-    if note.exists() and json.loads(note.read_text(encoding="utf-8")) == identity:
-        return
+    with contextlib.suppress(FileNotFoundError, ValueError):
+        if json.loads(note.read_text(encoding="utf-8")) == identity:
+            return
     for path in work.iterdir():
         if path.is_dir():
             shutil.rmtree(path)
         elif path.name != "lock":
             path.unlink()
     write_whole(note, json.dumps(identity))
-
-
-@contextlib.contextmanager
-def only_one(lock: Path) -> Iterator[None]:
-    """Hold a lock file; waits while another process holds it, and lets go however this one ends.
-
-    A benchmark that was killed may have left its children behind: the next one must not train into their folders.
-    """
-    with lock.open("w") as file:
-        try:
-            import fcntl
-        except ImportError:  # Windows: the reader must see to it
-            pass
-        else:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                print("Another process works on this run; waiting for it to end.", flush=True)
-                fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def main(argv: list[str] | None = None) -> Any:

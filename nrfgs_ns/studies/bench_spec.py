@@ -31,6 +31,10 @@ QUIET = (
 """Options that keep evaluation, the viewer and the terminal table out of the timing."""
 OWN = "own"
 """The protocol of a method that is run as it is."""
+DENSIFICATION = "--pipeline.model.densification"
+"""The option by which a protocol is told."""
+AVERAGE = "average"
+"""What stands for the scene in the rows of averages over scenes."""
 PRESET_STEPS = {"nrfgs-fast": 10_000}
 """Method -> training steps, of methods that are what they are by the number of their steps."""
 SET_HERE = {
@@ -178,7 +182,11 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     )
     for key, least in (("steps", 1), ("jobs", 1), ("gpus", 1), ("train_views", 0), ("checkpoint_every", 1)):
         _whole(getattr(spec, key), least, f"{where}: {key}")
-    views = isinstance(spec.crops, dict) and all(isinstance(chosen, list) for chosen in spec.crops.values())
+    for key in ("protocols", "seeds"):
+        _require(bool(getattr(spec, key)), f"{where}: {key} is empty. Name at least one, or leave it out.")
+    views = isinstance(spec.crops, dict) and all(
+        isinstance(chosen, list) and all(isinstance(view, int) for view in chosen) for chosen in spec.crops.values()
+    )
     _require(views, f"{where}: crops must map scenes to lists of numbers of test views, such as {{bonsai: [0, 5]}}.")
     for seed in spec.seeds:
         _whole(seed, 0, f"{where}: seeds")
@@ -187,6 +195,12 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
         _require_free(run.options, f"{where}: runs: {run.name}: options")
         for protocol in run.protocols or spec.protocols:
             options = protocol_options(protocol)
+            own = [word for word in (*spec.options, *run.options) if option_name(word) == DENSIFICATION and options]
+            _require(
+                not own,
+                f"{where}: runs: {run.name}: {DENSIFICATION} is what protocol {protocol} gives; "
+                "leave it out, or use protocol own.",
+            )
             _require(
                 not (run.protocols and options) or run.method.startswith("nrfgs"),
                 f"{where}: runs: {run.name}: {run.method} knows no protocol {protocol!r}; only this project's methods "
@@ -195,7 +209,11 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     cells = cells_of(spec)
     names = [cell.name for cell in cells]
     twice = sorted({name for name in names if names.count(name) > 1})
-    _require(not twice, f"{where}: {', '.join(twice[:3])} would be trained twice. Give runs and scenes distinct names.")
+    _require(
+        not twice,
+        f"{where}: {', '.join(twice[:3])} would be trained twice. Give runs and scenes distinct names, and each "
+        "protocol and seed once.",
+    )
     return spec
 
 
@@ -235,7 +253,7 @@ def protocol_options(protocol: str) -> list[str]:
         return []
     good = name in ("splatfacto", "original", "mcmc") and (not at or (name == "mcmc" and budget.isdigit()))
     _require(good, f"protocol {protocol!r} is unknown; use splatfacto, original, mcmc, mcmc@BUDGET or own.")
-    return ["--pipeline.model.densification", name, *(["--pipeline.model.splat-budget", budget] if at else [])]
+    return [DENSIFICATION, name, *(["--pipeline.model.splat-budget", budget] if at else [])]
 
 
 def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
@@ -284,9 +302,16 @@ def differences(made_with: dict[str, Any], wanted: dict[str, Any]) -> str:
         had = made_with.get(key)
         if had == value:
             continue
-        odd = [word for word in had if word not in value] if isinstance(had, list) else [str(had)]
+        both = isinstance(had, list) and isinstance(value, list)
+        odd = [one for one in settings(had) if one not in settings(value)] if both else [str(had)]
         words.append(f"{key}: {' '.join(odd) or 'fewer words'}")
     return "; ".join(words)
+
+
+def settings(words: list[str]) -> list[str]:
+    """Words of a command line, each value with its option before it."""
+    pairs = zip(["", *words], words, strict=False)
+    return [f"{before} {word}" if before.startswith("--") and word[:2] != "--" else word for before, word in pairs]
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -297,10 +322,12 @@ def read_record(path: Path) -> dict[str, Any]:
     """
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        missing = {"identity", "machine", "jobs", "train", "measured"} - set(record)
-    except (ValueError, TypeError) as error:
+    except ValueError as error:
         raise InputError(f"{path} is not a record of a run ({error}). Remove it to have the run made anew.") from error
-    _require(not missing, f"{path} is no whole record: it lacks {missing}. Remove it to have the run made anew.")
+    kinds = {"identity": dict, "machine": dict, "jobs": int, "train": dict, "measured": dict}
+    found = record if isinstance(record, dict) else {}
+    lacks = ", ".join(key for key, kind in kinds.items() if not isinstance(found.get(key), kind))
+    _require(not lacks, f"{path} is no whole record: it lacks {lacks}. Remove it to have the run made anew.")
     return record
 
 
@@ -313,11 +340,14 @@ def _method(name: str, value: Any, where: str) -> Method:
     value = {"method": value} if isinstance(value, str) else value
     where = f"{where}: runs: {name}"
     _require(isinstance(value, dict) and isinstance(value.get("method"), str), f"{where} names no method.")
+    one = len(value["method"].split()) == 1
+    _require(one, f"{where}: {value['method']!r} is no single word; use {{method: METHOD, options: OPTIONS}}.")
     unknown = sorted(set(value) - {"method", "options", "protocols", "steps"})
     _require(not unknown, f"{where}: unknown key {unknown}. Known are method, options, protocols, steps.")
     if value.get("steps") is not None:
         _whole(value["steps"], 1, f"{where}: steps")
     protocols = tuple(str(one) for one in as_list(value["protocols"])) if "protocols" in value else None
+    _require(protocols != (), f"{where}: protocols is empty. Name at least one, or leave it out.")
     options = _words(value.get("options", ()), f"{where}: options")
     return Method(str(name), value["method"], options, protocols, value.get("steps"))
 
@@ -330,7 +360,13 @@ def _scene(value: Any, where: str) -> Scene:
     downscale = value.get("downscale")
     if downscale is not None:
         _whole(downscale, 1, f"{where}: scenes: downscale")
-    return Scene(scene_name(value), downscale, _words(value.get("options", ()), f"{where}: scenes: options"))
+    name = scene_name(value)
+    _require(
+        not Path(name).is_absolute() and name != "." and ".." not in Path(name).parts,
+        f"{where}: scenes: {name!r} is no folder below --scenes. Give --scenes the folder that it lies in.",
+    )
+    _require(name != AVERAGE, f"{where}: scenes: {name!r} is what the table calls the average over scenes; rename it.")
+    return Scene(name, downscale, _words(value.get("options", ()), f"{where}: scenes: options"))
 
 
 def as_list(value: Any) -> list[Any]:
@@ -340,16 +376,22 @@ def as_list(value: Any) -> list[Any]:
 
 def _words(value: Any, where: str) -> tuple[str, ...]:
     """Options given as one string, as in a shell, or as a list of words."""
+    _require(isinstance(value, (str, list, tuple)), f"{where} must be a string or a list of words.")
     try:
         return tuple(shlex.split(value)) if isinstance(value, str) else tuple(str(word) for word in value)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where} must be a string or a list of words ({error}).") from error
+    except ValueError as error:
+        raise InputError(f"{where} cannot be told apart into words ({error}).") from error
+
+
+def option_name(word: str) -> str:
+    """The option in a word of a command line, as `ns-train --help` writes it."""
+    return word.partition("=")[0].replace("_", "-")
 
 
 def _require_free(options: tuple[str, ...], where: str) -> None:
     """Refuse options that the benchmark gives itself: ns-train would take the later one."""
     for word in options:
-        name = word.partition("=")[0].replace("_", "-")
+        name = option_name(word)
         _require(name not in SET_HERE, f"{where}: {name} is given by the benchmark; {SET_HERE.get(name)}.")
 
 

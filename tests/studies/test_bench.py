@@ -15,12 +15,9 @@ import pytest
 
 from nrfgs_ns import cli
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.studies import bench, bench_run
+from nrfgs_ns.studies import bench
 from nrfgs_ns.studies.bench import Bench, gpu_names
-from nrfgs_ns.studies.bench_run import forget_other_arguments, last_checkpoint, record_until, train_or_continue
-from nrfgs_ns.studies.bench_spec import Job
-from nrfgs_ns.studies.files import write_whole
-from nrfgs_ns.studies.run import TrainRecord
+from nrfgs_ns.studies.files import only_one
 
 FAKE = """
 import json, os, sys, time
@@ -205,12 +202,30 @@ def test_a_stopped_benchmark_says_so(fake, monkeypatch, capsys):
         os.kill(int(pid.read_text()), 0)
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"identity": {}}'])
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "5", '{"identity": {}}', '{"identity": {}, "machine": {}, "jobs": 1, "train": {}, "measured": null}'],
+)
 def test_a_broken_record_is_named(text, fake):
     bench_in(fake, seeds=(1,)).main()
     (fake / "out" / "runs" / "SH-own-scene-1.json").write_text(text)
     with pytest.raises(InputError, match="SH-own-scene-1.json is no.*Remove it"):
         bench_in(fake, seeds=(1,)).main()
+
+
+def test_of_two_that_end_together_the_last_one_reports_both(fake):
+    """A report waits for one that is being made, and reads the records only then."""
+    bench_in(fake, seeds=(1,)).main()
+    record = fake / "out" / "runs" / "NRF-own-scene-1.json"
+    kept = record.read_text()
+    record.unlink()
+    waits = threading.Thread(target=bench_in(fake, seeds=(1,), report_only=True).main)
+    with only_one(fake / "out" / ".lock", ""):
+        waits.start()
+        waits.join(0.5)
+        record.write_text(kept)
+    waits.join(60.0)
+    assert "| scene | NRF | own | 1 |" in (fake / "out" / "table.md").read_text()
 
 
 def spec_file(folder: Path, text: str) -> Path:
@@ -228,7 +243,9 @@ def test_report_only_runs_nothing_and_needs_no_data(fake):
 
 def test_records_of_other_arguments_are_refused_named_and_redone(fake, capsys):
     bench_in(fake, seeds=(1,)).main()
-    with pytest.raises(InputError, match="2 of the records.*SH-own-scene-1 had options: 100.*--redo-stale"):
+    with pytest.raises(
+        InputError, match="2 of the records.*SH-own-scene-1 had options: --max-num-iterations 100.*--redo-stale"
+    ):
         bench_in(fake, seeds=(1,), steps=50).main()
     assert len(ran(fake)) == 2
     bench_in(fake, seeds=(1,), steps=50, report_only=True).main()
@@ -258,6 +275,15 @@ def test_more_gpus_than_there_are_is_refused(monkeypatch):
         gpu_names(2)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert gpu_names(1) == [""], "GPUs that were hidden stay hidden"
+
+
+def test_gpus_that_the_machine_lacks_are_refused(monkeypatch):
+    """A child on a GPU that is not there would train on the CPU."""
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    assert gpu_names(1) == ["0"] and gpu_names(2) == ["0", "1"]
+    with pytest.raises(InputError, match="this machine has 2. Ask for at most 2"):
+        gpu_names(4)
 
 
 def test_a_terminated_benchmark_takes_its_children_along(fake):
@@ -298,105 +324,3 @@ def test_flags_have_precedence_over_the_file(fake):
     assert [run.name for run in Bench(runs=("nrfgs", "nrfgs-sh"), data=("x",)).plan().runs] == ["nrfgs", "nrfgs-sh"]
     with pytest.raises(InputError, match="runs is missing"):
         Bench().plan()
-
-
-# One run.
-
-
-def job_in(folder: Path, method="nrfgs", steps=100) -> Job:
-    args = [method, "--output-dir", str(folder), "--max-num-iterations", str(steps), "nrfgs-data", "--data", "x"]
-    return Job(args, {"options": args[:1]}, steps, str(folder / "record.json"), str(folder), 0, 1)
-
-
-def interrupted(folder: Path, *checkpoints: int, reached: int) -> None:
-    """The work folder of a training that was killed after step `reached`."""
-    models = folder / "scene" / "nrfgs" / "2000-01-01" / "nerfstudio_models"
-    models.mkdir(parents=True)
-    for step in checkpoints:
-        (models / f"step-{step:09d}.ckpt").write_bytes(b"")
-    splats = [[step, 10 + step] for step in range(0, reached + 1, 10)]
-    record = TrainRecord(
-        ["nrfgs"], "lost", steps=reached + 1, seconds=99.0, splats=splats, saved=[[20, 2.0], [40, 4.0]]
-    )
-    write_whole(folder / "train.json", json.dumps(record.__dict__))
-
-
-@pytest.fixture
-def trained(monkeypatch):
-    """Calls of a train() that does nothing."""
-    calls = []
-    monkeypatch.setattr(
-        bench_run, "train", lambda args, stepped, saved, earlier: calls.append((args, earlier)) or TrainRecord(args, "")
-    )
-    return calls
-
-
-def test_a_training_goes_on_from_its_last_checkpoint(tmp_path, trained):
-    interrupted(tmp_path, 20, 40, reached=60)
-    train_or_continue(job_in(tmp_path), tmp_path)
-    ((args, earlier),) = trained
-    models = tmp_path / "scene/nrfgs/2000-01-01/nerfstudio_models"
-    assert args[:3] == ["nrfgs", "--load-dir", str(models)]
-    assert args[args.index("--max-num-iterations") + 1] == "59"
-    assert (earlier.steps, earlier.seconds) == (41, 4.0)
-    assert earlier.splats[-1] == [40, 50] and earlier.saved == [[20, 2.0], [40, 4.0]]
-
-
-def test_the_record_fits_the_checkpoint_that_is_there(tmp_path):
-    """The kill came after the note about a checkpoint and before the checkpoint."""
-    interrupted(tmp_path, 20, reached=40)
-    earlier = record_until(tmp_path / "train.json", last_checkpoint(tmp_path))
-    assert (earlier.steps, earlier.seconds, earlier.splats[-1]) == (21, 2.0, [20, 30])
-    assert earlier.saved == [[20, 2.0]]
-
-
-def test_a_finished_training_is_only_evaluated(tmp_path, trained):
-    interrupted(tmp_path, 20, 40, reached=60)
-    record = train_or_continue(job_in(tmp_path, steps=41), tmp_path)
-    assert not trained and record.steps == 41
-    assert record.config_path == str(tmp_path / "scene/nrfgs/2000-01-01/config.yml")
-
-
-@pytest.mark.parametrize("method, checkpoints", [("nrfgs", []), ("splatfacto", [20, 40]), ("nrfgs", [33])])
-def test_what_cannot_be_continued_starts_anew(method, checkpoints, tmp_path, trained):
-    """No checkpoint; a method that cannot resume; a checkpoint of which nothing is noted."""
-    interrupted(tmp_path, *checkpoints, reached=60)
-    job = job_in(tmp_path, method)
-    train_or_continue(job, tmp_path)
-    assert trained == [(job.args, None)]
-
-
-def test_checkpoints_of_other_arguments_are_cleared(tmp_path):
-    forget_other_arguments(tmp_path, {"options": ["a"]})
-    interrupted(tmp_path, 20, reached=20)
-    forget_other_arguments(tmp_path, {"options": ["a"]})
-    assert last_checkpoint(tmp_path) is not None
-    forget_other_arguments(tmp_path, {"options": ["b"]})
-    assert last_checkpoint(tmp_path) is None and not (tmp_path / "train.json").exists()
-
-
-def test_two_children_do_not_share_a_folder(tmp_path):
-    """A lock belongs to an open file: another one waits, in this process as in any other."""
-    events = []
-
-    def first() -> None:
-        with bench_run.only_one(tmp_path / "lock"):
-            events.append("first in")
-            time.sleep(0.5)
-            events.append("first out")
-
-    thread = threading.Thread(target=first)
-    thread.start()
-    while not events:
-        time.sleep(0.01)
-    with bench_run.only_one(tmp_path / "lock"):
-        events.append("second in")
-    thread.join()
-    assert events == ["first in", "first out", "second in"]
-
-
-def test_a_finished_run_is_not_repeated_by_a_late_child(tmp_path, trained):
-    job = job_in(tmp_path)
-    Path(job.record).write_text("{}")
-    bench_run.run(job)
-    assert not trained and Path(job.record).read_text() == "{}"

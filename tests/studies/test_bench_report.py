@@ -5,23 +5,24 @@ import csv
 import io
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from nrfgs_ns.studies.bench_crops import crop_sheet, crop_side, largest_disagreement, numbered
-from nrfgs_ns.studies.bench_report import draw_splats, report
+from nrfgs_ns.studies.bench_report import draw_splats, pictures_of, report
 from nrfgs_ns.studies.bench_spec import cells_of, identity, make_spec
-from nrfgs_ns.studies.bench_table import COLUMNS, Row, as_csv, latex, markdown, ranks, with_averages
+from nrfgs_ns.studies.bench_table import COLUMNS, SHOWN, Row, as_csv, latex, markdown, ranks, with_averages
 
 PSNR = next(column for column in COLUMNS if column.name == "PSNR")
 
 
-def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=1000, parts=1):
+def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=1000, parts=1, device="a card"):
     test = {"psnr": psnr, "ssim": ssim, "ms_ssim": None, "l1": 0.01, "lpips": lpips}
     return {
-        "machine": {"device": "a card", "torch": "2.11"},
+        "machine": {"device": device, "torch": "2.11"},
         "jobs": jobs,
         "train": {"seconds": seconds, "parts": parts, "splats": [[0, 100], [100, splats]]},
         "measured": {
@@ -81,7 +82,20 @@ def test_csv_has_plain_numbers():
     assert float(lines[0]["MB"]) == 2.0 and lines[0]["LPIPS"] == "" and lines[3]["PSNR deviation"] == ""
 
 
-STRANGE = ["a|b", "50%", "_x_", "a & b", "f_1 {2} ~^", "$w^$", "a*b*", "<0.1>", "back\\slash", "two\nlines"]
+STRANGE = [
+    "a|b",
+    "50%",
+    "_x_",
+    "a & b",
+    "f_1 {2} ~^",
+    "$w^$",
+    "a*b*",
+    "<0.1>",
+    "back\\slash",
+    "two\nlines",
+    "[x](y)",
+    "*a--b",
+]
 
 
 def strange_rows():
@@ -92,15 +106,17 @@ def test_strange_names_break_no_table(tmp_path):
     """Each line has the table's columns, no letter of a name means anything, and the CSV gives the names back."""
     lines = [line for line in markdown(strange_rows()).splitlines() if line.startswith("|")]
     assert len(lines) == 2 + len(STRANGE)
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4 + len(COLUMNS) + 1}
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4 + len(SHOWN) + 1}
     names = [re.split(r"(?<!\\)\|", line)[2].strip() for line in lines[2:]]
     assert names == [
-        *(r"a\|b", "50%", r"\_x\_", "a & b", "f_1 {2} ~^", "$w^$", r"a\*b\*", r"\<0.1>", r"back\\slash", "two lines")
+        *(r"a\|b", "50%", r"\_x\_", "a & b", "f_1 {2} ~^", "$w^$", r"a\*b\*", r"\<0.1>", r"back\\slash", "two lines"),
+        *(r"\[x](y)", r"\*a--b"),
     ]
     text = latex(strange_rows())
     for name in (
         *("a\\textbar{}b", "50\\%", "\\_x\\_", "a \\& b", "f\\_1 \\{2\\} \\textasciitilde{}\\textasciicircum{}"),
         *("\\$w\\textasciicircum{}\\$", "\\textless{}0.1\\textgreater{}", "back\\textbackslash{}slash", "two lines"),
+        *("{[}x](y)", "{*}a-{}-b"),
     ):
         assert f"s & {name} & own & " in text
     assert [line["run"] for line in csv.DictReader(io.StringIO(as_csv(strange_rows())))] == STRANGE
@@ -135,17 +151,135 @@ def test_times_only_of_runs_that_were_alone():
     assert "shared their GPU" in text and "interrupted" in text
 
 
+def table_of(rows):
+    """Markdown's cells, (scene, run, protocol) -> column -> text; and the lines below."""
+    lines = markdown(rows).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    body = {tuple(line[:3]): dict(zip(cells[0], line, strict=True)) for line in cells[2:]}
+    return body, [line for line in lines if line and not line.startswith("|")]
+
+
+def test_marks_are_among_rows_of_one_protocol():
+    """A budget of a tenth is not best in bytes beside methods that chose their number themselves."""
+    plan = [("original", "SH", 30.0, 900), ("original", "NRF", 31.0, 400), ("mcmc@9", "SH", 20.0, 9)]
+    group = [Row("s", run, protocol, {1: record(psnr, splats=n)}).fill() for protocol, run, psnr, n in plan]
+    body, _ = table_of(group)
+    assert body["s", "SH", "mcmc@9"]["splats"] == "9" and body["s", "SH", "mcmc@9"]["PSNR"] == "20.00"
+    assert body["s", "SH", "original"]["splats"] == "_900_" and body["s", "NRF", "original"]["PSNR"] == "**31.00**"
+    lines = latex(group).splitlines()
+    assert lines[lines.index(r"\hline", 4) + 1].startswith("s & SH & mcmc@9"), "no line between the protocols"
+
+
+def test_times_of_different_machines_are_not_ranked():
+    one = Row("s", "SH", "own", {1: record(30.0, seconds=10.0)}).fill()
+    other = Row("s", "NRF", "own", {1: record(31.0, seconds=20.0, device="another")}).fill()
+    time = next(column for column in COLUMNS if column.name == "time s")
+    assert ranks([one, other], time) == {} and ranks([one, other], PSNR) == {0: 2, 1: 1}
+    assert ranks([one, Row("s", "NRF", "own", {1: record(31.0, seconds=20.0)}).fill()], time) == {0: 1, 1: 2}
+    body, below = table_of(
+        with_averages([one, other, *(Row("t", r.run, "own", r.records).fill() for r in (one, other))])
+    )
+    assert body["average", "SH", "own"]["time s"] == "10.0" and any("different machines" in line for line in below)
+
+
+def test_an_average_is_of_rows_that_have_all_scenes():
+    """NRF lacks seed 1 on one scene and failed it on the other; GS has no seed that both scenes have."""
+    plan = {
+        ("s", "SH"): ({1: record(30.0), 2: record(32.0)}, {}),
+        ("t", "SH"): ({1: record(20.0), 2: record(22.0)}, {}),
+        ("s", "NRF"): ({2: record(40.0)}, {1: "FAILED"}),
+        ("t", "NRF"): ({2: record(40.0)}, {1: "missing"}),
+        ("s", "GS"): ({1: record(50.0)}, {2: "missing"}),
+        ("t", "GS"): ({2: record(50.0)}, {1: "missing"}),
+    }
+    rows = [Row(*place, "own", records, absent).fill() for place, (records, absent) in plan.items()]
+    average = {row.run: row for row in with_averages(rows) if row.scene == "average"}
+    assert average["SH"].text(PSNR) == "26.00 ± 1.41"  # of 25 and 27
+    assert average["NRF"].absent == {1: "FAILED"} and average["NRF"].text(PSNR) == "40.00"
+    assert average["GS"].mean(PSNR) is None and ranks(list(average.values()), PSNR) == {0: 2, 1: 1}
+
+
+def test_what_failed_is_in_the_table_and_what_was_not_run_is_named_below():
+    plan = {"done": ({1: record(30.0)}, {}), "broke": ({}, {1: "FAILED"}), "not_yet": ({}, {1: "missing"})}
+    rows = [Row("s", run, "own", *what).fill() for run, what in plan.items()]
+    body, below = table_of(rows)
+    assert list(body) == [("s", "done", "own"), ("s", "broke", "own")]
+    assert body["s", "broke", "own"]["seeds"] == "0 (1 FAILED)"
+    assert below[0] == "Not run yet, and in no row: s, own: not_yet."
+    text = latex(rows)
+    assert "s & broke & own & 0 (1 FAILED) & -" in text and r"Not run yet, and in no row: s, own: not\_yet." in text
+    lines = list(csv.DictReader(io.StringIO(as_csv(rows))))
+    counts = [(line["run"], line["seeds"], line["FAILED"], line["missing"], line["stale"]) for line in lines]
+    assert counts == [("done", "1", "0", "0", "0"), ("broke", "0", "1", "0", "0"), ("not_yet", "0", "0", "1", "0")]
+
+
+def test_numbers_of_fewer_seeds_than_their_row_are_told():
+    rows = [Row("s", "SH", "own", {1: record(30.0, lpips=0.1), 2: record(31.0)}).fill()]
+    assert "fewer seeds than their row, on those that have them: LPIPS." in markdown(rows)
+    assert "fewer seeds" not in markdown([Row("s", "SH", "own", {1: record(30.0), 2: record(31.0)}).fill()])
+
+
+def test_negative_numbers_have_a_minus_in_latex():
+    assert "& $-$1.00 " in latex([Row("s", "SH", "own", {1: record(31.0, train=30.0)}).fill()])
+
+
+def test_metrics_of_training_views_are_in_the_files():
+    one = record(30.0, train=31.0)
+    one["measured"]["train"] |= {"ssim": 0.95, "l1": 0.02}
+    (line,) = csv.DictReader(io.StringIO(as_csv([Row("s", "SH", "own", {1: one}).fill()])))
+    assert (line["train SSIM"], line["train L1"], line["train LPIPS"]) == ("0.95", "0.02", "")
+    assert "train SSIM" not in markdown([Row("s", "SH", "own", {1: one}).fill()])
+
+
+def test_records_of_an_earlier_version_are_reported(tmp_path):
+    """What they lack is not there, and nothing else is lost."""
+    old = {"machine": {}, "jobs": 1, "train": {}, "measured": {"test": {"psnr": 30.0}}}
+    rows = [Row("s", "old", "own", {1: old}).fill(), Row("s", "new", "own", {1: record(31.0)}).fill()]
+    body, below = table_of(rows)
+    assert body["s", "old", "own"]["PSNR"] == "_30.00_" and body["s", "old", "own"]["time s"] == "-"
+    assert "Made on: unknown, torch unknown; a card, torch 2.11." in below
+    draw_splats(rows, tmp_path)
+    assert (tmp_path / "splats.png").exists()
+
+
 def test_one_scene_needs_no_average():
     assert len(with_averages(rows()[:2])) == 2
 
 
-def test_figure_has_a_line_for_each_run(tmp_path):
+def test_figure_has_a_panel_for_each_scene_and_protocol(tmp_path, monkeypatch):
+    """Twelve runs, of which one has two seeds: a mean on a band; all told apart, and the legend covers nothing."""
+    from matplotlib import pyplot
+
+    many = [Row("s", f"run {n}", "original", {1: record(30.0, splats=500 + n)}).fill() for n in range(12)]
+    many[0] = Row("s", "run 0", "original", {1: record(30.0, splats=400), 2: record(30.0, splats=600)}).fill()
+    many += [Row("t_1", "run 3", "mcmc", {1: record(30.0)}).fill(), Row("t_1", "none", "mcmc").fill()]
+    monkeypatch.setattr(pyplot, "close", lambda figure: None)
+    draw_splats(many, tmp_path)
+    figure = pyplot.gcf()
+    monkeypatch.undo()
+    panels = {panel.get_title(): panel for panel in figure.axes}
+    assert list(panels) == ["s original", "s mcmc", "t_1 original", "t_1 mcmc"]
+    lines = panels["s original"].get_lines()
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 12
+    assert list(lines[0].get_ydata()) == [100, 500], "the mean over seeds"
+    (band,) = panels["s original"].collections
+    assert {y for _, y in band.get_paths()[0].vertices} == {100, 400, 600}
+    (elsewhere,) = panels["t_1 mcmc"].get_lines()
+    assert elsewhere.get_color() == lines[3].get_color(), "a run has one colour"
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [f"run {n}" for n in range(12)]
+    below = legend.get_window_extent()
+    assert not any(below.overlaps(panel.get_window_extent()) for panel in figure.axes)
+    pyplot.close(figure)
+
+
+def test_the_same_numbers_give_the_same_figure(tmp_path):
     draw_splats(rows(), tmp_path)
     svg = (tmp_path / "splats.svg").read_text()
-    assert "SH mcmc" in svg and "NRF mcmc" in svg and ">t_1<" in svg
+    assert ">SH<" in svg and ">NRF<" in svg and ">t_1 mcmc<" in svg
     assert len(svg) < 100_000
     draw_splats(rows(), tmp_path)
-    assert svg == (tmp_path / "splats.svg").read_text(), "the same numbers must give the same file"
+    assert svg == (tmp_path / "splats.svg").read_text()
 
 
 # Crops.
@@ -199,6 +333,24 @@ def test_sheet_shows_the_views_where_runs_differ(pictures, tmp_path):
     assert set(np.unique(below)) == {0, 200}
 
 
+def test_many_runs_go_below_one_another(pictures, tmp_path):
+    """Nine runs and the truth: eight crops in the first line, two in the second, and no wider than eight."""
+    runs = {f"run {n}": pictures["AB"[n % 2]] for n in range(9)}
+    assert crop_sheet(runs, tmp_path / "many.png", [2])
+    assert crop_sheet(dict(list(runs.items())[:7]), tmp_path / "full.png", [2])
+    with Image.open(tmp_path / "many.png") as many, Image.open(tmp_path / "full.png") as full:
+        assert many.width == full.width
+        height = full.height - 16 - 4  # of the sheet's title and gap
+        assert many.height == full.height + height + 4
+        one, other = np.asarray(many), np.asarray(full)
+    assert np.array_equal(one[:height], other[:height])
+    # Run 8 is the first run's twin, in the second place of the second line.
+    step, left = 224, full.width - 8 * 224
+    line = height + 4
+    first, last = one[34:252, left + step :][:, :220], one[34 + line : 252 + line, left + step :][:, :220]
+    assert np.array_equal(first, last) and first.std() > 0
+
+
 def test_pictures_of_another_size_are_left_out(pictures, tmp_path):
     """A run on photographs scaled down, beside the others."""
     for file in numbered(pictures["A"]).values():
@@ -214,6 +366,39 @@ def test_pictures_of_another_size_are_left_out(pictures, tmp_path):
 def test_no_pictures_no_sheet(tmp_path):
     assert not crop_sheet({"A": tmp_path / "none"}, tmp_path / "sheet.png")
     assert not (tmp_path / "sheet.png").exists()
+
+
+def test_crops_are_of_the_seed_that_was_run(tmp_path, pictures):
+    """A has seed 43 alone, B both, C no pictures; where the seeds differ the labels say them."""
+    content = {"runs": {"A": "nrfgs", "B": "nrfgs-sh", "C": "nrfgs-sg"}, "scenes": ["s"], "seeds": [42, 43]}
+    spec = make_spec(content, "test")
+    runs, work = tmp_path / "runs", tmp_path / "work"
+    runs.mkdir()
+
+    def found(*names, stale=()):
+        for name in names:
+            (runs / f"{name}.json").touch()
+            if name[0] != "C":
+                shutil.copytree(pictures[name[0]], work / name / "pictures")
+        shown = pictures_of(spec, spec.scenes[0], runs, work, dict.fromkeys(stale, "other options"))
+        return {text: folder.parent.name for text, folder in shown.items()}
+
+    assert found() == {}
+    assert found("A-own-s-43", "B-own-s-43", "C-own-s-42") == {"A": "A-own-s-43", "B": "B-own-s-43"}
+    assert found("B-own-s-42") == {"A, seed 43": "A-own-s-43", "B, seed 42": "B-own-s-42"}
+    assert found(stale=["B-own-s-42"]) == {"A": "A-own-s-43", "B": "B-own-s-43"}
+
+
+def test_a_picture_that_cannot_be_read_breaks_no_report(tmp_path, pictures, capsys):
+    spec = make_spec({"runs": {"A": "nrfgs"}, "scenes": ["s"]}, "test")
+    (tmp_path / "out" / "runs").mkdir(parents=True)
+    (tmp_path / "out" / "runs" / "A-own-s-42.json").write_text(json.dumps({**record(30.0), "identity": {}}))
+    (tmp_path / "work" / "A-own-s-42").mkdir(parents=True)
+    pictures["A"].rename(tmp_path / "work" / "A-own-s-42" / "pictures")
+    next((tmp_path / "work").rglob("eval_img_0001*.png")).write_bytes(b"torn")
+    report(spec, tmp_path / "out", tmp_path / "work", {})
+    said = capsys.readouterr().out
+    assert "No crops of s: cannot identify image file" in said and "30.00" in said
 
 
 def test_report_of_hand_made_records(tmp_path, pictures, capsys):

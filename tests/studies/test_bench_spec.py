@@ -90,11 +90,29 @@ def test_methods_of_others_run_as_they_are():
         ({"runs": {"N": {"method": "nrfgs", "options": "--max-num-iterations 9"}}}, "N: options: --max-num.*use steps"),
         ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
         ({"options": "--time_budget 1"}, "--time-budget"),
+        ({"seeds": []}, "seeds is empty"),
+        ({"protocols": []}, "protocols is empty"),
+        ({"runs": {"NRF": {"method": "nrfgs", "protocols": []}}}, "NRF: protocols is empty"),
+        ({"seeds": [1, 1]}, "twice.*each protocol and seed once"),
+        ({"runs": {"NRF": "nrfgs --x 1"}}, "no single word"),
+        ({"runs": {"NRF": ""}}, "no single word"),
+        ({"options": {"--x": 1}}, "options must be a string or a list"),
+        ({"crops": {"bonsai": ["a"]}}, "crops"),
+        ({"scenes": ["average"]}, "rename it"),
+        ({"scenes": ["/data/bonsai"]}, "no folder below --scenes"),
+        ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
+        ({"scenes": ["."]}, "no folder below --scenes"),
+        ({"protocols": ["mcmc"], "options": "--pipeline.model.densification original"}, "densification is what.*mcmc"),
     ],
 )
 def test_what_is_wrong_is_named(content, says):
     with pytest.raises(InputError, match=says):
         spec(**content)
+
+
+def test_a_run_as_it_is_may_choose_its_densification():
+    run = {"method": "nrfgs", "options": "--pipeline.model.densification mcmc"}
+    assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}))] == ["own"]
 
 
 @pytest.mark.parametrize("text", ["runs: [", "just words", None])
@@ -156,7 +174,10 @@ def test_fingerprints_ignore_paths_and_see_the_rest():
         identity(plan, cell, ["nrfgs-data", "--data", "/here/bonsai", "--x", "2"]),
     ):
         assert differences(one, other)
-    assert differences(one, identity(spec(options="--a 2"), cell, None)) == "options: 1"
+    assert differences(one, identity(spec(options="--a 2"), cell, None)) == "options: --a 1"
+    # A value that another option has, too, and one that the seed had before.
+    assert differences(one, identity(spec(options="--a 42"), cell, None)) == "options: --a 1"
+    assert differences(one, identity(spec(options="--a 1 --b 1"), cell, None)) == "options: fewer words"
 
 
 # Data sets.
@@ -251,6 +272,48 @@ def test_downscaled_folders_of_any_rounding(size, factor, small, mode, tmp_path)
     assert cameras.fx[0].item() == pytest.approx(FOCAL / factor, rel=0.02)
 
 
+def test_a_data_set_of_the_same_name_elsewhere_is_read_there(tmp_path):
+    """--scenes has changed, --work has not: a link to the first place would train on other photographs."""
+    for place in ("first", "second"):
+        colmap_scene(tmp_path / place / "line", text=False)
+        parser = parser_options(tmp_path / place, Scene("line"), tmp_path / "mirrors")
+        mirror = Path(parser[parser.index("--data") + 1])
+        assert (mirror / "images").resolve() == (tmp_path / place / "line" / "images").resolve()
+    assert sorted(entry.name for entry in mirror.iterdir()) == [
+        *("images", "sparse", "test_list.txt", "train_list.txt", "val_list.txt")
+    ]
+
+
+def test_what_is_no_image_is_not_measured(tmp_path):
+    """A file that a desktop leaves in a folder sorts before the photographs."""
+    scene = colmap_scene(tmp_path / "line", text=False)
+    shutil.copytree(scene / "images", scene / "images_2")
+    for file in (scene / "images_2").iterdir():
+        Image.open(file).resize((48, 36)).save(file)
+    (scene / "images" / ".DS_Store").write_text("no image")
+    parser = parser_options(tmp_path, Scene("line", downscale=2), tmp_path / "mirrors")
+    assert parser[parser.index("--downscale-rounding-mode") + 1] == "floor"
+
+
+def test_dl3dv_is_read_from_the_downscaled_images_alone(tmp_path):
+    """Its transforms.json names images of full size, whose sizes it gives, and which the download lacks."""
+    folder = tmp_path / "hash" / "nerfstudio"
+    (folder / "images_4").mkdir(parents=True)
+    frames = []
+    for view in range(VIEWS):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.1 * view, 0.05 * view, 0.02 * view**2
+        name = f"frame_{view:05d}.png"
+        Image.new("RGB", (24, 18), (20 * view,) * 3).save(folder / "images_4" / name)
+        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
+    sizes = {"w": 96, "h": 72, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 48.0, "cy": 36.0, "camera_model": "OPENCV"}
+    (folder / "transforms.json").write_text(json.dumps({**sizes, "frames": frames}))
+    data = load(parser_options(tmp_path, Scene("hash/nerfstudio", downscale=4), tmp_path / "mirrors"))
+    assert names_of(data.eval_dataset) == ["frame_00000.png", "frame_00008.png"]
+    cameras = data.train_dataset.cameras
+    assert (cameras.width[0].item(), cameras.height[0].item(), cameras.fx[0].item()) == (24, 18, FOCAL / 4)
+
+
 def test_nerfstudios_layout_is_read_by_our_parser(tiny_scene, tmp_path):
     parser = parser_options(tiny_scene.parent, Scene(tiny_scene.name), tmp_path)
     assert parser == ["nrfgs-data", "--data", str(tiny_scene)]
@@ -288,6 +351,8 @@ def test_both_layouts_of_a_capture_have_the_same_test_images(captures, tmp_path)
         (lambda folder: folder.mkdir(parents=True), Scene("line"), "neither transforms.json nor"),
         (lambda folder: colmap_scene(folder, True), Scene("line", downscale=4), "images_4 is missing"),
         (lambda folder: wrong_size(colmap_scene(folder, True)), Scene("line", downscale=4), "however rounded"),
+        (lambda folder: torn(colmap_scene(folder, False), None), Scene("line"), "images.bin cannot be read"),
+        (lambda folder: torn(colmap_scene(folder, False), b"abc"), Scene("line"), "images.bin cannot be read"),
     ],
 )
 def test_data_that_cannot_be_read_are_named(prepare, scene, says, tmp_path):
@@ -299,3 +364,11 @@ def test_data_that_cannot_be_read_are_named(prepare, scene, says, tmp_path):
 def wrong_size(folder: Path) -> None:
     (folder / "images_4").mkdir()
     Image.new("RGB", (50, 20)).save(folder / "images_4" / "frame_00.png")
+
+
+def torn(folder: Path, content: bytes | None) -> None:
+    """Leave this of the list of images, or nothing."""
+    file = folder / "sparse/0/images.bin"
+    file.unlink()
+    if content is not None:
+        file.write_bytes(content)

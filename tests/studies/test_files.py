@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file is whole or not there, whoever else writes it."""
+"""A file is whole or not there, whoever else writes it; a lock is held by one."""
 
 import threading
+import time
 
 import pytest
 
-from nrfgs_ns.studies.files import whole, write_whole
+from nrfgs_ns.studies.files import only_one, whole, write_whole
 
 
 def test_writers_do_not_meet(tmp_path):
@@ -44,3 +45,23 @@ def test_a_write_that_fails_leaves_the_older_file(tmp_path):
         aside.write_text("ne")
         raise OSError("disk full")
     assert file.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_lock_is_held_by_one(tmp_path):
+    """A lock belongs to an open file: another one waits, in this process as in any other."""
+    events = []
+
+    def first() -> None:
+        with only_one(tmp_path / "lock", "waiting"):
+            events.append("first in")
+            time.sleep(0.5)
+            events.append("first out")
+
+    thread = threading.Thread(target=first)
+    thread.start()
+    while not events:
+        time.sleep(0.01)
+    with only_one(tmp_path / "lock", "waiting"):
+        events.append("second in")
+    thread.join()
+    assert events == ["first in", "first out", "second in"]
