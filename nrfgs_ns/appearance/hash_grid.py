@@ -20,8 +20,13 @@ rows, (2 N_l)^3 <= T, points are not hashed but numbered, and no two inside that
 
 Beyond the cube such a level repeats itself every 2 units (the cube's far faces are its near ones already); the hashed
 levels tell the repetitions apart. With N_0 = 16 and T = 2^15 level 0 is of this kind, and fills its table exactly.
+
+On CUDA, two Triton kernels compute all this and its gradients (`hash_grid_triton.py`); everywhere else, and for other
+dtypes than float32, PyTorch does. The kernels' gradients cannot be differentiated again.
 """
 
+import importlib.util
+import logging
 from collections.abc import Callable
 
 import torch
@@ -31,6 +36,8 @@ PRIMES = (1, 2654435761, 805459861)
 """The hash's multipliers for x, y, z."""
 INITIAL_RANGE = 1e-4
 """Features start uniform in +- this, as in the paper: next to nothing, and no two the same."""
+
+logger = logging.getLogger(__name__)
 
 
 class HashGrid(nn.Module):
@@ -76,6 +83,14 @@ class HashGrid(nn.Module):
         Returns:
             [M, levels * features], level by level.
         """
+        if self._kernels_take(positions):
+            from nrfgs_ns.appearance.hash_grid_triton import Interpolation
+
+            return Interpolation.apply(positions, self.table, self.resolutions, len(self.sides), self.table_size)
+        return self.in_torch(positions)
+
+    def in_torch(self, positions: Tensor) -> Tensor:
+        """The same in PyTorch alone, on any device and of any floating dtype: the kernels' twin."""
         scaled = positions[:, None, :] * self.resolutions[:, None]  # [M, L, 3]
         cells = scaled.floor()
         after = scaled - cells
@@ -85,6 +100,16 @@ class HashGrid(nn.Module):
         features = self.table.index_select(0, rows.flatten())
         features = features.view(*weights.shape, self.table.shape[1])  # [M, L, 8, F]
         return (weights[..., None] * features).sum(dim=2).flatten(1)
+
+    def _kernels_take(self, positions: Tensor) -> bool:
+        """Whether the kernels compute this call."""
+        table = self.table
+        return (
+            positions.is_cuda
+            and positions.device == table.device
+            and positions.dtype == table.dtype == self.resolutions.dtype == torch.float32
+            and _kernels_run_on(positions.device, table.shape[1])
+        )
 
     def _rows(self, coordinates: Tensor) -> Tensor:
         """Rows of the table, [M, L, 8], for the lower and upper lattice coordinates, int64 [M, L, 3, 2]."""
@@ -101,3 +126,37 @@ def _corners(per_axis: Tensor, combine: Callable[[Tensor, Tensor], Tensor]) -> T
     x, y, z = per_axis.unbind(dim=-2)
     xy = combine(x[..., :, None], y[..., None, :])
     return combine(xy[..., :, :, None], z[..., None, None, :]).flatten(-3)
+
+
+_RUNS: dict[tuple[torch.device, int], bool] = {}
+
+
+def _kernels_run_on(device: torch.device, features: int) -> bool:
+    """Whether Triton's kernels run on a CUDA device, for so many features per level; tried once."""
+    key = device, features
+    if key not in _RUNS:
+        why_not = _try_kernels(device, features)
+        if why_not is not None:
+            logger.warning("The hash grid runs in plain PyTorch on %s: %s.", device, why_not)
+        _RUNS[key] = why_not is None
+    return _RUNS[key]
+
+
+def _try_kernels(device: torch.device, features: int) -> str | None:
+    """Compile and run both kernels on one position; what went wrong, or None.
+
+    Triton may be missing, or the C compiler that its launcher is built with.
+    """
+    if importlib.util.find_spec("triton") is None:
+        return "Triton is not installed"
+    try:
+        from nrfgs_ns.appearance.hash_grid_triton import Interpolation
+
+        with torch.inference_mode(False), torch.enable_grad():
+            position = torch.zeros(1, 3, device=device, requires_grad=True)
+            table, resolutions = torch.zeros(2, features, device=device), torch.ones(1, device=device)
+            Interpolation.apply(position, table, resolutions, 0, 2).sum().backward()
+    except Exception as error:  # whatever stops Triton on this machine, PyTorch computes the same
+        first_line = next(iter(str(error).splitlines()), "")
+        return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
+    return None
