@@ -9,12 +9,23 @@ from rich.console import Console
 
 from nrfgs_ns.studies.bench_crops import crop_sheet, numbered
 from nrfgs_ns.studies.bench_spec import Cell, Scene, Spec, cells_of, read_record, rows_of
-from nrfgs_ns.studies.bench_table import COLUMNS, FAILED, MISSING, STALE, Row, as_csv, latex, markdown, with_averages
+from nrfgs_ns.studies.bench_table import (
+    COLUMNS,
+    FAILED,
+    MISSING,
+    STALE,
+    Row,
+    as_csv,
+    latex,
+    markdown,
+    views_as_csv,
+    with_averages,
+)
 from nrfgs_ns.studies.files import whole, write_whole
 
 
 def report(spec: Spec, out: Path, work: Path, stale: dict[str, str]) -> None:
-    """Write OUT/table.{md,csv,tex}, summary.json, splats.{png,svg} and crops/SCENE.png, and print the table.
+    """Write OUT/table.{md,csv,tex}, views.csv, summary.json, splats.{png,svg} and crops/SCENE.png, and print the table.
 
     Args:
         spec: the benchmark.
@@ -30,6 +41,7 @@ def report(spec: Spec, out: Path, work: Path, stale: dict[str, str]) -> None:
     write_whole(out / "table.md", table)
     write_whole(out / "table.csv", as_csv(everything))
     write_whole(out / "table.tex", latex(everything))
+    write_whole(out / "views.csv", views_as_csv(rows))
     write_whole(out / "summary.json", json.dumps([summary(row) for row in everything], indent=1) + "\n")
     if any(row.records for row in rows):
         draw_splats(rows, out)

@@ -293,3 +293,20 @@ def as_csv(rows: list[Row]) -> str:
         numbers = [number for column in COLUMNS for number in (row.mean(column), row.deviation(column))]
         writer.writerow([row.scene, row.run, row.protocol, *counts, *("" if n is None else n for n in numbers)])
     return file.getvalue()
+
+
+PER_VIEW = {"PSNR": "psnr", "SSIM": "ssim", "MS-SSIM": "ms_ssim", "LPIPS": "lpips", "L1": "l1"}
+
+
+def views_as_csv(rows: list[Row]) -> str:
+    """The metrics of every test view, a line for each run, seed and view: one bad view of a few moves a mean far."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow([*HEAD[:3], "seed", "image", *PER_VIEW])
+    for row in rows:
+        for seed, record in sorted(row.records.items()):
+            for view in (record.get("eval") or {}).get("per_image") or ():
+                numbers = (view.get(key) for key in PER_VIEW.values())
+                place = (row.scene, row.run, row.protocol, seed, view["image"])
+                writer.writerow([*place, *("" if n is None else f"{n:.6g}" for n in numbers)])
+    return file.getvalue()

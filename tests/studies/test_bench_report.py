@@ -14,7 +14,17 @@ from PIL import Image
 from nrfgs_ns.studies.bench_crops import crop_sheet, crop_side, largest_disagreement, numbered
 from nrfgs_ns.studies.bench_report import draw_splats, pictures_of, report
 from nrfgs_ns.studies.bench_spec import cells_of, identity, make_spec
-from nrfgs_ns.studies.bench_table import COLUMNS, SHOWN, Row, as_csv, latex, markdown, ranks, with_averages
+from nrfgs_ns.studies.bench_table import (
+    COLUMNS,
+    SHOWN,
+    Row,
+    as_csv,
+    latex,
+    markdown,
+    ranks,
+    views_as_csv,
+    with_averages,
+)
 
 PSNR = next(column for column in COLUMNS if column.name == "PSNR")
 
@@ -223,6 +233,21 @@ def test_negative_numbers_have_a_minus_in_latex():
     assert "& $-$1.00 " in latex([Row("s", "SH", "own", {1: record(31.0, train=30.0)}).fill()])
 
 
+def test_every_test_view_has_a_line():
+    """Seeds one below the other, in numbers' order; a record without images, or of no seed, has no lines."""
+    views = [{"image": "a.jpg", "psnr": 31.0, "ssim": 0.9}, {"image": "b, c.jpg", "psnr": 20.123456789, "ssim": None}]
+    runs = {2: {**record(25.0), "eval": {"per_image": views[::-1]}}, 1: {**record(25.0), "eval": {"per_image": views}}}
+    found = list(csv.DictReader(io.StringIO(views_as_csv([Row("s", "A", "own", runs), *rows()]))))
+    assert [(line["seed"], line["image"], line["PSNR"]) for line in found] == [
+        ("1", "a.jpg", "31"),
+        ("1", "b, c.jpg", "20.1235"),
+        ("2", "b, c.jpg", "20.1235"),
+        ("2", "a.jpg", "31"),
+    ]
+    assert {(line["scene"], line["run"], line["protocol"]) for line in found} == {("s", "A", "own")}
+    assert found[1]["SSIM"] == "" and found[1]["L1"] == ""
+
+
 def test_metrics_of_training_views_are_in_the_files():
     one = record(30.0, train=31.0)
     one["measured"]["train"] |= {"ssim": 0.95, "l1": 0.02}
@@ -413,6 +438,7 @@ def test_report_of_hand_made_records(tmp_path, pictures, capsys):
     assert (tmp_path / "out" / "crops" / "x_s.png").exists()
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [row["PSNR"] for row in summary] == [[30.0, None], [31.0, None]]
+    assert (tmp_path / "out" / "views.csv").read_text().startswith("scene,run,protocol,seed,image,PSNR")
     assert "**31.00**" in capsys.readouterr().out
     # Pictures of records that are not to be used are not shown beside the others.
     (tmp_path / "out" / "crops" / "x_s.png").unlink()
