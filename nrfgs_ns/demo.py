@@ -41,9 +41,6 @@ class Demo:
     """seed of the scene and of both trainings"""
 
     def main(self) -> None:
-        # Heavy imports only when there is work to do: `nrfgs --help` answers at once.
-        from nrfgs_ns.studies.run import evaluate, machine, train
-
         screen = Console(file=sys.__stdout__)
         scene, steps = self.scene(), min(self.steps, 150) if self.quick else self.steps
         results: dict[str, dict[str, Any]] = {}
@@ -52,6 +49,9 @@ class Demo:
         with Progress(*columns, console=screen) as progress:
             with _bar(progress, "make the scene", scene.views) as advance:
                 data = write_scene(scene, self.out / self.scene_folder, progress=lambda *_: advance())
+            # Heavy imports only when there is work to do: `nrfgs --help` answers at once, and so does a refusal.
+            from nrfgs_ns.studies.run import evaluate, machine, train
+
             for method, label in METHODS.items():
                 args = self.train_args(method, data, steps)
                 progress.console.print(f"[dim]$ ns-train {shlex.join(args)}", highlight=False, soft_wrap=True)

@@ -14,7 +14,30 @@ settings.load_profile("nrfgs")
 # nerfbaselines for installed.
 sys.path.insert(0, str(Path(__file__).resolve().parent / "helpers"))
 
+from quick_start import ask_for_callers_quickly, keep_what_is_imported, let_go  # noqa: E402
+
+ask_for_callers_quickly()
+
 SCENES = Path(os.environ.get("NRFGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
+
+
+def pytest_collection_finish():
+    keep_what_is_imported()
+
+
+def pytest_unconfigure():
+    let_go()
+
+
+@pytest.fixture(autouse=True)
+def end_the_logs():
+    """Nerfstudio's trainings write into the logs of all earlier ones of their process, too."""
+    yield
+    writer = sys.modules.get("nerfstudio.utils.writer")
+    while writer is not None and writer.EVENT_WRITERS:
+        listener = writer.EVENT_WRITERS.pop()
+        if isinstance(listener, writer.TensorboardWriter):
+            listener.tb_writer.close()
 
 
 @pytest.fixture

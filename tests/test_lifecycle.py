@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train, evaluate, render, resume, refuse: nerfstudio's own commands on a tiny scene, with CUDA out of reach."""
 
+import gc
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -121,14 +123,14 @@ def test_all_that_a_head_adds_is_learning(method, groups, finished):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_resumed_training_is_the_unbroken_one(method, tiny_scene, tmp_path):
+def test_resumed_training_is_the_unbroken_one(method, finished, tiny_scene, tmp_path):
     """40 steps at once, against 20 and 20 more from the checkpoint.
 
     In both halves splats are split (with random samples), pruned and their Adam state carried along; step 24 resets
     opacities.
     """
     whole = trained(options(tiny_scene, tmp_path / "whole", method, steps=40))
-    half = trained(options(tiny_scene, tmp_path / "half", method, steps=20))
+    half = finished(method)
     rest = trained(options(tiny_scene, tmp_path / "rest", method, {"--load-dir": models_of(half)}, steps=20))
     assert checkpoint_of(rest)["step"] == 39
     counts = [len(checkpoint_of(run)["pipeline"]["_model.gauss_params.means"]) for run in (half, whole)]
@@ -182,6 +184,27 @@ def test_saved_config_is_the_run(finished):
     assert config.pipeline.model.appearance.latent_dim == 32
     assert config.machine.device_type == "cpu" or torch.cuda.is_available()
     assert config.pipeline.model.refine_every == BUSY["--pipeline.model.refine-every"]
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_the_collector_is_held_off_while_training_and_no_longer(ends, tiny_scene, tmp_path, monkeypatch):
+    trainer = parse(options(tiny_scene, tmp_path, steps=1)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    calls = []
+    for name in ("collect", "freeze", "unfreeze"):
+        monkeypatch.setattr(gc, name, lambda name=name: calls.append(name))
+    step = trainer.train_iteration
+
+    def train_iteration(number: int):
+        calls.append("step")
+        if not ends:
+            raise KeyboardInterrupt
+        return step(number)
+
+    monkeypatch.setattr(trainer, "train_iteration", train_iteration)
+    with nullcontext() if ends else pytest.raises(KeyboardInterrupt):
+        trainer.train()
+    assert calls == ["collect", "freeze", "step", "unfreeze"]
 
 
 def test_checkpoint_is_written_aside_and_moved(tiny_scene, tmp_path, monkeypatch):

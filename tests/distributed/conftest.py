@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 DEVICE = Path(__file__).with_name("device.py")
 TIMEOUT = 500
@@ -38,8 +40,16 @@ def meet(job: str, scene: Path, folder: Path, world: int = 2, device_type: str =
 
 @pytest.fixture(scope="session")
 def two_devices(tiny_scene, tmp_path_factory) -> Path:
-    """The results of `jobs.everything` on two processes with gloo between them."""
-    return meet("everything", tiny_scene, tmp_path_factory.mktemp("two") / "devices")
+    """The results of `jobs.everything` on two processes with gloo between them; of several processes of tests that
+    want them, the first makes them."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "two-devices"
+    with FileLock(folder.with_suffix(".lock")):
+        if not (folder / "done").exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a meeting that failed
+            meet("everything", tiny_scene, folder)
+            (folder / "done").touch()
+    return folder
 
 
 @pytest.fixture

@@ -173,6 +173,10 @@ def told(trainer) -> Path:
 
 
 def main() -> None:
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
+    from quick_start import ask_for_callers_quickly, keep_what_is_imported, let_go
+
+    ask_for_callers_quickly()
     from nrfgs_ns.distributed.launch import join_group
 
     job, rank, world, meeting, scene, folder, device_type = sys.argv[1:]
@@ -180,7 +184,9 @@ def main() -> None:
     join_group(int(rank), int(world), f"file://{meeting}", device_type)
     import jobs
 
+    keep_what_is_imported()
     getattr(jobs, job)(Path(scene), Path(folder))
+    let_go()
     dist.barrier()
     dist.destroy_process_group()
 

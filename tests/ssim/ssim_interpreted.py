@@ -5,6 +5,7 @@ Run by test_ssim.py in a process of its own: Triton decides when it is imported 
 program takes about a tenth of a second there, hence the small images and blocks.
 """
 
+import quick_interpreter  # noqa: F401
 from ssim_cases import TOLERANCE, assert_near, pair
 
 from nrfgs_ns import ssim, ssim_triton
