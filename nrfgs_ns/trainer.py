@@ -73,6 +73,14 @@ class NrfgsTrainerConfig(TrainerConfig):
             prepare(self)
 
 
+def end_earlier_logs() -> None:
+    """Forget the logs of trainings that this process has set up before: nerfstudio would go on writing into them."""
+    while writer.EVENT_WRITERS:
+        log = writer.EVENT_WRITERS.pop()
+        if isinstance(log, writer.TensorboardWriter):
+            log.tb_writer.close()
+
+
 class NrfgsTrainer(Trainer):
     """Trainer that never leaves a torn checkpoint, or one with NaN, where `--load-dir` would find it."""
 
@@ -80,6 +88,7 @@ class NrfgsTrainer(Trainer):
     """how fast the training walks through its schedules; None: a step is a step"""
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        end_earlier_logs()
         super().setup(test_mode)
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))

@@ -29,17 +29,6 @@ def pytest_unconfigure():
     let_go()
 
 
-@pytest.fixture(autouse=True)
-def end_the_logs():
-    """Nerfstudio's trainings write into the logs of all earlier ones of their process, too."""
-    yield
-    writer = sys.modules.get("nerfstudio.utils.writer")
-    while writer is not None and writer.EVENT_WRITERS:
-        listener = writer.EVENT_WRITERS.pop()
-        if isinstance(listener, writer.TensorboardWriter):
-            listener.tb_writer.close()
-
-
 @pytest.fixture
 def captures() -> Path:
     """Folder of real captures (NRFGS_SCENES, else shared/scenes beside the checkout); skips where there is none."""

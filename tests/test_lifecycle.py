@@ -11,6 +11,7 @@ import torch
 import yaml
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender
+from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
@@ -184,6 +185,14 @@ def test_saved_config_is_the_run(finished):
     assert config.pipeline.model.appearance.latent_dim == 32
     assert config.machine.device_type == "cpu" or torch.cuda.is_available()
     assert config.pipeline.model.refine_every == BUSY["--pipeline.model.refine-every"]
+
+
+def test_a_training_writes_into_no_log_of_an_earlier_one(tiny_scene, tmp_path):
+    earlier = []
+    for name in ("first", "second"):
+        parse(options(tiny_scene, tmp_path / name, steps=1)).setup(local_rank=0, world_size=1).setup()
+        assert writer.EVENT_WRITERS and not set(map(id, earlier)) & set(map(id, writer.EVENT_WRITERS))
+        earlier = list(writer.EVENT_WRITERS)
 
 
 @pytest.mark.parametrize("ends", [True, False])

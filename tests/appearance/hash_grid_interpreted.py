@@ -5,6 +5,7 @@ Run by test_hash_grid.py in a process of its own: Triton decides when it is impo
 """
 
 import pytest
+import quick_interpreter  # noqa: F401
 import torch
 from hash_grid_cases import assert_near_twin, grids, positions
 

@@ -348,9 +348,7 @@ def test_resumed_training_is_the_unbroken_one(half, whole, tiny_scene, tmp_path,
     monkeypatch.setattr("nrfgs_ns.capacity.schedule.decide", lambda *args: decisions.append(args) or decide(*args))
     rest = trained(words(tiny_scene, tmp_path / "rest", {"--load-dir": models_of(first)}, steps=18 - half))
     assert len(decisions) == (1 if half == 8 else 0)
-    assert read_report(rest.parent)["step"] == read_report(whole.parent)["step"], (
-        "told, too"
-    )
+    assert read_report(rest.parent)["step"] == read_report(whole.parent)["step"], "told, too"
     assert checkpoint_of(whole)["pipeline"]["_extra_state"]["sampling"]["views_aside"] == []
     assert_same_training(checkpoint_of(rest), checkpoint_of(whole))
 
