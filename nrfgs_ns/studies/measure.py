@@ -44,14 +44,14 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
     metrics = ImageMetrics()
     test = data.fixed_indices_eval_dataloader
     names = [Path(name).name for name in data.eval_dataset.image_filenames]
-    result: dict[str, Any] = {"test": _views(model, metrics, zip(names, test, strict=True)), "train": None}
+    result: dict[str, Any] = {"test": over_views(model, metrics, zip(names, test, strict=True)), "train": None}
     if train_views > 0:
         images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
         cameras = data.train_dataset.cameras
         chosen = evenly_spaced(len(images), train_views)
         views = ((cameras[i : i + 1].to(model.device), images[i]) for i in chosen)
         names = [Path(data.train_dataset.image_filenames[i]).name for i in chosen]
-        result["train"] = _views(model, metrics, zip(names, views, strict=True))
+        result["train"] = over_views(model, metrics, zip(names, views, strict=True))
     cameras = [camera for camera, _ in test]
     return {
         **result,
@@ -73,7 +73,7 @@ def evenly_spaced(total: int, wanted: int) -> list[int]:
     return [i * total // count for i in range(count)]
 
 
-def _views(model, metrics: ImageMetrics, views: Iterable) -> dict[str, Any]:
+def over_views(model, metrics: ImageMetrics, views: Iterable) -> dict[str, Any]:
     """Means and each image's values over (name, (camera, batch))."""
     per_image = []
     for name, (camera, batch) in views:
