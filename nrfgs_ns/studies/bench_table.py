@@ -305,7 +305,7 @@ def views_as_csv(rows: list[Row]) -> str:
     writer.writerow([*HEAD[:3], "seed", "image", *PER_VIEW])
     for row in rows:
         for seed, record in sorted(row.records.items()):
-            for view in (record.get("eval") or {}).get("per_image") or ():
+            for view in (record["measured"].get("test") or {}).get("per_image", ()):
                 numbers = (view.get(key) for key in PER_VIEW.values())
                 place = (row.scene, row.run, row.protocol, seed, view["image"])
                 writer.writerow([*place, *("" if n is None else f"{n:.6g}" for n in numbers)])
