@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time the appearance head alone on a CUDA device: the fused field beside PyTorch's and beside spherical harmonics.
+"""Time the appearance head alone on a CUDA device: the fused field beside PyTorch's and beside the other heads.
 
     python benchmarks/head_gpu.py --out docs/results/head_gpu.json
     python benchmarks/head_gpu.py --sizes 1000000 --sweep               # launch constants of the fused kernels
@@ -36,8 +36,11 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE, Others  # noqa: E402
+from nrfgs_ns.appearance.gsnb import GsnbConfig  # noqa: E402
 from nrfgs_ns.appearance.nrf import NrfConfig  # noqa: E402
+from nrfgs_ns.appearance.sg import SgConfig  # noqa: E402
 from nrfgs_ns.appearance.sh import ShConfig  # noqa: E402
+from nrfgs_ns.appearance.vdgs import VdgsConfig  # noqa: E402
 
 PRECISIONS = ("fp32", "tf32", "bf16", "fp16")
 ERROR_SPLATS = 100_000
@@ -156,10 +159,27 @@ class HeadBenchmark:
         tables = {name: splats[name] for name in names}
         return Variant(lambda: tuple(head(tables, rows, center)), [*tables.values(), *head.parameters()])
 
+    def peer(
+        self, config, splats: dict[str, Tensor], rows: Tensor, center: Tensor, plain_grid: bool = False
+    ) -> Variant:
+        """Another head, with what it stores for each splat beside means and opacities; VDGS's hash grid in PyTorch, if
+        `plain_grid`."""
+        torch.manual_seed(1)
+        head = config.setup().to(self.device)
+        head.set_step(10**6)  # all of its degrees and lobes
+        if plain_grid:
+            head.grid.forward = head.grid.in_torch
+        own = head.splat_params(torch.rand(len(splats["means"]), 3, device=self.device))
+        tables = {name: splats.get(name, value.requires_grad_()) for name, value in own.items()}
+        tables |= {name: splats[name] for name in ("means", "opacities")}
+        return self.variant(head, tables, rows, center, tuple(tables))
+
     def variants(self, splats: dict[str, Tensor], rows: Tensor, center: Tensor) -> dict[str, Callable[[], Variant]]:
         """What to time, by name; each is built when its turn comes, so that one that fails stops nothing."""
         nrf = ("means", "opacities", "features_dc", "latents")
-        sh = ("means", "opacities", "features_dc", "features_rest")
+
+        def peer(config, **how):
+            return lambda: self.peer(config, splats, rows, center, **how)
 
         def fused(precision):
             return self.variant(self.field(implementation="fused", precision=precision), splats, rows, center, nrf)
@@ -169,11 +189,6 @@ class HeadBenchmark:
             run = torch.compile(head.forward, dynamic=True)
             tables = {name: splats[name] for name in nrf}
             return Variant(lambda: tuple(run(tables, rows, center)), [*tables.values(), *head.parameters()])
-
-        def harmonics_head():
-            head = ShConfig().setup().to(self.device)
-            head.set_step(10**6)
-            return self.variant(head, splats, rows, center, sh)
 
         def harmonics_kernel():
             from nrfgs_ns.appearance.spherical_harmonics import eval_sh
@@ -186,8 +201,12 @@ class HeadBenchmark:
         chosen["torch"] = lambda: self.variant(self.field(implementation="torch"), splats, rows, center, nrf)
         if self.compile:
             chosen["torch.compile"] = compiled
-        chosen["sh head"] = harmonics_head
+        chosen["sh head"] = peer(ShConfig())
         chosen["sh kernel"] = harmonics_kernel
+        chosen["vdgs head"] = peer(VdgsConfig())
+        chosen["vdgs head, grid in PyTorch"] = peer(VdgsConfig(), plain_grid=True)
+        chosen["gsnb head"] = peer(GsnbConfig())
+        chosen["sg head"] = peer(SgConfig())
         return chosen
 
     def diffuse_variants(
