@@ -34,7 +34,7 @@ def tanh(x):
 def operand(x, KIND: tl.constexpr):
     """Round to what the tensor cores multiply. float16 saturates: beyond 65504 it would be infinite.
 
-    Tensor cores cut float32 down to tf32's 10 bits of mantissa; rounding first halves the error and takes its bias.
+    Tensor cores cut float32 down to tf32's 10 bits of mantissa; rounding first halves the error and removes its bias.
     """
     if KIND == "fp16":
         x = tl.where(x > 65504.0, 65504.0, x)

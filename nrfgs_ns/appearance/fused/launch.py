@@ -3,7 +3,8 @@
 
 A training step of a small scene is bound by the host, so this is written for few launches: two to pack the weights,
 one forward, one to zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the
-weights' gradients. Where splats are diffuse, the tables' gradients are always zeroed.
+weights' gradients. Where splats are diffuse, one more makes their mask 32-bit, and the tables' gradients are always
+zeroed.
 """
 
 import itertools
