@@ -74,7 +74,11 @@ class NrfgsTrainerConfig(TrainerConfig):
 
 
 def end_earlier_logs() -> None:
-    """Forget the logs of trainings that this process has set up before: nerfstudio would go on writing into them."""
+    """Forget the logs of trainings that this process has set up before, and what one that was cut off left to write.
+
+    Nerfstudio would go on with both.
+    """
+    writer.EVENT_STORAGE.clear()
     while writer.EVENT_WRITERS:
         log = writer.EVENT_WRITERS.pop()
         if isinstance(log, writer.TensorboardWriter):

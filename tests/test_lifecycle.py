@@ -191,6 +191,8 @@ def test_a_training_writes_into_no_log_of_an_earlier_one(tiny_scene, tmp_path):
     earlier = []
     for name in ("first", "second"):
         parse(options(tiny_scene, tmp_path / name, steps=1)).setup(local_rank=0, world_size=1).setup()
+        assert "lost" not in [event["name"] for event in writer.EVENT_STORAGE]
+        writer.put_scalar(name="lost", scalar=1.0, step=0)
         assert writer.EVENT_WRITERS and not set(map(id, earlier)) & set(map(id, writer.EVENT_WRITERS))
         earlier = list(writer.EVENT_WRITERS)
 

@@ -296,6 +296,7 @@ def as_csv(rows: list[Row]) -> str:
 
 
 PER_VIEW = {"PSNR": "psnr", "SSIM": "ssim", "MS-SSIM": "ms_ssim", "LPIPS": "lpips", "L1": "l1"}
+"""Column -> its key in a view's measurement."""
 
 
 def views_as_csv(rows: list[Row]) -> str:

@@ -169,7 +169,7 @@ class FusedFunction(torch.autograd.Function):
         zero = not one_center or count < rows or flags is not None
         d_tables = _tables(rows, packing.latent_dim, device, zero)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
-        if flags is not None and not one_center:
+        if flags is not None and wants_center and not one_center:
             d_centers.zero_()
         if count > 0:
             programs = _programs(how, count, device)
