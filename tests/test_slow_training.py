@@ -56,7 +56,7 @@ def test_killed_training_goes_on_from_its_checkpoint(tiny_scene, tmp_path):
         [sys.executable, "-c", code, *args], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     deadline = time.time() + 120
-    while time.time() < deadline and not list(tmp_path.rglob("step-0000001*.ckpt")):
+    while time.time() < deadline and not list(tmp_path.rglob("nerfstudio_models/step-0000001*")):
         time.sleep(0.05)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
