@@ -23,8 +23,8 @@ SHORT = 1e-4
 
 
 class Others:
-    """The visible splats that are not diffuse, for fields that take no mask: finding them waits for the device. Fused
-    kernels are told the mask instead, where they take one.
+    """The visible splats that are not diffuse, for heads in PyTorch: finding them waits for the device. The fused field
+    is told the mask instead.
 
     Args:
         splats, visible, camera_centers: as for `AppearanceHead.forward`, with "diffuse" among the splats.

@@ -3,14 +3,12 @@
 
 import importlib.util
 import logging
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from fused_cases import heads, scene
+from interpreted import passes_in_the_interpreter
 
 from nrfgs_ns.appearance.fused.packing import pack
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -21,11 +19,7 @@ INTERPRETED = Path(__file__).with_name("fused_interpreted.py")
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
 def test_kernels_in_the_interpreter():
-    """Every test of fused_interpreted.py; a failure shows that process's report."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(INTERPRETED)]
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=INTERPRETED.parents[2])
-    assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-2000:]
+    passes_in_the_interpreter(INTERPRETED)
 
 
 @pytest.fixture

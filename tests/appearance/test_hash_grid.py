@@ -3,14 +3,12 @@
 grid computes: test_vdgs.py."""
 
 import importlib.util
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from hash_grid_cases import grids, positions
+from interpreted import passes_in_the_interpreter
 
 from nrfgs_ns.appearance import hash_grid
 
@@ -19,11 +17,7 @@ INTERPRETED = Path(__file__).with_name("hash_grid_interpreted.py")
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
 def test_kernels_in_the_interpreter():
-    """Every test of hash_grid_interpreted.py; a failure shows that process's report."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(INTERPRETED)]
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=INTERPRETED.parents[2])
-    assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-2000:]
+    passes_in_the_interpreter(INTERPRETED)
 
 
 def test_cpu_takes_torch():

@@ -2,15 +2,13 @@
 """The loss of L1 and SSIM: PyTorch's path against pytorch_msssim, and the kernels in Triton's interpreter."""
 
 import importlib.util
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from interpreted import passes_in_the_interpreter
 from pytorch_msssim import SSIM
 from ssim_cases import MOMENT_ROUNDINGS, TOLERANCE, ULP, assert_near, pair, reference
 
@@ -25,11 +23,7 @@ DOUBLE_TOLERANCE = TOLERANCE * 2.0**-29
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
 def test_kernels_in_the_interpreter():
-    """Every test of ssim_interpreted.py; a failure shows that process's report."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(INTERPRETED)]
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=INTERPRETED.parents[2])
-    assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-2000:]
+    passes_in_the_interpreter(INTERPRETED)
 
 
 @settings(max_examples=40, derandomize=True)
