@@ -16,7 +16,6 @@ Conventions: images are [H, W, 3] in [0, 1], of one floating dtype and on one de
 Images with a side shorter than the window go to pytorch_msssim, which warns and leaves that side unblurred.
 """
 
-import importlib.util
 import logging
 
 import torch
@@ -26,6 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nrfgs_ns.metrics import SSIM_C1, SSIM_C2, WINDOW_SIGMA, WINDOW_SIZE
+from nrfgs_ns.triton_trial import try_triton
 
 REACH = WINDOW_SIZE // 2
 """Pixels from a window's centre to its edge."""
@@ -145,27 +145,16 @@ _RUNS: dict[torch.device, bool] = {}
 def _kernels_run_on(device: torch.device) -> bool:
     """Whether Triton's kernels run on a CUDA device; tried once."""
     if device not in _RUNS:
-        why_not = _try_kernels(device)
+        why_not = try_triton(lambda: _try_kernels(device))
         if why_not is not None:
             logger.warning("SSIM runs in plain PyTorch on %s: %s.", device, why_not)
         _RUNS[device] = why_not is None
     return _RUNS[device]
 
 
-def _try_kernels(device: torch.device) -> str | None:
-    """Compile and run both kernels on one window; what went wrong, or None.
+def _try_kernels(device: torch.device) -> None:
+    """Compile and run both kernels on one window; raise whatever goes wrong."""
+    from nrfgs_ns.ssim_triton import WeightedSum
 
-    Triton may be missing, or the C compiler that its launcher is built with.
-    """
-    if importlib.util.find_spec("triton") is None:
-        return "Triton is not installed"
-    try:
-        from nrfgs_ns.ssim_triton import WeightedSum
-
-        image = torch.zeros(WINDOW_SIZE, WINDOW_SIZE, 3, device=device, requires_grad=True)
-        with torch.enable_grad():
-            WeightedSum.apply(image, torch.zeros_like(image), 0.5, 0.5, 0.0).backward()
-    except Exception as error:  # whatever stops Triton on this machine, PyTorch computes the same
-        first_line = next(iter(str(error).splitlines()), "")
-        return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
-    return None
+    image = torch.zeros(WINDOW_SIZE, WINDOW_SIZE, 3, device=device, requires_grad=True)
+    WeightedSum.apply(image, torch.zeros_like(image), 0.5, 0.5, 0.0).backward()

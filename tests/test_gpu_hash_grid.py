@@ -61,6 +61,21 @@ def test_what_is_no_lattice_coordinate():
     assert torch.isfinite(features[[0, 1, 4]]).all() and torch.isfinite(x.grad[[0, 1, 4]]).all()
 
 
+@pytest.mark.parametrize("wanted", [0, 1])
+def test_one_gradient_alone(wanted):
+    """To the last bit: among so few positions no row is a corner of three cells, and two addends have no order."""
+    grid, _ = grids("cuda", **PAPER)
+    leaves = positions(60, "cuda")[::3].contiguous().requires_grad_(), grid.table  # the near ones
+    cells = (leaves[0].detach()[:, None] * grid.resolutions[:, None]).floor().long()
+    assert grid._rows(torch.stack([cells, cells + 1], dim=-1)).flatten().bincount().max() <= 2
+    (expected,) = torch.autograd.grad(interpolate(grid, leaves[0]).square().sum(), leaves[wanted])
+    leaves[1 - wanted].requires_grad_(False)
+    before = leaves[1 - wanted].clone()
+    for _ in range(2):  # Triton's own launch, and another one
+        (found,) = torch.autograd.grad(interpolate(grid, leaves[0]).square().sum(), leaves[wanted])
+        assert torch.equal(found, expected) and torch.equal(leaves[1 - wanted], before)
+
+
 def test_float64_takes_torch():
     _, twin = grids("cuda")
     x = positions(100, "cuda")

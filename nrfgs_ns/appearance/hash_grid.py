@@ -25,12 +25,13 @@ On CUDA, two Triton kernels compute all this and its gradients (`hash_grid_trito
 dtypes than float32, PyTorch does. The kernels' gradients cannot be differentiated again.
 """
 
-import importlib.util
 import logging
 from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
+
+from nrfgs_ns.triton_trial import try_triton
 
 PRIMES = (1, 2654435761, 805459861)
 """The hash's multipliers for x, y, z."""
@@ -135,28 +136,16 @@ def _kernels_run_on(device: torch.device, features: int) -> bool:
     """Whether Triton's kernels run on a CUDA device, for so many features per level; tried once."""
     key = device, features
     if key not in _RUNS:
-        why_not = _try_kernels(device, features)
+        why_not = try_triton(lambda: _try_kernels(device, features))
         if why_not is not None:
             logger.warning("The hash grid runs in plain PyTorch on %s: %s.", device, why_not)
         _RUNS[key] = why_not is None
     return _RUNS[key]
 
 
-def _try_kernels(device: torch.device, features: int) -> str | None:
-    """Compile and run both kernels on one position; what went wrong, or None.
+def _try_kernels(device: torch.device, features: int) -> None:
+    """Compile and run both kernels on one position; raise whatever goes wrong."""
+    from nrfgs_ns.appearance.hash_grid_triton import Interpolation
 
-    Triton may be missing, or the C compiler that its launcher is built with.
-    """
-    if importlib.util.find_spec("triton") is None:
-        return "Triton is not installed"
-    try:
-        from nrfgs_ns.appearance.hash_grid_triton import Interpolation
-
-        with torch.inference_mode(False), torch.enable_grad():
-            position = torch.zeros(1, 3, device=device, requires_grad=True)
-            table, resolutions = torch.zeros(2, features, device=device), torch.ones(1, device=device)
-            Interpolation.apply(position, table, resolutions, 0, 2).sum().backward()
-    except Exception as error:  # whatever stops Triton on this machine, PyTorch computes the same
-        first_line = next(iter(str(error).splitlines()), "")
-        return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
-    return None
+    position, table = (torch.zeros(*shape, device=device, requires_grad=True) for shape in ((1, 3), (2, features)))
+    Interpolation.apply(position, table, torch.ones(1, device=device), 0, 2).sum().backward()

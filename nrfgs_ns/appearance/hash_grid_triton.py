@@ -5,6 +5,7 @@ A thread takes positions and walks over the eight corners of a level's cell; row
 registers and never reach memory. Forward, a program has one level, so that neighbouring programs gather from the same
 level's table. Backward, it has all of them: a position's gradient is their sum, written once. The table's gradient is
 added up by atomics, in whatever order, so its last bits differ from run to run, as those of PyTorch's index_select do.
+Of the two, only what autograd asks for is computed.
 
 Any number of features and levels is taken. Features are padded to a power of two; what is padded is neither read nor
 written, but where the number is a power of two, up to four are read, and on recent cards added, at once.
@@ -37,6 +38,18 @@ PRIME_Y = tl.constexpr(hash_grid.PRIMES[1])
 PRIME_Z = tl.constexpr(hash_grid.PRIMES[2])
 FARTHEST = tl.constexpr(2.0**31 - 2.0**7)  # the last float32 that an int32 holds
 CORNERS = tl.constexpr(8)
+
+
+@triton.jit
+def _block(positions, count, PADDED: tl.constexpr, B: tl.constexpr):
+    """A program's positions: which they are, int64 [B], which of them are there, x, y and z; lanes [1, PADDED]."""
+    items = tl.program_id(0).to(tl.int64) * B + tl.arange(0, B)
+    lanes = tl.arange(0, PADDED)[None, :]
+    valid = items < count
+    x = tl.load(positions + items * 3, mask=valid, other=0.0)
+    y = tl.load(positions + items * 3 + 1, mask=valid, other=0.0)
+    z = tl.load(positions + items * 3 + 2, mask=valid, other=0.0)
+    return items, valid, x, y, z, lanes
 
 
 @triton.jit
@@ -100,13 +113,7 @@ def forward_kernel(
 ):  # fmt: skip
     """Features [count, levels * F] of positions [count, 3]; program (i, l) computes block i of level l."""
     level = tl.program_id(1)
-    items = tl.program_id(0).to(tl.int64) * B + tl.arange(0, B)
-    lanes = tl.arange(0, PADDED)[None, :]
-    valid = items < count
-    x = tl.load(positions + items * 3, mask=valid, other=0.0)
-    y = tl.load(positions + items * 3 + 1, mask=valid, other=0.0)
-    z = tl.load(positions + items * 3 + 2, mask=valid, other=0.0)
-
+    items, valid, x, y, z, lanes = _block(positions, count, PADDED, B)
     _, numbered, keys, weights = _level(x, y, z, level, resolutions, numbered_levels)
     level_table = table + tl.cast(level, tl.int64) * table_size * F
     total = tl.zeros((B, PADDED), tl.float32)
@@ -121,15 +128,13 @@ def forward_kernel(
 def backward_kernel(
     positions, table, resolutions, d_features, d_positions, d_table,
     count, levels, numbered_levels, table_size,
-    F: tl.constexpr, PADDED: tl.constexpr, B: tl.constexpr,
+    F: tl.constexpr, PADDED: tl.constexpr, B: tl.constexpr, BY_POSITION: tl.constexpr, BY_TABLE: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of the positions, written, and of the table, added, from those of the features."""
-    items = tl.program_id(0).to(tl.int64) * B + tl.arange(0, B)
-    lanes = tl.arange(0, PADDED)[None, :]
-    valid = items < count
-    x = tl.load(positions + items * 3, mask=valid, other=0.0)
-    y = tl.load(positions + items * 3 + 1, mask=valid, other=0.0)
-    z = tl.load(positions + items * 3 + 2, mask=valid, other=0.0)
+    """Gradients of the positions, written, and of the table, added, from those of the features.
+
+    Without BY_POSITION, or without BY_TABLE, that one is not computed, and any tensor can be passed for it.
+    """
+    items, valid, x, y, z, lanes = _block(positions, count, PADDED, B)
     here = valid[:, None] & (lanes < F)
 
     d_x, d_y, d_z = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
@@ -140,27 +145,30 @@ def backward_kernel(
         upstream = tl.load(d_features + begin + lanes, mask=here, other=0.0)
 
         # All corners are read before any is added to: the compiler does not move a load past an atomic.
-        by_x, by_y, by_z = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
-        for corner in tl.static_range(CORNERS):
-            offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
-            read = tl.load(table + level_begin + offsets, mask=lanes < F, other=0.0)
-            by_weight = tl.sum(read * upstream, axis=1)
-            w_x, w_y, w_z = weights[0][corner // 4], weights[1][corner // 2 % 2], weights[2][corner % 2]
-            by_x += w_y * w_z * by_weight * (2 * (corner // 4) - 1)
-            by_y += w_x * w_z * by_weight * (2 * (corner // 2 % 2) - 1)
-            by_z += w_x * w_y * by_weight * (2 * (corner % 2) - 1)
-        d_x += by_x * resolution
-        d_y += by_y * resolution
-        d_z += by_z * resolution
+        if BY_POSITION:
+            by_x, by_y, by_z = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
+            for corner in tl.static_range(CORNERS):
+                offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
+                read = tl.load(table + level_begin + offsets, mask=lanes < F, other=0.0)
+                by_weight = tl.sum(read * upstream, axis=1)
+                w_x, w_y, w_z = weights[0][corner // 4], weights[1][corner // 2 % 2], weights[2][corner % 2]
+                by_x += w_y * w_z * by_weight * (2 * (corner // 4) - 1)
+                by_y += w_x * w_z * by_weight * (2 * (corner // 2 % 2) - 1)
+                by_z += w_x * w_y * by_weight * (2 * (corner % 2) - 1)
+            d_x += by_x * resolution
+            d_y += by_y * resolution
+            d_z += by_z * resolution
 
-        for corner in tl.static_range(CORNERS):
-            offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
-            gradient = _weight(weights, corner)[:, None] * upstream
-            tl.atomic_add(d_table + level_begin + offsets, gradient, mask=here, sem="relaxed")
+        if BY_TABLE:
+            for corner in tl.static_range(CORNERS):
+                offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
+                gradient = _weight(weights, corner)[:, None] * upstream
+                tl.atomic_add(d_table + level_begin + offsets, gradient, mask=here, sem="relaxed")
 
-    tl.store(d_positions + items * 3, d_x, mask=valid)
-    tl.store(d_positions + items * 3 + 1, d_y, mask=valid)
-    tl.store(d_positions + items * 3 + 2, d_z, mask=valid)
+    if BY_POSITION:
+        tl.store(d_positions + items * 3, d_x, mask=valid)
+        tl.store(d_positions + items * 3 + 1, d_y, mask=valid)
+        tl.store(d_positions + items * 3 + 2, d_z, mask=valid)
 
 
 launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
@@ -190,12 +198,15 @@ class Interpolation(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, d_features: Tensor):
         positions, table, resolutions = ctx.saved_tensors
-        d_positions, d_table = torch.empty_like(positions), torch.zeros_like(table)
+        by_position, by_table = ctx.needs_input_grad[:2]
+        d_positions = torch.empty_like(positions) if by_position else None
+        d_table = torch.zeros_like(table) if by_table else None
         if len(positions) > 0:
             blocks, constants = _blocks(len(positions), table.shape[1])
             launch_backward(
-                (blocks, 1, 1), positions, table, resolutions, d_features.contiguous(), d_positions, d_table,
-                *ctx.sizes, **constants, **OPTIONS,
+                (blocks, 1, 1), positions, table, resolutions, d_features.contiguous(),
+                positions if d_positions is None else d_positions, table if d_table is None else d_table,
+                *ctx.sizes, **constants, BY_POSITION=by_position, BY_TABLE=by_table, **OPTIONS,
             )  # fmt: skip
         return d_positions, d_table, None, None, None
 

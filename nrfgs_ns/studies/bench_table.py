@@ -222,6 +222,9 @@ def notes(rows: list[Row]) -> list[str]:
     )
     if machines:
         result.append(f"Made on: {'; '.join(machines)}.")
+    sources = {record["machine"].get("source", "unknown") for record in records}
+    if len(sources) > 1:
+        result.append("Not all were made with the same version of this package: `machine.source` of each record.")
     return result
 
 

@@ -8,6 +8,7 @@ everything measured to RECORD.json.
 """
 
 import contextlib
+import hashlib
 import json
 import platform
 import sys
@@ -27,6 +28,7 @@ from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler
 from torch import nn
 
+import nrfgs_ns
 from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.studies.files import write_whole
 
@@ -190,14 +192,33 @@ def _lpips_weights_are_here() -> bool:
 
 
 def machine() -> dict[str, str]:
-    """What the numbers were taken on."""
+    """What the numbers were taken on, and with which source."""
     return {
         "device": torch.cuda.get_device_name()
         if torch.cuda.is_available()
         else f"{torch.get_num_threads()} CPU threads",
         "python": platform.python_version(),
         "torch": torch.__version__,
+        "source": source_digest(),
     }
+
+
+def source_digest() -> str:
+    """Twelve hexadecimal digits that tell versions of this package's Python files apart.
+
+    Unlike a commit they are there for an installed package too, and see what was not committed. Of a commit:
+    `git archive COMMIT nrfgs_ns | tar x -C EMPTY`, and this function with EMPTY/nrfgs_ns.
+    """
+    return digest_of(Path(nrfgs_ns.__file__).parent)
+
+
+def digest_of(package: Path) -> str:
+    """`source_digest` of a package's folder: of names and contents, lines ending as Python reads them."""
+    digest = hashlib.sha256()
+    for file in sorted(package.rglob("*.py"), key=lambda file: file.relative_to(package).as_posix()):
+        for part in (file.relative_to(package).as_posix(), file.read_text(encoding="utf-8")):
+            digest.update(f"{len(part)} {part}".encode())
+    return digest.hexdigest()[:12]
 
 
 def _synchronize() -> None:

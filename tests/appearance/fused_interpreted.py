@@ -129,6 +129,20 @@ def test_all_ways_failing_names_the_last_reason(monkeypatch):
         head(*scene(head, 20, 15))
 
 
+def test_memory_that_is_out_is_not_held_against_a_way(monkeypatch):
+    tried = []
+
+    def lacking(packing, launches, options, some_diffuse):
+        tried.append(launches)
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(launch, "probe", lacking)
+    head, _ = heads(precision="bf16")
+    with pytest.raises(torch.OutOfMemoryError):
+        head(*scene(head, 20, 15))
+    assert tried == [launch.LAUNCHES["bf16"][0]] and head.fused.ready == {}
+
+
 @pytest.mark.parametrize("visible", [0, 1, 64, 65])
 def test_counts_around_a_block(visible):
     head, twin = heads()

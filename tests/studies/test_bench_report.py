@@ -265,6 +265,9 @@ def test_records_of_an_earlier_version_are_reported(tmp_path):
     body, below = table_of(rows)
     assert body["s", "old", "own"]["PSNR"] == "_30.00_" and body["s", "old", "own"]["time s"] == "-"
     assert "Made on: unknown, torch unknown; a card, torch 2.11." in below
+    assert "same version" not in " ".join(below), "of neither is the version known"
+    rows[1].records[1]["machine"] = {**rows[1].records[1]["machine"], "source": "0123456789ab"}
+    assert "Not all were made with the same version of this package" in " ".join(table_of(rows)[1])
     draw_splats(rows, tmp_path)
     assert (tmp_path / "splats.png").exists()
 

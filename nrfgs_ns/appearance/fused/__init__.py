@@ -10,7 +10,6 @@ is missing on machines without CUDA. With TRITON_INTERPRET=1 set before Triton i
 Triton's interpreter on the CPU: slowly, for tests.
 """
 
-import importlib.util
 import logging
 import math
 import os
@@ -23,6 +22,7 @@ from torch import Tensor, nn
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.fused.packing import Packing, pack
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.triton_trial import try_triton
 
 if TYPE_CHECKING:  # imports Triton
     from nrfgs_ns.appearance.fused.launch import FieldOptions, Launches
@@ -110,8 +110,6 @@ class FusedField:
 
     def _prepare(self, device: torch.device, some_diffuse: bool) -> "tuple[Packing, Launches] | str":
         """The index maps on `device` and how the kernels are launched there, or why they cannot run there."""
-        if importlib.util.find_spec("triton") is None:
-            return "Triton is not installed"
         width, hidden = self.on_cpu.width, self.on_cpu.hidden
         if width > MAX_WIDTH or 2 * width * hidden > MAX_WEIGHTS:
             return (
@@ -119,13 +117,14 @@ class FusedField:
                 f"{MAX_WIDTH}) and {2 * width} x {hidden} weights of the first layer (at most {MAX_WEIGHTS})"
             )
         packing = self.on_cpu.to(device)
-        try:
-            from nrfgs_ns.appearance.fused.launch import first_that_runs
+        launches = try_triton(lambda: self._launches(packing, some_diffuse))
+        return launches if isinstance(launches, str) else (packing, launches)
 
-            return packing, first_that_runs(packing, self._options(), some_diffuse)
-        except Exception as error:  # whatever stops Triton on this machine, PyTorch computes the same
-            first_line = next(iter(str(error).splitlines()), "")
-            return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
+    def _launches(self, packing: Packing, some_diffuse: bool) -> "Launches":
+        """How the kernels are launched where the index maps are; raise whatever goes wrong."""
+        from nrfgs_ns.appearance.fused.launch import first_that_runs
+
+        return first_that_runs(packing, self._options(), some_diffuse)
 
     def _options(self, scene_unit: float = 1.0) -> "FieldOptions":
         """The configuration as the launcher wants it."""

@@ -204,12 +204,15 @@ def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool)
         some_diffuse: those for tables with diffuse splats.
 
     What can go wrong shows only here: no C compiler for Triton's launcher, or less shared memory than the kernels take.
+    Memory of the device that ran out is none of it: a slower way would be taken for good.
     """
     *more, last = LAUNCHES[options.precision]
     for launches in more:
         try:
             probe(packing, launches, options, some_diffuse)
-        except Exception:  # whatever it is: if the last way fails too, that one tells
+        except torch.OutOfMemoryError:
+            raise
+        except Exception:  # whatever else it is: if the last way fails too, that one tells
             continue
         return launches
     probe(packing, last, options, some_diffuse)
