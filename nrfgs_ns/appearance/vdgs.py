@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from nrfgs_ns.appearance.directions import unit_vectors
 from nrfgs_ns.appearance.hash_grid import HashGrid
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import Component, SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics
 from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
 
@@ -109,3 +109,11 @@ class ViewDirectionFactors(SphericalHarmonics):
             colors=(eval_sh(self.active_degree, directions, coefficients) + 0.5).clamp_min(0.0),
             opacities=opacities,
         )
+
+    def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
+        """The harmonics' "residual", and "opacity residual", what the factor takes from opacity, if it does."""
+        seen, base = self(splats, visible, camera_centers), self.base_appearance(splats, visible)
+        shown = {"residual": Component(seen.colors - base.colors, "color")}
+        if self.config.mode != "sh":
+            shown["opacity residual"] = Component((seen.opacities - base.opacities)[:, None], "opacity")
+        return shown

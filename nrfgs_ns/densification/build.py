@@ -21,10 +21,12 @@ SPLATFACTOS_THRESHOLDS = (
     "stop_screen_size_at",
 )
 """Options of the model that only the protocol `splatfacto` reads."""
+READ_BY = {"original": "original", "mcmc": "mcmc", "splat_budget": "mcmc"}
+"""Options of the model that one of the others alone reads -> which."""
 UNREAD = {
-    "splatfacto": (),
-    "original": SPLATFACTOS_THRESHOLDS,
-    "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at"),
+    "splatfacto": ("original", "mcmc", "splat_budget"),
+    "original": (*SPLATFACTOS_THRESHOLDS, "mcmc", "splat_budget"),
+    "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at", "original"),
 }
 """Options of the model that a protocol does not read, and refuses where they are set."""
 
@@ -50,6 +52,7 @@ def build_densification(config: Any, num_train_images: int, scene_unit: float = 
             f"pipeline.model.opacity_seen_by_densification is {config.opacity_seen_by_densification!r}; "
             "use 'base' or 'peak'."
         )
+    _refuse_options(config)
     return makers[config.densification](config, num_train_images, scene_unit)
 
 
@@ -77,7 +80,6 @@ def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densif
 
 
 def _original(config: Any, num_train_images: int, scene_unit: float) -> Densification:
-    _refuse_options(config)
     rules: OriginalDensification = config.original
     strategy = PruneBySeenOpacity(
         prune_opa=rules.prune_opacity,
@@ -99,7 +101,6 @@ def _original(config: Any, num_train_images: int, scene_unit: float) -> Densific
 
 
 def _mcmc(config: Any, num_train_images: int, scene_unit: float) -> Densification:
-    _refuse_options(config)
     if not 1 <= config.splat_budget <= LARGEST_BUDGET:
         raise InputError(
             f"pipeline.model.splat_budget is {config.splat_budget}; it must lie between 1 and {LARGEST_BUDGET}."
@@ -116,10 +117,15 @@ def _mcmc(config: Any, num_train_images: int, scene_unit: float) -> Densificatio
 
 def _refuse_options(config: Any) -> None:
     """Raise InputError where an option was set that this protocol does not read: it would be ignored silently."""
-    for name in UNREAD[config.densification]:
-        if getattr(config, name) != getattr(type(config), name):
-            protocol = config.densification
+    protocol, default = config.densification, type(config)()
+    for name in UNREAD[protocol]:
+        if getattr(config, name) != getattr(default, name):
+            reader = READ_BY.get(name)
             raise InputError(
                 f"pipeline.model.{name} has no effect with the densification {protocol!r}. Leave it out, or use "
-                f"--pipeline.model.{protocol}.... (see ns-train METHOD --help)."
+                + (
+                    f"--pipeline.model.densification {reader}."
+                    if reader
+                    else f"--pipeline.model.{protocol}.... (see ns-train METHOD --help)."
+                )
             )

@@ -50,14 +50,12 @@ def with_fewer_steps(config: Any, devices: int) -> Any:
     head = replace(
         model.appearance, **{name: fewer(getattr(model.appearance, name), devices) for name in steps_of_head}
     )
-    steps_of_model = [name for name in MODEL_STEPS if name not in UNREAD.get(model.densification, ())]
-    mcmc: McmcDensification = model.mcmc
-    model = replace(
-        model,
-        appearance=head,
-        mcmc=replace(mcmc, stop_at=fewer(mcmc.stop_at, devices)),
-        **{name: fewer(getattr(model, name), devices) for name in steps_of_model},
-    )
+    unread = UNREAD.get(model.densification, ())
+    changed = {name: fewer(getattr(model, name), devices) for name in MODEL_STEPS if name not in unread}
+    if "mcmc" not in unread:
+        mcmc: McmcDensification = model.mcmc
+        changed["mcmc"] = replace(mcmc, stop_at=fewer(mcmc.stop_at, devices))
+    model = replace(model, appearance=head, **changed)
     names = (
         "max_num_iterations",
         "average_steps",

@@ -195,11 +195,12 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
         _require_free(run.options, f"{where}: runs: {run.name}: options")
         for protocol in run.protocols or spec.protocols:
             options = protocol_options(protocol)
-            own = [word for word in (*spec.options, *run.options) if option_name(word) == DENSIFICATION and options]
+            own = {option_name(word) for word in (*spec.options, *run.options) if word.startswith("--")}
+            twice = ", ".join(sorted(own.intersection(options)))
             _require(
-                not own,
-                f"{where}: runs: {run.name}: {DENSIFICATION} is what protocol {protocol} gives; "
-                "leave it out, or use protocol own.",
+                not twice,
+                f"{where}: runs: {run.name}: {twice} is what protocol {protocol} gives; leave it out, or use protocol "
+                "own.",
             )
             _require(
                 not (run.protocols and options) or run.method.startswith("nrfgs"),

@@ -97,6 +97,18 @@ def test_sh_mode_leaves_opacity_alone():
     assert not torch.allclose(ours.colors, theirs.colors)
 
 
+@pytest.mark.parametrize("mode", ["opacity", "both"])
+def test_what_the_view_takes_from_opacity_can_be_shown(mode):
+    head = awake(VdgsConfig(mode=mode))
+    splats, visible, centers = scene(head)
+    parts = head.components(splats, visible, centers)
+    change = parts["opacity residual"]
+    shown, stored = head(splats, visible, centers), torch.sigmoid(splats["opacities"][visible])
+    assert change.kind == "opacity" and torch.equal(change.values, shown.opacities[:, None] - stored)
+    assert (change.values < 0).all() and change.values.std() > 0.01
+    assert torch.equal(parts["residual"].values, shown.colors - head.base_appearance(splats, visible).colors)
+
+
 def test_the_degree_grows_as_for_harmonics():
     head = VdgsConfig(degree_interval=10).setup()
     head.set_step(25)

@@ -161,8 +161,24 @@ def test_constants_are_those_of_the_papers():
         ({"densification": "mcmc", "cull_alpha_thresh": 0.005}, "cull_alpha_thresh"),
         ({"densification": "original", "densify_grad_thresh": 1e-6}, "densify_grad_thresh"),
         ({"densification": "original", "use_absgrad": False}, "use_absgrad"),
+        ({"splat_budget": 200_000}, "splat_budget has no effect with the densification 'splatfacto'"),
+        ({"densification": "original", "splat_budget": 200_000}, "splat_budget has no effect"),
+        ({"original": OriginalDensification(prune_opacity=0.01)}, "original has no effect"),
+        ({"densification": "mcmc", "original": OriginalDensification(prune_opacity=0.01)}, "original has no effect"),
+        ({"densification": "original", "mcmc": McmcDensification(stop_at=100)}, "mcmc has no effect"),
     ],
 )
 def test_options_that_cannot_work_are_refused(options, says):
     with pytest.raises(InputError, match=says):
         build_densification(NrfgsModelConfig(**options), 8)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"densification": "original", "original": OriginalDensification(prune_opacity=0.01)},
+        {"densification": "mcmc", "mcmc": McmcDensification(stop_at=100), "splat_budget": 7},
+    ],
+)
+def test_options_of_the_protocol_itself_are_not_refused(options):
+    assert build_densification(NrfgsModelConfig(**options), 8).name == options["densification"]

@@ -2,6 +2,7 @@
 """What a benchmark's file may say, the commands that come of it, and how data sets in each layout are read."""
 
 import json
+import re
 import shutil
 import struct
 from pathlib import Path
@@ -103,6 +104,11 @@ def test_methods_of_others_run_as_they_are():
         ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
         ({"scenes": ["."]}, "no folder below --scenes"),
         ({"protocols": ["mcmc"], "options": "--pipeline.model.densification original"}, "densification is what.*mcmc"),
+        ({"protocols": ["mcmc@9"], "options": "--pipeline.model.splat_budget 5"}, "splat-budget is what.*mcmc@9"),
+        (
+            {"protocols": ["mcmc@9"], "runs": {"N": {"method": "nrfgs", "options": "--pipeline.model.splat-budget=5"}}},
+            "N: --pipeline.model.splat-budget is what.*mcmc@9",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(content, says):
@@ -113,6 +119,13 @@ def test_what_is_wrong_is_named(content, says):
 def test_a_run_as_it_is_may_choose_its_densification():
     run = {"method": "nrfgs", "options": "--pipeline.model.densification mcmc"}
     assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}))] == ["own"]
+
+
+def test_a_budget_may_be_an_option_where_the_protocol_names_none():
+    run = {"method": "nrfgs", "options": "--pipeline.model.splat-budget 5"}
+    assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}, protocols=["mcmc"]))] == ["mcmc"]
+    run["options"] = "--pipeline.model.appearance.latent-dim 9"  # the budget's number, but another option's
+    assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}, protocols=["mcmc@9"]))] == ["mcmc@9"]
 
 
 @pytest.mark.parametrize("text", ["runs: [", "just words", None])
@@ -157,6 +170,38 @@ def test_the_command_means_what_the_file_says(protocol, densification, budget, t
     assert (config.max_num_iterations, config.machine.seed, model.num_downscales) == (7, 5, 0)
     assert model.appearance.latent_dim == 9
     assert config.pipeline.datamanager.dataparser.data == tiny_scene
+
+
+def ablations() -> list[tuple[str, list[str], int]]:
+    """Name, options and shared weights of each run in the guide's table of ablations."""
+    guide = (ROOT / "docs" / "bench.md").read_text(encoding="utf-8")
+    rows = re.search(r"## Ablations.*?\|---\|---\|---\|\n(.*?)\n\n", guide, re.DOTALL)[1].splitlines()
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    return [(name, options.strip("`").split(), int(count.replace(",", ""))) for name, options, count in cells]
+
+
+def test_ablations_are_what_the_guide_says(tiny_scene, tmp_path):
+    off = {}
+    for name, options, count in ablations():
+        model = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), *options]).pipeline.model
+        head = model.appearance.setup()
+        assert sum(weights.numel() for weights in head.parameters()) == count, name
+        loud = any(layers[-1].weight.any() for layers in (head.low, head.high) if layers is not None)
+        off[name.partition(":")[0]] = (
+            head.high is None,
+            not head.config.opacity_residual,
+            not head.config.use_distance,
+            loud,
+            model.warmup_steps == 0,
+        )
+    assert off == {
+        "the field": (False, False, False, False, False),
+        "no split": (True, False, False, False, False),
+        "no opacity residual": (False, True, False, False, False),
+        "no distance": (False, False, True, False, False),
+        "the paper's start, with its warm-up": (False, False, False, True, False),
+        "the paper's start, no warm-up": (False, False, False, True, True),
+    }
 
 
 def test_fingerprints_ignore_paths_and_see_the_rest():
