@@ -12,7 +12,7 @@ outputs), or both (49). Source: the paper "Gaussian Splatting with NeRF-based Co
 
 Sizes at the defaults: 48 colour numbers per splat, as with harmonics alone; shared, 524,288 in the grid and 1,729 in
 the network (3,280 for the coefficients, 3,313 for both). f starts near 1/2, so a splat starts at half its opacity.
-Pruning sees the base opacity sigmoid(o).
+Pruning sees the base opacity sigmoid(o), but under `mcmc`, which sees the largest that views have shown.
 
 The grid and the network have the reference's optimiser, Adam at 1e-3 without a schedule; all else has the host's. The
 reference trains with opacity resets switched off. That is a matter of densification and not of the colour model;
