@@ -117,7 +117,7 @@ def verb_options(verb: type) -> Iterator[Option]:
         flag = (
             field.name.upper()
             if "Positional" in str(field.type)
-            else f"--no-{name}"
+            else f"--{name}, --no-{name}"
             if default is True
             else f"--{name}"
         )

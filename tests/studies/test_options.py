@@ -30,6 +30,13 @@ def test_every_option_is_explained():
     assert not any("sh-degree" in flag or "num-downscales" in flag for flag in flags)  # suppressed; splatfacto's
 
 
+def test_a_switch_that_is_on_is_named_as_the_default_and_the_text_mean_it():
+    """`--no-measure`, True, "render and tell" would say the opposite of what the switch does."""
+    measure = next(option for option in verb_options(VERBS["export"]) if "measure" in option.flag)
+    assert (measure.flag, measure.default) == ("--measure, --no-measure", True)
+    assert next(option for option in verb_options(VERBS["demo"]) if "quick" in option.flag).flag == "--quick"
+
+
 @pytest.mark.parametrize("words", [["nrfgs"], ["nrfgs", "nrfgs-data"]])
 def test_the_command_line_has_them(words):
     screen = io.StringIO()
