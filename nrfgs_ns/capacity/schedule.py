@@ -69,8 +69,12 @@ class CapacitySchedule:
         if self.is_done(step) or self.model.schedule_step < self.config.step:
             return
         started = perf_counter()
-        with CONSOLE.status(f"Step {step}: which parts of the field pay"):
-            decision = decide(self.model, self.data, self.optimizers.optimizers, self.config)
+
+        def trying(what: str) -> None:  # lines, not a bar alone: a log has no other sign that training goes on
+            CONSOLE.print(f"Step {step}: which parts of the field pay? Trying {what}", soft_wrap=True)
+
+        with CONSOLE.status("Which parts of the field pay?"):
+            decision = decide(self.model, self.data, self.optimizers.optimizers, self.config, trying)
         if decision.chosen is not None:
             install(self.model, self.optimizers, decision.chosen)
         head = head_changes(self.model.head.config)

@@ -100,7 +100,13 @@ def parts_of(field: Field, seen: Residuals) -> list[tuple[str, Callable[[Field],
     return parts
 
 
-def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config: CapacitySearch) -> Decision:
+def decide(
+    model,
+    data,
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    config: CapacitySearch,
+    trying: Callable[[str], None] = lambda what: None,
+) -> Decision:
     """Find the smallest field that is as good as the whole one.
 
     Args:
@@ -108,6 +114,7 @@ def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config:
         data: the datamanager, with views set aside.
         optimizers: the training's, by group.
         config: how.
+        trying: is told what settles next.
     """
     was_training = model.training
     model.eval()
@@ -120,6 +127,7 @@ def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config:
     def settling(smaller: Field, steps: int) -> Settling:
         return Settling(model, smaller, lessons, steps, optimizers, FIELD)
 
+    trying("the whole field")
     whole = Whole(settling(field, config.settle), aside)
 
     # Each part is taken from the field as it was trained: what is kept has not settled twice.
@@ -134,6 +142,7 @@ def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config:
             if gone_when_tried.get(part) == len(dropped):
                 continue  # the same field has been tried
             gone_when_tried[part] = len(dropped)
+            trying(f"the field without its {part}")
             smaller = keep_the_mean(model, kept, without(kept), lessons)
             learning, least = settling(smaller, config.settle), 0 if chosen is None else chosen.steps
             trial, candidate = try_without(part, smaller, learning, whole, aside, allowed, config.settle_most, least)
@@ -149,6 +158,7 @@ def decide(model, data, optimizers: Mapping[str, torch.optim.Optimizer], config:
     chosen = whole.settled if chosen is None else chosen
     trials.insert(0, whole.trial(field))
     del whole  # nothing is measured against it any more
+    trying("latents of fewer numbers")
     reference, steps = aside.scores(chosen.field), chosen.steps
     basis = with_unit_axes(latent_basis(chosen.field, seen.weight))
     # Within the tolerance as it stands, without a standard error: ranks are many, of which the luckiest would be found,

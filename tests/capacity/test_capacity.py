@@ -101,7 +101,11 @@ def test_a_scene_that_changes_with_the_view_keeps_what_shows_it(loud):
     photograph(model, data, lambda view: model.head(view.splats, view.visible, view.center))
     learn_gently(optimizers, 0.1)
     before = {name: value.clone() for name, value in model.state_dict().items() if name != "_extra_state"}
-    decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=8))
+    told: list[str] = []
+    decision = decide(model, data, optimizers.optimizers, CapacitySearch(settle=8), told.append)
+    tried = [f"the field without its {part}" for part in ("high branch", "opacity residual", "distance")]
+    # What is kept is not tried again, unless something else went.
+    assert told[:4] == ["the whole field", *tried] and told[-1] == "latents of fewer numbers"
     worth = {trial.part: trial.loss_db for trial in decision.trials}
     assert worth["high branch"] > 1.0 and worth["opacity residual"] > 1.0
     assert not {"high branch", "opacity residual"} & set(decision.dropped)
