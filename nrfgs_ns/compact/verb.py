@@ -69,7 +69,7 @@ def export_compact(
         numbers |= measure_loss(pipeline, config)
         CONSOLE.print(
             f"PSNR on {len(numbers['per_image'])} test views: model {numbers['psnr_model']:.2f} dB, file "
-            f"{numbers['psnr_file']:.2f} dB: it loses {numbers['loss_db']:.3f} dB."
+            f"{numbers['psnr_file']:.2f} dB: it loses {round(numbers['loss_db'], 3) + 0.0:.3f} dB."
         )
     CONSOLE.print(f"Read it with:  ns-eval --load-config {config}", markup=False, soft_wrap=True)
     if report is not None:
