@@ -92,9 +92,10 @@ class Export:
             CONSOLE.print(f"{fit.unseen:,} splats are seen by no training view and have their base colour.")
         if self.measure:
             report |= measure_loss(load_model(self.load_config, "test"), self.output, fit.splats)
+            lost = round(report["loss_db"], 2) + 0.0  # without the sign of a -0.0
             CONSOLE.print(
                 f"PSNR on {len(report['per_image'])} test views: model {report['psnr_model']:.2f} dB, "
-                f"file {report['psnr_file']:.2f} dB: it loses {round(report['loss_db'], 2) + 0.0:.2f} dB.\n"
+                f"file {report['psnr_file']:.2f} dB: it loses {lost:.2f} dB.\n"
                 f"With the model's own opacities in each view, the file's colours reach "
                 f"{report['psnr_colors']:.2f} dB; base colours and opacities {report['psnr_base']:.2f} dB.",
                 soft_wrap=True,

@@ -67,9 +67,10 @@ def export_compact(
     )
     if measure:
         numbers |= measure_loss(pipeline, config)
+        lost = round(numbers["loss_db"], 3) + 0.0  # without the sign of a -0.0
         CONSOLE.print(
             f"PSNR on {len(numbers['per_image'])} test views: model {numbers['psnr_model']:.2f} dB, file "
-            f"{numbers['psnr_file']:.2f} dB: it loses {round(numbers['loss_db'], 3) + 0.0:.3f} dB."
+            f"{numbers['psnr_file']:.2f} dB: it loses {lost:.3f} dB."
         )
     CONSOLE.print(f"Read it with:  ns-eval --load-config {config}", markup=False, soft_wrap=True)
     if report is not None:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """`nrfgs prepare PHOTOS OUT`: the stages in order, what each depends on, and the verdict.
 
-A stage is done when OUT/work/state.json says so under the stage's key: a digest of the input's bytes, of the options
-that the stage depends on, and of the stage before it. A stage whose key is known is skipped; one that was begun under
-the same key goes on from what it left; else what it left is removed. Running a stage forgets the ones after it.
+A stage is done when state.json in OUT's folder `work` says so under the stage's key: a digest of the input's bytes, of
+the options that the stage depends on, and of the stage before it. A stage whose key is known is skipped; one that was
+begun under the same key goes on from what it left; else what it left is removed. Running a stage forgets the ones after
+it.
 """
 
 import contextlib
