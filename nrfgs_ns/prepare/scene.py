@@ -17,8 +17,8 @@ import numpy as np
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare.structure import colmap
-from nrfgs_ns.studies.files import write_whole
 
 DOWNSCALES = (2, 4, 8)
 """nerfstudio looks for these copies; it takes the largest whose sides are at most 1600 pixels."""
