@@ -25,6 +25,9 @@ lint: $(VENV)/.installed
 $(VENV)/.installed: pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint requirements.lock --editable '.[dev]'
+	@# nerfstudio brings OpenCV twice, and the one with windows, which a dependency of its asks for, needs libGL.
+	$(BIN)/pip uninstall --quiet --yes opencv-python
+	$(BIN)/pip install --quiet --constraint requirements.lock --no-deps --force-reinstall opencv-python-headless
 	touch $@
 
 clean:
