@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs-data`: nerfstudio's own data sets, checked up front, split by every 8th image, with points read by plyfile;
-and what reads COLMAP's models in its place.
+"""`nrfgs-data`: nerfstudio's own data sets, checked up front, every 8th image for testing, points read by plyfile; and
+what reads COLMAP's models in its place.
 
 Both layouts become one dictionary, that of transforms.json, so that there is one way from it to cameras, and the same
 checks on it.
@@ -48,6 +48,7 @@ from nrfgs_ns.data.colmap import read_model
 from nrfgs_ns.data.pictures import read_header, smaller_copies
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
+from nrfgs_ns.data.split import interior_test_images
 from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
 
@@ -80,10 +81,11 @@ class NrfgsDataParserConfig(NerfstudioDataParserConfig):
 
     _target: type = field(default_factory=lambda: NrfgsDataParser)
     """target class to instantiate"""
-    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    """How to split into train and eval if the data set does not name its own split: fraction (train_split_fraction of
-    them train), filename (train or eval in the name), interval (every eval_interval-th by sorted name is eval,
-    beginning with the first), all (every image is both)."""
+    eval_mode: Literal["interior", "interval", "fraction", "filename", "all"] = "interior"
+    """How to split into train and eval if the data set does not name its own split: interior (every eval_interval-th by
+    sorted name is eval, beginning in the middle of the first eval_interval images), interval (beginning with the first,
+    as in the literature), fraction (train_split_fraction of them train), filename (train or eval in the name), all
+    (every image is both)."""
     load_3D_points: bool = True
     """Whether to start from the points of the data set (ply_file_path, or else colmap/sparse/0)."""
 
@@ -313,6 +315,13 @@ class NrfgsDataParser(DataParser):
         if len(images) == 1:
             return {"train": np.array([0]), "val": np.empty(0, int), "test": np.empty(0, int)}
         config = self.config
+        if config.eval_mode == "interior":
+            if config.eval_interval < 2:
+                raise InputError(
+                    f"--eval-interval is {config.eval_interval}. Give 2 or more, or choose another --eval-mode."
+                )
+            evaluated = np.array(interior_test_images(len(images), config.eval_interval))
+            return {"train": np.setdiff1d(np.arange(len(images)), evaluated), "val": evaluated, "test": evaluated}
         try:
             train, evaluated = {
                 "fraction": lambda: get_train_eval_split_fraction(images, config.train_split_fraction),

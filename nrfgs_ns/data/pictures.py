@@ -107,13 +107,17 @@ def _copy_of(path: Path, size: tuple[int, int], kind: str) -> Path:
 
 
 def _resize(path: Path, size: tuple[int, int], copy: Path, kind: str) -> None:
+    from nrfgs_ns.data.exif import exif_of_copy  # which reads with what is above
+
     picture = read_picture(path) if kind == "images" else read_mask(path)
     sampling = Image.Resampling.LANCZOS if kind == "images" else Image.Resampling.NEAREST
     lossy = kind == "images" and picture.mode == "RGB" and read_format(path) in ("JPEG", "MPO")
+    exif = exif_of_copy(picture.getexif())
     aside = copy.with_name(f"{os.getpid()}{TEMPORARY}")
     try:
         copy.parent.mkdir(parents=True, exist_ok=True)
-        picture.resize(size, sampling).save(aside, "JPEG" if lossy else "PNG", quality=95, compress_level=1)
+        form = "JPEG" if lossy else "PNG"
+        picture.resize(size, sampling).save(aside, form, quality=95, compress_level=1, exif=exif)
         os.replace(aside, copy)
     except OSError as error:
         raise InputError(
