@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs-data`: nerfstudio's own data sets, checked up front, split by every 8th image, with points read by plyfile."""
+"""`nrfgs-data`: nerfstudio's own data sets, checked up front, every 8th image for testing, points read by plyfile."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -31,6 +31,7 @@ from nrfgs_ns.data.checks import (
     warn,
 )
 from nrfgs_ns.data.points import read_colmap, read_ply
+from nrfgs_ns.data.split import interior_test_images
 from nrfgs_ns.errors import InputError
 
 SPLITS = ("train", "val", "test")
@@ -49,10 +50,11 @@ class NrfgsDataParserConfig(NerfstudioDataParserConfig):
 
     _target: type = field(default_factory=lambda: NrfgsDataParser)
     """target class to instantiate"""
-    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    """How to split into train and eval if the data set does not name its own split: fraction (train_split_fraction of
-    them train), filename (train or eval in the name), interval (every eval_interval-th by sorted name is eval,
-    beginning with the first), all (every image is both)."""
+    eval_mode: Literal["interior", "interval", "fraction", "filename", "all"] = "interior"
+    """How to split into train and eval if the data set does not name its own split: interior (every eval_interval-th by
+    sorted name is eval, beginning in the middle of the first eval_interval images), interval (beginning with the first,
+    as in the literature), fraction (train_split_fraction of them train), filename (train or eval in the name), all
+    (every image is both)."""
     load_3D_points: bool = True
     """Whether to start from the points of the data set (ply_file_path, or else colmap/sparse/0)."""
 
@@ -83,11 +85,17 @@ class NrfgsDataParser(Nerfstudio):
             self._check(meta)
             self._meta = meta
         own_config = self.config
+        interior = self._splits_interior(self._meta)
         self.config = self._host_config()
         try:
-            outputs = super()._generate_dataparser_outputs(self._host_split(split))
+            part = self._host_split(split)
+            outputs = super()._generate_dataparser_outputs("train" if interior else part)
         finally:
             self.config = own_config
+        if interior:
+            test = interior_test_images(len(outputs.image_filenames), self.config.eval_interval)
+            train = [index for index in range(len(outputs.image_filenames)) if index not in test]
+            outputs = _select(outputs, train if part == "train" else list(test))
         self._check_outputs(outputs)
         if self._points_wanted and "ply_file_path" not in self._meta:
             # nerfstudio has loaded none. COLMAP's world is the "original" one that dataparser_transform starts from.
@@ -103,6 +111,8 @@ class NrfgsDataParser(Nerfstudio):
             # Without a .ply it would turn to the terminal.
             load_3D_points=self._points_wanted and "ply_file_path" in self._meta,
         )
+        if self._splits_interior(self._meta):
+            return replace(config, eval_mode="fraction", train_split_fraction=1.0)  # everything, for us to choose from
         if len(self._meta["frames"]) > 1:
             return config
         vertical = config.orientation_method == "vertical"  # needs two cameras
@@ -113,6 +123,11 @@ class NrfgsDataParser(Nerfstudio):
             eval_mode="fraction",
             train_split_fraction=1.0,
         )
+
+    def _splits_interior(self, meta: dict[str, Any]) -> bool:
+        """Whether the split is ours, which nerfstudio does not have."""
+        named = any(f"{split}_filenames" in meta for split in SPLITS)
+        return self.config.eval_mode == "interior" and not named and len(meta["frames"]) > 1
 
     def _host_split(self, split: str) -> str:
         """The split that nerfstudio is asked for: itself, or the stand-in for one without images."""
@@ -135,6 +150,10 @@ class NrfgsDataParser(Nerfstudio):
             )
         if config.downscale_factor is not None and config.downscale_factor < 1:
             raise InputError(f"--downscale-factor is {config.downscale_factor}. Give 1 or more, or leave it out.")
+        if config.eval_mode == "interior" and config.eval_interval < 2:
+            raise InputError(
+                f"--eval-interval is {config.eval_interval}. Give 2 or more, or choose another --eval-mode."
+            )
         if self._images_needed and config.downscale_factor is None:
             # nerfstudio chooses the factor by the first image in its full size.
             originals = [source.parent / frame["file_path"] for frame in frames]
@@ -162,8 +181,12 @@ class NrfgsDataParser(Nerfstudio):
         if named:
             return self._count_named(named, images)
         config = self.config
+        if self._splits_interior(meta):
+            evaluated = len(interior_test_images(len(images), config.eval_interval))
+            return {"train": len(images) - evaluated, "val": evaluated, "test": evaluated}
         try:
             train, evaluated = {
+                "interior": lambda: (images, []),  # one image, which is nerfstudio's to treat: see _host_config
                 "fraction": lambda: get_train_eval_split_fraction(images, config.train_split_fraction),
                 "filename": lambda: get_train_eval_split_filename(images),
                 "interval": lambda: get_train_eval_split_interval(images, config.eval_interval),
@@ -267,6 +290,18 @@ class NrfgsDataParser(Nerfstudio):
     ) -> dict[str, torch.Tensor] | None:
         """nerfstudio's hook for the points of ply_file_path, [3, 4] and a factor away from the parsed world."""
         return self._placed(transform_matrix, scale_factor)
+
+
+def _select(outputs: DataparserOutputs, indices: list[int]) -> DataparserOutputs:
+    """The part of a data set whose images have these indices."""
+    depths = outputs.metadata.get("depth_filenames")
+    return replace(
+        outputs,
+        image_filenames=[outputs.image_filenames[i] for i in indices],
+        mask_filenames=outputs.mask_filenames and [outputs.mask_filenames[i] for i in indices],
+        cameras=outputs.cameras[torch.tensor(indices)],
+        metadata={**outputs.metadata, "depth_filenames": depths and [depths[i] for i in indices]},
+    )
 
 
 nrfgs_dataparser = DataParserSpecification(
