@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far photographs disagree about how bright, and of what colour, the same points are.
 
-A point of the reconstruction is looked up in the photographs that see it. Photographs taken next to each other have most
-points in common, and see them under almost the same angle. Their light differs by a shift, in stops:
+A point of the reconstruction is looked up in the photographs that see it. Photographs taken next to each other have
+most points in common, and see them under almost the same angle. Their light differs by a shift, in stops:
 
 - If exposure or white balance changed, by the same shift all over the picture.
 - If surfaces shine, points are occluded or the sun has moved, by other shifts in other parts of the picture.
