@@ -21,10 +21,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare import photos as files
 from nrfgs_ns.prepare import structure
 from nrfgs_ns.prepare.structure import CameraModel
-from nrfgs_ns.studies.files import write_whole
 
 STAGES = ("import", "features", "match", "map", "undistort", "write")
 """In the order of work; each builds on the one before it."""
@@ -163,7 +163,7 @@ class Run:
         registered = len(list((self.undistorted / "images").iterdir()))
         with self.stage("write", "write the scene", made, registered) as advance:
             if advance is not None:
-                write_scene(self.undistorted, self.out, lambda: advance(1))
+                write_scene(self.undistorted, self.stored, self.out, lambda: advance(1))
 
     @contextlib.contextmanager
     def stage(

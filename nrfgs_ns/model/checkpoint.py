@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a checkpoint must satisfy before it is loaded, and what torch must allow for it to be read at all."""
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from nrfgs_ns.appearance.head import AppearanceHeadConfig
+from nrfgs_ns.errors import InputError
+
+
+def allow_nerfstudio_checkpoints() -> None:
+    """Let `torch.load(weights_only=True)`, the default since torch 2.6, read nerfstudio's checkpoints.
+
+    They hold the learning-rate schedulers' state, in which learning rates are numpy scalars. These three types are
+    plain data; nothing that could run code is allowed.
+    """
+    scalar = np._core.multiarray.scalar if hasattr(np, "_core") else np.core.multiarray.scalar
+    torch.serialization.add_safe_globals(
+        [scalar, (scalar, "numpy.core.multiarray.scalar"), np.dtype, np.dtypes.Float64DType]
+    )
+
+
+def reduced_config(config: AppearanceHeadConfig, state: Mapping[str, Any]) -> AppearanceHeadConfig:
+    """The configuration of the head that a checkpoint was written with.
+
+    Args:
+        config: the model's.
+        state: the checkpoint's state of the model; its "capacity" says in which options its head differs, if it does.
+    """
+    found = state.get("_extra_state", {}).get("capacity", {}).get("head", {})
+    is_this_head = found.keys() <= {one.name for one in fields(config)}
+    return replace(config, **found) if is_this_head else config
+
+
+def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint that this model cannot hold.
+
+    Args:
+        model: an NrfgsModel.
+        state: the checkpoint's state of the model. Tensors under "gauss_params." may have any number of rows.
+
+    Raises:
+        InputError: naming the first tensor that is missing, unknown, of another shape or not finite, and the mend.
+    """
+    written_by = state.get("_extra_state", {}).get("head", "another method")
+    same = f"Both have the '{written_by}' head, but of another size or with other switches."
+    other = f"The checkpoint was written by the '{written_by}' head and this model has the '{model.head.name}' head."
+    mend = (
+        f"{same if written_by == model.head.name else other} Use the config.yml that was saved beside the checkpoint "
+        "(--load-config), or the same method and --pipeline.model.appearance options as in that training."
+    )
+    expected = {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
+    given = {name: value for name, value in state.items() if isinstance(value, Tensor)}
+    splats_first = sorted(expected, key=lambda name: not name.startswith("gauss_params."))
+    for name in splats_first:
+        if name not in given:
+            raise InputError(f"The checkpoint has no '{name}'. {mend}")
+        rows = 1 if name.startswith("gauss_params.") else 0
+        if given[name].shape[rows:] != expected[name].shape[rows:]:
+            raise InputError(
+                f"The checkpoint's '{name}' is of shape {list(given[name].shape)}, this model's of shape "
+                f"{list(expected[name].shape)}. {mend}"
+            )
+    for name in given:
+        if name not in expected:
+            raise InputError(f"The checkpoint has '{name}', which this model does not know. {mend}")
+    for name, value in given.items():
+        if value.numel() > 0 and not torch.isfinite(value).all():
+            rows = (~torch.isfinite(value)).reshape(len(value), -1).any(dim=1).nonzero().flatten().tolist()
+            raise InputError(
+                f"The checkpoint's '{name}' is not finite in {len(rows)} of {len(value)} rows, first row {rows[0]}. "
+                "Load an older checkpoint (--load-step)."
+            )

@@ -1,0 +1,400 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs to a posed scene: what is collected, what is refused, what is taken up again, and whether it is right."""
+
+import io
+import json
+import math
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+from rich.console import Console
+
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.exif import read_exif
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.prepare import photos, structure
+from nrfgs_ns.prepare.verb import Prepare, Run
+
+pytest.importorskip("pycolmap")
+
+
+def photo(path: Path, size: tuple[int, int] = (40, 30), colour: str = "grey", **options) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, colour).save(path, **options)
+    return path
+
+
+# Two textured walls, one before the other, seen by cameras that step sideways and turn a little.
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
+
+
+def walk(count: int) -> list[np.ndarray]:
+    """Camera-to-world matrices, x right, y down, z forward."""
+    poses = []
+    for i in range(count):
+        pose, turn = np.eye(4), -0.05 * (i - (count - 1) / 2)
+        pose[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
+        pose[:3, 3] = 0.45 * (i - (count - 1) / 2), 0.15 * (-1) ** i, 0.1 * (i % 3)
+        poses.append(pose)
+    return poses
+
+
+def render_walls(pose: np.ndarray) -> Image.Image:
+    """Noise of three sizes on a wall at depth 6 and on a smaller one at depth 4, looked up at the nearest texel."""
+    rng = np.random.default_rng(0)
+    texture = sum(
+        np.asarray(
+            Image.fromarray(rng.random((n, n)).astype(np.float32)).resize((1024, 1024), Image.Resampling.BICUBIC)
+        )
+        for n in (32, 96, 256)
+    )
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    rays = np.stack([u / FOCAL, v / FOCAL, np.ones_like(u)], axis=-1) @ pose[:3, :3].T
+    image = np.zeros((HEIGHT, WIDTH))
+    for depth, half in ((6.0, 20.0), (4.0, 1.0)):
+        hit = pose[:3, 3] + rays * ((depth - pose[2, 3]) / rays[..., 2:])
+        inside = (np.abs(hit[..., :2]) < half).all(axis=-1)
+        texel = (hit[..., :2] * 110 + 37 * depth).astype(int) % 1024
+        image = np.where(inside, texture[texel[..., 1], texel[..., 0]], image)
+    return Image.fromarray(np.uint8(np.clip(255 * (image / 3 * 1.8 - 0.4), 0, 255))).convert("RGB")
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("walls") / "photos"
+    folder.mkdir()
+    for i, pose in enumerate(walk(6)):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base.ExposureTime: 1 / (100 + i)})
+        render_walls(pose).save(
+            folder / f"IMG {i:02d}.png", exif=exif.tobytes()
+        )  # a blank in the name, as phones write them
+    return folder
+
+
+@pytest.fixture(scope="module")
+def prepared(walls, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("out") / "scene"
+    Prepare(walls, out).main()
+    return out
+
+
+def run_quietly(source: Path, out: Path, **options) -> str:
+    """Run the verb; what it says."""
+    screen = Console(record=True, width=200, file=io.StringIO())
+    run = Run(Prepare(source, out, **options), screen)
+    for stage in (run.import_input, run.find_features, run.match, run.map, run.undistort, run.write, run.verdict):
+        stage()
+    return screen.export_text()
+
+
+def aligned(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position errors [V] in the units of `given`, and angles [V] in degrees, of poses [V, 4, 4] after the similarity
+    that brings their centres closest (Umeyama 1991)."""
+    x, y = found[:, :3, 3], given[:, :3, 3]
+    u, s, vt = np.linalg.svd((y - y.mean(0)).T @ (x - x.mean(0)))
+    flip = np.diag([1, 1, np.linalg.det(u @ vt)])
+    rotation = u @ flip @ vt
+    scale = (s * np.diag(flip)).sum() / ((x - x.mean(0)) ** 2).sum()
+    errors = np.linalg.norm(scale * (x - x.mean(0)) @ rotation.T + y.mean(0) - y, axis=1)
+    cosines = (np.einsum("ab,vbc,vac->v", rotation, found[:, :3, :3], given[:, :3, :3]) - 1) / 2
+    return errors, np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+# The whole way, in small.
+
+
+def test_recovered_cameras_are_those_that_rendered(prepared):
+    meta = json.loads((prepared / "transforms.json").read_text())
+    assert len(meta["frames"]) == 6
+    assert meta["fl_x"] / meta["w"] == pytest.approx(FOCAL / WIDTH, rel=0.03)
+    opencv = np.diag([1, -1, -1, 1])
+    found = np.array([frame["transform_matrix"] for frame in meta["frames"]]) @ opencv
+    errors, angles = aligned(found, np.stack(walk(6)))
+    # Texels are 1/110 wide: looked up at the nearest, features lie within half of one of the truth, 0.3 px at depth
+    # 4.5, and hundreds of them leave less. A pixel is 0.2 degrees, and 0.02 at depth 6; the path is 2.25 long.
+    assert errors.max() < 0.05 and angles.max() < 0.6
+
+
+def test_the_scene_is_read_by_the_data_parser(prepared):
+    outputs = NrfgsDataParserConfig(data=prepared).setup().get_dataparser_outputs("train")
+    test = NrfgsDataParserConfig(data=prepared).setup().get_dataparser_outputs("test")
+    assert [path.name for path in outputs.image_filenames] == [f"IMG_{i:02d}.png" for i in (0, 1, 3, 4, 5)]
+    assert [path.name for path in test.image_filenames] == ["IMG_02.png"]
+    assert len(outputs.metadata["points3D_xyz"]) > 100
+    verdict = json.loads((prepared / "prepare.json").read_text())
+    assert verdict["registered"] == verdict["photographs"] == 6
+    assert verdict["points"] == len(outputs.metadata["points3D_xyz"]) and 0 < verdict["mean_reprojection_error_px"] < 1
+    for factor in (2, 4, 8):  # the cameras of a copy have its size
+        config = NrfgsDataParserConfig(data=prepared, downscale_factor=factor)
+        smaller = config.setup().get_dataparser_outputs("train")
+        with Image.open(smaller.image_filenames[0]) as image:
+            assert image.size == (int(smaller.cameras.width[0]), int(smaller.cameras.height[0]))
+            assert f"images_{factor}" in str(smaller.image_filenames[0])
+
+
+def test_how_a_photograph_was_taken_stays_with_it(prepared):
+    for i, frame in enumerate(json.loads((prepared / "transforms.json").read_text())["frames"]):
+        assert frame["exif"] == {"exposure_time": pytest.approx(1 / (100 + i))}
+        for folder in ("images_2", "images_8"):  # COLMAP keeps it in images, of JPEGs
+            assert read_exif(prepared / folder / Path(frame["file_path"]).name) == frame["exif"], folder
+
+
+def test_points_are_where_the_cameras_see_them(prepared):
+    """The foremost wall is at two thirds of the depth of the other, in the file's own units."""
+    from nrfgs_ns.data.points import read_ply
+
+    xyz, rgb = read_ply(prepared / "sparse.ply")
+    meta = json.loads((prepared / "transforms.json").read_text())
+    world_to_camera = np.linalg.inv(np.array(meta["frames"][2]["transform_matrix"]))
+    depth = -(xyz @ world_to_camera[:3, :3].T + world_to_camera[:3, 3])[:, 2]
+    assert (depth > 0).all(), "nerfstudio's cameras look along -z"
+    far = np.median(depth)
+    near = depth[depth < 0.85 * far]
+    # Camera 2 stands 0.2 before the origin and turns by 1.4 degrees: depths 3.8 and 5.8 on its axis.
+    assert len(near) > 20 and np.median(near) / far == pytest.approx(3.8 / 5.8, abs=0.05)
+    assert len(np.unique(rgb)) > 20
+
+
+def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, tmp_path, monkeypatch):
+    out, source = tmp_path / "scene", tmp_path / "photos"
+    shutil.copytree(prepared, out)
+    shutil.copytree(walls, source)
+    for name in ("extract_features", "match_features", "map_incrementally", "undistort"):
+        monkeypatch.setattr(structure, name, None)
+    said = run_quietly(source, out)
+    assert said.count("done before") == 6 and "6 of 6 photographs" in said
+
+    with pytest.raises(TypeError):  # another option: everything from the features on, whose function is gone
+        run_quietly(source, out, features=100)
+    with pytest.raises(TypeError):  # and back: what was overwritten is not taken for finished
+        run_quietly(source, out)
+    shutil.rmtree(out)
+    shutil.copytree(prepared, out)
+    (source / "IMG 03.png").write_bytes((source / "IMG 02.png").read_bytes())
+    with pytest.raises(TypeError):
+        run_quietly(source, out)
+    stored = [path.read_bytes() for path in sorted((out / "work" / "photos").iterdir())]
+    assert stored[2] == stored[3], "the changed photograph was taken in"
+    assert json.loads((out / "work" / "state.json").read_text())["features"]["done"] is False
+
+
+def test_interrupted_features_are_taken_up(walls, tmp_path, monkeypatch):
+    """Killed after the first photographs: COLMAP is then asked for all, and keeps what its database has."""
+    real, calls = structure.colmap().extract_features, []
+
+    def dying(*args, **options):
+        calls.append(options["image_names"])
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        real(*args, **options)
+
+    monkeypatch.setattr(structure.os, "cpu_count", lambda: 4)
+    run = Run(Prepare(walls, tmp_path / "scene"), Console(quiet=True))
+    run.import_input()
+    monkeypatch.setattr(structure.colmap(), "extract_features", dying)
+    with pytest.raises(KeyboardInterrupt):
+        run.find_features()
+    monkeypatch.setattr(structure.colmap(), "extract_features", real)
+
+    def with_features() -> list[bool]:
+        with structure.colmap().Database.open(run.database) as database:
+            assert database.num_cameras() == 1
+            return [database.exists_keypoints(image.image_id) for image in database.read_all_images()]
+
+    assert with_features() == [True] * 4
+    run = Run(Prepare(walls, tmp_path / "scene"), Console(quiet=True))
+    run.import_input()
+    run.find_features()
+    assert with_features() == [True] * 6
+
+
+# Advice where it fails.
+
+
+def test_photographs_that_show_nothing_in_common_are_told(tmp_path):
+    for i in range(3):
+        photo(tmp_path / "photos" / f"{i}.png", (120, 90), ("red", "green", "blue")[i])
+    with pytest.raises(InputError, match="no two of the 3 photographs show the same"):
+        run_quietly(tmp_path / "photos", tmp_path / "out")
+
+
+def test_a_camera_that_only_turns_is_told(prepared, walls, tmp_path, monkeypatch):
+    """COLMAP then has matches and no pair to begin with."""
+    monkeypatch.setattr(structure, "map_incrementally", lambda *_: 0)
+    out = tmp_path / "scene"
+    shutil.copytree(prepared, out)
+    shutil.rmtree(out / "work" / "model")
+    with pytest.raises(InputError, match="far enough apart"):
+        run_quietly(walls, out)
+
+
+def test_a_poor_reconstruction_comes_with_advice(prepared, walls):
+    run = Run(Prepare(walls, prepared))
+    run.state["models"] = 2
+    assert list(run._advice(6, 6, 0.5)) == []
+    poor = " ".join(run._advice(3, 6, 2.0))
+    assert "2 groups" in poor and "--features" in poor and "OPENCV" in poor
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda d: None, "no such folder"),
+        (lambda d: d.mkdir(), "holds no photographs"),
+        (lambda d: photo(d / "more" / "a.jpg"), "Name the subfolder"),
+        (lambda d: (d.mkdir(), (d / "a.HEIC").touch()), "HEIC"),
+        (lambda d: (d.mkdir(), (d / "a.mp4").touch()), "name that file itself"),
+        (lambda d: [photo(d / f"{i}.jpg") for i in range(2)], "2 photographs; at least 3"),
+        (lambda d: d.write_text("no video"), "neither a folder of photographs nor a video"),
+    ],
+)
+def test_inputs_that_cannot_do_are_refused(make, said, tmp_path):
+    make(tmp_path / "in")
+    with pytest.raises(InputError, match=said):
+        photos.find_inputs(tmp_path / "in")
+
+
+def test_unreadable_photographs_and_foreign_folders_are_named(tmp_path):
+    folder = tmp_path / "in"
+    for i in range(3):
+        photo(folder / f"{i}.jpg")
+    whole = (folder / "1.jpg").read_bytes()
+    for broken in (b"junk", whole[: len(whole) // 2]):
+        (folder / "1.jpg").write_bytes(broken)
+        with pytest.raises(InputError, match=r"1\.jpg cannot be read"):
+            Run(Prepare(folder, tmp_path / "out"), Console(quiet=True)).import_input()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "precious.txt").touch()
+    with pytest.raises(InputError, match="was not made by"):
+        Run(Prepare(folder, tmp_path / "mine"))
+    with pytest.raises(InputError, match="--features is 1"):
+        Run(Prepare(folder, tmp_path / "out", features=1))
+
+
+def test_a_missing_package_is_told_with_its_mend(tmp_path, monkeypatch):
+    for i in range(3):
+        photo(tmp_path / "in" / f"{i}.jpg")
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(InputError, match="pip install pycolmap"):
+        Run(Prepare(tmp_path / "in", tmp_path / "out"))
+
+
+def test_the_verb_says_it_in_one_line(tmp_path, monkeypatch):
+    from nrfgs_ns.cli import entrypoint
+
+    monkeypatch.setattr(sys, "argv", ["nrfgs", "prepare", str(tmp_path / "none"), str(tmp_path / "out")])
+    with pytest.raises(SystemExit, match="^nrfgs: .*no such folder or video"):
+        entrypoint()
+
+
+# Collecting.
+
+
+def test_photographs_are_kept_or_made_upright(tmp_path):
+    plain = photo(tmp_path / "a b.JPG")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Model] = 6, "Camera"
+    turned = photo(tmp_path / "c.jpg", (40, 30), exif=exif)
+    Image.new("RGBA", (40, 30), (255, 0, 0, 0)).save(tmp_path / "d.png")
+    photo(tmp_path / "e.bmp")
+    paths = [plain, turned, tmp_path / "d.png", tmp_path / "e.bmp"]
+    done = []
+    photos.import_photos(paths, tmp_path / "stored" / "photos", lambda: done.append(1))
+    stored = {path.name: path for path in (tmp_path / "stored" / "photos").iterdir()}
+    assert set(stored) == {"a_b.jpg", "c.jpg", "d.png", "e.png"} and len(done) == 4
+    assert stored["a_b.jpg"].read_bytes() == plain.read_bytes(), "not encoded a second time"
+    with Image.open(stored["c.jpg"]) as image:
+        assert image.size == (30, 40) and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+        assert image.getexif()[ExifTags.Base.Model] == "Camera", "the lens is a first guess of the focal length"
+    with Image.open(stored["d.png"]) as image:
+        assert image.mode == "RGB" and image.getpixel((0, 0)) == (255, 255, 255)
+
+
+def test_names_stay_different():
+    names = photos.stored_names([Path("a b.jpg"), Path("a_b.jpg"), Path("a_b.jpeg")])
+    assert len(set(names)) == 3
+
+
+def test_one_camera_only_where_everything_agrees(tmp_path):
+    photo(tmp_path / "a.jpg")
+    photo(tmp_path / "b.jpg")
+    assert photos.same_camera(tmp_path, ["a.jpg", "b.jpg"])
+    photo(tmp_path / "b.jpg", (30, 40))
+    assert not photos.same_camera(tmp_path, ["a.jpg", "b.jpg"])
+
+
+def test_the_sharpest_frame_of_each_piece_of_a_video_is_taken(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
+    rng = np.random.default_rng(0)
+    for index in range(12):  # in each piece of 3 the second frame is sharp, the others are grey
+        grey = np.full((48, 64, 3), 40 + 10 * (index // 3), np.uint8)
+        writer.write(rng.integers(0, 255, grey.shape, dtype=np.uint8) if index % 3 == 1 else grey)
+    writer.release()
+    done = []
+    photos.import_video(tmp_path / "v.avi", tmp_path / "frames", 4, lambda: done.append(1))
+    frames = sorted((tmp_path / "frames").iterdir())
+    assert [path.name for path in frames] == [f"frame_{i:05d}.jpg" for i in range(4)] and len(done) == 4
+    assert all(np.asarray(Image.open(path)).std() > 30 for path in frames)
+    (tmp_path / "broken.mp4").write_bytes(b"no video")
+    with pytest.raises(InputError, match=r"broken\.mp4: OpenCV finds 0 frames"):
+        photos.import_video(tmp_path / "broken.mp4", tmp_path / "none", 4, lambda: None)
+
+
+def test_a_video_without_a_decoder_is_told(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(InputError, match="opencv-python-headless"):
+        photos.import_video(tmp_path / "v.mp4", tmp_path / "frames", 4, lambda: None)
+
+
+def test_which_pairs_are_matched():
+    numbered = [f"IMG_{i:04d}.jpg" for i in range(300)]
+    assert structure.choose_matching(numbered[:100], False) == "exhaustive"
+    assert structure.choose_matching(numbered, False) == "sequential"
+    assert structure.choose_matching(numbered[::2], False) == "sequential"  # every other one was thrown away
+    assert structure.choose_matching(numbered[::4], True) == "exhaustive"
+    scattered = [f"IMG_{i * i:06d}.jpg" for i in range(300)]
+    assert structure.choose_matching(scattered, False) == "exhaustive"
+    assert structure.choose_matching(scattered, True) == "sequential"
+
+    assert len(structure.pairs_of(20, "exhaustive")) == 190
+    pairs = structure.pairs_of(300, "sequential")
+    assert len(set(pairs)) == len(pairs) and all(0 <= a < b < 300 for a, b in pairs)
+    assert {(0, 10), (7, 23), (0, 299), (0, 256)} <= set(pairs) and (0, 11) not in pairs
+    assert len(pairs) < 0.12 * 300 * 299 / 2
+    assert structure.pairs_of(5, "sequential") == structure.pairs_of(5, "exhaustive")
+
+
+# The whole way, on real photographs.
+
+
+@pytest.mark.slow
+def test_a_real_capture_is_recovered(captures, tmp_path):
+    """Every second photograph of `fox` at two thirds of its size, against the poses that the capture came with."""
+    given = json.loads((captures / "fox" / "transforms.json").read_text())
+    frames = sorted(given["frames"], key=lambda frame: frame["file_path"])[::2]
+    (tmp_path / "photos").mkdir()
+    for frame in frames:
+        with Image.open(captures / "fox" / frame["file_path"]) as image:
+            small = image.resize((image.width * 2 // 3, image.height * 2 // 3), Image.Resampling.LANCZOS)
+            small.save(tmp_path / "photos" / Path(frame["file_path"]).name, quality=95)
+    Prepare(tmp_path / "photos", tmp_path / "scene").main()
+    verdict = json.loads((tmp_path / "scene" / "prepare.json").read_text())
+    assert verdict["registered"] == len(frames) and verdict["mean_reprojection_error_px"] < 1
+    meta = json.loads((tmp_path / "scene" / "transforms.json").read_text())
+    assert meta["fl_x"] / meta["w"] == pytest.approx(given["fl_x"] / given["w"], rel=0.02)
+    found = np.array([frame["transform_matrix"] for frame in meta["frames"]])
+    truth = np.array([frame["transform_matrix"] for frame in frames])
+    errors, angles = aligned(found, truth)
+    # Two reconstructions of one capture, each to about half a pixel: 0.15 degrees for a feature at this size, and the
+    # hundreds in an image average. What remains is the lens: 2 % of focal length trade against depth, and half a
+    # degree of view direction against the principal point. Hence 1 % of the camera path, and 1.5 degrees.
+    assert errors.max() < 0.01 * np.ptp(truth[:, :3, 3], axis=0).max() and angles.max() < 1.5
+    outputs = NrfgsDataParserConfig(data=tmp_path / "scene").setup().get_dataparser_outputs("train")
+    assert len(outputs.image_filenames) == 21 and len(outputs.metadata["points3D_xyz"]) == verdict["points"]
