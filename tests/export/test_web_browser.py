@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pages of `nrfgs export web` in a real browser, without a network and without a GPU.
 
-    pip install -e '.[browser]'; apt-get install chromium; pytest -m browser tests/export
+pip install -e '.[browser]'; apt-get install chromium; pytest -m browser tests/export
 """
 
 import base64
@@ -442,9 +442,7 @@ def web_server(folder: Path):
         def log_message(self, *_):
             pass
 
-    with http.server.ThreadingHTTPServer(
-        ("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))
-    ) as server:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
@@ -458,7 +456,11 @@ def test_a_folder_on_a_web_server(browser, tmp_path):
     with web_server(folder) as address:
         page = Page(browser, f"{address}/").begun()
         assert psnr(page.picture(), rendered(scene, photographs[0])) >= ALIKE
-        assert {url.rsplit("/", 1)[1] for url in page.requests if url.startswith("http")} <= {"", "scene.nrf", "favicon.ico"}
+        assert {url.rsplit("/", 1)[1] for url in page.requests if url.startswith("http")} <= {
+            "",
+            "scene.nrf",
+            "favicon.ico",
+        }
         page.page.close()
         scene.unlink()
         page = Page(browser, f"{address}/")

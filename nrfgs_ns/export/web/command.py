@@ -21,6 +21,7 @@ from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.compact import PLY_BYTES, check_options, chosen_field, measure_loss, write_config
 from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.export.web.options import WebOptions
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import whole
 from nrfgs_ns.image.metrics import psnr
@@ -40,8 +41,7 @@ def export_web(
     load_config: Path,
     output: Path,
     options: CompactOptions,
-    title: str | None,
-    author: str,
+    web: WebOptions,
     measure: bool,
     report: Path | None,
 ) -> None:
@@ -63,8 +63,8 @@ def export_web(
         )
     if (vectors := weight_vectors(model.head.config)) > MOST_WEIGHTS:
         raise InputError(
-            f"--load-config {load_config}: the field's weights fill {vectors} vectors of a shader, and phones have room "
-            f"for {MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
+            f"--load-config {load_config}: the field's weights fill {vectors} vectors of a shader, and some phones "
+            f"have room for {MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
         )
     field, threshold = chosen_field(pipeline, load_config, options)
     render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
@@ -75,7 +75,8 @@ def export_web(
         scene_bytes = write_container(file, header, streams)
         scene = file.read_bytes()
         losses = measure_loss(pipeline, write_config(load_config, file)) if measure else {}
-    text = page(about, poster, scene if alone else SCENE, output.stem if title is None else title, author)
+    title = output.stem if web.title is None else web.title
+    text = page(about, poster, scene if alone else SCENE, title, web.author)
     written = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
     for path, content in written.items():
         write(path, content)
