@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command that gives a good result in ten minutes where there is no CUDA device. No nerfstudio here: asked early."""
+"""The command that gives a good result in ten minutes without a CUDA device. No nerfstudio here: it is asked early."""
 
 import shlex
 from pathlib import Path
