@@ -97,7 +97,11 @@ def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor]
                 raise ValueError(f"the {part} of the grid of {name} is not {count} numbers")
         if not (np.asarray(header["grids"][name]["step"]) > 0).all():
             raise ValueError(f"the step of the grid of {name} is not positive")
-    with torch.device("meta"):  # shapes without numbers
+    if config.hidden_width > weights["low.0.weight"].shape[0]:
+        raise ValueError(
+            f"head.low.0.weight of shape {list(weights['low.0.weight'].shape)} with {config.hidden_width} hidden units"
+        )
+    with torch.random.fork_rng(devices=[]):  # whose numbers are not looked at
         shapes = {name: list(value.shape) for name, value in config.setup().state_dict().items()}
     for name in shapes.keys() | weights.keys():
         found = list(weights[name].shape) if name in weights else "none"
