@@ -4,10 +4,12 @@
 `test_browser_viewer.py` clicks through the same in a real browser.
 """
 
+import shutil
 import threading
 import urllib.request
 from contextlib import nullcontext
 from itertools import combinations
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,7 +23,6 @@ from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
-from short_trainings import command_line, trained
 from torch.testing import assert_close
 from viser.transforms import SO3
 
@@ -34,6 +35,7 @@ from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.export import Export, read_splats
+from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.studies.run import parse
 from nrfgs_ns.viewer import BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture, scaled_depth, view_dependence
 
@@ -270,20 +272,13 @@ def test_page_is_served_and_every_output_can_be_shown(build, open_viewer, method
 
 
 @pytest.fixture
-def reduced(tiny_scene, tmp_path):
+def reduced(tmp_path, monkeypatch):
     """config.yml of a training that left a reduced field, of whose splats some are diffuse."""
-    options = {
-        "--pipeline.model.num-downscales": 0,
-        "--pipeline.model.appearance.output-init": "default",
-        "--pipeline.model.warmup-steps": 0,
-        "--pipeline.model.capacity": "auto",
-        "--pipeline.model.capacity-search.step": 2,
-        "--pipeline.model.capacity-search.settle": 2,
-        "--pipeline.model.capacity-search.tolerance-db": 100.0,
-        "--pipeline.model.diffuse.start": 4,
-        "--pipeline.model.diffuse.threshold": 1.0,
-    }
-    return trained(command_line("nrfgs", tiny_scene, tmp_path, 6, options))
+    write_scene(SceneConfig(views=10, width=48, height=36, points=60, samples=1), tmp_path / "scene")
+    config = Path("outputs/reduced/nrfgs/before/config.yml")
+    shutil.copytree(Path(__file__).parent / "fixtures" / "saved_0_1_0" / "reduced", tmp_path / config.parent)
+    monkeypatch.chdir(tmp_path)
+    return config
 
 
 def test_ns_viewer_and_export_take_a_reduced_checkpoint(reduced, tmp_path, monkeypatch):

@@ -134,30 +134,31 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return [self._view(index) for index in indices], self._image(indices[own])
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """One training camera and its image, as `next_train` gives them, out of turn; it may be one set aside."""
+        """One training camera and its image, as `next_train` gives them, out of turn; it may be one held out."""
         return self._view(index), self._image(index)
 
     @cached_property
-    def views_aside(self) -> list[int]:
-        """Training views whose turn does not come; none unless `set_views_aside` says so."""
+    def held_out_views(self) -> list[int]:
+        """Training views whose turn does not come; none unless `hold_out` says so."""
         return []
 
-    def set_views_aside(self, indices: list[int]) -> None:
-        """Keep some training views, but not all, from being trained on until they are given back."""
-        self.views_aside = sorted(indices)
-        self.train_unseen_cameras = [i for i in self.train_unseen_cameras if i not in self.views_aside]
+    def hold_out(self, indices: list[int]) -> None:
+        """Keep some training views, but not all, from being trained on until they are given back (`data/views.py` says
+        which). What they say of a model is no test, and may decide a setting."""
+        self.held_out_views = sorted(indices)
+        self.train_unseen_cameras = [i for i in self.train_unseen_cameras if i not in self.held_out_views]
         if not self.train_unseen_cameras:
             self.train_unseen_cameras = self._next_round()
 
     def give_back_views(self) -> None:
         """Train on all views again, from the next round on."""
-        self.views_aside = []
+        self.held_out_views = []
 
     def _next_round(self) -> list[int]:
         """Training cameras in the order of their turns."""
         order: list[int] = []
-        while not order:  # the strategy fps takes some views only, and may take none but those set aside
-            order = [index for index in self.sample_train_cameras() if index not in self.views_aside]
+        while not order:  # the strategy fps takes some views only, and may take none but those held out
+            order = [index for index in self.sample_train_cameras() if index not in self.held_out_views]
         return order
 
     def _next_index(self) -> int:
@@ -202,7 +203,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             "strategy": self.config.train_cameras_sampling_strategy,
             "num_images": len(self.train_dataset),
             "unseen_cameras": list(self.train_unseen_cameras),
-            "views_aside": list(self.views_aside),
+            "views_aside": list(self.held_out_views),
         }
         if state["strategy"] == "random":
             return {**state, "generator": self.random_generator.getstate()}
@@ -231,7 +232,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
                 f"{state['strategy']}. Set it back, or train anew."
             )
         self.train_unseen_cameras = list(state["unseen_cameras"])
-        self.views_aside = list(state.get("views_aside", []))  # older checkpoints have none
+        self.held_out_views = list(state.get("views_aside", []))  # older checkpoints have none
         if state["strategy"] == "random":
             version, words, gauss = state["generator"]
             self.random_generator = random.Random()
