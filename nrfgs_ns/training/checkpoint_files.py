@@ -223,8 +223,8 @@ def _bytes_in(content: Any) -> int:
 def _no_room(folder: Path, step: int, needed: int, free: int) -> str:
     kept = next(iter(find(folder).values()), None)
     return (
-        f"The disk of {folder} is full: the checkpoint of step {step} takes {needed / 1e6:,.0f} MB, and {free / 1e6:,.0f} MB "
-        f"are free. {f'Kept: {kept}.' if kept else 'None has been written before.'} Make room on it."
+        f"The disk of {folder} is full: the checkpoint of step {step} takes {needed / 1e6:,.0f} MB, and "
+        f"{free / 1e6:,.0f} MB are free. {f'Kept: {kept}.' if kept else 'None has been written before.'} Make room."
     )
 
 
