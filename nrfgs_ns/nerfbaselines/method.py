@@ -25,7 +25,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
 
-from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model import NrfgsModel
 from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory

@@ -29,7 +29,7 @@ from nerfstudio.utils import profiler
 from torch import nn
 
 import nrfgs_ns
-from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.studies.files import write_whole
 
 

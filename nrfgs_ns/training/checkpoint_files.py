@@ -11,7 +11,6 @@ import re
 import secrets
 import shutil
 import time
-import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -22,7 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.data.checks import warn
+from nrfgs_ns.errors import ForTheUser, InputError
 
 NAME = re.compile(r"step-(\d{9,})\.ckpt")
 """What checkpoints are called; other files in their folder are not looked at."""
@@ -32,7 +32,7 @@ ABANDONED = 3600.0
 """Seconds after which a file that was being written is taken for that of a process that was killed."""
 
 
-class DiskFull(OSError):
+class DiskFull(ForTheUser, RuntimeError):
     """A checkpoint found no room. The message says what was kept."""
 
 
@@ -130,6 +130,20 @@ def read(path: Path) -> dict[str, Any]:
     return content
 
 
+def read_or_refuse(path: Path) -> dict[str, Any]:
+    """As `read`.
+
+    Raises:
+        InputError: there is no such file, or it is damaged.
+    """
+    try:
+        return read(path)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file. Check the path that --load-checkpoint names.") from error
+    except Damaged as damage:
+        raise InputError(f"{path} is damaged: {damage}. Restore it from a copy, or take an older one.") from damage
+
+
 def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, Any]]:
     """Read a folder's last checkpoint; where that is damaged the one before, with a warning.
 
@@ -153,7 +167,7 @@ def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, 
             damages.append(f"{path} is damaged: {damage}.")
             continue
         if damages:
-            warnings.warn(f"{' '.join(damages)} Taking the one before, {path.name}.", stacklevel=2)
+            warn(f"{' '.join(damages)} Taking the one before, {path.name}.")
         return path, content
     raise InputError(f"{' '.join(damages)} Restore it from a copy, or train anew.")
 

@@ -31,14 +31,18 @@ class StopRequest:
 
     Attributes:
         signal: the first that was heard; None: the training goes on.
+        is_over: whether the training has ended, so that signals end the process as usual.
     """
 
     def __init__(self):
         self.signal: signal.Signals | None = None
+        self.is_over = False
         self._heard_at = 0.0
 
     def hear(self, number: int, frame: object = None) -> None:
         """A signal has come. Called between two of Python's instructions, in the main thread."""
+        if self.is_over:
+            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
         if self.signal is None:
             self.signal, self._heard_at = signal.Signals(number), monotonic()
             if self.signal.name == "SIGHUP":

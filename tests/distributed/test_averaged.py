@@ -10,7 +10,7 @@ import torch
 from torch.testing import assert_close
 
 from nrfgs_ns.averaging import ParameterMean
-from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.distributed.averaging import ShardedMean
 
 SPLATS = "gauss_params."
