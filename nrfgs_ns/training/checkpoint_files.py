@@ -125,7 +125,7 @@ def read(path: Path) -> dict[str, Any]:
         raise
     except Exception as error:  # whatever damage makes of a zip archive and of a pickle within
         raise Damaged(str(error).splitlines()[0][:200] if str(error) else type(error).__name__) from error
-    if not isinstance(content, dict) or not {"step", "pipeline", "optimizers"} <= content.keys():
+    if not isinstance(content, dict) or not {"step", "pipeline"} <= content.keys():
         raise Damaged("it is not a checkpoint of nerfstudio")
     return content
 

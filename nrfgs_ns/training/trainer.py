@@ -221,7 +221,7 @@ class NrfgsTrainer(Trainer):
             model = self.config.pipeline.model
             phases = resolution_phases(model.num_downscales, model.resolution_schedule)
             return TimedPace(length, 60.0 * self.config.time_budget, phases)
-        return None if self.config.schedule_steps is None else Pace(length)
+        return None if self.config.schedule_steps is None else Pace(length, length / self.total_steps)
 
     # Going on from a checkpoint.
 
@@ -240,10 +240,14 @@ class NrfgsTrainer(Trainer):
             content = checkpoint_files.read_or_refuse(path)
         else:
             return
+        if "optimizers" not in content:
+            raise InputError(f"{path} is of a compact file, which no training goes on from. Use its training's own.")
         self._start_step = content["step"] + 1
         training = _training_in(content)
-        self._check_training(training, path)
+        if "scene" in training:  # older checkpoints do not say
+            check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
         self.pipeline.load_pipeline(content["pipeline"], content["step"])
+        self._check_options(training.get("options", {}), path)
         self.optimizers.load_optimizers(content["optimizers"])
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
@@ -260,14 +264,12 @@ class NrfgsTrainer(Trainer):
         budget = self.config.time_budget
         return f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
 
-    def _check_training(self, training: dict[str, Any], path: Path) -> None:
+    def _check_options(self, written: dict[str, str], path: Path) -> None:
         """Refuse to go on where that makes no sense; see `_load_checkpoint`."""
-        if "scene" in training:  # older checkpoints do not say
-            check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
-            changed = check_options(training["options"], options_of(self.config))
-            if changed:
-                shown = "; ".join(changed[:5]) + ("; ..." if len(changed) > 5 else "")
-                warn(f"Going on with other options than {path.name} was trained with: {shown}.")
+        changed = check_options(written, options_of(self.config))
+        if changed:
+            shown = "; ".join(changed[:5]) + ("; ..." if len(changed) > 5 else "")
+            warn(f"Going on with other options than {path.name} was trained with: {shown}.")
         if self.config.time_budget is None and self._start_step >= self.total_steps:
             raise InputError(
                 f"{path} is the end of a training of {self.total_steps:,} steps: there is nothing left to do. "
@@ -494,8 +496,7 @@ class NrfgsTrainer(Trainer):
         with self._last_good_state_on_disk():
             self.guard.settle()
         if mean.count == 0:
-            late = isinstance(self.pace, TimedPace) and self.step >= self._start_step
-            tell_why_not(window, "the time was up sooner than foreseen" if late else "no step was made")
+            tell_why_not(window, "the time was up sooner than foreseen")
         else:
             tell(mean.count, window, mean.began_anew)
             with self.train_lock:
