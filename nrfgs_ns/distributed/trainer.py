@@ -11,6 +11,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -144,6 +145,7 @@ class ShardedTrainer(NrfgsTrainer):
             config = with_fewer_steps(config, world_size)
         config = replace(config, vis=vis, pipeline=replace(config.pipeline, _target=ShardedPipeline))
         super().__init__(config, local_rank, world_size)
+        self.request.quiet = comm.rank() > 0
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         # nerfstudio seeds each device differently; the initial splats and the order of the cameras must be the same.
@@ -156,6 +158,10 @@ class ShardedTrainer(NrfgsTrainer):
     @property
     def _is_asked_to_stop(self) -> bool:
         return self.guard.all_stop
+
+    def _end(self, line: str, status: int) -> None:
+        comms.synchronize()  # until the main device has written
+        super()._end(line, status)
 
     def setup_optimizers(self) -> Optimizers:
         self.guard = ShardedGuard(self.pipeline, self.request)

@@ -29,12 +29,16 @@ TO_LOAD = ("--load-dir", "--load-checkpoint", "--load-step")
 class StopRequest:
     """What signals have asked for.
 
+    Args:
+        quiet: say nothing on the terminal: another process does.
+
     Attributes:
         signal: the first that was heard; None: the training goes on.
         is_over: whether the training has ended, so that signals end the process as usual.
     """
 
-    def __init__(self):
+    def __init__(self, quiet: bool = False):
+        self.quiet = quiet
         self.signal: signal.Signals | None = None
         self.is_over = False
         self._heard_at = 0.0
@@ -47,7 +51,7 @@ class StopRequest:
             self.signal, self._heard_at = signal.Signals(number), monotonic()
             if self.signal.name == "SIGHUP":
                 _let_go_of_terminal()
-            else:
+            elif not self.quiet:
                 _say("Stopping when this step is done. Ctrl-C again stops at once, and saves nothing.")
         elif number == signal.SIGINT and monotonic() - self._heard_at > PATIENCE:
             _say("Stopped at once; what was not saved yet is lost.")

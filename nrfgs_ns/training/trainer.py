@@ -5,7 +5,6 @@ over the last steps, and an end in order whatever ends it."""
 import gc
 import math
 import re
-import shlex
 import sys
 import warnings
 from collections.abc import Iterator
@@ -29,6 +28,7 @@ from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, tell, tell_why_not
 from nrfgs_ns.training.checkpoint_files import DiskFull
+from nrfgs_ns.training.cpu_command import ten_minute_command
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 from nrfgs_ns.training.optimizers import in_world_units
@@ -42,6 +42,7 @@ from nrfgs_ns.training.stopping import (
 )
 from nrfgs_ns.training.tracking import track
 
+NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
 TIME_STAMP = re.compile(r"\d{4}-\d\d-\d\d_\d{6}")
 """What nerfstudio calls a training's folder if it is not told."""
 
@@ -111,11 +112,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         data = self.data or self.pipeline.datamanager.data
         lines = [f"{self.method_name} on {data}"]
         if machine.device_type == "cpu" and self.time_budget is None:
-            words = ["ns-train", "nrfgs-fast", "--data", str(data), *TEN_MINUTES]
-            lines.append(
-                f"No CUDA device: {self.max_num_iterations:,} steps on the CPU. For a good result in ten minutes: "
-                f"{shlex.join(words)}"
-            )
+            steps = f"No CUDA device: {self.max_num_iterations:,} steps on the CPU"
+            lines.append(f"{steps}. For a good result in ten minutes: {ten_minute_command(data)}")
         CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
     def save_config(self) -> None:
@@ -137,10 +135,6 @@ class NrfgsTrainerConfig(TrainerConfig):
                 return
             except FileExistsError:
                 self.timestamp = f"{first}_{number}"
-
-
-TEN_MINUTES = ("--time-budget", "10", "--pipeline.datamanager.camera-res-scale-factor", "0.25")
-"""Options that give a good result in ten minutes on two CPU cores (docs/measurements.md)."""
 
 
 def _absolute(path: Path | None) -> Path | None:
@@ -199,7 +193,7 @@ class NrfgsTrainer(Trainer):
         try:
             super().setup(test_mode)
         except KeyboardInterrupt:
-            self._end("Stopped before the first step; there is nothing to save.", 130)
+            NrfgsTrainer._end(self, NOTHING_TO_SAVE, 130)
         writer.GLOBAL_BUFFER["max_iter"] = self.total_steps
         self._made = self._start_step - 1
         """the last step that was made"""
@@ -416,7 +410,7 @@ class NrfgsTrainer(Trainer):
     def _stop_as_asked(self) -> None:
         """Save, say so, and end the process with the status of the signal."""
         if self._made < self._start_step:
-            self._end("Stopped before the first step; there is nothing to save.", self.request.exit_status)
+            self._end(NOTHING_TO_SAVE, self.request.exit_status)
         if self._saved_step != self._made:
             self.save_checkpoint(self._made)
         writer.write_out_storage()
