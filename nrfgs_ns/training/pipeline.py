@@ -22,6 +22,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.metrics import METRIC_NAMES
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
+from nrfgs_ns.training.evaluation_table import print_evaluation
 
 
 @dataclass
@@ -147,6 +148,7 @@ class NrfgsPipeline(VanillaPipeline):
         result["parameter_bytes"] = self.model.parameter_bytes
         if get_std:
             result["per_image"] = per_image
+            print_evaluation(result)
         return result
 
     def get_extra_state(self) -> dict[str, Any]:

@@ -365,14 +365,14 @@ class NrfgsTrainer(Trainer):
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         with self._last_good_state_on_disk():
             self.guard.begin(step, self.optimizers)
-            result = super().train_iteration(step)
+            loss, losses, metrics = super().train_iteration(step)
         self._made = step
         if pace is not None:
             model.schedule_at(int(pace.position))
         if isinstance(pace, TimedPace):  # the step that brings the time's end is the last
             self.stop_training = self._stop or pace.is_spent
             writer.GLOBAL_BUFFER["max_iter"] = step + 1 + pace.steps_left  # what the terminal counts towards
-        return result
+        return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     @property
     def last_step(self) -> int:
