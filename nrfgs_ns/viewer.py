@@ -33,6 +33,7 @@ from viser.transforms import SO3
 
 from nrfgs_ns.appearance.head import AppearanceHead, Component, SplatAppearance
 from nrfgs_ns.rasterizer import composite
+from nrfgs_ns.viewer_server import protect
 
 if TYPE_CHECKING:
     from nrfgs_ns.model import NrfgsModel
@@ -242,6 +243,7 @@ class ViewerPanel(ViewerControl):
     """
 
     def __init__(self, model: "NrfgsModel"):
+        protect()
         self.model = model
         self.background: Tensor | None = None
         """the viewer's background colour, [3]"""
