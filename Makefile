@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO_ARGS ?=
+# uv, not pip: it can leave out the dependencies that need a compiler (requirements.override).
+INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python --constraint requirements.lock --override requirements.override
 
 .PHONY: demo test test-slow test-browser lint clean
 
@@ -16,15 +18,16 @@ test-slow: $(VENV)/.installed  ## real training runs
 	$(BIN)/python -m pytest -m slow
 
 test-browser: $(VENV)/.installed  ## the viewer in a headless Chromium, which must be on the path
-	$(BIN)/pip install --quiet --constraint requirements.lock --editable '.[browser]'
+	$(INSTALL) --editable '.[browser]'
 	$(BIN)/python -m pytest -m browser
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check . && $(BIN)/ruff format --check .
 
-$(VENV)/.installed: pyproject.toml requirements.lock
+$(VENV)/.installed: pyproject.toml requirements.lock requirements.override
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint requirements.lock --editable '.[dev]'
+	$(BIN)/pip install --quiet --constraint requirements.lock uv
+	$(INSTALL) --editable '.[dev]'
 	touch $@
 
 clean:

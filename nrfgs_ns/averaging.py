@@ -6,10 +6,9 @@ Most learning rates never fall, and each step sees one view: parameters walk abo
 step's are one place on that walk. Their mean lies nearer to its middle.
 
 A mean over two meanings of a row is no number. It begins anew where splats were added, removed, moved onto others or
-had their opacity reset, where the field is another one, and where splats became diffuse or ceased to be. All but the
-last put other `Parameter` objects in the place of the old ones, even where shapes stay; the last is told by the table
-of diffuse splats, another tensor each time or none. The noise of MCMC, which changes the means in place at every step,
-is averaged away with the rest.
+had their opacity reset, and where the field is another one: all put other `Parameter` objects in the place of the old
+ones, even where shapes stay. The noise of MCMC, which changes the means in place at every step, is averaged away with
+the rest.
 """
 
 from collections.abc import Mapping
@@ -20,7 +19,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.optim import Optimizer
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.optimizers import parameters_of
 
 
@@ -40,7 +38,6 @@ class ParameterMean:
         self.count, self.began_anew = 0, False
         self._means: dict[str, Tensor] = {}
         self._of: dict[str, Tensor] = {}
-        self._diffuse: Tensor | None = None
 
     @torch.no_grad()
     def add(self, model, optimizers: Mapping[str, Optimizer]) -> None:
@@ -50,11 +47,11 @@ class ParameterMean:
             model: an NrfgsModel in training.
             optimizers: by group.
         """
-        parameters, diffuse = _parameters(optimizers), _diffuse(model)
-        if not self._is_of(parameters, diffuse):
+        parameters = _parameters(optimizers)
+        if not self._is_of(parameters):
             self.began_anew = self.began_anew or self.count > 0
             self._means = {name: torch.zeros_like(parameter) for name, parameter in parameters.items()}
-            self._of, self._diffuse, self.count = parameters, diffuse, 0
+            self._of, self.count = parameters, 0
         self.count += 1
         torch._foreach_lerp_(list(self._means.values()), list(parameters.values()), 1.0 / self.count)
 
@@ -82,15 +79,15 @@ class ParameterMean:
             return  # of splats that the guard has taken out since
         self.count, self.began_anew = state["count"], state["began_anew"]
         self._means = {name: mean.to(parameters[name]) for name, mean in state["means"].items()}
-        self._of, self._diffuse = parameters, _diffuse(model)
+        self._of = parameters
 
     def is_current(self, model, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether rows mean what they meant when it was last added to."""
-        return self._is_of(_parameters(optimizers), _diffuse(model))
+        return self._is_of(_parameters(optimizers))
 
-    def _is_of(self, parameters: Mapping[str, Tensor], diffuse: Tensor | None) -> bool:
+    def _is_of(self, parameters: Mapping[str, Tensor]) -> bool:
         """Whether these very objects are those that it is the mean of."""
-        same = self._of.keys() == parameters.keys() and diffuse is self._diffuse
+        same = self._of.keys() == parameters.keys()
         return same and all(parameter is self._of[name] for name, parameter in parameters.items())
 
 
@@ -127,7 +124,3 @@ def _parameters(optimizers: Mapping[str, Optimizer]) -> dict[str, Tensor]:
         for group, optimizer in optimizers.items()
         for place, parameter in enumerate(parameters_of(optimizer))
     }
-
-
-def _diffuse(model) -> Tensor | None:
-    return model.densification.state.get(DIFFUSE)

@@ -2,12 +2,14 @@
 """What a checkpoint must satisfy before it is loaded, and what torch must allow for it to be read at all."""
 
 from collections.abc import Mapping
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.errors import InputError
 
 
@@ -21,6 +23,18 @@ def allow_nerfstudio_checkpoints() -> None:
     torch.serialization.add_safe_globals(
         [scalar, (scalar, "numpy.core.multiarray.scalar"), np.dtype, np.dtypes.Float64DType]
     )
+
+
+def reduced_config(config: AppearanceHeadConfig, state: Mapping[str, Any]) -> AppearanceHeadConfig:
+    """The configuration of the head that a checkpoint was written with.
+
+    Args:
+        config: the model's.
+        state: the checkpoint's state of the model; its "capacity" says in which options its head differs, if it does.
+    """
+    found = state.get("_extra_state", {}).get("capacity", {}).get("head", {})
+    is_this_head = found.keys() <= {one.name for one in fields(config)}
+    return replace(config, **found) if is_this_head else config
 
 
 def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:

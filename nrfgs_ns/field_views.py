@@ -27,14 +27,11 @@ class FieldViews:
     Args:
         model: an NrfgsModel in evaluation mode.
         views: pairs of a camera and its batch; at least one.
-        geometry: whether the fields to be measured have positions and shapes of their own; they are projected each
-            time.
     """
 
-    def __init__(self, model, views: list, geometry: bool = False):
+    def __init__(self, model, views: list):
         self.model = model
         self.views = []
-        self.cameras = [camera.to(model.device) for camera, _ in views] if geometry else None
         for camera, batch in views:
             with torch.no_grad():
                 view = model.look(camera.to(model.device))
@@ -50,9 +47,7 @@ class FieldViews:
     def scores(self, field: Field) -> list[float]:
         """PSNR of each view inside its mask, dB; views whose mask is empty are left out."""
         scores = []
-        for index, (view, truth, mask) in enumerate(self.views):
-            if self.cameras is not None:
-                view = self.model.look(self.cameras[index], field.splats)
+        for view, truth, mask in self.views:
             appearance = field.head(field.splats, view.visible, view.center)
             score = psnr(self.model.paint(view, appearance)[0]["rgb"], truth, mask)
             scores += [] if score is None else [score]

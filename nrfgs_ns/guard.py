@@ -229,7 +229,7 @@ class WatchedOptimizers(LeanOptimizers):
         """Nerfstudio's; the checkpoint may have brought a smaller head than these were built on."""
         weights = list(self.guard.model.head.parameters())
         if weights:
-            self.hold("field", weights, {})
+            self.hold("field", weights)
         super().load_optimizers(loaded_state)
 
 

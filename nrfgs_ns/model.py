@@ -23,11 +23,7 @@ from torch.nn import Parameter
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.capacity.charge import ResidualCharge
-from nrfgs_ns.capacity.config import Capacity, CapacitySearch
-from nrfgs_ns.capacity.install import shape_head
-from nrfgs_ns.capacity.schedule import deciding_callbacks
-from nrfgs_ns.checkpoint import check_compatible
+from nrfgs_ns.checkpoint import check_compatible, reduced_config
 from nrfgs_ns.densification import (
     McmcDensification,
     OpacitySeen,
@@ -35,7 +31,6 @@ from nrfgs_ns.densification import (
     Protocol,
     build_densification,
 )
-from nrfgs_ns.diffuse_splats import DiffuseSplats
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.exported import ExportedTables
 from nrfgs_ns.metrics import ImageMetrics
@@ -74,17 +69,6 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """thresholds of the densification 'original'"""
     mcmc: McmcDensification = field(default_factory=McmcDensification)
     """constants of the densification 'mcmc'"""
-    diffuse: DiffuseSplats = field(default_factory=DiffuseSplats)
-    """when splats whose residual never matters lose it"""
-    capacity: Capacity = "full"
-    """full: all parts of the appearance head that its options name. auto: those that pay on training views that are set
-    aside for a while (nrfgs alone)"""
-    capacity_search: CapacitySearch = field(default_factory=CapacitySearch)
-    """capacity auto: when and how it is decided"""
-    residual_cost: float = 0.0
-    """capacity auto and diffuse splats: weight of the residuals' mean length in the loss, from the end of densification
-    until the last decision. What does not pay for it falls silent, and colour, opacity and geometry do its work. 0.05
-    makes more splats diffuse, at a price in quality"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -99,10 +83,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     """
 
     config: NrfgsModelConfig
-    capacity_found: dict[str, Any] | None = None
-    """what capacity "auto" has decided: "step", "head" (options of the head that it was left with) and "dropped" """
-    residual_charge: ResidualCharge | None = None
-    """when the residuals' length is part of the training's loss; None: never"""
+    reduced_head: dict[str, Any] | None = None
+    """options of the head that a checkpoint was written with, where they are not the configuration's"""
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
 
@@ -192,11 +174,10 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
             warm_up(self, cameras, steps, self.config.warmup_lr)
 
-        callbacks = [
+        return [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before_first_step, iters=(0,)),
             *super().get_training_callbacks(attributes),
         ]
-        return callbacks + deciding_callbacks(self, attributes)
 
     def step_cb(self, optimizers, step: int) -> None:
         super().step_cb(optimizers, step)
@@ -207,11 +188,6 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         """The step that the head and the resolution are scheduled by."""
         return self.step if self.pace is None else int(self.pace.position)
 
-    @property
-    def charges_residuals(self) -> bool:
-        """Whether the residuals' length is part of the training's loss in this step."""
-        return self.residual_charge is not None and self.residual_charge.is_due(self.step)
-
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
         self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
@@ -221,7 +197,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
 
         Terms that are zero in this step are left out. Nothing waits for the GPU.
         """
-        losses = {"main_loss": self.photometric_loss(outputs, batch)}
+        losses = {"main_loss": self._photometric_loss(outputs, batch)}
         if self.config.use_scale_regularization and self.step % 10 == 0:
             scales = self.scales.exp()
             ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
@@ -231,14 +207,12 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params)
-            if self.charges_residuals:
-                losses["residual"] = self.config.residual_cost * self.residual_length
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")
         return losses
 
-    def photometric_loss(self, outputs, batch) -> Tensor:
+    def _photometric_loss(self, outputs, batch) -> Tensor:
         """Splatfacto's loss of an image against its photograph, a scalar."""
         truth = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         rgb = outputs["rgb"]
@@ -313,8 +287,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
         }
-        if self.capacity_found is not None:
-            state["capacity"] = self.capacity_found
+        if self.reduced_head is not None:
+            state["capacity"] = {"head": self.reduced_head}
         return state if self.pace is None else {**state, "pace": self.pace.state()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -325,7 +299,6 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
-        self.capacity_found = state.get("capacity")
         if "pace" in state:
             self.pace = self.pace or Pace(state["pace"]["length"])
             self.pace.load_state(state["pace"])
@@ -340,9 +313,22 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         Raises:
             InputError: the checkpoint belongs to another head, or to another size of this one.
         """
-        shape_head(self, state)
+        self._shape_head(state)
         check_compatible(self, state)
         self.forget_fit()
         for name, parameter in self.gauss_params.items():
             parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)
         return super(SplatfactoModel, self).load_state_dict(state, strict=strict, **kwargs)
+
+    def _shape_head(self, state: dict[str, Any]) -> None:
+        """Take the head of a checkpoint that has a smaller one than the configuration; its weights come later."""
+        config = reduced_config(self.config.appearance, state)
+        self.reduced_head = state.get("_extra_state", {}).get("capacity", {}).get("head")
+        if config == self.head.config:
+            return
+        head = config.setup()
+        head.scene_unit = self.scene_unit
+        self.head = head.to(self.device).train(self.training)
+        for name, value in head.splat_params(self.gauss_params["means"]).items():
+            # In place: the optimiser was built on this very parameter.
+            self.gauss_params[name].data = value.to(self.device)

@@ -7,7 +7,7 @@ group, and after its first step that kernel is called directly. Numbers and stat
 and checkpoints find what they expect.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -90,19 +90,11 @@ class LeanOptimizers(Optimizers):
             if step % self.steps_per_log == 0:
                 writer.put_scalar(name=f"learning_rate/{name}", scalar=scheduler.get_last_lr()[0], step=step)
 
-    def hold(self, name: str, parameters: list[Parameter], state: Mapping[Parameter, dict[str, Any]]) -> None:
-        """Optimise other parameters than before under a group's name, at its learning rate and in its schedule.
-
-        Args:
-            name: of the group.
-            parameters: from now on.
-            state: Adam's, of each of them; nothing for those that start anew. Other optimisers always start anew.
-        """
+    def hold(self, name: str, parameters: list[Parameter]) -> None:
+        """Optimise other parameters than before under a group's name, at its learning rate and in its schedule."""
         optimizer = self.optimizers[name]
         optimizer.param_groups[0]["params"] = self.parameters[name] = parameters
         optimizer.state.clear()
-        if type(optimizer) is Adam:
-            optimizer.state.update({parameter: dict(of_one) for parameter, of_one in state.items()})
         self._warm.discard(optimizer)
         self.fuse()
 

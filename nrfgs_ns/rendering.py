@@ -13,7 +13,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE, mean_length
+from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.pinhole import Pinhole, pinhole
@@ -122,8 +122,6 @@ class Rendering:
         appearance = self.head(view.splats, view.visible, view.center)
         outputs, self.info = self.paint(view, appearance)
         if self.training:
-            if self.charges_residuals:
-                self.residual_length = mean_length(self.head.base_appearance(view.splats, view.visible), appearance)
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._correct_colors(outputs, camera)
         return outputs

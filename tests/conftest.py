@@ -15,7 +15,9 @@ settings.load_profile("nrfgs")
 sys.path.insert(0, str(Path(__file__).resolve().parent / "helpers"))
 
 from quick_start import ask_for_callers_quickly, keep_what_is_imported, let_go  # noqa: E402
+from without_open3d import hide_open3d, open3d_shown  # noqa: E402
 
+hide_open3d()
 ask_for_callers_quickly()
 
 SCENES = Path(os.environ.get("NRFGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
@@ -44,6 +46,17 @@ def tiny_scene(tmp_path_factory) -> Path:
 
     config = SceneConfig(views=10, width=48, height=36, points=300, samples=1)
     return write_scene(config, tmp_path_factory.mktemp("data") / "tiny")
+
+
+@pytest.fixture
+def export_gaussian_splat():
+    """ExportGaussianSplat of nerfstudio's exporter, which imports open3d; skips where that does not import."""
+    with open3d_shown():
+        try:
+            from nerfstudio.scripts.exporter import ExportGaussianSplat
+        except ImportError as error:
+            pytest.skip(f"ns-export imports open3d, which does not import here: {error}")
+        yield ExportGaussianSplat
 
 
 @pytest.fixture

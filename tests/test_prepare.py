@@ -14,6 +14,7 @@ from PIL import ExifTags, Image
 from rich.console import Console
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.exif import read_exif
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.prepare import photos, structure
 from nrfgs_ns.prepare.verb import Prepare, Run
@@ -68,7 +69,11 @@ def walls(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("walls") / "photos"
     folder.mkdir()
     for i, pose in enumerate(walk(6)):
-        render_walls(pose).save(folder / f"IMG {i:02d}.png")  # a blank in the name, as phones write them
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base.ExposureTime: 1 / (100 + i)})
+        render_walls(pose).save(
+            folder / f"IMG {i:02d}.png", exif=exif.tobytes()
+        )  # a blank in the name, as phones write them
     return folder
 
 
@@ -119,8 +124,8 @@ def test_recovered_cameras_are_those_that_rendered(prepared):
 def test_the_scene_is_read_by_the_data_parser(prepared):
     outputs = NrfgsDataParserConfig(data=prepared).setup().get_dataparser_outputs("train")
     test = NrfgsDataParserConfig(data=prepared).setup().get_dataparser_outputs("test")
-    assert [path.name for path in outputs.image_filenames] == [f"IMG_{i:02d}.png" for i in range(1, 6)]
-    assert [path.name for path in test.image_filenames] == ["IMG_00.png"]
+    assert [path.name for path in outputs.image_filenames] == [f"IMG_{i:02d}.png" for i in (0, 1, 3, 4, 5)]
+    assert [path.name for path in test.image_filenames] == ["IMG_02.png"]
     assert len(outputs.metadata["points3D_xyz"]) > 100
     verdict = json.loads((prepared / "prepare.json").read_text())
     assert verdict["registered"] == verdict["photographs"] == 6
@@ -131,6 +136,13 @@ def test_the_scene_is_read_by_the_data_parser(prepared):
         with Image.open(smaller.image_filenames[0]) as image:
             assert image.size == (int(smaller.cameras.width[0]), int(smaller.cameras.height[0]))
             assert f"images_{factor}" in str(smaller.image_filenames[0])
+
+
+def test_how_a_photograph_was_taken_stays_with_it(prepared):
+    for i, frame in enumerate(json.loads((prepared / "transforms.json").read_text())["frames"]):
+        assert frame["exif"] == {"exposure_time": pytest.approx(1 / (100 + i))}
+        for folder in ("images_2", "images_8"):  # COLMAP keeps it in images, of JPEGs
+            assert read_exif(prepared / folder / Path(frame["file_path"]).name) == frame["exif"], folder
 
 
 def test_points_are_where_the_cameras_see_them(prepared):

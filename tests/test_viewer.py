@@ -4,10 +4,12 @@
 `test_browser_viewer.py` clicks through the same in a real browser.
 """
 
+import shutil
 import threading
 import urllib.request
 from contextlib import nullcontext
 from itertools import combinations
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,14 +17,12 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.configs.base_config import ViewerConfig
-from nerfstudio.scripts.exporter import ExportGaussianSplat
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
-from short_trainings import command_line, trained
 from torch.testing import assert_close
 from viser.transforms import SO3
 
@@ -34,7 +34,8 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.export import read_splats
+from nrfgs_ns.export import Export, read_splats
+from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.studies.run import parse
 from nrfgs_ns.viewer import BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture, scaled_depth, view_dependence
 
@@ -270,20 +271,18 @@ def test_page_is_served_and_every_output_can_be_shown(build, open_viewer, method
             assert shown.shape[-1] == 3 and torch.isfinite(shown).all(), name
 
 
-def test_ns_viewer_and_ns_export_take_a_reduced_checkpoint(tiny_scene, tmp_path, monkeypatch):
-    """Their own main functions, on what is left of a field of whose splats some are diffuse."""
-    options = {
-        "--pipeline.model.num-downscales": 0,
-        "--pipeline.model.appearance.output-init": "default",
-        "--pipeline.model.warmup-steps": 0,
-        "--pipeline.model.capacity": "auto",
-        "--pipeline.model.capacity-search.step": 2,
-        "--pipeline.model.capacity-search.settle": 2,
-        "--pipeline.model.capacity-search.tolerance-db": 100.0,
-        "--pipeline.model.diffuse.start": 4,
-        "--pipeline.model.diffuse.threshold": 1.0,
-    }
-    config = trained(command_line("nrfgs", tiny_scene, tmp_path, 6, options))
+@pytest.fixture
+def reduced(tmp_path, monkeypatch):
+    """config.yml of a training that left a reduced field, of whose splats some are diffuse."""
+    write_scene(SceneConfig(views=10, width=48, height=36, points=60, samples=1), tmp_path / "scene")
+    config = Path("outputs/reduced/nrfgs/before/config.yml")
+    shutil.copytree(Path(__file__).parent / "fixtures" / "saved_0_1_0" / "reduced", tmp_path / config.parent)
+    monkeypatch.chdir(tmp_path)
+    return config
+
+
+def test_ns_viewer_and_export_take_a_reduced_checkpoint(reduced, tmp_path, monkeypatch):
+    """ns-viewer's own main function, and our command."""
     opened, seen = [], {}
 
     def viewer(*args, **more):
@@ -305,7 +304,7 @@ def test_ns_viewer_and_ns_export_take_a_reduced_checkpoint(tiny_scene, tmp_path,
     options = run_viewer.ViewerConfigWithoutNumRays(websocket_host="127.0.0.1")
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_viewer.RunViewer(config, options).main()
+            run_viewer.RunViewer(reduced, options).main()
     finally:
         for one in opened:
             one.viser_server.stop()
@@ -314,9 +313,15 @@ def test_ns_viewer_and_ns_export_take_a_reduced_checkpoint(tiny_scene, tmp_path,
     model = opened[0].pipeline.model
     assert model.head.high is None and 0 < int(model.densification.state[DIFFUSE].sum()) < model.num_points
 
-    ExportGaussianSplat(load_config=config, output_dir=tmp_path / "ply").main()
-    exported = read_splats(tmp_path / "ply" / "splat.ply")
+    Export("ply", reduced, tmp_path / "splats.ply", measure=False).main()
+    exported = read_splats(tmp_path / "splats.ply")
     assert 0 < len(exported.means) <= model.num_points and torch.isfinite(exported.features_dc).all()
+
+
+def test_ns_export_takes_a_reduced_checkpoint(reduced, tmp_path, export_gaussian_splat):
+    export_gaussian_splat(load_config=reduced, output_dir=tmp_path / "ply").main()
+    exported = read_splats(tmp_path / "ply" / "splat.ply")
+    assert len(exported.means) > 0 and torch.isfinite(exported.features_dc).all()
 
 
 def coarse(rgb: torch.Tensor) -> torch.Tensor:

@@ -15,11 +15,6 @@ from nrfgs_ns.appearance.head import Component, SplatAppearance
 
 DIFFUSE = "diffuse"
 """Name of the table's entry."""
-SHIFT = "diffuse_shift"
-"""Name of what was added to a diffuse splat's "features_dc" and "opacities" when it became one, [N, 4]."""
-
-SHORT = 1e-4
-"""Length of a residual, a fortieth of an 8-bit step, around which its own length has a round corner."""
 
 
 class Others:
@@ -54,14 +49,3 @@ class Others:
             whole = torch.zeros(self.count, *values.shape[1:], dtype=values.dtype, device=values.device)
             spread[name] = Component(whole.index_copy(0, self.rows, values), kind)
         return spread
-
-
-def mean_length(base: SplatAppearance, appearance: SplatAppearance) -> Tensor:
-    """How long the residuals of M visible splats are on average: a scalar in [0, 2], 0 where none says anything.
-
-    A residual is the vector of its changes to three colour channels and to opacity; white and opaque count 1. Unlike
-    its square, its length pulls at a small residual as at a large one, so that what does not pay ends at nothing, and
-    at all four numbers together (the group lasso: Yuan and Lin, Journal of the Royal Statistical Society B 68, 2006).
-    """
-    changes = torch.cat([appearance.colors - base.colors, (appearance.opacities - base.opacities)[:, None]], dim=1)
-    return (changes.square().sum(dim=1) + SHORT**2).sqrt().sum() / max(len(changes), 1) - SHORT

@@ -158,15 +158,6 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     return LatentBasis(mean, shrink @ turns, turns.T @ stretch, variances.flip(0).clamp_min(0.0))
 
 
-def with_unit_axes(basis: LatentBasis) -> LatentBasis:
-    """The same components in other units: a step of y moves z by as much, |B_k| = 1. With these an optimiser's learning
-    rate means what it meant."""
-    length = basis.axes.norm(dim=0)
-    return LatentBasis(
-        basis.mean, basis.axes / length, basis.inverse * length[:, None], basis.variances * length.square()
-    )
-
-
 def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
     """Latents of `rank` numbers, 1..D: their first principal components, with the basis folded into the first layer."""
     size = field.head.config.latent_dim

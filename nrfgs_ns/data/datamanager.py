@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
@@ -18,10 +18,14 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
-from nrfgs_ns.data.checks import UNREADABLE
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.checks import some, warn
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, checked
+from nrfgs_ns.data.pictures import read_picture
 from nrfgs_ns.data.scene_unit import scene_unit
 from nrfgs_ns.errors import InputError
+
+LARGEST_SCALE = 16.0
+"""By which images may be enlarged."""
 
 
 class NrfgsInputDataset(InputDataset):
@@ -43,19 +47,7 @@ class NrfgsInputDataset(InputDataset):
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Decodes an image, uint8 [H, W, 3 or 4], scaled by scale_factor."""
         path = self.image_filenames[image_idx]
-        try:
-            with Image.open(path) as image:
-                mode = image.mode
-                transparent = mode.endswith(("A", "a")) or (mode == "P" and "transparency" in image.info)
-                pixels = image.convert("RGBA" if transparent else "RGB")
-        except UNREADABLE as error:
-            raise InputError(
-                f"{path} cannot be decoded ({error}). Restore the file, or remove its frame from the data set."
-            ) from error
-        if mode[0] in "IF":
-            raise InputError(
-                f"{path} has more than 8 bits per channel (mode {mode}). Convert it to an 8-bit PNG or JPEG."
-            )
+        pixels = read_picture(path)
         if self.scale_factor != 1.0:
             size = [int(side * self.scale_factor) for side in pixels.size]
             pixels = pixels.resize(size, resample=Image.Resampling.BILINEAR)
@@ -77,7 +69,7 @@ class NrfgsInputDataset(InputDataset):
             return super().get_data(image_idx, image_type)
         except InputError:
             raise
-        except (*UNREADABLE, AssertionError) as error:
+        except Exception as error:  # nerfstudio reads the mask with PIL, which lets out whatever it meets
             if self._dataparser_outputs.mask_filenames is None:
                 raise
             raise InputError(
@@ -103,13 +95,37 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     config: NrfgsDatamanagerConfig
 
+    def __init__(self, config: NrfgsDatamanagerConfig, *args: Any, **kwargs: Any):
+        config.dataparser = checked(config.dataparser)
+        scale = config.camera_res_scale_factor
+        if not 0 < scale <= LARGEST_SCALE:
+            raise InputError(
+                f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, at most {LARGEST_SCALE}."
+            )
+        super().__init__(config, *args, **kwargs)
+
     def load_all_images(self) -> tuple[int, int]:
         """Decodes all images now, so that a broken one is found before the first step.
 
         Returns:
             The numbers of training and evaluation images.
+
+        Raises:
+            InputError: an image or a mask cannot be used, or all masks of the training images are empty.
         """
-        return len(self.cached_train), len(self.cached_eval)
+        count = len(self.cached_train)
+        names = [path.name for path in self.train_dataset.image_filenames]
+        empty = [
+            name
+            for name, data in zip(names, self.cached_train, strict=True)
+            if "mask" in data and not data["mask"].any()
+        ]
+        if empty:
+            finding = f"{self.get_datapath()}: the masks of {some(empty)} leave nothing of the image"
+            if len(empty) == count:
+                raise InputError(f"{finding}, so there is nothing to learn. Masks are 0 outside, anything else inside.")
+            warn(f"{finding}.")
+        return count, len(self.cached_eval)
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """The next camera in turn, and its image.
@@ -134,30 +150,31 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return [self._view(index) for index in indices], self._image(indices[own])
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """One training camera and its image, as `next_train` gives them, out of turn; it may be one set aside."""
+        """One training camera and its image, as `next_train` gives them, out of turn; it may be one held out."""
         return self._view(index), self._image(index)
 
     @cached_property
-    def views_aside(self) -> list[int]:
-        """Training views whose turn does not come; none unless `set_views_aside` says so."""
+    def held_out_views(self) -> list[int]:
+        """Training views whose turn does not come; none unless `hold_out` says so."""
         return []
 
-    def set_views_aside(self, indices: list[int]) -> None:
-        """Keep some training views, but not all, from being trained on until they are given back."""
-        self.views_aside = sorted(indices)
-        self.train_unseen_cameras = [i for i in self.train_unseen_cameras if i not in self.views_aside]
+    def hold_out(self, indices: list[int]) -> None:
+        """Keep some training views, but not all, from being trained on until they are given back (`data/views.py` says
+        which). What they say of a model is no test, and may decide a setting."""
+        self.held_out_views = sorted(indices)
+        self.train_unseen_cameras = [i for i in self.train_unseen_cameras if i not in self.held_out_views]
         if not self.train_unseen_cameras:
             self.train_unseen_cameras = self._next_round()
 
     def give_back_views(self) -> None:
         """Train on all views again, from the next round on."""
-        self.views_aside = []
+        self.held_out_views = []
 
     def _next_round(self) -> list[int]:
         """Training cameras in the order of their turns."""
         order: list[int] = []
-        while not order:  # the strategy fps takes some views only, and may take none but those set aside
-            order = [index for index in self.sample_train_cameras() if index not in self.views_aside]
+        while not order:  # the strategy fps takes some views only, and may take none but those held out
+            order = [index for index in self.sample_train_cameras() if index not in self.held_out_views]
         return order
 
     def _next_index(self) -> int:
@@ -191,7 +208,11 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             # "gpu" means `self.device`. "cpu" means pinned memory, which needs an accelerator's driver, and which
             # nerfstudio chooses by itself above 500 images.
             cache_images_device = "gpu"
-        return super()._load_images(split, cache_images_device)
+        images = super()._load_images(split, cache_images_device)
+        # What is in memory is a pinhole's, whatever the lens: nerfstudio undistorts, and keeps the camera's type.
+        for dataset in (self.train_dataset, self.eval_dataset):
+            dataset.cameras.camera_type[:] = CameraType.PERSPECTIVE.value
+        return images
 
     def sampling_state(self) -> dict[str, Any]:
         """Everything that decides which training camera comes next, as plain numbers, strings, lists and tuples.
@@ -202,7 +223,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             "strategy": self.config.train_cameras_sampling_strategy,
             "num_images": len(self.train_dataset),
             "unseen_cameras": list(self.train_unseen_cameras),
-            "views_aside": list(self.views_aside),
+            "views_aside": list(self.held_out_views),
         }
         if state["strategy"] == "random":
             return {**state, "generator": self.random_generator.getstate()}
@@ -231,7 +252,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
                 f"{state['strategy']}. Set it back, or train anew."
             )
         self.train_unseen_cameras = list(state["unseen_cameras"])
-        self.views_aside = list(state.get("views_aside", []))  # older checkpoints have none
+        self.held_out_views = list(state.get("views_aside", []))  # older checkpoints have none
         if state["strategy"] == "random":
             version, words, gauss = state["generator"]
             self.random_generator = random.Random()

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Growth where screen-space gradients are large: splatfacto's densification, and 3DGS's (Kerbl et al. 2023)."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -105,11 +104,6 @@ class GradientDensification(Densification):
         strategy.step_post_backward(splats, optimizers, self.state, step, info, packed=True)
         if step % strategy.reset_every == 0 or self._refines(step):
             self.forget_views()
-
-    def has_ended(self, step: int, last: float) -> bool:
-        every = self.strategy.refine_every
-        first = math.ceil(step / every) * every
-        return not any(map(self._refines, range(first, int(min(self.strategy.refine_stop_iter, last + 1)), every)))
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         for name, step in self.bounds.items():

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """3DGS-MCMC (Kheradmand et al. 2024): nothing is deleted, dead splats move to live ones, noise explores."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -116,10 +115,6 @@ class Mcmc(Densification):
         stored = torch.sigmoid(opacities.detach().flatten())
         changes = [self.state[name] for name in (CHANGE, CHANGE_BEFORE) if self.state.get(name) is not None]
         return seen_with(stored, torch.stack(changes).amax(dim=0)) if changes else stored
-
-    def has_ended(self, step: int, last: float) -> bool:
-        first = math.ceil(max(step, self.start + 1) / self.every) * self.every
-        return first >= self.stop or first > last
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         self.start, self.stop = (step_at(step) for step in self.bounds)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE, SHIFT
+from nrfgs_ns.appearance.diffuse import DIFFUSE
 
 Protocol = Literal["splatfacto", "original", "mcmc"]
 OpacitySeen = Literal["base", "peak"]
@@ -101,16 +101,6 @@ class Densification(ABC):
         return {}
 
     @abstractmethod
-    def has_ended(self, step: int, last: float) -> bool:
-        """Whether no step from `step` to `last`, the training's last, adds splats or moves some onto others, as things
-        look now. The noise of MCMC and resets of opacity go on.
-
-        Args:
-            step: training step.
-            last: training step; infinity if it is not known.
-        """
-
-    @abstractmethod
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         """Begin and end when the training's pace says (`pace.py`); the steps between two refinements stay.
 
@@ -123,10 +113,9 @@ class Densification(ABC):
         for name in self.state:
             value = state.get(name, self.state[name])
             self.state[name] = value.to(device) if isinstance(value, Tensor) else value
-        for name in (DIFFUSE, SHIFT):  # which protocol it is does not matter, nor whether such splats are looked for
-            self.state.pop(name, None)
-            if state.get(name) is not None:
-                self.state[name] = state[name].to(device)
+        self.state.pop(DIFFUSE, None)
+        if state.get(DIFFUSE) is not None:  # of whichever protocol
+            self.state[DIFFUSE] = state[DIFFUSE].to(device)
 
     def seen_opacity(self, opacities: Tensor) -> Tensor:
         """The opacities [N] that decide whether a splat is dead.

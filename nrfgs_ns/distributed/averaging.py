@@ -19,9 +19,9 @@ from nrfgs_ns.distributed import comm
 class ShardedMean(ParameterMean):
     """`ParameterMean` of one device. All but `install` and `state` must be called on all devices."""
 
-    def _is_of(self, parameters: Mapping[str, Tensor], diffuse: Tensor | None) -> bool:
+    def _is_of(self, parameters: Mapping[str, Tensor]) -> bool:
         """Whether on all devices these very objects are those that it is the mean of. The host waits for the answer."""
-        here = super()._is_of(parameters, diffuse)
+        here = super()._is_of(parameters)
         return all(comm.gather_counts(int(here), next(iter(parameters.values())).device))
 
     def whole_state(self, model, optimizers: Mapping[str, Optimizer]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, ImageOps
 
+from nrfgs_ns.data.exif import exif_of_copy
 from nrfgs_ns.errors import InputError
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -116,7 +117,7 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
     turned = ImageOps.exif_transpose(image)
     if turned.mode in ("RGBA", "LA", "PA") or "transparency" in turned.info:  # nothing is behind a cut-out object
         turned = Image.alpha_composite(Image.new("RGBA", turned.size, "white"), turned.convert("RGBA"))
-    exif = turned.getexif().tobytes()  # has the focal length, and no orientation any more
+    exif = exif_of_copy(image.getexif())  # has the focal length
     turned.convert("RGB").save(target, quality=97, subsampling=0, exif=exif)
 
 

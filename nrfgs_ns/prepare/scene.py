@@ -17,20 +17,21 @@ import numpy as np
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
+from nrfgs_ns.data.exif import exif_of_copy, known
+from nrfgs_ns.data.split import interior_test_images
 from nrfgs_ns.prepare.structure import colmap
 from nrfgs_ns.studies.files import write_whole
 
 DOWNSCALES = (2, 4, 8)
 """nerfstudio looks for these copies; it takes the largest whose sides are at most 1600 pixels."""
-TEST_EVERY = 8
-"""Every eighth photograph by sorted name, beginning with the first, is for testing."""
 
 
-def write_scene(undistorted: Path, out: Path, advance: Callable[[], None]) -> None:
+def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[], None]) -> None:
     """Write a scene from an undistorted COLMAP model.
 
     Args:
         undistorted: has images/ and sparse/; its images are linked.
+        photos: the photographs by the same names, whose EXIF tells how they were taken.
         advance: called for each photograph.
     """
     model = colmap().Reconstruction(undistorted / "sparse")
@@ -38,29 +39,39 @@ def write_scene(undistorted: Path, out: Path, advance: Callable[[], None]) -> No
     for folder in ("images", *(f"images_{factor}" for factor in DOWNSCALES)):
         shutil.rmtree(out / folder, ignore_errors=True)
         (out / folder).mkdir(parents=True)
+    taken: dict[str, dict[str, float | str]] = {}
     for image in images:
         source = undistorted / "images" / image.name
+        with Image.open(photos / image.name) as photo:
+            exif = photo.getexif()
+            taken[image.name] = known(exif)
+            kept = exif_of_copy(exif)
         with Image.open(source) as picture:
             picture = picture.convert("RGB")
         for factor in DOWNSCALES:
             size = max(picture.width // factor, 1), max(picture.height // factor, 1)  # as nerfstudio rounds its cameras
-            picture.resize(size, Image.Resampling.LANCZOS).save(out / f"images_{factor}" / image.name, quality=95)
+            smaller = picture.resize(size, Image.Resampling.LANCZOS)
+            smaller.save(out / f"images_{factor}" / image.name, quality=95, exif=kept)
         try:
             os.link(source, out / "images" / image.name)
         except OSError:  # a file system without hard links
             shutil.copyfile(source, out / "images" / image.name)
         advance()
     _write_points(model, out / "sparse.ply")
-    write_whole(out / "transforms.json", json.dumps(transforms(model, images), indent=1) + "\n")
+    write_whole(out / "transforms.json", json.dumps(transforms(model, images, taken), indent=1) + "\n")
 
 
-def transforms(model: Any, images: list[Any]) -> dict[str, Any]:
-    """The content of transforms.json for images sorted by name. Intrinsics that all share stand at the top."""
+def transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float | str]]) -> dict[str, Any]:
+    """The content of transforms.json for images sorted by name. Intrinsics that all share stand at the top.
+
+    Args:
+        taken: for each name, how the photograph was taken, which its frame repeats under "exif": see `data.exif`.
+    """
     cameras = [_intrinsics(model.cameras[image.camera_id]) for image in images]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
     names = [f"images/{image.name}" for image in images]
-    test = names[::TEST_EVERY]
-    train = [name for name in names if name not in set(test)]
+    test = [names[index] for index in interior_test_images(len(names))]
+    train = [name for name in names if name not in test]
     return {
         "camera_model": "OPENCV",
         **shared,
@@ -70,7 +81,12 @@ def transforms(model: Any, images: list[Any]) -> dict[str, Any]:
         "val_filenames": test,
         "test_filenames": test,
         "frames": [
-            {"file_path": name, **({} if shared else camera), "transform_matrix": camera_to_world(image).tolist()}
+            {
+                "file_path": name,
+                **({} if shared else camera),
+                **({"exif": taken[image.name]} if taken[image.name] else {}),
+                "transform_matrix": camera_to_world(image).tolist(),
+            }
             for name, camera, image in zip(names, cameras, images, strict=True)
         ],
     }

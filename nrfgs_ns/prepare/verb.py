@@ -163,7 +163,7 @@ class Run:
         registered = len(list((self.undistorted / "images").iterdir()))
         with self.stage("write", "write the scene", made, registered) as advance:
             if advance is not None:
-                write_scene(self.undistorted, self.out, lambda: advance(1))
+                write_scene(self.undistorted, self.stored, self.out, lambda: advance(1))
 
     @contextlib.contextmanager
     def stage(

@@ -7,6 +7,7 @@
   into the work folder, with lists of names that say which image is what; the data set itself is not touched.
 """
 
+import json
 import struct
 from pathlib import Path
 
@@ -41,7 +42,8 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     folder = Path(root) / scene.name
     if (folder / "transforms.json").is_file():
         scale = [] if scene.downscale is None else ["--downscale-factor", str(scene.downscale)]
-        return ["nrfgs-data", "--data", str(folder), *scale, *scene.options]
+        split = [] if names_its_split(folder / "transforms.json") else ["--eval-mode", "interval"]
+        return ["nrfgs-data", "--data", str(folder), *split, *scale, *scene.options]
     model = colmap_model(folder)
     if model is None:
         raise InputError(
@@ -57,6 +59,14 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
         *(["--downscale-rounding-mode", rounding(folder, factor, model)] if factor > 1 else []),
         *scene.options,
     ]
+
+
+def names_its_split(transforms: Path) -> bool:
+    """Whether a data set says which images are for testing. Files that cannot be read are left to the data parser."""
+    try:
+        return any(f"{split}_filenames" in json.loads(transforms.read_bytes()) for split in ("train", "val", "test"))
+    except (OSError, ValueError, TypeError):
+        return False
 
 
 def colmap_model(folder: Path) -> str | None:

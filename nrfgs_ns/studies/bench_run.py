@@ -16,7 +16,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from nrfgs_ns.capacity.report import read_report
 from nrfgs_ns.studies.bench_spec import Job
 from nrfgs_ns.studies.files import only_one, write_whole
 from nrfgs_ns.studies.run import TrainRecord, evaluate, host_without_downloads, machine, train
@@ -59,7 +58,6 @@ def run(job: Job) -> None:
             },
             "eval": results,
             "measured": measured,
-            "capacity": read_report(config.parent),
         }
         write_whole(record_path, json.dumps(content, indent=1) + "\n")
 

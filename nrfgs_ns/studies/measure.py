@@ -14,6 +14,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
 
+from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.metrics import METRIC_NAMES, ImageMetrics
 
 TIMED_CAMERAS = 20
@@ -65,12 +66,6 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
         or sum(parameter.numel() * parameter.element_size() for parameter in model.gauss_params.values()),
         "checkpoint_bytes": Path(checkpoint).stat().st_size,
     }
-
-
-def evenly_spaced(total: int, wanted: int) -> list[int]:
-    """At most `wanted` of 0..total-1, evenly spaced, the first among them."""
-    count = min(total, wanted)
-    return [i * total // count for i in range(count)]
 
 
 def over_views(model, metrics: ImageMetrics, views: Iterable) -> dict[str, Any]:

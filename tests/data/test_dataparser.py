@@ -13,6 +13,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from PIL import Image
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, nrfgs_dataparser
+from nrfgs_ns.data.split import interior_test_images
 from nrfgs_ns.errors import InputError
 
 
@@ -44,16 +45,38 @@ def assert_points_stay_in_front_of_cameras(capture, outputs, xyz):
     np.testing.assert_allclose(seen, outputs.dataparser_scale * seen_from(before, xyz), atol=1e-5)
 
 
-def test_every_eighth_image_by_sorted_name_is_test(capture):
-    assert names(capture.parse("train")) == [1, 2, 3, 4, 5, 6, 7, 9]
-    assert names(capture.parse("val")) == names(capture.parse("test")) == [0, 8]
+def test_every_eighth_image_by_sorted_name_is_test_but_neither_end(capture):
+    capture.add_masks()
+    parser = capture.parser()
+    parts = {split: parser.get_dataparser_outputs(split) for split in ("train", "val", "test")}
+    assert names(parts["train"]) == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+    assert names(parts["val"]) == names(parts["test"]) == [4]
+    whole = capture.parse(eval_mode="all")
+    for part in parts.values():
+        chosen = torch.tensor(names(part))
+        assert [path.stem for path in part.mask_filenames] == [path.stem for path in part.image_filenames]
+        assert torch.equal(part.cameras.camera_to_worlds, whole.cameras.camera_to_worlds[chosen])
+        assert torch.equal(part.cameras.fx, whole.cameras.fx[chosen])
+
+
+def test_interval_begins_with_the_first_image_as_in_the_literature(capture):
+    parser = capture.parser(eval_mode="interval")
+    assert names(parser.get_dataparser_outputs("train")) == [1, 2, 3, 4, 5, 6, 7, 9]
+    assert names(parser.get_dataparser_outputs("val")) == names(parser.get_dataparser_outputs("test")) == [0, 8]
+
+
+@pytest.mark.parametrize(
+    ("count", "test"), [(1, [0]), (2, [0]), (3, [1]), (5, [2]), (8, [3]), (9, [4]), (13, [4]), (14, [4, 12])]
+)
+def test_interior_test_images(count, test):
+    assert list(interior_test_images(count)) == test
 
 
 @pytest.mark.parametrize("split", ["train", "val", "test"])
 @pytest.mark.parametrize("distortion", [{}, {"k1": 0.01, "p2": 0.02}])
 def test_cameras_are_those_of_nerfstudio(capture, split, distortion):
     capture.meta |= distortion
-    ours = capture.parse(split)
+    ours = capture.parse(split, eval_mode="interval")
     config = NerfstudioDataParserConfig(data=capture.folder, eval_mode="interval")
     theirs = config.setup().get_dataparser_outputs(split)
     assert ours.image_filenames == theirs.image_filenames
@@ -110,7 +133,7 @@ def test_overlapping_splits_are_mentioned(capture, printed):
 
 @pytest.mark.parametrize("orientation", ["pca", "up", "vertical", "none"])
 @pytest.mark.parametrize("center", ["poses", "focus", "none"])
-@pytest.mark.parametrize("mode", ["interval", "fraction", "all"])
+@pytest.mark.parametrize("mode", ["interior", "interval", "fraction", "all"])
 def test_one_image(single, printed, orientation, center, mode):
     single.add_ply(*cloud())
     parser = single.parser(orientation_method=orientation, center_method=center, eval_mode=mode)
@@ -143,6 +166,9 @@ def test_double_precision_points_far_from_the_origin(capture):
     """A georeferenced cloud: positions of a million metres, details of a millimetre."""
     xyz, rgb = cloud()
     capture.add_ply(xyz.astype(np.float64) + 1e6, rgb)
+    for frame in capture.meta["frames"]:
+        for row in range(3):
+            frame["transform_matrix"][row][3] += 1e6
     points = capture.parse(center_method="none", orientation_method="none", auto_scale_poses=False, scale_factor=1e-3)
     # Stored as float32 at 1,000: a spacing of 2^-14; float32 on the way (spacing 2^-4 at 10^6) would be 60 times that.
     error = points.metadata["points3D_xyz"].double().numpy() - (xyz.astype(np.float64) + 1e6) * 1e-3
@@ -224,9 +250,10 @@ def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, 
     folder = capture.folder / "colmap" / "sparse" / "0"
     folder.mkdir(parents=True)
     nothing = np.empty(0, dtype=int)
-    points = {
-        i: Point3D(i, p.astype(float), c, 0.5, nothing, nothing) for i, (p, c) in enumerate(zip(xyz, rgb, strict=True))
-    }
+    # nerfstudio's axes for data sets from before it wrote applied_transform.
+    world = np.array(applied or [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], dtype=np.float64)
+    stored = (xyz - world[:, 3]) @ world[:, :3]
+    points = {i: Point3D(i, p, c, 0.5, nothing, nothing) for i, (p, c) in enumerate(zip(stored, rgb, strict=True))}
     write(points, folder / name)
     if applied is not None:
         capture.meta["applied_transform"] = applied
@@ -235,9 +262,7 @@ def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, 
     outputs = capture.parse(data=capture.folder / "transforms.json" if as_file else capture.folder)
     assert files(capture.folder) == before
 
-    # nerfstudio's axes for data sets from before it wrote applied_transform.
-    world = np.array(applied or [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], dtype=np.float64)
-    assert_points_stay_in_front_of_cameras(capture, outputs, xyz @ world[:, :3].T + world[:, 3])
+    assert_points_stay_in_front_of_cameras(capture, outputs, xyz)
     np.testing.assert_array_equal(outputs.metadata["points3D_rgb"], rgb)
 
 

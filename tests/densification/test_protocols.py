@@ -63,42 +63,6 @@ def test_mcmc_rests_before_its_start_and_after_its_end():
     assert len(table) == 52
 
 
-@pytest.mark.parametrize("last", [99, 65, 50, 25, 15])
-@pytest.mark.parametrize("name, pace", [(name, pace) for name in PROTOCOLS for pace in (1, 2)])
-def test_it_has_ended_when_no_step_adds_splats(name, pace, last):
-    """Every step of a training is made, and those that add splats are written down."""
-    options = {"mcmc": {"mcmc": McmcDensification(stop_at=65 // pace)}}.get(
-        name, {"stop_split_at": 65 // pace, "reset_alpha_every": 3}
-    )
-    rules = protocol(name, warmup_length=20 // pace, refine_every=10, **options)
-    if pace != 1:
-        rules.reschedule(lambda step: pace * step)
-    before = [rules.has_ended(step, last) for step in range(last + 1)]
-    table, added = Table(40), []
-    for step in range(last + 1):
-        count = len(table)
-        table.step(rules, step, gradient=1.0)
-        added += [step] if len(table) > count else []
-    assert added == [step for step in ([50] if name == "splatfacto" else [30, 40, 50, 60]) if step <= last]
-    assert before == [all(step > one for one in added) for step in range(last + 1)]
-    assert rules.has_ended(last + 1, last)
-
-
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_the_step_of_its_end_adds_none(name):
-    options = {"mcmc": {"mcmc": McmcDensification(stop_at=60)}}.get(
-        name, {"stop_split_at": 60, "reset_alpha_every": 30}
-    )
-    rules = protocol(name, warmup_length=20, refine_every=10, **options)
-    assert not rules.has_ended(50, 99) and rules.has_ended(51, 99)
-
-
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_it_never_has_begun_where_it_starts_behind_its_end(name):
-    assert protocol(name, warmup_length=30_000).has_ended(0, 10**6)
-    assert protocol(name, warmup_length=3000).has_ended(0, 2999)
-
-
 # Thresholds.
 
 

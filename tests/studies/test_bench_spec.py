@@ -375,7 +375,9 @@ def test_nerfstudios_layout_without_a_split_has_every_8th_by_name(tiny_scene, tm
         del meta[key]
     meta["frames"].reverse()
     file.write_text(json.dumps(meta))
-    data = load(parser_options(tmp_path, Scene("plain"), tmp_path / "mirrors"))
+    parser = parser_options(tmp_path, Scene("plain"), tmp_path / "mirrors")
+    assert parser == ["nrfgs-data", "--data", str(tmp_path / "plain"), "--eval-mode", "interval"]
+    data = load(parser)
     assert names_of(data.eval_dataset) == ["view_000.png", "view_008.png"]
 
 

@@ -10,7 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 
 from nrfgs_ns.studies import bench_run
 from nrfgs_ns.studies.bench_spec import Job, cells_of, command, identity, make_spec
-from nrfgs_ns.studies.measure import at_size, evenly_spaced
+from nrfgs_ns.studies.measure import at_size
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -71,16 +71,9 @@ def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monke
     mean = sum(image["psnr"] for image in measured["train"]["per_image"]) / 3
     assert measured["train"]["psnr"] == pytest.approx(mean)
     assert measured["parameter_bytes"] == record["eval"]["parameter_bytes"] == 4 * (measured["splats"] * 46 + 6664)
-    assert record["capacity"] == {} and measured["diffuse"] == 0, "nothing was decided"
+    assert measured["diffuse"] == 0
     assert measured["fps"] > 0 and measured["checkpoint_bytes"] > measured["parameter_bytes"]
     assert len(list((tmp_path / "work" / "pictures").glob("eval_img_*.png"))) == 2
-
-
-@pytest.mark.parametrize(
-    "total, wanted, chosen", [(10, 4, [0, 2, 5, 7]), (3, 5, [0, 1, 2]), (5, 5, [0, 1, 2, 3, 4]), (5, 0, [])]
-)
-def test_evenly_spaced(total, wanted, chosen):
-    assert evenly_spaced(total, wanted) == chosen
 
 
 def test_at_size_keeps_the_pose_and_the_vertical_angle():

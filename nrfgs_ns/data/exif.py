@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a photograph's file says about how it was taken."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+from PIL import ExifTags, Image
+
+from nrfgs_ns.data.pictures import open_picture
+
+NUMBERS = {
+    "exposure_time": ExifTags.Base.ExposureTime,
+    "f_number": ExifTags.Base.FNumber,
+    "iso": ExifTags.Base.ISOSpeedRatings,
+    "focal_length": ExifTags.Base.FocalLength,
+}
+NAMES = {"make": ExifTags.Base.Make, "model": ExifTags.Base.Model}
+KEPT = (*NAMES.values(), ExifTags.Base.DateTime)
+"""Tags of the main directory that hold for copies of a photograph in another size, too."""
+KEPT_EXIF = (*NUMBERS.values(), ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DateTimeOriginal)
+"""The same of the photographic directory."""
+
+
+def read_exif(path: Path) -> dict[str, float | str]:
+    """How a photograph was taken, as far as its file says; nothing for a file without EXIF, or one that is no image.
+
+    Returns:
+        Some of exposure_time (seconds), f_number, iso, focal_length (mm), each finite and above 0, and make, model.
+    """
+    try:
+        with open_picture(path) as image:
+            return known(image.getexif())
+    except Exception:  # PIL lets out whatever it meets in a broken file
+        return {}
+
+
+def known(exif: Image.Exif) -> dict[str, float | str]:
+    """The same from what PIL has read."""
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    found: dict[str, float | str] = {}
+    for name, tag in NUMBERS.items():
+        value = _number(details.get(tag))
+        if value is not None:
+            found[name] = value
+    for name, tag in NAMES.items():
+        if text := str(exif.get(tag) or "").strip(" \0"):
+            found[name] = text
+    return found
+
+
+def _number(value: Any) -> float | None:
+    """A tag's value, or the first of several, if it is a finite number above 0."""
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, IndexError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def exif_of_copy(exif: Image.Exif) -> bytes:
+    """For PIL's `exif` option: what of it holds for a copy that was turned, undistorted or made smaller.
+
+    Camera, lens, exposure, date and position are kept; orientation, sizes, thumbnails and makers' notes are not.
+    """
+    copy = Image.Exif()
+    for tag in KEPT:
+        if tag in exif:
+            copy[tag] = exif[tag]
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    if kept := {tag: details[tag] for tag in KEPT_EXIF if tag in details}:
+        copy.get_ifd(ExifTags.IFD.Exif).update(kept)
+    if position := exif.get_ifd(ExifTags.IFD.GPSInfo):
+        copy.get_ifd(ExifTags.IFD.GPSInfo).update(position)
+    return copy.tobytes() if {*copy, *copy.get_ifd(ExifTags.IFD.Exif), *copy.get_ifd(ExifTags.IFD.GPSInfo)} else b""

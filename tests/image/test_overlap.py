@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs of known exposure of a painted wall, from places next to each other."""
+
+import math
+
+import pytest
+import torch
+
+from nrfgs_ns.image.overlap import compare, drawn, estimate, shrunk, sight, slope, varies
+from nrfgs_ns.image.photograph import exposed
+
+WIDTH, HEIGHT, FOCAL = 120, 90, 110.0
+UNKNOWN = math.nan
+
+
+def wall(count: int = 3000, seed: int = 0):
+    """Points on a wall at z = 0, [N, 3], whose colour varies slowly."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.cat([torch.rand(count, 2, generator=generator) * 4 - 2, torch.zeros(count, 1)], dim=1)
+
+
+def painted(x, y):
+    return 0.4 + 0.2 * torch.stack([torch.sin(2 * x), torch.cos(1.5 * y), torch.sin(x + y)], dim=-1)
+
+
+def photographs(stops, gloss: float = 0.0):
+    """Views of the wall from 3 away, each a little to the right of the one before, with these stops [V, 3].
+
+    With gloss, a light that is brightest to the right of the camera adds stops, other ones in each place.
+    """
+    cameras, images = [], []
+    for index, of_one in enumerate(stops):
+        offset = 0.05 * index
+        viewmat = torch.eye(4)
+        viewmat[:3, 3] = torch.tensor([-offset, 0.0, 3.0])
+        column, row = torch.meshgrid(torch.arange(WIDTH) + 0.5, torch.arange(HEIGHT) + 0.5, indexing="xy")
+        x, y = (column - WIDTH / 2) / FOCAL * 3 + offset, (row - HEIGHT / 2) / FOCAL * 3
+        shine = gloss * torch.sin(25 * (x - 3 * offset))[..., None]
+        light = of_one + shine
+        images.append(
+            torch.stack([exposed(painted(x, y)[..., [c]], light[..., c : c + 1])[..., 0] for c in range(3)], -1)
+        )
+        cameras.append(viewmat)
+    return torch.stack(cameras), images
+
+
+def pairs_of(stops, gloss: float = 0.0):
+    cameras, images = photographs(stops, gloss)
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    points = wall()
+    return compare(
+        [sight(points, one, K, image) for one, image in zip(cameras, images, strict=True)], -cameras[:, :3, 3]
+    )
+
+
+def test_same_exposure_is_found_to_be_the_same():
+    pairs = pairs_of(torch.zeros(8, 3))
+    assert len(pairs.first) >= 7
+    assert pairs.share_beyond_noise == 0.0
+    assert estimate(pairs, torch.full((8,), UNKNOWN)).abs().max() < 0.03
+
+
+def test_known_stops_are_found():
+    torch.manual_seed(1)
+    stops = torch.randn(8, 1) * 0.5 + torch.randn(8, 3) * 0.2
+    pairs = pairs_of(stops)
+    assert pairs.share_beyond_noise > 0.6
+    found = estimate(pairs, torch.full((8,), UNKNOWN))
+    assert (found - (stops - stops.mean(0))).abs().max() < 0.05
+
+
+def test_white_balance_alone_is_noticed():
+    stops = torch.zeros(8, 3)
+    stops[::2, 0] = 0.4
+    assert pairs_of(stops).share_beyond_noise > 0.2
+
+
+def test_gloss_is_noise():
+    glossy = pairs_of(torch.zeros(8, 3), gloss=0.5)
+    assert glossy.shift[:, 0].abs().max() > 0.02
+    assert glossy.share_beyond_noise < 0.2
+
+
+def test_hidden_points_and_dark_or_bright_pixels_are_left_out():
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -9.0]])
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 3.0
+    image = torch.full((HEIGHT, WIDTH, 3), 0.5)
+    image[:, 90:] = 0.99
+    seen = sight(points, viewmat, K, image)
+    assert seen.points.tolist() == [1, 3]  # 0 is behind 1, 2 is too bright, 4 is behind the camera
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    assert len(sight(points, viewmat, K, image, mask).points) == 0
+
+
+def test_exif_is_a_start_as_far_as_photographs_agree_with_it():
+    torch.manual_seed(2)
+    exposure = torch.tensor([0.0, 1.0, -0.5, 0.3, 0.8, -1.0, 0.2, -0.4])
+    pairs = pairs_of(exposure[:, None].expand(8, 3))
+    factor, explained = slope(pairs, exposure)
+    assert (factor, explained) == (pytest.approx(1.0, abs=0.05), pytest.approx(1.0, abs=0.02))
+    lies = exposure[torch.randperm(8)] * 5
+    factor, explained = slope(pairs, lies)
+    assert explained < 0.5
+    found = estimate(pairs, lies)
+    assert (found.mean(1) - (exposure - exposure.mean())).abs().max() < 0.1
+
+
+def test_exif_alone():
+    nothing = compare([], torch.zeros(0, 3))
+    known = torch.tensor([0.0, 1.0, UNKNOWN, 2.0])
+    assert varies(known) and not varies(torch.tensor([0.3, 0.3, UNKNOWN])) and not varies(torch.tensor([UNKNOWN]))
+    assert slope(nothing, known) == (1.0, None)
+    assert estimate(nothing, known)[:, 1].tolist() == pytest.approx([-1.0, 0.0, 0.0, 1.0])
+
+
+def test_shrunk_and_drawn():
+    image, factor = shrunk(torch.full((1200, 900, 3), 255, dtype=torch.uint8))
+    assert (image.shape, factor) == ((400, 300, 3), 3)
+    assert (image == 1).all()
+    few = torch.rand(50_000, 3)
+    assert len(drawn(few)) == 20_000 and torch.equal(drawn(few), drawn(few))
