@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """config.yml read as a configuration and as nothing else.
 
-Nerfstudio saves a training's configuration as YAML with Python tags, and its own commands construct whatever those name:
-`!!python/object/apply:os.system` in a file that somebody hands on is run. Here a file may name
+Nerfstudio saves a training's configuration as YAML with Python tags, and its own commands construct whatever those
+name: `!!python/object/apply:os.system` in a file that somebody hands on is run. Here a file may name
 
     configuration classes of nerfstudio (subclasses of its PrintableConfig) and dataclasses of this package
     what a configuration sets up (`_target`): its default's class or a subclass of it, or an optimiser of torch
@@ -47,7 +47,7 @@ def read_config(path: Path) -> TrainerConfig:
         raise InputError(f"{path} is larger than {LARGEST_FILE} bytes. Name the config.yml that the training saved.")
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise InputError(f"{path} is not a configuration: {' '.join(str(error).split())}.") from error
     if not isinstance(config, TrainerConfig):
         raise InputError(f"{path} is not the configuration of a training. Name the config.yml that the training saved.")
@@ -60,8 +60,8 @@ class _Loader(yaml.SafeLoader):
 
 def _refuse(node: yaml.Node, name: str) -> yaml.YAMLError:
     return yaml.constructor.ConstructorError(
-        problem=f"it asks for {name!r}, which is no option of nerfstudio or {OURS}. If you trust the file, nerfstudio's "
-        "own commands read it",
+        problem=f"it asks for {name!r}, which is no option of nerfstudio or {OURS}. If you trust the file, "
+        "nerfstudio's own commands read it",
         problem_mark=node.start_mark,
     )
 

@@ -66,7 +66,7 @@ HOSTILE = {
     "a module of a package": "!!python/object/apply:nerfstudio.scripts.train.os.system ['touch {mark}']",
     "a module": "!!python/module:os",
     "a function as target": WHOLE.replace(
-        "!!python/name:nrfgs_ns.trainer.NrfgsTrainer ''", "!!python/name:os.system ''"
+        "!!python/name:nrfgs_ns.training.trainer.NrfgsTrainer ''", "!!python/name:os.system ''"
     ),
     "another class as target": WHOLE.replace(
         "!!python/name:torch.optim.adam.Adam ''", "!!python/name:nerfstudio.utils.writer.TensorboardWriter ''", 1

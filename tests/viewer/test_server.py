@@ -18,8 +18,8 @@ from short_trainings import command_line, trained
 from websockets.asyncio.client import connect
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.studies.run import parse
-from nrfgs_ns.viewer_server import LocalViewerConfig
+from nrfgs_ns.training.run import parse
+from nrfgs_ns.viewer.server import LocalViewerConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -296,8 +296,6 @@ def test_ns_viewer_listens_to_this_machine_alone(tiny_scene, tmp_path, monkeypat
 
 def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):
     with pytest.raises(InputError, match="legacy viewer .* Use --vis viewer"):
-        config = parse(
-            ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "viewer_legacy"]
-        )
+        config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "viewer_legacy"])
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
