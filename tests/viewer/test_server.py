@@ -17,8 +17,12 @@ from nerfstudio.viewer.viewer import Viewer
 from short_trainings import command_line, trained
 from websockets.asyncio.client import connect
 
+from nrfgs_ns.compact.format import MAGIC
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.training.run import parse
+from nrfgs_ns.viewer.command import View, view_file
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -299,3 +303,52 @@ def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):
         config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "viewer_legacy"])
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
+
+
+def test_nrfgs_view_opens_a_compact_file_alone(tiny_scene, tmp_path, monkeypatch):
+    """No config.yml, no data set; and what it draws is what the file's config.yml leads to."""
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "out", 2))
+    Export("compact", config, tmp_path / "with" / "it.nrf", measure=False).main()
+    original = load_model(next((tmp_path / "with").rglob("config.yml")), "test")
+    (tmp_path / "alone").mkdir()
+    (tmp_path / "with" / "it.nrf").rename(tmp_path / "alone" / "it.nrf")
+
+    drawn = []
+    viewer = view_file(tmp_path / "alone" / "it.nrf", LocalViewerConfig())
+    try:
+        model = viewer.pipeline.model
+        camera = original.datamanager.eval_dataset.cameras[:1]
+        ours, theirs = (one.get_outputs_for_camera(camera)["rgb"] for one in (model, original.model))
+        assert (ours - theirs).abs().max() < 1e-6 and ours.std() > 0.01
+        render = model.viewer_panel.render
+
+        def watched(camera, obb_box=None):
+            drawn.append(render(camera, obb_box))
+            return drawn[-1]
+
+        monkeypatch.setattr(model.viewer_panel, "render", watched)
+        # A browser's first view looks away; it is moved to where there is something to see.
+        away = {**CAMERA, "position": [0.0, 0.0, 900.0], "look_at": [0.0, 0.0, 1000.0]}
+        moved = []
+
+        async def be_moved():
+            port = viewer.viser_server.get_port()
+            async with connect(f"ws://127.0.0.1:{port}", max_size=None) as client:
+                await client.send(msgspec.msgpack.encode(away))
+                while not {"SetCameraPositionMessage", "SetCameraLookAtMessage"} <= {one["type"] for one in moved}:
+                    moved.extend(msgspec.msgpack.decode(await asyncio.wait_for(client.recv(), 60)))
+                while not drawn:
+                    await asyncio.sleep(0.1)
+
+        asyncio.run(asyncio.wait_for(be_moved(), 100))
+    finally:
+        viewer.viser_server.stop()
+    assert os.listdir(tmp_path / "alone") == ["it.nrf"], "nothing is written beside it"
+
+
+def test_nrfgs_view_refuses_what_it_cannot_open(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        View(tmp_path / "none.nrf").main()
+    (tmp_path / "broken.nrf").write_bytes(MAGIC + b"1234")
+    with pytest.raises(InputError, match="broken.nrf"):
+        View(tmp_path / "broken.nrf").main()
