@@ -67,6 +67,9 @@ class ShardedGuard(Guard):
         self.all_stop = self.all_stop or sizes[-1] > 0
         return sizes
 
+    def _out_of_sight(self) -> bool:
+        return False  # one device's shard may be, and others are not asked
+
     def _full_name(self, name: str, tensor: Tensor) -> str:
         return name if name == ELSEWHERE else super()._full_name(name, tensor)
 

@@ -30,6 +30,7 @@ from torch import Tensor
 from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.errors import ForTheUser
 from nrfgs_ns.training.guard_report import Finding, report
+from nrfgs_ns.training.in_sight import PATIENCE, InSight
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 from nrfgs_ns.training.pace import Pace
 
@@ -40,13 +41,13 @@ PARAMETERS_EVERY = 100
 """Steps between two looks at the parameters."""
 
 
-Origin = Literal["rendering", "gradient", "parameter", "elsewhere", "memory"]
-"""What stops a training: a number in the image or a loss, in a gradient or a parameter, or on another device; or that
-the memory has run out."""
+Origin = Literal["rendering", "gradient", "parameter", "elsewhere", "nothing visible", "memory"]
+"""What stops a training: a number in the image or a loss, in a gradient or a parameter, or on another device; that
+nothing is visible; or that the memory has run out."""
 
 
 class TrainingStopped(ForTheUser, RuntimeError):
-    """A training cannot go on: it met a number that is not finite, or its memory has run out.
+    """A training cannot go on: it met a number that is not finite, sees nothing, or its memory has run out.
 
     Args:
         message: what was met, where, and the likely cause.
@@ -86,6 +87,7 @@ class Guard:
     def __init__(self, pipeline):
         self.pipeline = pipeline
         self.step = 0
+        self.in_sight = InSight()
         self._verdict: Verdict | None = None
         # Pinned memory and events are dear to make; one of each will do, for a verdict is read before the next is made.
         self._in_host_memory: Tensor | None = None
@@ -99,10 +101,18 @@ class Guard:
         """Head of a training step: learn about the step before, and now and then look at the parameters.
 
         Raises:
-            TrainingStopped: the step before was condemned, or a parameter is not finite.
+            TrainingStopped: the step before was condemned, a parameter is not finite, or nothing is visible any more.
         """
         self.settle()
         self.step = step
+        if self._out_of_sight():
+            raise TrainingStopped(
+                f"No splat has been visible in the last {PATIENCE} steps, so nothing is learnt. Poses and points are "
+                "not of one world, or a learning rate has thrown the splats out of sight. The viewer shows where the "
+                "cameras are.",
+                step,
+                "nothing visible",
+            )
         if step % PARAMETERS_EVERY == 0:
             self.check_parameters(optimizers)
 
@@ -137,6 +147,10 @@ class Guard:
                 self._send_home(self._verdict)
         else:
             self.settle()
+
+    def _out_of_sight(self) -> bool:
+        """Whether nothing has been visible for long."""
+        return not self.in_sight.see(getattr(self.model, "info", {}))
 
     def _share(self, verdict: Verdict) -> Verdict:
         """Here joins in what other devices have found, where there are any (`distributed`)."""
