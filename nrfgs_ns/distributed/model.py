@@ -45,6 +45,7 @@ class ShardedModel(NrfgsModel):
 
     def populate_modules(self):
         super().populate_modules()
+        self.view_noise.seed += comm.rank()  # each device has other splats
         self.sizes: list[tuple[int, int]] = []
         if isinstance(self.densification, Mcmc):
             budget, rank = self.densification.budget, comm.rank()

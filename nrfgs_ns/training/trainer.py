@@ -127,6 +127,8 @@ class NrfgsTrainer(Trainer):
 
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
+    steps_are_chosen: bool = False
+    """whether the number of training views says how many steps are made"""
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
