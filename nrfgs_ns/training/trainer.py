@@ -32,7 +32,15 @@ from nrfgs_ns.training.cpu_command import ten_minute_command
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 from nrfgs_ns.training.optimizers import in_world_units
-from nrfgs_ns.training.pace import Pace, TimedPace, resolution_phases
+from nrfgs_ns.training.pace import (
+    FEWEST_STEPS,
+    STEPS,
+    STEPS_PER_VIEW,
+    Pace,
+    TimedPace,
+    resolution_phases,
+    steps_for,
+)
 from nrfgs_ns.training.stopping import (
     StopRequest,
     command_to_go_on,
@@ -42,6 +50,8 @@ from nrfgs_ns.training.stopping import (
 )
 from nrfgs_ns.training.tracking import track
 
+AVERAGED = 200
+"""Last steps whose mean is the trained model, where their number is chosen and in the presets."""
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
 TIME_STAMP = re.compile(r"\d{4}-\d\d-\d\d_\d{6}")
 """What nerfstudio calls a training's folder if it is not told."""
@@ -53,15 +63,19 @@ class NrfgsTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: NrfgsTrainer)
     """target class to instantiate"""
+    max_num_iterations: int = STEPS
+    """training steps. 0: chosen, 120 for each training view but at least 10,000 and at most 30,000, with all schedules
+    stretched to them (docs/captures.md)"""
     time_budget: float | None = None
     """minutes that training may take, from the first step to the end of the last. As many steps are made as fit, and
     all schedules are stretched to them. None: max_num_iterations steps"""
     schedule_steps: int | None = None
     """steps of the training that learning rates, resolution, harmonics and densification are laid out for; they are
     stretched to the steps that are made. None: not stretched, or with a time budget laid out for max_num_iterations"""
-    average_steps: int = 0
+    average_steps: int | None = None
     """the trained model is the mean of its parameters over the last so many steps, or over those since splats or the
-    field last changed if they are fewer; with a time budget about so many. 0: the last step's numbers"""
+    field last changed if they are fewer; with a time budget about so many. 0: the last step's numbers. None:
+    200 where the number of steps is chosen, 0 otherwise"""
 
     def setup(self, **kwargs) -> "NrfgsTrainer":
         """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
@@ -76,24 +90,42 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} is {value}; it must be positive.")
             if value is not None and devices > 1:
                 raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
-        if self.average_steps < 0:
-            raise InputError(f"average_steps is {self.average_steps}; it must be zero or positive.")
-        if self.max_num_iterations < 1:
-            raise InputError(f"max_num_iterations is {self.max_num_iterations}; it must be positive.")
+        for name in ("max_num_iterations", "average_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 0:
+                raise InputError(f"{name} is {value}; it must be zero or positive.")
         scale = self.pipeline.datamanager.camera_res_scale_factor
         if not 0 < scale < math.inf:
             raise InputError(f"pipeline.datamanager.camera_res_scale_factor is {scale}; it must be positive.")
-        if (self.pipeline.model.warmup_steps or 0) < 0:
-            raise InputError(
-                f"pipeline.model.warmup_steps is {self.pipeline.model.warmup_steps}; it must not be negative."
-            )
+        warmup = self.pipeline.model.warmup_steps
+        if warmup is not None and warmup < 0:
+            raise InputError(f"pipeline.model.warmup_steps is {warmup}; it must be zero or positive.")
         if self.load_dir is not None:
             checkpoint_files.checkpoints_in(self.load_dir)
         if devices == 1:
             return super().setup(**kwargs)
         from nrfgs_ns.distributed.trainer import ShardedTrainer
 
-        return ShardedTrainer(self, **kwargs)
+        # Schedules are not stretched there.
+        whole = replace(
+            self, max_num_iterations=self.max_num_iterations or STEPS, average_steps=self.average_steps or 0
+        )
+        return ShardedTrainer(whole, **kwargs)
+
+    def for_views(self, views: int) -> "NrfgsTrainerConfig":
+        """The configuration with what is left open chosen: steps, schedules and mean of a training on one device.
+
+        Args:
+            views: number of training views.
+        """
+        if self.max_num_iterations > 0:
+            return replace(self, average_steps=self.average_steps or 0)
+        return replace(
+            self,
+            max_num_iterations=STEPS if self.time_budget is not None else steps_for(views),
+            schedule_steps=STEPS if self.schedule_steps is None else self.schedule_steps,
+            average_steps=AVERAGED if self.average_steps is None else self.average_steps,
+        )
 
     def print_to_terminal(self) -> None:
         """What ns-train says before it begins: one line, and on several devices whether they are there. The whole
@@ -112,8 +144,7 @@ class NrfgsTrainerConfig(TrainerConfig):
         data = self.data or self.pipeline.datamanager.data
         lines = [f"{self.method_name} on {data}"]
         if machine.device_type == "cpu" and self.time_budget is None:
-            steps = f"No CUDA device: {self.max_num_iterations:,} steps on the CPU"
-            lines.append(f"{steps}. For a good result in ten minutes: {ten_minute_command(data)}")
+            lines.append(f"No CUDA device: the CPU trains. A good result in ten minutes: {ten_minute_command(data)}")
         CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
     def save_config(self) -> None:
@@ -159,6 +190,7 @@ class NrfgsTrainer(Trainer):
     Attributes:
         total_steps: steps of the whole training, those before a checkpoint included.
         pace: how fast the training walks through its schedules; None: a step is a step.
+        steps_are_chosen: whether the number of training views says how many steps are made.
         mean: of the parameters over the last steps; None if none was asked for.
         request: what signals have asked for.
     """
@@ -170,6 +202,7 @@ class NrfgsTrainer(Trainer):
             warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's GradScaler
             super().__init__(config, local_rank, world_size)
         self.total_steps = config.max_num_iterations
+        self.steps_are_chosen = False
         self.pace: Pace | None = None
         self.mean: ParameterMean | None = None
         self._saved_step: int | None = None
@@ -197,16 +230,37 @@ class NrfgsTrainer(Trainer):
         writer.GLOBAL_BUFFER["max_iter"] = self.total_steps
         self._made = self._start_step - 1
         """the last step that was made"""
+        if comms.is_main_process():
+            self._tell_what_was_chosen()
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
+        self.steps_are_chosen = self.config.max_num_iterations == 0
+        self.config = self.config.for_views(len(self.pipeline.datamanager.train_dataset))
+        self.total_steps = self.config.max_num_iterations
         self.guard = Guard(self.pipeline)
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self._pace()
         groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
         return WatchedOptimizers(self.optimizer_configs(), groups, self.guard, every, self.pace)
+
+    def _tell_what_was_chosen(self) -> None:
+        """One line: how many steps, how much noise, and why."""
+        model, views = self.pipeline.model, len(self.pipeline.datamanager.train_dataset)
+        chosen = []
+        if self.steps_are_chosen and self.config.time_budget is None:
+            chosen.append(
+                f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
+            )
+        if model.view_noise.sigma > 0.0:
+            chosen.append(f"the head sees each splat from about {model.config.view_noise:g} of that beside the camera")
+        if chosen:
+            apart = model.camera_spacing / model.scene_unit
+            CONSOLE.print(
+                f"{views} training views, {apart:.2g} scene units apart: {'; '.join(chosen)}.", soft_wrap=True
+            )
 
     def _pace(self) -> Pace | None:
         """How fast to walk through the schedules (`pace.py`), or None for a step at a time."""
