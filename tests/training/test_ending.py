@@ -197,7 +197,7 @@ def test_a_folder_without_checkpoints_is_refused_before_the_data_is_read(tmp_pat
 @pytest.mark.parametrize(
     ("option", "bad"),
     [
-        ("--max-num-iterations", 0),
+        ("--max-num-iterations", -1),
         ("--pipeline.model.warmup-steps", -1),
         ("--pipeline.datamanager.camera-res-scale-factor", 0),
     ],
