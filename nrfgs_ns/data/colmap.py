@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
+from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
 from nrfgs_ns.data.checks import shown
 from nrfgs_ns.errors import InputError
@@ -122,7 +123,7 @@ def _camera(model: str, width: int, height: int, parameters: list[float], path: 
 
 
 def _view(id: int, rotation: list[float], translation: list[float], camera: int, name: str, path: Path) -> View:
-    w, x, y, z = quaternion = np.array(rotation)
+    quaternion = np.array(rotation)
     pose = np.eye(4)
     pose[:3, 3] = translation
 
@@ -133,11 +134,7 @@ def _view(id: int, rotation: list[float], translation: list[float], camera: int,
         reject("holds NaN or Inf")
     if abs(np.linalg.norm(quaternion) - 1) > QUATERNION_TOLERANCE:
         reject(f"has a quaternion of length {np.linalg.norm(quaternion):.3g} instead of 1")
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    pose[:3, :3] = qvec2rotmat(quaternion)
     return View(id, name, camera, pose)
 
 
@@ -160,6 +157,10 @@ class _Bytes:
             raise ValueError(f"{count} bytes are announced and {len(self.data) - self.at} are there")
         self.at += count
 
+    def end(self) -> None:
+        if self.at != len(self.data):
+            raise ValueError(f"{len(self.data) - self.at} bytes follow the last entry")
+
     def word(self) -> str:
         end = self.data.index(b"\0", self.at)
         word, self.at = self.data[self.at : end].decode("utf-8"), end + 1
@@ -173,6 +174,7 @@ def _cameras_bin(path: Path) -> dict[int, dict[str, Any]]:
         id, model, width, height = file.take("<iiQQ")
         name, parameters = MODELS.get(model, (f"number {model}", ()))
         cameras[id] = _camera(name, width, height, list(file.take(f"<{len(parameters)}d")), path)
+    file.end()
     return cameras
 
 
@@ -184,6 +186,7 @@ def _images_bin(path: Path) -> list[View]:
         name = file.word()
         file.skip(24 * file.take("<Q")[0])  # its features
         views.append(_view(id, pose[:4], pose[4:], camera, name, path))
+    file.end()
     return views
 
 
@@ -194,6 +197,7 @@ def _points_bin(path: Path) -> np.ndarray:
         _, *row, _ = file.take("<Q3d3Bd")
         file.skip(8 * file.take("<Q")[0])  # where it was seen
         rows.append(row)
+    file.end()
     return np.array(rows, dtype=np.float64).reshape(-1, 6)
 
 
