@@ -7,6 +7,7 @@ nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the pa
 hold, so that an interrupted training can go on.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,8 +37,8 @@ from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.checkpoint import check_compatible, reduced_config
 from nrfgs_ns.model.exported import ExportedTables
 from nrfgs_ns.model.renderer import Rendering
+from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.training.pace import Pace
 from nrfgs_ns.viewer.panel import ViewerPanel
 
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
@@ -52,6 +53,9 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """target class to instantiate"""
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
+    view_noise: float = 0.0
+    """in training the head sees each splat from a camera centre of its own, moved by noise this many times as long as
+    neighbouring training cameras are apart (docs/captures.md). 0: from the camera's"""
     warmup_steps: int | None = None
     """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
     A head that adds nothing from the start skips them."""
@@ -85,8 +89,9 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     config: NrfgsModelConfig
     reduced_head: dict[str, Any] | None = None
     """options of the head that a checkpoint was written with, where they are not the configuration's"""
-    pace: Pace | None = None
-    """how fast the training walks through its schedules; None: a step is a step"""
+    camera_spacing: float = 0.0
+    """world units between neighbouring training cameras; 0 until a training begins"""
+    _scheduled: int | None = None
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
@@ -115,6 +120,9 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             else get_color(self.config.background_color)
         )
         self.densification = build_densification(self.config, self.num_train_data, self.scene_unit)
+        if not self.config.view_noise >= 0.0:
+            raise InputError(f"pipeline.model.view_noise is {self.config.view_noise}; it must be zero or positive.")
+        self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
 
     def _initial_splats(self) -> dict[str, Parameter]:
         """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
@@ -168,7 +176,10 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
-        self.densification.see_cameras(cameras.camera_to_worlds[:, :3, 3])
+        centers = cameras.camera_to_worlds[:, :3, 3]
+        self.densification.see_cameras(centers)
+        self.camera_spacing = camera_spacing(centers)
+        self.view_noise.sigma = self.config.view_noise * self.camera_spacing / math.sqrt(3.0)
 
         def before_first_step(step: int) -> None:
             steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
@@ -186,7 +197,11 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     @property
     def schedule_step(self) -> int:
         """The step that the head and the resolution are scheduled by."""
-        return self.step if self.pace is None else int(self.pace.position)
+        return self.step if self._scheduled is None else self._scheduled
+
+    def schedule_at(self, step: int) -> None:
+        """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
+        self._scheduled = step
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
@@ -289,7 +304,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         }
         if self.reduced_head is not None:
             state["capacity"] = {"head": self.reduced_head}
-        return state if self.pace is None else {**state, "pace": self.pace.state()}
+        return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         written_by = state.get("densification", "splatfacto")  # older checkpoints do not say
@@ -299,9 +314,10 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
-        if "pace" in state:
-            self.pace = self.pace or Pace(state["pace"]["length"])
-            self.pace.load_state(state["pace"])
+        if "pace" in state:  # of version 0.1.0
+            state = {**state, "schedule_step": int(state["pace"]["position"])}
+        if "schedule_step" in state:
+            self.schedule_at(state["schedule_step"])
             self.head.set_step(self.schedule_step)
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):

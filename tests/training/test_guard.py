@@ -8,7 +8,9 @@ import torch
 from short_trainings import command_line
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.checkpoint_files import seal, write
 from nrfgs_ns.training.guard import MAX_GRADIENT, PARAMETERS_EVERY, TrainingStopped
+from nrfgs_ns.training.in_sight import PATIENCE, InSight
 from nrfgs_ns.training.run import _set_random_seed, parse
 
 
@@ -132,7 +134,7 @@ def test_training_goes_on_from_where_it_stopped(start, fused):
     again = start({"--load-dir": trainer.checkpoint_dir})
     assert again._start_step == 4
     again.train()
-    assert max(checkpoints(again)) == 13
+    assert max(checkpoints(again)) == 9
 
 
 @pytest.mark.parametrize("fused", [False, True], ids=["on the host", "on the device"])
@@ -244,7 +246,8 @@ def test_a_checkpoint_that_is_not_finite_is_refused(start, name):
     trainer.train()
     ((step, state),) = checkpoints(trainer).items()
     state["pipeline"][f"_model.{name}"].view(-1)[4] = INF
-    torch.save(state, trainer.checkpoint_dir / f"step-{step:09d}.ckpt")
+    seal(state["pipeline"], step)
+    write(trainer.checkpoint_dir, step, state)
     with pytest.raises(InputError, match=f"'{name}'.*not finite"):
         start({"--load-dir": trainer.checkpoint_dir})
 
@@ -288,3 +291,18 @@ def state_of(trainer) -> dict:
     """What a checkpoint would hold now."""
     optimizers = {name: optimizer.state_dict() for name, optimizer in trainer.optimizers.optimizers.items()}
     return {"pipeline": trainer.pipeline.state_dict(), "optimizers": optimizers}
+
+
+def test_a_training_in_which_nothing_is_visible_stops(start):
+    trainer = start(steps=PATIENCE + 50)
+    with torch.no_grad():
+        trainer.pipeline.model.gauss_params["means"] += 1e6
+    with pytest.raises(TrainingStopped, match=f"No splat has been visible in the last {PATIENCE} steps") as stopped:
+        trainer.train()
+    assert stopped.value.step == PATIENCE and list(checkpoints(trainer)) == [PATIENCE]
+
+
+def test_now_and_then_a_view_may_see_nothing():
+    sight, nothing, something = InSight(), {"gaussian_ids": torch.empty(0)}, {"gaussian_ids": torch.arange(3)}
+    assert all(sight.see(nothing) for _ in range(PATIENCE - 1)) and sight.see(something) and sight.see({})
+    assert all(sight.see(nothing) for _ in range(PATIENCE - 1)) and not sight.see(nothing)
