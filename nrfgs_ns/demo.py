@@ -8,21 +8,25 @@ import contextlib
 import json
 import shlex
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from nrfgs_ns.scenes import SceneConfig, write_scene
+from nrfgs_ns.scenes import SceneConfig, build_scene, dome_cameras, render, split_names, write_scene
 
 METHODS = {"nrfgs": "NRF", "nrfgs-sh": "SH"}
 RESIDUAL_GAIN = 4.0
 """How much the contact sheet amplifies NRF's view-dependent part around mid grey."""
+CELL = 280
+"""Width of a picture in the contact sheet, pixels."""
+SHINES = 0.1
+"""How much of white gloss must change a pixel's truth for it to count as one that shines."""
 
 
 @dataclass
@@ -32,8 +36,8 @@ class Demo:
     out: Path = Path("demo")
     """folder for the data set, the trainings, results.json and contact_sheet.png"""
     gloss: float = 1.0
-    """0: everything is diffuse. 1: glossy and mirror-like."""
-    steps: int = 1000
+    """0: everything is diffuse. 1: satin and glossy."""
+    steps: int = 800
     """training steps of each method"""
     quick: bool = False
     """a smaller scene and fewer steps: a minute, to see that everything works"""
@@ -41,7 +45,10 @@ class Demo:
     """seed of the scene and of both trainings"""
 
     def main(self) -> None:
-        screen = Console(file=sys.__stdout__)
+        with _one_thread():
+            self._run(Console(file=sys.__stdout__))
+
+    def _run(self, screen: Console) -> None:
         scene, steps = self.scene(), min(self.steps, 150) if self.quick else self.steps
         results: dict[str, dict[str, Any]] = {}
         self.out.mkdir(parents=True, exist_ok=True)
@@ -62,14 +69,17 @@ class Demo:
                     with _bar(progress, f"evaluate {label}", 1):
                         results[method] = {"eval": evaluate(config, config.parent / "eval.json")}
                 results[method]["train"] = asdict(record)
+        with (self.out / "contact_sheet.log").open("w") as log, contextlib.redirect_stdout(log):
+            views = {method: seen_views(Path(one["train"]["config_path"]), scene) for method, one in results.items()}
+        for method, seen in views.items():
+            results[method]["shine"] = where_it_shines(seen)
         screen.print(comparison(results, steps))
         sheet = self.out / "contact_sheet.png"
-        with (self.out / "contact_sheet.log").open("w") as log, contextlib.redirect_stdout(log):
-            contact_sheet({method: Path(result["train"]["config_path"]) for method, result in results.items()}, sheet)
+        contact_sheet(views, sheet)
         summary = {"steps": steps, "scene": asdict(scene), "machine": machine(), "methods": results}
         (self.out / "results.json").write_text(json.dumps(summary, indent=1) + "\n")
         screen.print(f"Pictures: {sheet}. Numbers: {self.out / 'results.json'}. Look around with:")
-        screen.print(f"  ns-viewer --load-config {results['nrfgs']['train']['config_path']}", soft_wrap=True)
+        screen.print(f"  nrfgs view {results['nrfgs']['train']['config_path']}", soft_wrap=True)
 
     @property
     def scene_folder(self) -> str:
@@ -79,14 +89,16 @@ class Demo:
     def scene(self) -> SceneConfig:
         """The scene's configuration."""
         if self.quick:
-            return SceneConfig(gloss=self.gloss, seed=self.seed, views=24, width=100, height=76, points=2000)
-        return SceneConfig(gloss=self.gloss, seed=self.seed)
+            return SceneConfig(
+                gloss=self.gloss, mirror=0.0, seed=self.seed, views=24, width=100, height=76, points=2000
+            )
+        return SceneConfig(gloss=self.gloss, mirror=0.0, seed=self.seed, views=72, width=160, height=120, points=6000)
 
     def train_args(self, method: str, data: Path, steps: int) -> list[str]:
-        """The options of `ns-train`: everything default but the number of steps and where things go.
+        """The options of `ns-train`: as many splats for both as the scene has points, and schedules that fit the steps.
 
-        Splatfacto's schedules are made for 30,000 steps; here resolution and spherical harmonics reach their full size
-        within the first third.
+        Splatfacto's are made for 30,000 steps; here resolution and spherical harmonics reach their full size within the
+        first third.
         """
         options = {
             "--data": data,
@@ -97,12 +109,29 @@ class Demo:
             "--steps-per-eval-image": 10 * steps,
             "--steps-per-eval-all-images": 10 * steps,
             "--logging.profiler": "none",
+            "--pipeline.model.densification": "mcmc",
+            "--pipeline.model.splat-budget": self.scene().points,
             "--pipeline.model.num-downscales": 1,
             "--pipeline.model.resolution-schedule": max(steps // 5, 1),
         }
         if method == "nrfgs-sh":
             options["--pipeline.model.appearance.degree-interval"] = max(steps // 10, 1)
         return [method, *(str(word) for option in options.items() for word in option)]
+
+
+@contextlib.contextmanager
+def _one_thread():
+    """Let torch compute with one CPU thread until the block ends.
+
+    Threads that share their cores with another program wait for each other, most of the time in loops: two on two busy
+    cores take as long as one, and several times the CPU.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager
@@ -124,6 +153,8 @@ def comparison(results: dict[str, dict[str, Any]], steps: int) -> Table:
         values = [results[method][part].get(key) for method in METHODS]
         table.add_row(name, *("-" if value is None else form.format(value / unit) for value in values))
 
+    row("PSNR where it shines (dB)", "shine", "psnr", "{:.2f}")
+    row("  of the base colour alone", "shine", "psnr_base", "{:.2f}")
     row("PSNR (dB)", "eval", "psnr", "{:.2f}")
     row("SSIM", "eval", "ssim", "{:.4f}")
     row("L1", "eval", "l1", "{:.4f}")
@@ -134,37 +165,98 @@ def comparison(results: dict[str, dict[str, Any]], steps: int) -> Table:
     return table
 
 
-def contact_sheet(configs: dict[str, Path], path: Path, views: int = 3) -> None:
-    """Write a picture of `views` test images: truth, NRF, SH, NRF's base colour alone, and its residual.
+@dataclass
+class SeenView:
+    """One test view of the demo, as a trained model shows it. Pictures are [H, W, 3] in [0, 1]."""
+
+    truth: torch.Tensor
+    dull: torch.Tensor
+    """the truth without gloss, as the ray tracer has it"""
+    rendered: torch.Tensor
+    base: torch.Tensor
+    """base colours and opacities alone"""
+
+    @property
+    def shine(self) -> torch.Tensor:
+        """What gloss does to a pixel, its strongest channel, [H, W]."""
+        return (self.truth - self.dull).abs().amax(dim=-1)
+
+
+def seen_views(config: Path, scene: SceneConfig) -> list[SeenView]:
+    """All test views of a training on a procedural scene."""
+    from nrfgs_ns.export.loading import load_model
+
+    pipeline = load_model(config, "test")
+    model, dull = pipeline.model, build_scene(replace(scene, gloss=0.0))
+    cameras = dict(zip(sorted(sum(split_names(scene), [])), dome_cameras(scene), strict=True))
+    views = []
+    names = pipeline.datamanager.eval_dataset.image_filenames
+    for name, (camera, batch) in zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True):
+        truth = model.get_gt_img(batch["image"])[..., :3].cpu()
+        without = torch.from_numpy(render(dull, cameras[f"images/{Path(name).name}"]))
+        rendered, base = model.get_outputs_for_camera(camera)["rgb"], model.get_base_color(camera)
+        views.append(SeenView(truth, without, rendered.cpu(), base.cpu()))
+    return views
+
+
+def where_it_shines(views: list[SeenView]) -> dict[str, float | None]:
+    """PSNR of the pixels whose truth gloss changes by more than SHINES, over all views; with the share of such pixels.
+
+    None where there are none, as without gloss.
+    """
+    shines = [view.shine > SHINES for view in views]
+    share = float(torch.stack(shines).float().mean())
+    if share == 0:
+        return {"share": share, "psnr": None, "psnr_base": None}
+
+    def psnr(name: str) -> float:
+        pairs = zip(views, shines, strict=True)
+        wrong = torch.cat([(getattr(view, name) - view.truth)[shine] for view, shine in pairs])
+        return float(-10 * torch.log10(wrong.square().mean()))
+
+    return {"share": share, "psnr": psnr("rendered"), "psnr_base": psnr("base")}
+
+
+def brightest_window(shine: torch.Tensor, part: int = 3) -> tuple[int, int, int, int]:
+    """The window of 1 / part of a picture's sides in which gloss does most: top, left, height, width, pixels."""
+    height, width = (max(size // part, 1) for size in shine.shape)
+    sums = torch.nn.functional.avg_pool2d(shine[None, None], (height, width), stride=1)[0, 0]
+    place = int(sums.argmax())
+    return place // sums.shape[1], place % sums.shape[1], height, width
+
+
+def contact_sheet(views: dict[str, list[SeenView]], path: Path, count: int = 3) -> None:
+    """Write a picture of `count` test views, each whole and below it where it shines most: truth, NRF, SH, NRF's base
+    colour alone, and what NRF adds to it.
 
     Args:
-        configs: method -> config.yml of its training.
+        views: method -> its test views.
         path: where the PNG goes.
     """
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    columns: list[tuple[str, list[torch.Tensor]]] = []
-    for method, label in METHODS.items():
-        _, pipeline, _, _ = eval_setup(configs[method], test_mode="test")
-        model = pipeline.model
-        pairs = pipeline.datamanager.fixed_indices_eval_dataloader
-        pairs = pairs[:: max(len(pairs) // views, 1)][:views]
-        renders = [model.get_outputs_for_camera(camera)["rgb"] for camera, _ in pairs]
-        if method == "nrfgs":
-            bases = [model.get_base_color(camera) for camera, _ in pairs]
-            columns.append(("truth", [model.get_gt_img(batch["image"])[..., :3] for _, batch in pairs]))
-            residuals = [0.5 + RESIDUAL_GAIN * (render - base) for render, base in zip(renders, bases, strict=True)]
-        columns.append((label, renders))
-    columns += [("base colour only", bases), (f"view-dependent part x {RESIDUAL_GAIN:g}", residuals)]
-
-    height, width = renders[0].shape[:2]
-    gap, title = 4, 16
-    sheet = Image.new("RGB", (len(columns) * (width + gap) - gap, title + len(pairs) * (height + gap)), "white")
+    nrf, sh = views["nrfgs"], views["nrfgs-sh"]
+    chosen = range(0, len(nrf), max(len(nrf) // count, 1))[:count]
+    columns = {
+        "truth": [view.truth for view in nrf],
+        METHODS["nrfgs"]: [view.rendered for view in nrf],
+        METHODS["nrfgs-sh"]: [view.rendered for view in sh],
+        "NRF's base colour alone": [view.base for view in nrf],
+        f"what NRF adds to it, x {RESIDUAL_GAIN:g}": [
+            0.5 + RESIDUAL_GAIN * (view.rendered - view.base) for view in nrf
+        ],
+    }
+    height = round(CELL * nrf[0].truth.shape[0] / nrf[0].truth.shape[1])
+    gap, title, font = 6, 26, ImageFont.load_default(16)
+    size = len(columns) * (CELL + gap) - gap, title + len(chosen) * (2 * height + 3 * gap)
+    sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
-    for column, (label, images) in enumerate(columns):
-        x = column * (width + gap)
-        draw.text((x + 2, 2), label, fill="black")
-        for row, image in enumerate(images):
-            pixels = (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
-            sheet.paste(Image.fromarray(pixels), (x, title + row * (height + gap)))
+    for column, (label, images) in enumerate(columns.items()):
+        x = column * (CELL + gap)
+        draw.text((x + 2, 3), label, fill="black", font=font)
+        for row, index in enumerate(chosen):
+            y = title + row * (2 * height + 3 * gap)
+            top, left, high, wide = brightest_window(nrf[index].shine)
+            part = images[index][top : top + high, left : left + wide]
+            for image, below in ((images[index], 0), (part, height + gap)):
+                pixels = (image.clamp(0, 1) * 255).round().byte().numpy()
+                sheet.paste(Image.fromarray(pixels).resize((CELL, height), Image.Resampling.BICUBIC), (x, y + below))
     sheet.save(path)

@@ -6,9 +6,10 @@ import subprocess
 import sys
 
 import pytest
+import torch
 from PIL import Image
 
-from nrfgs_ns.demo import METHODS, Demo
+from nrfgs_ns.demo import CELL, METHODS, Demo, SeenView, brightest_window, where_it_shines
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -22,9 +23,22 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd):
     for result in results["methods"].values():
         assert result["train"]["steps"] == 6
         assert 5 < result["eval"]["psnr"] < 60
+        assert 0.02 < result["shine"]["share"] < 0.9 and 5 < result["shine"]["psnr"] < 60
     sheet = Image.open(tmp_path / "demo" / "contact_sheet.png")
-    scene = demo.scene()
-    assert sheet.width > 5 * scene.width and sheet.height > 3 * scene.height
+    assert sheet.width >= 5 * CELL and sheet.height >= 6 * 0.7 * CELL
+
+
+def test_where_it_shines_is_where_gloss_changes_the_truth():
+    grey = torch.full((12, 15, 3), 0.5)
+    truth = grey.clone()
+    truth[6:9, 10:14] = 0.9
+    view = SeenView(truth=truth, dull=grey, rendered=truth - 0.1, base=grey)
+    score = where_it_shines([view, view])
+    assert score["share"] == pytest.approx(12 / 180)
+    assert score["psnr"] == pytest.approx(20.0, abs=1e-3) and score["psnr_base"] == pytest.approx(7.96, abs=1e-2)
+    top, left, height, width = brightest_window(view.shine)
+    assert (height, width) == (4, 5) and top <= 6 and top + height >= 9 and left <= 10 and left + width >= 14
+    assert where_it_shines([SeenView(grey, grey, grey, grey)]) == {"share": 0.0, "psnr": None, "psnr_base": None}
 
 
 def test_help_answers_and_names_the_commands():

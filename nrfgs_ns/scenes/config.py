@@ -16,6 +16,9 @@ class SceneConfig:
 
     gloss: float = 1.0
     """Weight g of everything specular, in [0, 1]. At 0 each surface point has one colour, whatever the view."""
+    mirror: float = 1.0
+    """Weight of the mirror's share in what is specular, in [0, 1]. At 0 it is all satin: broad highlights of the lamps,
+    and nothing reflected."""
     views: int = 48
     """Number of images, at least 2."""
     width: int = 200
@@ -38,8 +41,10 @@ class SceneConfig:
             self._require_integer(name, lowest)
         self._require_integer("test_every", 2)
         self._require_integer("seed", 0)
-        if not _is_finite(self.gloss) or not 0.0 <= self.gloss <= 1.0:
-            raise ValueError(f"SceneConfig.gloss must lie in [0, 1], got {self.gloss!r}")
+        for name in ("gloss", "mirror"):
+            value = getattr(self, name)
+            if not _is_finite(value) or not 0.0 <= value <= 1.0:
+                raise ValueError(f"SceneConfig.{name} must lie in [0, 1], got {value!r}")
         if not _is_finite(self.field_of_view) or not 0.0 < self.field_of_view <= 120.0:
             raise ValueError(f"SceneConfig.field_of_view must lie in (0, 120] degrees, got {self.field_of_view!r}")
 

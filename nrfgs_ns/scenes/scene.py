@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene that can be asked for the colour along any ray, and the one layout that this package ships."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -216,7 +216,9 @@ def build_scene(config: SceneConfig) -> Scene:
     return Scene(
         config=config,
         world=World(sky_radius=10.0, solids=tuple(item.solid for item in objects)),
-        objects=objects,
+        objects=tuple(
+            replace(item, finish=replace(item.finish, mirror=config.mirror * item.finish.mirror)) for item in objects
+        ),
         lamps=lamps,
         ambient=Ambient(below=(0.08, 0.07, 0.06), above=(0.17, 0.18, 0.26)),
         floor=Floor(),

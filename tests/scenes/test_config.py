@@ -15,6 +15,8 @@ from nrfgs_ns.scenes import SceneConfig
         ("gloss", 1.01),
         ("gloss", math.nan),
         ("gloss", "shiny"),
+        ("mirror", -0.1),
+        ("mirror", 2),
         ("views", 1),
         ("views", 4.0),
         ("width", 0),

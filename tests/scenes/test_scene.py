@@ -142,3 +142,17 @@ def test_seed_changes_the_textures_and_nothing_else():
 def _image_rays(config):
     xs, ys = np.meshgrid(np.arange(config.width) + 0.5, np.arange(config.height) + 0.5)
     return camera_rays(config, dome_cameras(config)[5], np.stack([xs, ys], axis=-1).reshape(-1, 2))
+
+
+def test_without_a_mirror_nothing_is_reflected():
+    """What leaves a surface is then the same whether or not rays are followed off it, and it still shines."""
+    for mirror in (0.0, 1.0):
+        scene = build_scene(SceneConfig(mirror=mirror, **SMALL))
+        points, surfaces = surface_points(scene)
+        solid = surfaces >= FIRST_SOLID
+        points, surfaces = points[solid], surfaces[solid]
+        directions = views_above(scene, points, surfaces, 2)
+        alone, followed = (scene._outgoing(points.T, surfaces, directions[0].T, bounces) for bounces in (0, 2))
+        assert np.array_equal(alone, followed) == (mirror == 0.0)
+        other = scene._outgoing(points.T, surfaces, directions[1].T, 0)
+        assert np.abs(other - alone).mean() > 0.01
