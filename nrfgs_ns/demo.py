@@ -50,7 +50,7 @@ class Demo:
             with _bar(progress, "make the scene", scene.views) as advance:
                 data = write_scene(scene, self.out / self.scene_folder, progress=lambda *_: advance())
             # Heavy imports only when there is work to do: `nrfgs --help` answers at once, and so does a refusal.
-            from nrfgs_ns.studies.run import evaluate, machine, train
+            from nrfgs_ns.training.run import evaluate, machine, train
 
             for method, label in METHODS.items():
                 args = self.train_args(method, data, steps)

@@ -22,9 +22,9 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.model import NrfgsModelConfig
-from nrfgs_ns.pipeline import NrfgsPipelineConfig
-from nrfgs_ns.trainer import NrfgsTrainerConfig
+from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
+from nrfgs_ns.training.trainer import NrfgsTrainerConfig
 
 STEPS = 30_000
 AVERAGED = 200

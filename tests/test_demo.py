@@ -27,9 +27,18 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd):
     assert sheet.width > 5 * scene.width and sheet.height > 3 * scene.height
 
 
-def test_help_answers_and_names_the_verbs():
+def test_help_answers_and_names_the_commands():
     run = subprocess.run([sys.executable, "-m", "nrfgs_ns.cli", "--help"], capture_output=True, text=True, check=True)
-    assert "demo" in run.stdout
+    assert {"demo", "export", "bench"} <= set(run.stdout.split())
+
+
+def test_a_command_imports_no_other():
+    code = (
+        "import sys; from nrfgs_ns.cli import chosen; chosen(['demo', '--quick']);"
+        "print([name for name in sys.modules if name.startswith(('nrfgs_lab', 'nrfgs_ns.export', 'nrfgs_ns.prepare'))])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["[]"]
 
 
 def test_a_folder_that_is_not_ours_is_refused_in_one_line(tmp_path):

@@ -15,10 +15,12 @@ import yaml
 
 import nrfgs_ns
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.export import Export, load_model, read_splats
+from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.scenes import SceneConfig, write_scene
-from nrfgs_ns.studies.run import evaluate
-from nrfgs_ns.trainer import NrfgsTrainer
+from nrfgs_ns.training.run import evaluate
+from nrfgs_ns.training.trainer import NrfgsTrainer
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

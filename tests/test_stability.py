@@ -5,10 +5,10 @@ import ast
 from pathlib import Path
 
 import pytest
+from hard_trainings import SCENE, hard_trainings, run, table
+from stability_catalogue import CATALOGUE, markdown
 
 from nrfgs_ns.scenes import write_scene
-from nrfgs_ns.studies.stability import CATALOGUE, markdown
-from nrfgs_ns.studies.stability_trainings import SCENE, hard_trainings, run, table
 
 ROOT = Path(__file__).resolve().parents[1]
 

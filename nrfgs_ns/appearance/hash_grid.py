@@ -31,7 +31,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.triton_trial import try_triton
+from nrfgs_ns.kernels.trial import try_triton
 
 PRIMES = (1, 2654435761, 805459861)
 """The hash's multipliers for x, y, z."""

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nrfgs_ns.appearance import hash_grid
-from nrfgs_ns.triton_launch import Launcher
+from nrfgs_ns.kernels.launch import Launcher
 
 POSITIONS = 128
 """Most positions of a program: one for each thread."""

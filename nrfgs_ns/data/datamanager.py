@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
@@ -18,10 +18,14 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
-from nrfgs_ns.data.checks import UNREADABLE
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.checks import some, warn
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, checked
+from nrfgs_ns.data.pictures import read_picture
 from nrfgs_ns.data.scene_unit import scene_unit
 from nrfgs_ns.errors import InputError
+
+LARGEST_SCALE = 16.0
+"""By which images may be enlarged."""
 
 
 class NrfgsInputDataset(InputDataset):
@@ -43,19 +47,7 @@ class NrfgsInputDataset(InputDataset):
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Decodes an image, uint8 [H, W, 3 or 4], scaled by scale_factor."""
         path = self.image_filenames[image_idx]
-        try:
-            with Image.open(path) as image:
-                mode = image.mode
-                transparent = mode.endswith(("A", "a")) or (mode == "P" and "transparency" in image.info)
-                pixels = image.convert("RGBA" if transparent else "RGB")
-        except UNREADABLE as error:
-            raise InputError(
-                f"{path} cannot be decoded ({error}). Restore the file, or remove its frame from the data set."
-            ) from error
-        if mode[0] in "IF":
-            raise InputError(
-                f"{path} has more than 8 bits per channel (mode {mode}). Convert it to an 8-bit PNG or JPEG."
-            )
+        pixels = read_picture(path)
         if self.scale_factor != 1.0:
             size = [int(side * self.scale_factor) for side in pixels.size]
             pixels = pixels.resize(size, resample=Image.Resampling.BILINEAR)
@@ -77,7 +69,7 @@ class NrfgsInputDataset(InputDataset):
             return super().get_data(image_idx, image_type)
         except InputError:
             raise
-        except (*UNREADABLE, AssertionError) as error:
+        except Exception as error:  # nerfstudio reads the mask with PIL, which lets out whatever it meets
             if self._dataparser_outputs.mask_filenames is None:
                 raise
             raise InputError(
@@ -103,13 +95,37 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     config: NrfgsDatamanagerConfig
 
+    def __init__(self, config: NrfgsDatamanagerConfig, *args: Any, **kwargs: Any):
+        config.dataparser = checked(config.dataparser)
+        scale = config.camera_res_scale_factor
+        if not 0 < scale <= LARGEST_SCALE:
+            raise InputError(
+                f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, at most {LARGEST_SCALE}."
+            )
+        super().__init__(config, *args, **kwargs)
+
     def load_all_images(self) -> tuple[int, int]:
         """Decodes all images now, so that a broken one is found before the first step.
 
         Returns:
             The numbers of training and evaluation images.
+
+        Raises:
+            InputError: an image or a mask cannot be used, or all masks of the training images are empty.
         """
-        return len(self.cached_train), len(self.cached_eval)
+        count = len(self.cached_train)
+        names = [path.name for path in self.train_dataset.image_filenames]
+        empty = [
+            name
+            for name, data in zip(names, self.cached_train, strict=True)
+            if "mask" in data and not data["mask"].any()
+        ]
+        if empty:
+            finding = f"{self.get_datapath()}: the masks of {some(empty)} leave nothing of the image"
+            if len(empty) == count:
+                raise InputError(f"{finding}, so there is nothing to learn. Masks are 0 outside, anything else inside.")
+            warn(f"{finding}.")
+        return count, len(self.cached_eval)
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """The next camera in turn, and its image.
@@ -192,7 +208,11 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             # "gpu" means `self.device`. "cpu" means pinned memory, which needs an accelerator's driver, and which
             # nerfstudio chooses by itself above 500 images.
             cache_images_device = "gpu"
-        return super()._load_images(split, cache_images_device)
+        images = super()._load_images(split, cache_images_device)
+        # What is in memory is a pinhole's, whatever the lens: nerfstudio undistorts, and keeps the camera's type.
+        for dataset in (self.train_dataset, self.eval_dataset):
+            dataset.cameras.camera_type[:] = CameraType.PERSPECTIVE.value
+        return images
 
     def sampling_state(self) -> dict[str, Any]:
         """Everything that decides which training camera comes next, as plain numbers, strings, lists and tuples.

@@ -1,15 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs-data`: nerfstudio's own data sets, checked up front, every 8th image for testing, points read by plyfile."""
+"""`nrfgs-data`: nerfstudio's own data sets, checked up front, every 8th image for testing, points read by plyfile; and
+what reads COLMAP's models in its place.
 
+Both layouts become one dictionary, that of transforms.json, so that there is one way from it to cameras, and the same
+checks on it.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import cv2
 import numpy as np
 import torch
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION, NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.dataparsers_utils import (
     get_train_eval_split_all,
     get_train_eval_split_filename,
@@ -19,19 +29,27 @@ from nerfstudio.data.utils.dataparsers_utils import (
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from nrfgs_ns.data.checks import (
+    SMALLEST,
     check_exist,
     check_frames,
     check_headers,
     check_intrinsics,
+    check_options,
     check_poses,
     check_unique,
-    read_header,
+    exists,
+    number,
     read_transforms,
+    shown,
     some,
     warn,
 )
+from nrfgs_ns.data.colmap import read_model
+from nrfgs_ns.data.pictures import read_header, smaller_copies
 from nrfgs_ns.data.points import read_colmap, read_ply
+from nrfgs_ns.data.sight import check_sight, in_reach
 from nrfgs_ns.data.split import interior_test_images
+from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
 
 SPLITS = ("train", "val", "test")
@@ -42,6 +60,19 @@ MASK_MODES = ("1", "L", "I", "I;16")
 """PIL modes with one value per pixel that means something by itself (a palette index does not)."""
 MIN_POINTS = 4
 """Fewer points cannot start a training: a splat's first size is its distance to its three nearest neighbours."""
+ORIENTATIONS = ("pca", "up", "vertical", "none")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""nerfstudio's order of the parameters."""
+FISHEYE_AT_LEAST = 1e-12
+"""A distortion without effect: nerfstudio undistorts, and a fisheye needs it, only if some parameter is not 0."""
+LEFT_OF_IMAGE = 0.25
+"""Share of an image's pixels that undistortion must leave."""
+FOLDERS = {"file_path": "images", "mask_path": "masks", "depth_file_path": "depths"}
+"""Where smaller copies of a frame's files are, followed by _ and the factor."""
+COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
+"""The applied_transform of data sets from before nerfstudio wrote it down."""
+COLMAP_UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""nerfstudio's turn of COLMAP's world, whose y points downwards, to one whose z points upwards."""
 
 
 @dataclass
@@ -59,7 +90,27 @@ class NrfgsDataParserConfig(NerfstudioDataParserConfig):
     """Whether to start from the points of the data set (ply_file_path, or else colmap/sparse/0)."""
 
 
-class NrfgsDataParser(Nerfstudio):
+class Scene(NamedTuple):
+    """A whole data set, before it is split."""
+
+    meta: dict[str, Any]
+    """what transforms.json says, or would say"""
+    source: Path
+    """the file that messages name"""
+    splits: dict[str, np.ndarray]
+    """rows of each split"""
+    factor: int
+    """by which images are smaller than the intrinsics say"""
+    cameras: Cameras
+    """all of them, placed and of the size of the images"""
+    transform: torch.Tensor
+    """[3, 4], from the frames' world to the cameras', before `scale`"""
+    to_frames: torch.Tensor | None
+    """[3, 4], from the original world to the frames'"""
+    scale: float
+
+
+class NrfgsDataParser(DataParser):
     """nerfstudio's parser, with these differences.
 
     - The data set is checked before it is parsed (see `checks`); what cannot be used raises InputError.
@@ -68,146 +119,236 @@ class NrfgsDataParser(Nerfstudio):
     - A data set of one image loads. It keeps its own scale, having no extent to normalise by.
     - Points are read by plyfile instead of open3d, or straight from colmap/sparse/0, where nerfstudio asks a question
       at the terminal and then writes into the data set.
+    - Cameras far from the origin are moved there in float64 (see `world`).
+    - With a downscale_factor of which there is no folder, images are resized into a cache.
     - To render from a checkpoint, nerfstudio announces that it needs no images (it presets `downscale_factor`). Then
       neither images nor points need be there.
     """
 
-    config: NrfgsDataParserConfig
+    config: NerfstudioDataParserConfig
+    downscale_factor: int | None = None
+    """set by nerfstudio, before the parsing, if no image is needed"""
 
-    def __init__(self, config: NrfgsDataParserConfig):
-        super().__init__(config)
-        self._meta: dict[str, Any] | None = None  # until the checks have passed
-
-    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+    def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
         """Parses one split; the first call checks the whole data set."""
-        if self._meta is None:
-            meta, self._source = read_transforms(self.config.data)
-            self._check(meta)
-            self._meta = meta
-        own_config = self.config
-        interior = self._splits_interior(self._meta)
-        self.config = self._host_config()
-        try:
-            part = self._host_split(split)
-            outputs = super()._generate_dataparser_outputs("train" if interior else part)
-        finally:
-            self.config = own_config
-        if interior:
-            test = interior_test_images(len(outputs.image_filenames), self.config.eval_interval)
-            train = [index for index in range(len(outputs.image_filenames)) if index not in test]
-            outputs = _select(outputs, train if part == "train" else list(test))
-        self._check_outputs(outputs)
-        if self._points_wanted and "ply_file_path" not in self._meta:
-            # nerfstudio has loaded none. COLMAP's world is the "original" one that dataparser_transform starts from.
-            outputs.metadata.update(self._placed(outputs.dataparser_transform, outputs.dataparser_scale) or {})
+        scene = self._scene
+        chosen = next((name for name in STAND_INS.get(split, ()) if len(scene.splits[name])), split)
+        if chosen == "train" != split:
+            warn(f"{scene.source}: no image is kept for {split}. The training images are evaluated instead.")
+        rows = scene.splits[chosen]
+        frames = [scene.meta["frames"][row] for row in rows]
+        files = {key: self._files(scene, frames, key) for key in FOLDERS}
+        cameras = scene.cameras[torch.from_numpy(rows)]
+        if self._images_needed:
+            sizes = list(zip(cameras.width.flatten().tolist(), cameras.height.flatten().tolist(), strict=True))
+            files = self._checked_files(scene, frames, files, sizes)
+        box = self.config.scene_scale * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        outputs = PlacedOutputs(
+            image_filenames=files["file_path"],
+            cameras=cameras,
+            scene_box=SceneBox(aabb=box),
+            mask_filenames=files["mask_path"] or None,
+            dataparser_scale=scene.scale * number(scene.meta.get("applied_scale", 1.0)),
+            dataparser_transform=after(scene.transform, scene.to_frames),
+            metadata={
+                "depth_filenames": files["depth_file_path"] or None,
+                "depth_unit_scale_factor": self.config.depth_unit_scale_factor,
+                "mask_color": getattr(self.config, "mask_color", None),
+            },
+        )
+        if self.config.load_3D_points and self._images_needed:  # rendering from a checkpoint needs no points
+            outputs.metadata |= self._placed_points
         return outputs
 
-    def _host_config(self) -> NrfgsDataParserConfig:
-        """The configuration for which nerfstudio's parser does what this one promises."""
-        config = replace(
-            self.config,
-            # nerfstudio looks for colmap/sparse/0 and its axes only beside a folder, not beside a file in it.
-            data=self._source.parent if self._source.name == "transforms.json" else self._source,
-            # Without a .ply it would turn to the terminal.
-            load_3D_points=self._points_wanted and "ply_file_path" in self._meta,
-        )
-        if self._splits_interior(self._meta):
-            return replace(config, eval_mode="fraction", train_split_fraction=1.0)  # everything, for us to choose from
-        if len(self._meta["frames"]) > 1:
-            return config
-        vertical = config.orientation_method == "vertical"  # needs two cameras
-        return replace(
-            config,
-            auto_scale_poses=False,
-            orientation_method="up" if vertical else config.orientation_method,
-            eval_mode="fraction",
-            train_split_fraction=1.0,
-        )
+    @cached_property
+    def _images_needed(self) -> bool:
+        """Whether nerfstudio asks for images."""
+        return self.downscale_factor is None
 
-    def _splits_interior(self, meta: dict[str, Any]) -> bool:
-        """Whether the split is ours, which nerfstudio does not have."""
-        named = any(f"{split}_filenames" in meta for split in SPLITS)
-        return self.config.eval_mode == "interior" and not named and len(meta["frames"]) > 1
+    # From files to a scene.
 
-    def _host_split(self, split: str) -> str:
-        """The split that nerfstudio is asked for: itself, or the stand-in for one without images."""
-        chosen = next((name for name in STAND_INS.get(split, ()) if self._counts[name]), split)
-        if chosen == "train" != split:
-            warn(f"{self._source}: no image is kept for {split}. The training images are evaluated instead.")
-        return chosen
-
-    # Checks.
-
-    def _check(self, meta: dict[str, Any]) -> None:
-        """Everything that can be checked before parsing."""
-        frames, source, config = meta["frames"], self._source, self.config
-        check_frames(frames, source)
+    @cached_property
+    def _scene(self) -> Scene:
+        """The whole data set, checked as far as can be done without opening all images."""
+        check_options(self.config)
+        meta, source = self._read()
+        frames, config = meta["frames"], self.config
         check_intrinsics(meta, source)
         check_poses(frames, source, need_spread=config.auto_scale_poses and len(frames) > 1)
-        if config.mask_color is not None and "mask_path" not in frames[0]:
+        if getattr(config, "mask_color", None) is not None and "mask_path" not in frames[0]:
             raise InputError(
                 f"{source}: --mask-color is set, but no frame has a mask_path. Add masks or drop the option."
             )
-        if config.downscale_factor is not None and config.downscale_factor < 1:
-            raise InputError(f"--downscale-factor is {config.downscale_factor}. Give 1 or more, or leave it out.")
-        if config.eval_mode == "interior" and config.eval_interval < 2:
-            raise InputError(
-                f"--eval-interval is {config.eval_interval}. Give 2 or more, or choose another --eval-mode."
-            )
-        if self._images_needed and config.downscale_factor is None:
-            # nerfstudio chooses the factor by the first image in its full size.
-            originals = [source.parent / frame["file_path"] for frame in frames]
-            if not originals[0].is_file():
-                check_exist(originals, source, "images")
-            read_header(originals[0])
-        images = [self._get_fname(Path(frame["file_path"]), source.parent) for frame in frames]
-        check_unique(images, f"{source}: frames")
         if self._images_needed:
-            check_exist(images, source, "images")
-            for key, prefix in (("mask_path", "masks_"), ("depth_file_path", "depths_")):
-                names = [Path(frame[key]) for frame in frames if key in frame]
-                paths = [self._get_fname(name, source.parent, downsample_folder_prefix=prefix) for name in names]
-                check_exist(paths, source, f"files of {key}")
-        self._counts = self._count_splits(meta, images)
-        if not self._counts["train"]:
+            for key in FOLDERS:
+                what = "images" if key == "file_path" else f"files of {key}"
+                check_exist([self._file(frame[key], key) for frame in frames if key in frame], source, what)
+        factor = self._factor(frames) if self._images_needed else self.downscale_factor
+        frames = meta["frames"] = self._order(frames)
+        paths = [self._file(frame["file_path"]) for frame in frames]
+        check_unique(paths, f"{source}: frames")
+        splits = self._splits(meta, source, paths)
+        if not len(splits["train"]):
             raise InputError(
                 f"{source}: no image is left for training. Correct train_filenames if it is there, else --eval-mode, "
                 "--eval-interval or --train-split-fraction."
             )
+        orientation = meta.get("orientation_override", config.orientation_method)
+        if orientation not in ORIENTATIONS:
+            raise InputError(
+                f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, "
+                "or remove it."
+            )
+        single = len(frames) == 1
+        poses, transform, scale = place(
+            np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64),
+            "up" if single and orientation == "vertical" else orientation,  # which needs two cameras
+            config.center_method,
+            config.auto_scale_poses and not single,
+            config.scale_factor,
+        )
+        if not torch.isfinite(poses).all():
+            raise InputError(
+                f"{source}: the poses cannot be oriented (their up directions cancel). "
+                "Set --orientation-method none, or recompute the poses."
+            )
+        cameras = _cameras(meta, poses, source)
+        rounding = getattr(config, "downscale_rounding_mode", "floor")
+        cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
+        if min(cameras.width.min(), cameras.height.min()) < SMALLEST:
+            raise InputError(
+                f"{source}: --downscale-factor {factor} leaves images of {cameras.width.min()} x "
+                f"{cameras.height.min()} pixels. Give a smaller one."
+            )
+        return Scene(meta, source, splits, factor, cameras, transform, self._to_frames(meta), scale)
 
-    def _count_splits(self, meta: dict[str, Any], images: list[Path]) -> dict[str, int]:
-        """How many images each split has."""
-        named = {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}
-        if named:
-            return self._count_named(named, images)
+    def _read(self) -> tuple[dict[str, Any], Path]:
+        """What the data set says, and the file that it says so in."""
+        meta, source = read_transforms(self.config.data)
+        self._folder = source.parent
+        check_frames(meta["frames"], source)
+        return meta, source
+
+    def _order(self, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """The frames in the order that they are split in: by name, as in nerfstudio."""
+        return sorted(frames, key=lambda frame: self._file(frame["file_path"]))
+
+    def _to_frames(self, meta: dict[str, Any]) -> torch.Tensor | None:
+        """The transform [3, 4] that has already been applied to the frames' poses, if one has."""
+        if "applied_transform" in meta:
+            return torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
+        return COLMAP_TO_FRAMES if self._colmap.exists() else None
+
+    @property
+    def _colmap(self) -> Path:
+        return self._folder / "colmap" / "sparse" / "0"
+
+    def _file(self, name: str, key: str = "file_path") -> Path:
+        """A file that a frame names, in full size."""
+        return self._folder / name
+
+    def _copy(self, name: str, key: str, factor: int) -> Path:
+        """Where the data set keeps its own copy of the file at 1 / factor of its size, if it does."""
+        return self._folder / f"{FOLDERS[key]}_{factor}" / Path(name).name
+
+    def _factor(self, frames: list[dict[str, Any]]) -> int:
+        """The factor that was asked for, or the smallest power of two that makes the first image no larger than 1600
+        pixels and for which there is a folder."""
+        if self.config.downscale_factor is not None:
+            return self.config.downscale_factor
+        name = frames[0]["file_path"]
+        size, factor = max(read_header(self._file(name))[0]), 1
+        while size / factor > MAX_AUTO_RESOLUTION and self._copy(name, "file_path", 2 * factor).exists():
+            factor *= 2
+        return factor
+
+    def _files(self, scene: Scene, frames: list[dict[str, Any]], key: str) -> list[Path]:
+        """The files of some frames, in full size or, where the data set has copies of the size wanted, those."""
+        names = [frame[key] for frame in frames if key in frame]
+        if names and self._has_copies(scene, key):
+            return [self._copy(name, key, scene.factor) for name in names]
+        return [self._file(name, key) for name in names]
+
+    def _has_copies(self, scene: Scene, key: str) -> bool:
+        folder = self._copy(scene.meta["frames"][0][key], key, scene.factor).parent
+        return scene.factor > 1 and folder.is_dir()
+
+    def _checked_files(
+        self,
+        scene: Scene,
+        frames: list[dict[str, Any]],
+        files: dict[str, list[Path]],
+        sizes: Sequence[tuple[int, int]],
+    ) -> dict[str, list[Path]]:
+        """The same files, found to have the sizes that their cameras have; those that are larger, resized."""
+        scale_all = "Use the images that the poses were computed from, or scale w, h, fl_x, fl_y, cx and cy alike."
+        for key, what, mend in (
+            ("file_path", "images", scale_all),
+            ("mask_path", "masks", "Make them as large as the images."),
+        ):
+            if not files[key]:
+                continue
+            shrink = scene.factor > 1 and not self._has_copies(scene, key)
+            if not shrink:
+                check_exist(files[key], scene.source, what)
+                check_unique(files[key], f"{scene.source}: frames")
+            expected = [_size(scene.meta, frame) for frame in frames] if shrink else sizes
+            modes = check_headers(files[key], expected, what, mend)
+            if key == "mask_path":
+                bad = [path for path, mode in zip(files[key], modes, strict=True) if mode not in MASK_MODES]
+                if bad:
+                    raise InputError(
+                        f"{some(bad)}: a mask must have one grey channel (0 outside, anything else inside), not "
+                        "colours or a palette. Save it as 8-bit grey."
+                    )
+            if shrink:
+                files = {**files, key: smaller_copies(files[key], sizes, what)}
+        return files
+
+    # Splits.
+
+    def _splits(self, meta: dict[str, Any], source: Path, images: list[Path]) -> dict[str, np.ndarray]:
+        """The rows of each split, int64."""
+        named = self._named_splits(meta, source)
+        if named is not None:
+            return self._rows_of(named, source, images)
+        if len(images) == 1:
+            return {"train": np.array([0]), "val": np.empty(0, int), "test": np.empty(0, int)}
         config = self.config
-        if self._splits_interior(meta):
-            evaluated = len(interior_test_images(len(images), config.eval_interval))
-            return {"train": len(images) - evaluated, "val": evaluated, "test": evaluated}
+        if config.eval_mode == "interior":
+            if config.eval_interval < 2:
+                raise InputError(
+                    f"--eval-interval is {config.eval_interval}. Give 2 or more, or choose another --eval-mode."
+                )
+            evaluated = np.array(interior_test_images(len(images), config.eval_interval))
+            return {"train": np.setdiff1d(np.arange(len(images)), evaluated), "val": evaluated, "test": evaluated}
         try:
             train, evaluated = {
-                "interior": lambda: (images, []),  # one image, which is nerfstudio's to treat: see _host_config
                 "fraction": lambda: get_train_eval_split_fraction(images, config.train_split_fraction),
                 "filename": lambda: get_train_eval_split_filename(images),
                 "interval": lambda: get_train_eval_split_interval(images, config.eval_interval),
                 "all": lambda: get_train_eval_split_all(images),
             }[config.eval_mode]()
-        except (AssertionError, ValueError) as error:
+        except (AssertionError, ValueError, KeyError) as error:
             raise InputError(
-                f"{self._source}: --eval-mode {config.eval_mode} cannot split these images ({error}). Choose another."
+                f"{source}: --eval-mode {config.eval_mode} cannot split these images ({error}). Choose another."
             ) from error
-        if len(images) == 1:  # see _host_config
-            return {"train": 1, "val": 0, "test": 0}
-        return {"train": len(train), "val": len(evaluated), "test": len(evaluated)}
+        train, evaluated = (np.asarray(rows, dtype=np.int64) for rows in (train, evaluated))
+        return {"train": train, "val": evaluated, "test": evaluated}
 
-    def _count_named(self, named: dict[str, list[str]], images: list[Path]) -> dict[str, int]:
-        """The same if the data set names its own splits, which must name images that it has."""
+    def _named_splits(self, meta: dict[str, Any], source: Path) -> dict[str, tuple[str, Any]] | None:
+        """The splits that the data set names itself, if it does: what names it, and the names."""
+        named = {split: (f"{split}_filenames", meta.get(f"{split}_filenames")) for split in SPLITS}
+        return {k: v for k, v in named.items() if v[0] in meta} or None
+
+    def _rows_of(self, named: dict[str, tuple[str, Any]], source: Path, images: list[Path]) -> dict[str, np.ndarray]:
+        """The rows of splits that are named, which must name images that there are."""
         members = dict.fromkeys(SPLITS, frozenset())
-        for split, names in named.items():
-            where = f"{self._source}: {split}_filenames"
+        for split, (field_name, names) in named.items():
+            where = f"{source}: {field_name}"
             if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
                 raise InputError(f"{where} is not a list of file paths. Correct or remove it.")
-            paths = [self._get_fname(Path(name), self._source.parent) for name in names]
+            paths = [self._file(name) for name in names]
             check_unique(paths, where)
             members[split] = frozenset(paths)
             unknown = sorted(members[split].difference(images))
@@ -217,91 +358,198 @@ class NrfgsDataParser(Nerfstudio):
                 )
         shared = sorted(members["train"] & (members["val"] | members["test"]))
         if shared:
-            warn(f"{self._source}: {some(shared)} are for training and for evaluation, whose results this flatters.")
-        return {split: len(paths) for split, paths in members.items()}
-
-    def _check_outputs(self, outputs: DataparserOutputs) -> None:
-        """What is known only after parsing: finite poses, and files of the size that the scaled cameras have."""
-        cameras = outputs.cameras
-        if not torch.isfinite(cameras.camera_to_worlds).all():
-            raise InputError(
-                f"{self._source}: the poses cannot be oriented (their up directions cancel). "
-                "Set --orientation-method none, or recompute the poses."
-            )
-        if not self._images_needed:
-            return
-        sizes = list(zip(cameras.width.flatten().tolist(), cameras.height.flatten().tolist(), strict=True))
-        mend = "Use the images that the poses were computed from, or scale w, h, fl_x, fl_y, cx and cy alike."
-        check_headers(outputs.image_filenames, sizes, "images", mend)
-        if outputs.mask_filenames is not None:
-            modes = check_headers(outputs.mask_filenames, sizes, "masks", "Make them as large as the images.")
-            bad = [path for path, mode in zip(outputs.mask_filenames, modes, strict=True) if mode not in MASK_MODES]
-            if bad:
-                raise InputError(
-                    f"{some(bad)}: a mask must have one grey channel (0 outside, anything else inside), not colours "
-                    "or a palette. Save it as 8-bit grey."
-                )
-
-    @cached_property
-    def _images_needed(self) -> bool:
-        """Whether nerfstudio asks for images. First read before the parsing, which sets the factor itself."""
-        return self.downscale_factor is None
+            warn(f"{source}: {some(shared)} are for training and for evaluation, whose results this flatters.")
+        return {
+            split: np.array([row for row, path in enumerate(images) if path in paths], dtype=np.int64)
+            for split, paths in members.items()
+        }
 
     # Points.
 
-    @property
-    def _points_wanted(self) -> bool:
-        """Points begin a training; rendering from a checkpoint needs none."""
-        return self.config.load_3D_points and self._images_needed
-
-    @cached_property
-    def _points(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Positions [N, 3] and colours [N, 3] as stored, read once for all splits; None (and a warning) without."""
-        colmap = self._host_config().data / "colmap" / "sparse" / "0"
-        if "ply_file_path" in self._meta:
-            points = read_ply(self._source.parent / self._meta["ply_file_path"])
-            found = f"{self._meta['ply_file_path']} holds {len(points[0])} usable points, fewer than {MIN_POINTS}"
-        elif colmap.is_dir():
-            points = read_colmap(colmap)
-            found = f"{colmap} holds {len(points[0])} usable points, fewer than {MIN_POINTS}"
-        else:
-            points = np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8)
-            found = "the data set has no point cloud (no ply_file_path, no colmap/sparse/0)"
-        if len(points[0]) >= MIN_POINTS:
-            return points
-        warn(f"{self._source}: {found}. Training starts from random points, which costs quality.")
+    def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor] | None:
+        """Positions [N, 3] and colours [N, 3] as stored, and the transform [3, 4] from their world to the cameras'
+        before scaling; None without."""
+        if "ply_file_path" in scene.meta:
+            name = scene.meta["ply_file_path"]
+            if not isinstance(name, str):
+                raise InputError(f"{scene.source}: ply_file_path is {shown(repr(name))}. Name a file, or remove it.")
+            return *read_ply(self._file(name)), scene.transform
+        if self._colmap.is_dir():
+            return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
         return None
 
-    def _placed(self, transform: torch.Tensor, scale: float) -> dict[str, torch.Tensor] | None:
-        """The points in the world of the parsed cameras: scale * (transform [3, 4] applied to each).
-
-        Returns:
-            points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3], or None without points.
-        """
-        if self._points is None:
-            return None
-        xyz, rgb = (torch.from_numpy(array) for array in self._points)
+    @cached_property
+    def _placed_points(self) -> dict[str, torch.Tensor]:
+        """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the world of the cameras, which see enough of
+        them; nothing (and a warning) without."""
+        scene = self._scene
+        points = self._points(scene)
+        count = 0 if points is None else len(points[0])
+        if count < MIN_POINTS:
+            found = "the data set has no point cloud (no ply_file_path, no colmap/sparse/0)"
+            if points is not None:
+                found = f"the point cloud holds {count} usable points, fewer than {MIN_POINTS}"
+            warn(f"{scene.source}: {found}. Training starts from random points, which costs quality.")
+            return {}
+        xyz, rgb, transform = (torch.as_tensor(table) for table in points)
         transform = transform.double()
+        scale = scene.scale * number(scene.meta.get("applied_scale", 1.0))
         xyz = scale * (xyz @ transform[:, :3].T + transform[:, 3])
-        return {"points3D_xyz": xyz.float(), "points3D_rgb": rgb}
+        near = torch.from_numpy(in_reach(xyz.numpy(), scene.cameras, scene.source))
+        xyz, rgb = xyz[near].float(), rgb[near]
+        rows = scene.splits["train"]
+        names = [scene.meta["frames"][row]["file_path"] for row in rows]
+        check_sight(xyz, scene.cameras[torch.from_numpy(rows)], names, scene.source)
+        return {"points3D_xyz": xyz, "points3D_rgb": rgb}
 
-    def _load_3D_points(
-        self, ply_file_path: Path, transform_matrix: torch.Tensor, scale_factor: float
-    ) -> dict[str, torch.Tensor] | None:
-        """nerfstudio's hook for the points of ply_file_path, [3, 4] and a factor away from the parsed world."""
-        return self._placed(transform_matrix, scale_factor)
+
+class NrfgsColmapDataParser(NrfgsDataParser):
+    """nerfstudio's `colmap` parser, with the checks of `NrfgsDataParser` and without questions at the terminal.
+
+    Images that are larger than 1600 pixels are resized by a power of two, as nerfstudio proposes. Multiple cameras may
+    be of several models if all are pinholes or all are fisheyes.
+    """
+
+    config: ColmapDataParserConfig
+
+    def _read(self) -> tuple[dict[str, Any], Path]:
+        self._folder = self.config.data
+        if not exists(self._folder):
+            raise InputError(f"{shown(str(self._folder))}: no such folder. Check the path that --data names.")
+        cameras, views, source = read_model(self._colmap)
+        kinds = {cameras[view.camera]["camera_model"] for view in views}
+        if len(kinds) > 1:
+            raise InputError(f"{source}: some cameras are fisheyes and some are not. Undistort the photographs.")
+        upright = COLMAP_UPRIGHT if self.config.assume_colmap_world_coordinate_convention else np.eye(4)
+        frames = []
+        for view in views:
+            frame = {"file_path": view.name, **cameras[view.camera]}
+            pose = upright @ np.linalg.inv(view.world_to_camera)
+            frame["transform_matrix"] = pose * np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backwards
+            if self.config.masks_path is not None:
+                frame["mask_path"] = view.name
+            if self.config.depths_path is not None:
+                frame["depth_file_path"] = view.name
+            frames.append(frame)
+        meta = {"frames": frames, "camera_model": kinds.pop()}
+        if self.config.assume_colmap_world_coordinate_convention:
+            meta["applied_transform"] = COLMAP_UPRIGHT[:3].tolist()
+        check_frames(frames, source)
+        return meta, source
+
+    def _order(self, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return frames  # by COLMAP's numbers
+
+    @property
+    def _colmap(self) -> Path:
+        return self._folder / self.config.colmap_path
+
+    def _root(self, key: str) -> Path:
+        config = self.config
+        folders = {
+            "file_path": config.images_path,
+            "mask_path": config.masks_path,
+            "depth_file_path": config.depths_path,
+        }
+        return self._folder / folders[key]
+
+    def _file(self, name: str, key: str = "file_path") -> Path:
+        path = self._root(key) / name
+        return path if key == "file_path" else path.with_suffix(".png")
+
+    def _copy(self, name: str, key: str, factor: int) -> Path:
+        root = self._root(key)
+        return root.with_name(f"{root.name}_{factor}") / self._file(name, key).relative_to(root)
+
+    def _has_copies(self, scene: Scene, key: str) -> bool:
+        root = self._root(key)
+        return scene.factor > 1 and root.with_name(f"{root.name}_{scene.factor}").is_dir()
+
+    def _factor(self, frames: list[dict[str, Any]]) -> int:
+        if self.config.downscale_factor is not None:
+            return self.config.downscale_factor
+        size, factor = max(read_header(self._file(frames[0]["file_path"]))[0]), 1
+        while size / factor > MAX_AUTO_RESOLUTION:
+            factor *= 2
+        return factor
+
+    def _named_splits(self, meta: dict[str, Any], source: Path) -> dict[str, tuple[str, Any]] | None:
+        named = {}
+        for split, file in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
+            path = self._folder / f"{file}_list.txt"
+            if path.is_file():
+                try:
+                    lines = path.read_text(encoding="utf-8").splitlines()
+                except (OSError, ValueError) as error:
+                    raise InputError(f"{path} cannot be read ({error}). Write one image name on each line.") from error
+                named[split] = path.name, [line.strip() for line in lines if line.strip()]
+        return named or None
+
+    def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
+        return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
 
 
-def _select(outputs: DataparserOutputs, indices: list[int]) -> DataparserOutputs:
-    """The part of a data set whose images have these indices."""
-    depths = outputs.metadata.get("depth_filenames")
-    return replace(
-        outputs,
-        image_filenames=[outputs.image_filenames[i] for i in indices],
-        mask_filenames=outputs.mask_filenames and [outputs.mask_filenames[i] for i in indices],
-        cameras=outputs.cameras[torch.tensor(indices)],
-        metadata={**outputs.metadata, "depth_filenames": depths and [depths[i] for i in indices]},
-    )
+def checked(config: DataParserConfig) -> DataParserConfig:
+    """The configuration of a parser that checks what it reads, for nerfstudio's own two, and any other as it is."""
+    parsers = {NerfstudioDataParserConfig: NrfgsDataParser, ColmapDataParserConfig: NrfgsColmapDataParser}
+    return replace(config, _target=parsers[type(config)]) if type(config) in parsers else config
+
+
+def _column(meta: dict[str, Any], key: str) -> list[float]:
+    """An intrinsic parameter of every frame, by nerfstudio's rule: the top level's if it has it."""
+    return [number((meta if key in meta else frame)[key]) for frame in meta["frames"]]
+
+
+def _size(meta: dict[str, Any], frame: dict[str, Any]) -> tuple[int, int]:
+    """Width and height of a frame's image in full size."""
+    return tuple(int(number((meta if key in meta else frame)[key])) for key in ("w", "h"))
+
+
+def _distortion(holder: dict[str, Any]) -> list[float]:
+    """In nerfstudio's order, of the top level or of a frame."""
+    given = holder.get("distortion_params", [holder.get(key, 0.0) for key in DISTORTION])
+    return [number(value) for value in given]
+
+
+def _cameras(meta: dict[str, Any], poses: torch.Tensor, source: Path) -> Cameras:
+    """The cameras in full size."""
+    frames = meta["frames"]
+    fx, fy, cx, cy = (torch.tensor(_column(meta, key)) for key in ("fl_x", "fl_y", "cx", "cy"))
+    width, height = (torch.tensor(_column(meta, key)).int() for key in ("w", "h"))
+    shared = any(key in meta for key in (*DISTORTION[:3], *DISTORTION[4:], "distortion_params"))
+    distortion = torch.tensor([_distortion(meta if shared else frame) for frame in frames])
+    kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
+    if kind == CameraType.FISHEYE:
+        distortion[(distortion == 0).all(dim=1), 0] = FISHEYE_AT_LEAST
+    _check_distortion(fx, fy, cx, cy, width, height, distortion, kind, frames, source)
+    return Cameras(poses, fx, fy, cx, cy, width, height, distortion, kind, metadata={})
+
+
+def _check_distortion(fx, fy, cx, cy, width, height, distortion, kind: CameraType, frames, source: Path) -> None:
+    """Undistorting leaves enough of every image."""
+    numbers = torch.stack([fx, fy, cx, cy, width, height], dim=1)
+    lenses, first = np.unique(torch.cat([numbers, distortion], dim=1).double().numpy(), axis=0, return_index=True)
+    for lens, index in zip(lenses, first, strict=True):
+        if not lens[6:].any():
+            continue
+        where = f"{source}: the distortion of {shown(frames[index]['file_path'])}"
+        fx, fy, cx, cy, w, h, k1, k2, k3, k4, p1, p2 = lens
+        K, size = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]), (int(w), int(h))
+        if kind == CameraType.FISHEYE:
+            flat = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+                K, np.array([k1, k2, k3, k4]), size, np.eye(3), balance=0
+            )
+            good = np.isfinite(flat).all() and 1e-2 * w < flat[0, 0] < 1e3 * w and 1e-2 * h < flat[1, 1] < 1e3 * h
+        elif k4 != 0:
+            raise InputError(f"{where} has k4 = {k4:g}, which is for fisheyes. Set it to 0, or undistort the images.")
+        else:
+            flat, (_, _, left, rows) = cv2.getOptimalNewCameraMatrix(K, np.array([k1, k2, p1, p2, k3]), size, 0)
+            good = np.isfinite(flat).all() and left * rows >= LEFT_OF_IMAGE * w * h
+        if not good:
+            raise InputError(
+                f"{where} is so strong that undistorting leaves next to nothing of the image. Correct the parameters, "
+                "or undistort the photographs yourself."
+            )
 
 
 nrfgs_dataparser = DataParserSpecification(

@@ -7,6 +7,8 @@ from typing import Any
 
 from PIL import ExifTags, Image
 
+from nrfgs_ns.data.pictures import open_picture
+
 NUMBERS = {
     "exposure_time": ExifTags.Base.ExposureTime,
     "f_number": ExifTags.Base.FNumber,
@@ -27,9 +29,9 @@ def read_exif(path: Path) -> dict[str, float | str]:
         Some of exposure_time (seconds), f_number, iso, focal_length (mm), each finite and above 0, and make, model.
     """
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             return known(image.getexif())
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+    except Exception:  # PIL lets out whatever it meets in a broken file
         return {}
 
 

@@ -8,54 +8,57 @@ points that are there but damaged must not turn into a random start unnoticed.
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
-from nerfstudio.data.utils.colmap_parsing_utils import read_points3D_binary, read_points3D_text
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData
 
-from nrfgs_ns.data.checks import warn
+from nrfgs_ns.data.checks import exists, shown, warn
+from nrfgs_ns.data.colmap import read_points
 from nrfgs_ns.errors import InputError
 
 GREY = 127
 """Colour of points that have none."""
+LONGEST_HEADER = 2**16
+"""Bytes in which the header of a .ply must end."""
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Reads vertices (x, y, z) and their colours (red, green, blue: integers in [0, 255], or floats in
     [0, 1]) of a .ply file."""
     mend = "Repair or replace it, or remove ply_file_path from transforms.json to start from random points."
-    if not path.is_file():
+    if not (exists(path) and path.is_file()):
         raise InputError(f"{path}, named by ply_file_path, is missing. {mend}")
     try:
+        _check_counts(path)
         vertices = PlyData.read(path)["vertex"].data
         xyz = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     except KeyError as error:
         raise InputError(f"{path} has no vertex element. {mend}") from error
-    except (PlyParseError, OSError, ValueError, MemoryError) as error:
-        raise InputError(f"{path} cannot be read as vertices with x, y, z ({error}). {mend}") from error
+    except Exception as error:  # plyfile lets out whatever it meets in a broken file
+        raise InputError(f"{path} cannot be read as vertices with x, y, z ({shown(str(error))}). {mend}") from error
     if not {"red", "green", "blue"} <= set(vertices.dtype.names):
         warn(f"{path} has no colours; its points start in mid grey.")
         return _finite(xyz, np.full(xyz.shape, float(GREY)), path)
     rgb = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)
+    if rgb.dtype.kind not in "iuf":
+        raise InputError(f"{path}: its colours are not numbers. {mend}")
     return _finite(xyz, rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0), path)
+
+
+def _check_counts(path: Path) -> None:
+    """No element announces more entries than the file has bytes: room is made for them before they are read."""
+    with path.open("rb") as file:
+        header = file.read(LONGEST_HEADER).partition(b"end_header")[0]
+    for line in header.split(b"\n"):
+        words = line.split()
+        if words[:1] == [b"element"] and len(words) == 3 and int(words[2]) > path.stat().st_size:
+            raise ValueError(f"{int(words[2])} entries are announced, in {path.stat().st_size} bytes")
 
 
 def read_colmap(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Reads points3D.bin or points3D.txt of a COLMAP model."""
-    reader, path = read_points3D_binary, folder / "points3D.bin"
-    if not path.is_file():
-        reader, path = read_points3D_text, folder / "points3D.txt"
-    if not path.is_file():
-        raise InputError(f"{folder} holds neither points3D.bin nor points3D.txt. Restore one, or remove the folder.")
-    try:
-        points = reader(path).values()
-    except (struct.error, OSError, ValueError, IndexError, MemoryError) as error:
-        raise InputError(f"{path} cannot be read ({error}). Export the COLMAP model again.") from error
-    xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
-    rgb = np.array([point.rgb for point in points], dtype=np.float64).reshape(-1, 3)
-    return _finite(xyz, rgb, path)
+    return _finite(*read_points(folder))
 
 
 def _finite(xyz: np.ndarray, rgb: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:

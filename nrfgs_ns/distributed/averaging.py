@@ -12,8 +12,8 @@ from typing import Any
 from torch import Tensor
 from torch.optim import Optimizer
 
-from nrfgs_ns.averaging import ParameterMean
 from nrfgs_ns.distributed import comm
+from nrfgs_ns.training.averaging import ParameterMean
 
 
 class ShardedMean(ParameterMean):

@@ -14,10 +14,10 @@ from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.config import ShardingConfig
 from nrfgs_ns.distributed.exchange import scale_gradient, send_to_cameras
 from nrfgs_ns.distributed.shards import cut_model_state, rebalance, rows_of, shard_counts
-from nrfgs_ns.model import NrfgsModel
-from nrfgs_ns.pinhole import Pinhole
+from nrfgs_ns.model.model import NrfgsModel
+from nrfgs_ns.model.pinhole import Pinhole
+from nrfgs_ns.model.renderer import View
 from nrfgs_ns.rasterizer import Projection
-from nrfgs_ns.rendering import View
 
 
 @dataclass

@@ -11,7 +11,7 @@ from nerfstudio.utils import profiler
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.model import ShardedModel
 from nrfgs_ns.distributed.schedules import fewer
-from nrfgs_ns.pipeline import NrfgsPipeline, NrfgsPipelineConfig
+from nrfgs_ns.training.pipeline import NrfgsPipeline, NrfgsPipelineConfig
 
 
 class ShardedPipeline(NrfgsPipeline):

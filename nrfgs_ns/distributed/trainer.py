@@ -21,9 +21,9 @@ from nrfgs_ns.distributed.pipeline import ShardedPipeline
 from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import cut_optimizer_state, gather_model_state, gather_optimizer_state
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.guard import MAX_GRADIENT, Guard, TrainingStopped, WatchedOptimizers
-from nrfgs_ns.optimizers import LeanOptimizers, parameters_of
-from nrfgs_ns.trainer import NrfgsTrainer, NrfgsTrainerConfig
+from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, WatchedOptimizers
+from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
+from nrfgs_ns.training.trainer import NrfgsTrainer, NrfgsTrainerConfig
 
 ELSEWHERE = "a number on another device"
 WITHOUT_VIEWER = {"viewer": "tensorboard", "viewer_legacy": "tensorboard"}

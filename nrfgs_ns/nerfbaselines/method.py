@@ -25,12 +25,12 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
 
-from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.model import NrfgsModel
+from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory
-from nrfgs_ns.studies.run import parse
-from nrfgs_ns.trainer import NrfgsTrainer, NrfgsTrainerConfig
+from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer import NrfgsTrainer, NrfgsTrainerConfig
 
 BACKGROUND = "pipeline.model.background_color"
 MODELS = "nerfstudio_models"

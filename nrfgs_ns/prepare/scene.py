@@ -19,8 +19,8 @@ from plyfile import PlyData, PlyElement
 
 from nrfgs_ns.data.exif import exif_of_copy, known
 from nrfgs_ns.data.split import interior_test_images
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare.structure import colmap
-from nrfgs_ns.studies.files import write_whole
 
 DOWNSCALES = (2, 4, 8)
 """nerfstudio looks for these copies; it takes the largest whose sides are at most 1600 pixels."""

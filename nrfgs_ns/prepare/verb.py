@@ -21,10 +21,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare import photos as files
 from nrfgs_ns.prepare import structure
 from nrfgs_ns.prepare.structure import CameraModel
-from nrfgs_ns.studies.files import write_whole
 
 STAGES = ("import", "features", "match", "map", "undistort", "write")
 """In the order of work; each builds on the one before it."""

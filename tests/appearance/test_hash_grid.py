@@ -10,8 +10,8 @@ import torch
 from hash_grid_cases import grids, positions
 from interpreted import passes_in_the_interpreter
 
-from nrfgs_ns import triton_trial
 from nrfgs_ns.appearance import hash_grid
+from nrfgs_ns.kernels import trial
 
 INTERPRETED = Path(__file__).with_name("hash_grid_interpreted.py")
 
@@ -30,7 +30,7 @@ def test_cpu_takes_torch():
 
 def test_without_triton_a_warning_and_torch(monkeypatch, caplog):
     monkeypatch.setattr(hash_grid, "_RUNS", {})
-    monkeypatch.setattr(triton_trial.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: None)
     assert not hash_grid._kernels_run_on(torch.device("cpu"), 4)
     assert not hash_grid._kernels_run_on(torch.device("cpu"), 4)
     assert [record.getMessage() for record in caplog.records] == [

@@ -23,8 +23,8 @@ from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode, means_grid
 from nrfgs_ns.compact.format import read_container, write_container
 from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export import Export
-from nrfgs_ns.studies.run import evaluate, parse, train
+from nrfgs_ns.export.command import Export
+from nrfgs_ns.training.run import evaluate, parse, train
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -125,7 +125,7 @@ def test_refused(capture, change, words):
     ({"eval_mode": "filename"}, "--eval-mode filename"),
     ({"eval_mode": "fraction", "train_split_fraction": 1.5}, "--eval-mode fraction"),
     ({"downscale_factor": 0}, "--downscale-factor"),
-    ({"downscale_factor": 4}, "images_4"),
+    ({"downscale_factor": 4}, "--downscale-factor 4 leaves images of 3 x 2"),
     ({"mask_color": (0.0, 0.0, 0.0)}, "--mask-color"),
 ])  # fmt: skip
 def test_impossible_options_are_refused(capture, options, word):

@@ -166,6 +166,9 @@ def test_double_precision_points_far_from_the_origin(capture):
     """A georeferenced cloud: positions of a million metres, details of a millimetre."""
     xyz, rgb = cloud()
     capture.add_ply(xyz.astype(np.float64) + 1e6, rgb)
+    for frame in capture.meta["frames"]:
+        for row in range(3):
+            frame["transform_matrix"][row][3] += 1e6
     points = capture.parse(center_method="none", orientation_method="none", auto_scale_poses=False, scale_factor=1e-3)
     # Stored as float32 at 1,000: a spacing of 2^-14; float32 on the way (spacing 2^-4 at 10^6) would be 60 times that.
     error = points.metadata["points3D_xyz"].double().numpy() - (xyz.astype(np.float64) + 1e6) * 1e-3
@@ -247,9 +250,10 @@ def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, 
     folder = capture.folder / "colmap" / "sparse" / "0"
     folder.mkdir(parents=True)
     nothing = np.empty(0, dtype=int)
-    points = {
-        i: Point3D(i, p.astype(float), c, 0.5, nothing, nothing) for i, (p, c) in enumerate(zip(xyz, rgb, strict=True))
-    }
+    # nerfstudio's axes for data sets from before it wrote applied_transform.
+    world = np.array(applied or [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], dtype=np.float64)
+    stored = (xyz - world[:, 3]) @ world[:, :3]
+    points = {i: Point3D(i, p, c, 0.5, nothing, nothing) for i, (p, c) in enumerate(zip(stored, rgb, strict=True))}
     write(points, folder / name)
     if applied is not None:
         capture.meta["applied_transform"] = applied
@@ -258,9 +262,7 @@ def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, 
     outputs = capture.parse(data=capture.folder / "transforms.json" if as_file else capture.folder)
     assert files(capture.folder) == before
 
-    # nerfstudio's axes for data sets from before it wrote applied_transform.
-    world = np.array(applied or [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], dtype=np.float64)
-    assert_points_stay_in_front_of_cameras(capture, outputs, xyz @ world[:, :3].T + world[:, 3])
+    assert_points_stay_in_front_of_cameras(capture, outputs, xyz)
     np.testing.assert_array_equal(outputs.metadata["points3D_rgb"], rgb)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from nrfgs_ns.data.views import evenly_spaced, held_out
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.studies.run import parse
+from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

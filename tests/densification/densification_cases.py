@@ -9,8 +9,8 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from torch.nn import Parameter
 
 from nrfgs_ns.densification import build_densification
-from nrfgs_ns.model import NrfgsModelConfig
-from nrfgs_ns.studies.run import parse
+from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.training.run import parse
 
 PROTOCOLS = ("splatfacto", "original", "mcmc")
 REFINES = 1000

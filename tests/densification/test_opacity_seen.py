@@ -12,7 +12,7 @@ from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.densification import CHANGE, UNSEEN, build_densification
 from nrfgs_ns.densification.protocol import change_of, seen_with
-from nrfgs_ns.studies.run import parse
+from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

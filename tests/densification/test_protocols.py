@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import McmcDensification, OriginalDensification, build_densification
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.model import NrfgsModelConfig
+from nrfgs_ns.model.model import NrfgsModelConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

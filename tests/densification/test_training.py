@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE, UNSEEN
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.studies.run import parse, train
+from nrfgs_ns.training.run import parse, train
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -119,7 +119,7 @@ def fits_one_process(scene: Path, folder: Path) -> None:
 
 def stops_together(scene: Path, folder: Path) -> None:
     """The second device's image has NaN at step 7."""
-    from nrfgs_ns.guard import TrainingStopped
+    from nrfgs_ns.training.guard import TrainingStopped
 
     def break_image(trainer) -> None:
         step = trainer.pipeline.get_train_loss_dict
@@ -144,7 +144,7 @@ def stops_together(scene: Path, folder: Path) -> None:
 def averaged(scene: Path, folder: Path) -> None:
     """12 steps with a mean over the last 10, and the last 4 of them again, from the checkpoint in between. That is
     also looked at by one process. Then it goes on once more, until the second device has a splat that is NaN."""
-    from nrfgs_ns.guard import TrainingStopped
+    from nrfgs_ns.training.guard import TrainingStopped
 
     world, main = dist.get_world_size(), dist.get_rank() == 0
     after, counts = [], []

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mean over a training's last steps on two devices, of which the second alone refines, at step 4 (`jobs.averaged`).
-What it is on one device is told by `tests/test_averaging.py`."""
+What it is on one device is told by `tests/training/test_averaging.py`."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from nrfgs_ns.averaging import ParameterMean
-from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.distributed.averaging import ShardedMean
+from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.training.averaging import ParameterMean
 
 SPLATS = "gauss_params."
 

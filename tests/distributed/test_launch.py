@@ -13,10 +13,10 @@ import pytest
 import torch
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
-from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.distributed import launch
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
+from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import rows_of, shard_counts, transfers
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
-from nrfgs_ns.pipeline import NrfgsPipeline
+from nrfgs_ns.training.pipeline import NrfgsPipeline
 
 
 @given(st.integers(0, 50), st.integers(1, 8))

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from nrfgs_ns.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.densification import CHANGE
+from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
 
 
 def checkpoint(folder: str | Path) -> dict:

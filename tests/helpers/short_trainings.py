@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch.testing import assert_close
 
-from nrfgs_ns.studies.run import train
+from nrfgs_ns.training.run import train
 
 QUIET = {
     "--vis": "tensorboard",

@@ -22,11 +22,11 @@ from plyfile import PlyData
 from torch.testing import assert_close
 
 import nrfgs_ns.nerfbaselines as package
+from nrfgs_lab.pages.options import methods
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.nerfbaselines.method import Nrfgs, NrfgsFast, configure, options_of
 from nrfgs_ns.nerfbaselines.photos import World, background_of
-from nrfgs_ns.studies.options import methods
 
 needs_nerfbaselines = pytest.mark.skipif(
     find_spec("nerfbaselines") is None, reason="nerfbaselines is not installed: pip install --no-deps nerfbaselines"

@@ -18,11 +18,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import reference
 import torch
 from make_gsplat_fixtures import PARAMETERS, Case
 from torch import Tensor
-
-from nrfgs_ns.rasterizer.torch_cpu import reference
 
 FLOAT32 = 2.0**-24
 FLOAT64 = (

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.fused.packing import Packing, pack
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.triton_trial import try_triton
+from nrfgs_ns.kernels.trial import try_triton
 
 if TYPE_CHECKING:  # imports Triton
     from nrfgs_ns.appearance.fused.launch import FieldOptions, Launches

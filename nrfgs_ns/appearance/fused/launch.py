@@ -19,7 +19,7 @@ from nrfgs_ns.appearance.fused.arithmetic import INTERPRETED
 from nrfgs_ns.appearance.fused.kernels import backward_kernel, forward_kernel
 from nrfgs_ns.appearance.fused.packing import CENTER_SLOTS, Packing
 from nrfgs_ns.appearance.head import SH_C0
-from nrfgs_ns.triton_launch import Launcher
+from nrfgs_ns.kernels.launch import Launcher
 
 launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The CPU back end: `projection`, `tiles`, `compositing`, in this order, and their float64 twin in `reference`."""
+"""The CPU back end: `projection`, `tiles`, `compositing`, in this order. Their float64 twin lives with the tests."""
 
 from __future__ import annotations
 

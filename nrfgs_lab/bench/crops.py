@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Crops of test views side by side: the truth, each run's rendering, and below it its error.
+
+They are cut from the pictures that `ns-eval` wrote, truth and rendering side by side in each.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageDraw
+
+from nrfgs_ns.files import whole
+
+VIEWS = 2
+"""Views in a sheet if nobody chose them."""
+CROP_FRACTION = 0.3
+"""Side of a crop, in shorter sides of the image."""
+CROP_PIXELS = 220
+"""Side of a crop in the sheet."""
+ERROR_GAIN = 4.0
+"""How much the error maps are amplified."""
+TITLE, GAP = 16, 4
+ACROSS = 8
+"""Crops side by side, the truth's among them; more go below."""
+PICTURE = re.compile(r"eval_img_(\d{4})")
+
+Images = npt.NDArray[np.float32]
+
+
+def crop_sheet(pictures: dict[str, Path], path: Path, views: list[int] | None = None) -> bool:
+    """Write a sheet: for each view lines of renderings and below them |error| x 4, the whole truth on the left.
+
+    Args:
+        pictures: label -> folder of ns-eval's pictures of a run.
+        path: where the PNG goes.
+        views: numbers of test views; None: those where the runs differ most.
+
+    Returns:
+        Whether there was something to show: a run without pictures is left out, or with pictures of another size than
+        the first run's, and a view that some run lacks.
+    """
+    files = {label: numbered(folder) for label, folder in pictures.items()}
+    files = {label: found for label, found in files.items() if found}
+    if not files:
+        return False
+    files = of_one_size(files)
+    shared = sorted(set.intersection(*(set(found) for found in files.values())))
+    chosen = [view for view in views if view in shared] if views is not None else shared
+    places = []
+    for view in chosen:
+        truth, renders = read(files, view)
+        side = crop_side(truth.shape[0], truth.shape[1])
+        places.append((*largest_disagreement(truth, list(renders.values()), side), view))
+    if views is None:
+        places = sorted(places, key=lambda place: -place[0])[:VIEWS]
+    if not places:
+        return False
+    parts = [_view(*read(files, view), top, left) for _, top, left, view in places]
+    width, height = max(part.width for part in parts), sum(part.height + TITLE + GAP for part in parts)
+    sheet = Image.new("RGB", (width, height), "white")
+    y = 0
+    for part, (*_, view) in zip(parts, places, strict=True):
+        ImageDraw.Draw(sheet).text((2, y + 2), f"test view {view}; below: |error| x {ERROR_GAIN:g}", fill="black")
+        sheet.paste(part, (0, y + TITLE))
+        y += TITLE + part.height + GAP
+    with whole(path) as aside:
+        sheet.save(aside, format="PNG")
+    return True
+
+
+def numbered(folder: Path) -> dict[int, Path]:
+    """Number of the test view -> its picture."""
+    found = {}
+    for file in sorted(Path(folder).glob("eval_img_*.png")):
+        if match := PICTURE.match(file.name):
+            found[int(match.group(1))] = file
+    return found
+
+
+def of_one_size(files: dict[str, dict[int, Path]]) -> dict[str, dict[int, Path]]:
+    """The runs whose pictures are as large as the first run's: another one may have had scaled photographs."""
+
+    def size(file: Path) -> tuple[int, int]:
+        with Image.open(file) as picture:
+            return picture.size
+
+    first = {view: size(file) for view, file in next(iter(files.values())).items()}
+    return {
+        label: found
+        for label, found in files.items()
+        if all(size(file) == first[view] for view, file in found.items() if view in first)
+    }
+
+
+def read(files: dict[str, dict[int, Path]], view: int) -> tuple[Images, dict[str, Images]]:
+    """The truth and each run's rendering of a view, [H, W, 3] in [0, 1]."""
+    truth, renders = None, {}
+    for label, found in files.items():
+        with Image.open(found[view]) as picture:
+            pair = np.asarray(picture.convert("RGB"), dtype=np.float32) / 255.0
+        half = pair.shape[1] // 2
+        truth = pair[:, :half] if truth is None else truth
+        renders[label] = pair[:, half:]
+    return truth, renders
+
+
+def crop_side(height: int, width: int) -> int:
+    """Side of a crop, pixels of the image."""
+    return max(1, int(CROP_FRACTION * min(height, width)))
+
+
+def largest_disagreement(truth: Images, renders: list[Images], side: int) -> tuple[float, int, int]:
+    """The square where the runs' errors differ most, or where the error of a single run is largest.
+
+    Returns:
+        mean over the square of the deviation of the errors over the runs, and the square's top and left.
+    """
+    errors = np.stack([np.abs(render - truth).mean(axis=-1) for render in renders])
+    map_ = errors.std(axis=0) if len(errors) > 1 else errors[0]
+    sums = np.zeros((map_.shape[0] + 1, map_.shape[1] + 1))
+    sums[1:, 1:] = map_.cumsum(axis=0, dtype=np.float64).cumsum(axis=1)
+    boxes = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+    top, left = np.unravel_index(int(boxes.argmax()), boxes.shape)
+    return float(boxes[top, left] / side**2), int(top), int(left)
+
+
+def _view(truth: Images, renders: dict[str, Images], top: int, left: int) -> Image.Image:
+    """One view's lines: up to `ACROSS` crops, and below each its error."""
+    side = crop_side(*truth.shape[:2])
+    box = slice(top, top + side), slice(left, left + side)
+    scale = (2 * CROP_PIXELS + GAP) / truth.shape[0]
+    whole = _image(truth).resize((max(1, int(truth.shape[1] * scale)), 2 * CROP_PIXELS + GAP))
+    corners = [(left * scale, top * scale), ((left + side) * scale, (top + side) * scale)]
+    ImageDraw.Draw(whole).rectangle(corners, outline="red", width=2)
+    columns = {"truth": truth, **renders}
+    step = CROP_PIXELS + GAP
+    lines, across = -(-len(columns) // ACROSS), min(ACROSS, len(columns))
+    size = whole.width + GAP + step * across, lines * (TITLE + whole.height + GAP) - GAP
+    result = Image.new("RGB", size, "white")
+    result.paste(whole, (0, TITLE))
+    draw = ImageDraw.Draw(result)
+    for number, (label, image) in enumerate(columns.items()):
+        line, column = divmod(number, ACROSS)
+        x, y = whole.width + GAP + column * step, line * (TITLE + whole.height + GAP)
+        draw.text((x + 2, y + 2), label, fill="black")
+        result.paste(_enlarged(image[box]), (x, y + TITLE))
+        if label != "truth":
+            result.paste(_enlarged(ERROR_GAIN * np.abs(image - truth)[box]), (x, y + TITLE + step))
+    return result
+
+
+def _image(pixels: Images) -> Image.Image:
+    return Image.fromarray((pixels.clip(0, 1) * 255).round().astype(np.uint8))
+
+
+def _enlarged(pixels: Images) -> Image.Image:
+    return _image(pixels).resize((CROP_PIXELS, CROP_PIXELS), Image.Resampling.NEAREST)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which data parser reads a folder, so that every 8th image by name is a test image.
+
+- `transforms.json`: `nrfgs-data`. The data set's own split if it names one, else every 8th image.
+- `sparse/0` (or `colmap/sparse/0`, or `sparse`) with COLMAP's text or binary files: nerfstudio's `colmap`. That one
+  counts images in the order of COLMAP's numbers, which is not the order of names. So the folder is mirrored by links
+  into the work folder, with lists of names that say which image is what; the data set itself is not touched.
+"""
+
+import json
+import struct
+from pathlib import Path
+
+from PIL import Image
+
+from nrfgs_lab.bench.spec import Scene
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import whole, write_whole
+
+TEST_EVERY = 8
+MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
+"""Where a COLMAP reconstruction may lie."""
+ROUNDINGS = {
+    "floor": lambda side, factor: side // factor,
+    "round": lambda side, factor: int(side / factor + 0.5),
+    "ceil": lambda side, factor: -(-side // factor),
+}
+"""How a downscaled image's side may have come about; nerfstudio must be told."""
+
+
+def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
+    """The data parser's name and options, the last words of ns-train's command line.
+
+    Args:
+        root: folder of the scenes.
+        scene: which one.
+        mirrors: folder for mirrored COLMAP data sets.
+
+    Raises:
+        InputError: the folder is in neither layout, or the downscaled images are missing or of an unknown size.
+    """
+    folder = Path(root) / scene.name
+    if (folder / "transforms.json").is_file():
+        scale = [] if scene.downscale is None else ["--downscale-factor", str(scene.downscale)]
+        split = [] if names_its_split(folder / "transforms.json") else ["--eval-mode", "interval"]
+        return ["nrfgs-data", "--data", str(folder), *split, *scale, *scene.options]
+    model = colmap_model(folder)
+    if model is None:
+        raise InputError(
+            f"{folder} has neither transforms.json nor a COLMAP reconstruction ({', '.join(MODELS)} with cameras.bin "
+            "or cameras.txt). Give a folder in one of these layouts (--scenes ROOT, and scenes: in the file)."
+        )
+    factor = scene.downscale or 1
+    mirror = mirrors / scene.name
+    mirror_with_split(folder, model, mirror)
+    return [
+        *("colmap", "--data", str(mirror), "--colmap-path", model),
+        *("--downscale-factor", str(factor)),
+        *(["--downscale-rounding-mode", rounding(folder, factor, model)] if factor > 1 else []),
+        *scene.options,
+    ]
+
+
+def names_its_split(transforms: Path) -> bool:
+    """Whether a data set says which images are for testing. Files that cannot be read are left to the data parser."""
+    try:
+        return any(f"{split}_filenames" in json.loads(transforms.read_bytes()) for split in ("train", "val", "test"))
+    except (OSError, ValueError, TypeError):
+        return False
+
+
+def colmap_model(folder: Path) -> str | None:
+    """Path of the reconstruction inside a folder, or None."""
+    for model in MODELS:
+        if any((folder / model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return model
+    return None
+
+
+def image_names(model: Path) -> list[str]:
+    """Names of a reconstruction's images, sorted. As nerfstudio does, text is read if both are there.
+
+    Raises:
+        InputError: the list of images is missing or torn.
+    """
+    from nerfstudio.data.utils.colmap_parsing_utils import read_images_binary, read_images_text
+
+    text = (model / "cameras.txt").is_file()
+    file = model / ("images.txt" if text else "images.bin")
+    try:
+        images = read_images_text(file) if text else read_images_binary(file)
+    except (OSError, ValueError, IndexError, struct.error) as error:
+        raise InputError(
+            f"{file} cannot be read as COLMAP's ({error}). Restore it, or export the model anew."
+        ) from error
+    return sorted(image.name for image in images.values())
+
+
+def mirror_with_split(folder: Path, model: str, mirror: Path) -> None:
+    """Link everything in `folder` into `mirror`, and put lists of training and test images beside it.
+
+    Links that an earlier benchmark made to another place are replaced.
+    """
+    names = image_names(folder / model)
+    if len(names) < 2:
+        raise InputError(f"{folder / model} has {len(names)} images; one to train on and one to test are needed.")
+    mirror.mkdir(parents=True, exist_ok=True)
+    test = names[::TEST_EVERY]
+    lists = {"train": sorted(set(names) - set(test)), "val": test, "test": test}
+    targets = {entry.name: entry.resolve() for entry in folder.iterdir()}
+    for name in [f"{split}_list.txt" for split in lists]:
+        targets.pop(name, None)
+    for name, target in targets.items():
+        link = mirror / name
+        if not link.is_symlink() or link.readlink() != target:
+            with whole(link) as aside:
+                aside.symlink_to(target, target_is_directory=target.is_dir())
+    for split, members in lists.items():
+        write_whole(mirror / f"{split}_list.txt", "".join(f"{name}\n" for name in members))
+
+
+def rounding(folder: Path, factor: int, model: str) -> str:
+    """How the sides of the images in images_FACTOR were rounded, from the first image of the reconstruction."""
+    originals, smaller = folder / "images", folder / f"images_{factor}"
+    if not smaller.is_dir():
+        raise InputError(
+            f"{smaller} is missing. Downscale the images into it, or choose a factor that is there (scenes: downscale)."
+        )
+    name = image_names(folder / model)[0]
+    original, same = originals / name, smaller / name
+    for file in (original, same):
+        if not file.is_file():
+            raise InputError(f"{smaller} and {originals} must hold images of the same names; {file} is missing.")
+    with Image.open(original) as large, Image.open(same) as small:
+        sizes = large.size, small.size
+    for mode, rounded in ROUNDINGS.items():
+        if tuple(rounded(side, factor) for side in sizes[0]) == sizes[1]:
+            return mode
+    raise InputError(
+        f"{same} is {sizes[1][0]} x {sizes[1][1]}, which is not {sizes[0][0]} x {sizes[0][1]} / {factor} however "
+        "rounded. Downscale the images again."
+    )

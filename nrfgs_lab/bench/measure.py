@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a trained model is worth, measured alike for every method: on test views, on training views, in time and bytes.
+
+`ns-eval` reports what a method chooses to report; nerfstudio's own splatfacto has neither L1 nor MS-SSIM, ignores masks
+and takes its frames per second without waiting for the GPU. Here one piece of code looks at the renderings of all.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.eval_utils import eval_setup
+
+from nrfgs_ns.data.views import evenly_spaced
+from nrfgs_ns.image.metrics import METRIC_NAMES, ImageMetrics
+
+TIMED_CAMERAS = 20
+"""Test cameras, evenly spaced, whose rendering is timed."""
+TIMED_SECONDS = 1.0
+"""They are rendered in turn for at least this long."""
+FULL_HD = 1920, 1080
+"""A screen's size, at which frames per second are taken beside the photographs' own."""
+
+
+@torch.no_grad()
+def measure(config_path: Path, train_views: int) -> dict[str, Any]:
+    """Load the last checkpoint of a training and measure it at full resolution.
+
+    Args:
+        config_path: the config.yml that the training saved.
+        train_views: of how many training images, evenly spaced among all; 0 leaves them out.
+
+    Returns:
+        "test" and "train" (null without views), each with the means of psnr, ssim, ms_ssim, l1, lpips (null where it
+        cannot be had) and "per_image"; "fps" at the photographs' size and "fps_1080p" (null on a CPU); "splats", of
+        which "diffuse" have no residual; "parameter_bytes" (what a renderer needs); "checkpoint_bytes" (the file, with
+        the optimisers' moments).
+    """
+    _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
+    model, data = pipeline.model, pipeline.datamanager
+    model.eval()
+    metrics = ImageMetrics()
+    test = data.fixed_indices_eval_dataloader
+    names = [Path(name).name for name in data.eval_dataset.image_filenames]
+    result: dict[str, Any] = {"test": over_views(model, metrics, zip(names, test, strict=True)), "train": None}
+    if train_views > 0:
+        images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
+        cameras = data.train_dataset.cameras
+        chosen = evenly_spaced(len(images), train_views)
+        views = ((cameras[i : i + 1].to(model.device), images[i]) for i in chosen)
+        names = [Path(data.train_dataset.image_filenames[i]).name for i in chosen]
+        result["train"] = over_views(model, metrics, zip(names, views, strict=True))
+    cameras = [camera for camera, _ in test]
+    return {
+        **result,
+        "fps": frames_per_second(model, cameras),
+        "fps_1080p": frames_per_second(model, [at_size(camera, *FULL_HD) for camera in cameras])
+        if model.device.type == "cuda"
+        else None,
+        "splats": int(model.num_points),
+        "diffuse": getattr(model, "num_diffuse", 0),
+        "parameter_bytes": getattr(model, "parameter_bytes", None)  # nerfstudio's own have splats and no more
+        or sum(parameter.numel() * parameter.element_size() for parameter in model.gauss_params.values()),
+        "checkpoint_bytes": Path(checkpoint).stat().st_size,
+    }
+
+
+def over_views(model, metrics: ImageMetrics, views: Iterable) -> dict[str, Any]:
+    """Means and each image's values over (name, (camera, batch))."""
+    per_image = []
+    for name, (camera, batch) in views:
+        outputs = model.get_outputs_for_camera(camera)
+        truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
+        mask = batch["mask"].to(model.device).float() >= 0.5 if "mask" in batch else None
+        per_image.append({"image": name, **metrics(outputs["rgb"], truth, mask)})
+    means = {}
+    for metric in METRIC_NAMES:
+        values = [image[metric] for image in per_image if image[metric] is not None]
+        means[metric] = sum(values) / len(values) if values else None
+    return {**means, "per_image": per_image}
+
+
+def at_size(camera: Cameras, width: int, height: int) -> Cameras:
+    """The camera [1] with another image: of the same vertical angle, and as much to the sides as there is room for."""
+    scale = height / camera.height
+    size = {"width": torch.full_like(camera.width, width), "height": torch.full_like(camera.height, height)}
+    return Cameras(camera.camera_to_worlds, camera.fx * scale, camera.fy * scale, width / 2, height / 2, **size).to(
+        camera.device
+    )
+
+
+def frames_per_second(model, cameras: list) -> float:
+    """Renderings per second of wall-clock, one after the other, after one of each that is not timed."""
+    chosen = [cameras[i].to(model.device) for i in evenly_spaced(len(cameras), TIMED_CAMERAS)]
+    rendered, seconds = 0, 0.0
+    for timed in (False, True):
+        _synchronize()
+        start = perf_counter()
+        while True:
+            for camera in chosen:
+                model.get_outputs_for_camera(camera)
+            _synchronize()
+            if not timed:
+                break
+            rendered, seconds = rendered + len(chosen), perf_counter() - start
+            if seconds >= TIMED_SECONDS:
+                break
+    return rendered / seconds
+
+
+def _synchronize() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()

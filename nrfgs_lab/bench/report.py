@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a benchmark, from the records that are there: tables, numbers of splats over steps, crops."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from nrfgs_lab.bench.crops import crop_sheet, numbered
+from nrfgs_lab.bench.spec import Cell, Scene, Spec, cells_of, read_record, rows_of
+from nrfgs_lab.bench.table import (
+    COLUMNS,
+    FAILED,
+    MISSING,
+    STALE,
+    Row,
+    as_csv,
+    latex,
+    markdown,
+    views_as_csv,
+    with_averages,
+)
+from nrfgs_ns.files import whole, write_whole
+
+
+def report(spec: Spec, out: Path, work: Path, stale: dict[str, str]) -> None:
+    """Write OUT/table.{md,csv,tex}, views.csv, summary.json, splats.{png,svg} and crops/SCENE.png, and print the table.
+
+    Args:
+        spec: the benchmark.
+        out: folder of the report; its runs/ holds the records.
+        work: folder of the trainings, for their pictures; without them there are no crops.
+        stale: names of records that are not to be used, with the reason.
+    """
+    rows = rows_from_records(spec, out / "runs", stale)
+    for name, difference in stale.items():
+        print(f"{name} is stale: it was made with {difference}")
+    everything = with_averages(rows)
+    table = markdown(everything)
+    write_whole(out / "table.md", table)
+    write_whole(out / "table.csv", as_csv(everything))
+    write_whole(out / "table.tex", latex(everything))
+    write_whole(out / "views.csv", views_as_csv(rows))
+    write_whole(out / "summary.json", json.dumps([summary(row) for row in everything], indent=1) + "\n")
+    if any(row.records for row in rows):
+        draw_splats(rows, out)
+    for scene in spec.scenes:
+        path = out / "crops" / f"{scene.name.replace('/', '_')}.png"
+        try:
+            crop_sheet(pictures_of(spec, scene, out / "runs", work, stale), path, spec.crops.get(scene.name))
+        except OSError as error:
+            print(f"No crops of {scene.name}: {error}")
+    Console(soft_wrap=True, markup=False, highlight=False).print(table)
+    print(f"Report: {out}")
+
+
+def pictures_of(spec: Spec, scene: Scene, runs: Path, work: Path, stale: dict[str, str]) -> dict[str, Path]:
+    """Label -> folder of ns-eval's pictures of each run on a scene, of its first seed that has some.
+
+    The labels name the seeds if the runs have not all the same one.
+    """
+    found = []
+    for protocol, run in rows_of(spec):
+        for seed in spec.seeds:
+            name = Cell(run, protocol, scene, seed).name
+            folder = work / name / "pictures"
+            if name not in stale and (runs / f"{name}.json").exists() and numbered(folder):
+                found.append((label(run.name, protocol), seed, folder))
+                break
+    several = len({seed for _, seed, _ in found}) > 1
+    return {f"{text}, seed {seed}" if several else text: folder for text, seed, folder in found}
+
+
+def rows_from_records(spec: Spec, runs: Path, stale: dict[str, str]) -> list[Row]:
+    """One row for each scene, protocol and run, whether or not it has records."""
+    by_place: dict[tuple[str, str, str], Row] = {}
+    for cell in cells_of(spec):
+        place = (cell.scene.name, cell.run.name, cell.protocol)
+        row = by_place.setdefault(place, Row(*place))
+        file = runs / f"{cell.name}.json"
+        if cell.name in stale:
+            row.absent[cell.seed] = STALE
+        elif file.exists():
+            row.records[cell.seed] = read_record(file)
+        else:
+            row.absent[cell.seed] = FAILED if file.with_suffix(".failed").exists() else MISSING
+    return [row.fill() for row in by_place.values()]
+
+
+def summary(row: Row) -> dict[str, Any]:
+    """A row as plain data."""
+    values = {column.name: [row.mean(column), row.deviation(column)] for column in COLUMNS}
+    return {
+        "scene": row.scene,
+        "run": row.run,
+        "protocol": row.protocol,
+        "seeds": sorted(row.records),
+        "absent": {str(seed): why for seed, why in row.absent.items()},
+        **values,
+    }
+
+
+def label(run: str, protocol: str) -> str:
+    """What a run under a protocol is called in pictures."""
+    return run if protocol == "own" else f"{run} {protocol}"
+
+
+def plain_label(text: str) -> str:
+    """A name as matplotlib writes it out: `$` begins no formula, and a leading underscore keeps it in the legend."""
+    return ("\N{ZERO WIDTH SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+def draw_splats(rows: list[Row], out: Path) -> None:
+    """Number of splats over training steps: OUT/splats.png and .svg, one panel for each scene and protocol.
+
+    A line is the mean over seeds, on a band from the smallest to the largest.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    scenes = list(dict.fromkeys(row.scene for row in rows if row.records))
+    protocols = list(dict.fromkeys(row.protocol for row in rows if row.records))
+    runs = list(dict.fromkeys(row.run for row in rows if row.records))
+    places = [(scene, protocol) for scene in scenes for protocol in protocols]
+    across = min(3, len(scenes)) if len(protocols) == 1 else len(protocols)
+    down = -(-len(places) // across)
+    # Text as text keeps the SVG small; a fixed salt gives the same file for the same numbers.
+    with pyplot.rc_context({"svg.fonttype": "none", "svg.hashsalt": "nrfgs", "font.size": 8}):
+        size = 3.6 * across, 2.6 * down + 0.3
+        figure, panels = pyplot.subplots(down, across, figsize=size, squeeze=False, layout="constrained")
+        for panel in panels.flat[len(places) :]:
+            panel.set_visible(False)
+        for panel, (scene, protocol) in zip(panels.flat, places, strict=False):
+            for row in rows:
+                if (row.scene, row.protocol) == (scene, protocol) and row.records:
+                    draw_counts(panel, row, runs.index(row.run))
+            panel.set(title=plain_label(label(scene, protocol)), xlabel="step", ylabel="splats", ylim=(0, None))
+            panel.yaxis.set_major_formatter("{x:,.0f}")
+        lines = {line.get_label(): line for panel in panels.flat for line in panel.get_lines()}
+        ordered = [plain_label(run) for run in runs if plain_label(run) in lines]
+        figure.legend([lines[name] for name in ordered], ordered, loc="outside lower center", ncols=min(5, 2 * across))
+        with whole(out / "splats.png") as aside:
+            figure.savefig(aside, format="png", dpi=150, metadata={"Software": None})
+        with whole(out / "splats.svg") as aside:
+            figure.savefig(aside, format="svg", metadata={"Date": None})
+        pyplot.close(figure)
+
+
+STYLES = "-", "--", ":", "-."
+"""Of lines: the next one when the ten colours are used up."""
+
+
+def draw_counts(panel, row: Row, number: int) -> None:
+    """One row's numbers of splats over steps, in the colour and style of its run's number."""
+    told = [record["train"].get("splats") for record in row.records.values()]
+    curves = [dict(map(tuple, pairs)) for pairs in told if pairs]
+    if not curves:
+        return
+    steps = sorted(set.intersection(*(set(curve) for curve in curves)))
+    counts = [[curve[step] for curve in curves] for step in steps]
+    colour, style = f"C{number % 10}", STYLES[number // 10 % len(STYLES)]
+    means = [sum(of_step) / len(curves) for of_step in counts]
+    panel.plot(steps, means, label=plain_label(row.run), color=colour, linestyle=style, linewidth=1.2)
+    least, most = list(map(min, counts)), list(map(max, counts))
+    if least != most:
+        panel.fill_between(steps, least, most, color=colour, alpha=0.2, linewidth=0)

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What pages of the documentation are made by: options, the newcomer's page, pictures of the viewer."""

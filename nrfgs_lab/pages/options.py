@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of all options: read from the configurations, so that it cannot say anything else than they do.
+
+    python -m nrfgs_lab.pages.options            # writes docs/options.md
+
+Of what `ns-train` offers it has the options that this project adds, or that it explains or presets in its own way;
+nerfstudio's own are in `ns-train METHOD --help`, with these.
+"""
+
+import ast
+import dataclasses
+import inspect
+import textwrap
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from nerfstudio.plugins.types import MethodSpecification
+
+from nrfgs_ns import method_config
+from nrfgs_ns.cli import commands
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "options.md"
+PACKAGES = "nrfgs_ns", "nrfgs_lab"
+MODEL = "pipeline.model."
+APPEARANCE = "pipeline.model.appearance."
+
+INTRODUCTION = """# Options
+
+This page is written by `python -m nrfgs_lab.pages.options`, from the configurations themselves. It has what this
+package adds to nerfstudio's options, or explains or presets in its own way; all of nerfstudio's and splatfacto's are
+there too, in `ns-train nrfgs --help`. Underscores and hyphens are the same. A scene unit is what the cameras fill:
+they lie within [-1, 1].
+"""
+HOST = "`--max-num-iterations` (30000), `--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
+
+
+class Option(NamedTuple):
+    """A line of the page."""
+
+    flag: str
+    """with dots and hyphens, without leading hyphens"""
+    default: Any
+    text: str
+    """what it does"""
+
+
+def own_options(config: Any, prefix: str = "") -> Iterator[Option]:
+    """The options of a configuration, and of those inside it, whose explanation stands in this project's code.
+
+    Args:
+        config: a dataclass's instance, which has the defaults.
+        prefix: dotted names down to it.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            yield from own_options(value, f"{prefix}{field.name}.")
+        elif not field.name.startswith("_") and "Suppress" not in str(field.type):
+            text = _explanation(type(config), field.name)
+            if text is not None:
+                yield Option((prefix + field.name).replace("_", "-"), value, text)
+
+
+def _explanation(config: type, name: str) -> str | None:
+    """What the nearest of this project's classes says of a field, or None if none of them has it."""
+    for base in config.__mro__:
+        if base.__module__.split(".")[0] in PACKAGES and name in vars(base).get("__annotations__", {}):
+            return _explanations(base)[name]
+    return None
+
+
+@cache
+def _explanations(config: type) -> dict[str, str]:
+    """Field -> the string that follows it in the source, on one line."""
+    (body,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
+    found = {}
+    for node, following in zip(body.body, [*body.body[1:], None], strict=True):
+        if isinstance(node, ast.AnnAssign):
+            is_text = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
+            found[node.target.id] = " ".join(following.value.value.split()) if is_text else ""
+    return found
+
+
+def table(options: list[Option], prefix: str = "") -> str:
+    """A Markdown table, the flags without the prefix that they share."""
+    lines = [f"| `--{prefix}` | default | |" if prefix else "| | default | |", "|---|---|---|"]
+    for option in options:
+        text = option.text.replace("|", "\\|")
+        lines.append(f"| `{option.flag.removeprefix(prefix)}` | {_shown(option.default)} | {text} |")
+    return "\n".join(lines) + "\n"
+
+
+def _shown(default: Any) -> str:
+    if default is dataclasses.MISSING:
+        return "required"
+    if default is None or default == "" or default == ():
+        return "none"
+    if isinstance(default, (tuple, list)):
+        return " ".join(map(str, default))
+    return default.as_posix() if isinstance(default, Path) else str(default)
+
+
+def command_options(command: type) -> Iterator[Option]:
+    """The options of a command of `nrfgs`, with their hyphens. What has no name on the command line is in capitals."""
+    for field in dataclasses.fields(command):
+        default = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        if dataclasses.is_dataclass(default):
+            for option in own_options(default, f"{field.name}."):
+                yield option._replace(flag=f"--{option.flag}")
+            continue
+        name = field.name.replace("_", "-")
+        flag = (
+            field.name.upper()
+            if "Positional" in str(field.type)
+            else f"--{name}, --no-{name}"
+            if default is True
+            else f"--{name}"
+        )
+        yield Option(flag, default, _explanation(command, field.name) or "")
+
+
+def methods() -> list[MethodSpecification]:
+    """The registered methods."""
+    return [value for value in vars(method_config).values() if isinstance(value, MethodSpecification)]
+
+
+def page() -> str:
+    """The whole page."""
+    first, *others = methods()
+    options = list(own_options(first.config))
+    heads = [option for option in options if option.flag.startswith(APPEARANCE)]
+    model = [option for option in options if option.flag.startswith(MODEL) and option not in heads]
+    rest = [option._replace(flag=f"--{option.flag}") for option in options if not option.flag.startswith(MODEL)]
+    data = [option._replace(flag=f"--{option.flag}") for option in own_options(NrfgsDataParserConfig())]
+    parts = [
+        INTRODUCTION,
+        "## `ns-train nrfgs`: the field\n",
+        table(heads, APPEARANCE),
+        "## All methods: the model\n",
+        table(model, MODEL),
+        "## All methods: training\n",
+        table([option for option in rest if ".dataparser." not in option.flag]),
+        HOST,
+        "## All methods: the data set\n\nAfter the word `nrfgs-data`, at the end of the command.\n",
+        table(data),
+    ]
+    presets = [method for method in others if is_preset(method, first)]
+    parts += ["## Presets\n", *(f"`ns-train {one.config.method_name}`: {one.description}\n" for one in presets)]
+    for method in others:
+        if method in presets:
+            continue
+        own = list(own_options(method.config.pipeline.model.appearance, APPEARANCE))
+        parts += [f"## `ns-train {method.config.method_name}`: the head\n", f"{method.description}\n"]
+        parts.append(table(own, APPEARANCE))
+    parts += ["## Learning rates\n", rates(first)]
+    for name, entry_point in commands().items():
+        command = entry_point.load()
+        summary = inspect.getdoc(command).split("\n")[0]
+        parts += [f"## `nrfgs {name}`\n", f"{summary}\n", table(list(command_options(command)))]
+    return "\n".join(parts)
+
+
+def is_preset(method: MethodSpecification, of: MethodSpecification) -> bool:
+    """Whether a method has the same head as another one."""
+    return type(method.config.pipeline.model.appearance) is type(of.config.pipeline.model.appearance)
+
+
+def rates(method: MethodSpecification) -> str:
+    """The learning rates of a method's parameters."""
+    lines = ["| `--optimizers.NAME` | `.optimizer.lr` | `.scheduler.lr-final` |", "|---|---|---|"]
+    for name, group in method.config.optimizers.items():
+        scheduler = group["scheduler"]
+        final = "no scheduler" if scheduler is None else f"{scheduler.lr_final:g}"
+        lines.append(f"| `{name}` | {group['optimizer'].lr:g} | {final} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the capture's world to the one that is trained in, and back.
+
+Training is in float32, whose numbers of ten million are a metre apart. So cameras that are far from the origin, as
+georeferenced ones are, are moved there in float64 before anything else is done, and the way back is float64 too.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from nerfstudio.cameras import camera_utils
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs, transform_poses_to_original_space
+from torch import Tensor
+
+FAR = 100.0
+"""Cameras whose mean is farther from the origin than so many times their extent are moved there in float64. Nearer ones
+lose less than a hundredth of a pixel to float32, and stay to the bit where nerfstudio puts them."""
+
+
+@dataclass(frozen=True)
+class CaptureFrame:
+    """Where the capture's own world lies in the one that is trained in: x_training = scale (R x_capture + t).
+
+    The capture's own world is that of the original reconstruction, before an `applied_transform` in transforms.json:
+    the one that dataparser_transforms.json leads back to.
+    """
+
+    rotation: np.ndarray
+    """R, float64 [3, 3]"""
+    translation: np.ndarray
+    """t, float64 [3]"""
+    scale: float
+    """> 0"""
+
+    origin: np.ndarray
+    """a point of the capture's world amid the cameras, float64 [3], to be subtracted from coordinates that are to fit
+    into float32; 0 where they do as they are"""
+
+    @classmethod
+    def of(cls, outputs: DataparserOutputs) -> "CaptureFrame":
+        """That of a data set, such as `pipeline.datamanager.train_dataparser_outputs`."""
+        transform, scale = outputs.dataparser_transform.double().numpy(), float(outputs.dataparser_scale)
+        frame = cls(transform[:, :3], transform[:, 3], scale, np.zeros(3))
+        if outputs.dataparser_transform.dtype != torch.float64:
+            return frame
+        return replace(frame, origin=_rounded(frame.to_capture(np.zeros((1, 3)))[0], 1 / scale))
+
+    def to_capture(self, points: np.ndarray) -> np.ndarray:
+        """Points [N, 3] of the training's world in the capture's, float64 [N, 3]."""
+        return (np.asarray(points, dtype=np.float64) / self.scale - self.translation) @ self.rotation
+
+    def to_training(self, points: np.ndarray) -> np.ndarray:
+        """Points [N, 3] of the capture's world in the training's, float64 [N, 3]."""
+        return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
+
+
+class PlacedOutputs(DataparserOutputs):
+    """Nerfstudio's outputs, whose way back may be in float64."""
+
+    def transform_poses_to_original_space(self, poses: Tensor, camera_convention="opencv") -> Tensor:
+        way_back = self.dataparser_transform
+        return transform_poses_to_original_space(
+            poses.to(way_back.dtype), way_back, self.dataparser_scale, camera_convention=camera_convention
+        )
+
+
+def place(
+    poses: np.ndarray, orientation: str, centering: str, auto_scale: bool, factor: float
+) -> tuple[Tensor, Tensor, float]:
+    """Orient, centre and scale cameras as nerfstudio does.
+
+    Args:
+        poses: camera-to-world, float64 [V, 4, 4].
+        orientation: nerfstudio's orientation_method.
+        centering: nerfstudio's center_method.
+        auto_scale: whether the largest coordinate of a camera becomes 1.
+        factor: a further scale.
+
+    Returns:
+        The poses, float32 [V, 3, 4]; the transform [3, 4] that they were moved by, float64 if they were far from the
+        origin and otherwise float32; and the scale that came after it.
+    """
+    positions = poses[:, :3, 3]
+    center, extent = positions.mean(axis=0), np.ptp(positions, axis=0).max()
+    far = centering != "none" and np.abs(center).max() > FAR * extent > 0
+    offset = _rounded(center, extent) if far else np.zeros(3)
+    near = poses.copy()
+    near[:, :3, 3] -= offset
+    placed, transform = camera_utils.auto_orient_and_center_poses(
+        torch.from_numpy(near.astype(np.float32)), method=orientation, center_method=centering
+    )
+    scale = 1.0
+    if auto_scale:
+        scale /= float(torch.max(torch.abs(placed[:, :3, 3])))
+    scale *= factor
+    placed[:, :3, 3] *= scale
+    if far:
+        transform = transform.double()
+        transform[:, 3] -= transform[:, :3] @ torch.from_numpy(offset)
+    return placed[:, :3, :4], transform, scale
+
+
+def _rounded(place: np.ndarray, extent: float) -> np.ndarray:
+    """A place in whole units, or in parts of one if the extent of what is there is less."""
+    step = min(1.0, 2.0 ** np.floor(np.log2(extent)))
+    return np.round(place / step) * step
+
+
+def after(transform: Tensor, earlier: Tensor | None) -> Tensor:
+    """One transform [3, 4] after an earlier one, in the first one's precision."""
+    if earlier is None:
+        return transform
+    return transform @ torch.cat([earlier.to(transform), torch.tensor([[0, 0, 0, 1]]).to(transform)], 0)

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs export`: which file is written, and what about it can be chosen."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from nrfgs_ns.compact.options import CompactOptions
+from nrfgs_ns.errors import InputError
+
+
+@dataclass
+class Export:
+    """Write a trained model as a file that other programs read."""
+
+    format: tyro.conf.Positional[Literal["ply", "compact"]]
+    """ply: the format of 3D Gaussian Splatting, with spherical harmonics fitted to the colours. compact: the field
+    itself in a small file, which ns-eval, ns-viewer and ns-render read (docs/compact-format.md)"""
+    load_config: Path
+    """config.yml of the training"""
+    output: Path
+    """the file to write; an older one is replaced"""
+    measure: bool = True
+    """render the test views from the model and from the written file, and tell what the fit loses"""
+    report: Path | None = None
+    """also write the numbers to this file, as JSON"""
+    compact: CompactOptions = field(default_factory=CompactOptions)
+    """what a compact file may leave out"""
+
+    def main(self) -> None:
+        if self.output.is_dir():
+            raise InputError(f"--output {self.output} is a folder. Name a file in it, such as splats.ply.")
+        if self.format == "compact":
+            from nrfgs_ns.export.compact import export_compact
+
+            export_compact(self.load_config, self.output, self.compact, self.measure, self.report)
+        else:
+            from nrfgs_ns.export.ply import export_ply
+
+            export_ply(self.load_config, self.output, self.measure, self.report)

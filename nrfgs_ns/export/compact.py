@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs export compact`: choose what is left out, write the file, and a config.yml with which nerfstudio reads it."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from nrfgs_ns.appearance.nrf import NeuralResidualField
+from nrfgs_ns.appearance.reduce import Field
+from nrfgs_ns.compact.decode import decode
+from nrfgs_ns.compact.encode import encode
+from nrfgs_ns.compact.format import write_container
+from nrfgs_ns.compact.options import CompactOptions
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.image.metrics import psnr
+from nrfgs_ns.simplify.field_views import FieldViews, slim
+from nrfgs_ns.simplify.residuals import look_over
+
+PLY_BYTES = 62 * 4
+"""Of one splat in 3DGS's PLY file, with harmonics of degree 3."""
+
+
+def export_compact(
+    load_config: Path, output: Path, options: CompactOptions, measure: bool, report: Path | None
+) -> None:
+    """See `nrfgs export --help`."""
+    options.precision.validate()
+    if options.views < 1:
+        raise InputError(f"--compact.views is {options.views}; it must be at least 1.")
+    for name in ("budget", "threshold"):
+        value = getattr(options, name)
+        if value is not None and not value >= 0:
+            raise InputError(f"--compact.{name} is {value}; it must be zero or positive.")
+    pipeline = load_model(load_config, "test")
+    field, threshold = chosen_field(pipeline, load_config, options)
+    model = pipeline.model
+    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
+    header, streams = encode(field, options.precision, render)
+    size = write_container(output, header, streams)
+    count = sum(header["splats"].values())
+    config = write_config(load_config, output)
+    numbers = {
+        "splats": model.num_points,
+        "written": count,
+        "view_dependent": header["splats"]["view"],
+        "rank": field.head.config.latent_dim,
+        "threshold": threshold if threshold != float("inf") else None,
+        "bytes": size,
+        "ply_bytes": PLY_BYTES * count,
+        "ply_ratio": PLY_BYTES * count / size,
+        "stream_bytes": stream_bytes(output),
+        "precision": asdict(options.precision),
+    }
+    CONSOLE.print(
+        f"{output}: {count:,} splats, {header['splats']['view']:,} of them view-dependent with latents of "
+        f"{numbers['rank']} numbers, {size / 1e6:.2f} MB, {size / count:.1f} bytes a splat: 3DGS's PLY of as many "
+        f"splats has {numbers['ply_bytes'] / 1e6:.2f} MB, {numbers['ply_ratio']:.1f} times as much.",
+        markup=False,
+        soft_wrap=True,
+    )
+    if measure:
+        numbers |= measure_loss(pipeline, config)
+        lost = round(numbers["loss_db"], 3) + 0.0  # without the sign of a -0.0
+        CONSOLE.print(
+            f"PSNR on {len(numbers['per_image'])} test views: model {numbers['psnr_model']:.2f} dB, file "
+            f"{numbers['psnr_file']:.2f} dB: it loses {lost:.3f} dB."
+        )
+    CONSOLE.print(f"Read it with:  ns-eval --load-config {config}", markup=False, soft_wrap=True)
+    if report is not None:
+        report.parent.mkdir(parents=True, exist_ok=True)
+        report.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+
+
+def chosen_field(pipeline, load_config: Path, options: CompactOptions) -> tuple[Field, float]:
+    """The field to write, slimmed as the options say, and the threshold below which residuals were dropped."""
+    model, data = pipeline.model, pipeline.datamanager
+    if not isinstance(model.head, NeuralResidualField):
+        raise InputError(
+            f"--load-config {load_config}: a compact file holds a neural residual field, and this model has the "
+            f"{model.head.name!r} head. Use nrfgs export ply."
+        )
+    size = model.head.config.latent_dim
+    if options.rank is not None and not 1 <= options.rank <= size:
+        raise InputError(f"--compact.rank is {options.rank}; this model's latents have ranks 1 to {size}.")
+    with torch.no_grad():
+        field = Field(model.head, {name: value.detach() for name, value in model._splats_to_draw().items()})
+        images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
+        cameras = data.train_dataset.cameras
+        with CONSOLE.status(f"Looking at the splats from {len(cameras)} training views"):
+            seen = look_over(model, cameras)
+        chosen = [i * len(images) // options.views for i in range(options.views)] if images else []
+        views = FieldViews(model, [(cameras[i : i + 1].to(model.device), images[i]) for i in sorted(set(chosen))])
+        columns = TextColumn("{task.description:<40}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=CONSOLE, transient=True) as progress:
+            task = progress.add_task("Choosing what to leave out", total=None)
+            slimmed = slim(
+                field,
+                seen,
+                views,
+                views.psnr(field) - options.budget,
+                options.threshold,
+                options.rank,
+                lambda what: progress.update(task, description=f"Without {what}", advance=1),
+            )
+    return slimmed.field, slimmed.threshold
+
+
+def stream_bytes(path: Path) -> dict[str, int]:
+    """How the bytes of a file are spread over its streams, by name."""
+    from nrfgs_ns.compact.format import read_container
+
+    header, _ = read_container(path)
+    return {entry["name"]: entry["bytes"] for entry in header["streams"]}
+
+
+def write_config(load_config: Path, output: Path) -> Path:
+    """Write what nerfstudio's commands need to find a compact file: a config.yml, and a checkpoint that says nothing.
+
+    For FILE.nrf they are in FILE/METHOD/compact. Paths are as they were given, so relative ones count from the folder
+    in which the commands are run, as in every config.yml of nerfstudio.
+
+    Returns:
+        the config.yml.
+    """
+    config = yaml.load(load_config.read_text(), Loader=yaml.Loader)
+    config.output_dir, config.experiment_name, config.timestamp = output.parent, output.stem, "compact"
+    config.relative_model_dir = Path("nerfstudio_models")
+    config.load_dir = config.load_checkpoint = config.load_step = None
+    config.pipeline.compact = output
+    config.pipeline.model.appearance = decode(output).config
+    # What only the training had.
+    config.pipeline.model.camera_optimizer.mode = "off"
+    config.pipeline.model.use_bilateral_grid = False
+    models = config.get_checkpoint_dir()
+    models.mkdir(parents=True, exist_ok=True)
+    for older in models.glob("step-*.ckpt"):
+        older.unlink()
+    step = config.max_num_iterations - 1
+    torch.save({"step": step, "pipeline": {}}, models / f"step-{step:09d}.ckpt")
+    path = config.get_base_dir() / "config.yml"
+    path.write_text(yaml.dump(config), encoding="utf-8")
+    return path
+
+
+@torch.no_grad()
+def measure_loss(pipeline, config: Path) -> dict[str, Any]:
+    """What a file has lost against the model that it was written from, on the test views, read as ns-eval reads it.
+
+    Args:
+        pipeline: of the model, with its test images.
+        config: the config.yml beside the file.
+
+    Returns:
+        Means over the images, dB, inside their masks: psnr_model, psnr_file; loss_db, their difference; per_image.
+    """
+    original, small = pipeline.model, load_model(config, "test").model
+    names = [Path(name).name for name in pipeline.datamanager.eval_dataset.image_filenames]
+    images = list(zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True))
+    per_image = []
+    columns = TextColumn("Measuring the loss"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=CONSOLE, transient=True) as progress:
+        for name, (camera, batch) in progress.track(images):
+            scores = {}
+            for key, model in (("psnr_model", original), ("psnr_file", small)):
+                outputs = model.get_outputs_for_camera(camera)
+                truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
+                scores[key] = psnr(outputs["rgb"], truth, model._mask(batch))
+            if None not in scores.values():  # nothing inside the mask
+                per_image.append({"image": name, **scores})
+    if not per_image:
+        raise InputError("The file is written, but no test image has pixels inside its mask. Use --no-measure.")
+    means = {key: sum(image[key] for image in per_image) / len(per_image) for key in ("psnr_model", "psnr_file")}
+    return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}

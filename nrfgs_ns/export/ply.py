@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A trained model as the PLY file that 3D Gaussian Splatting writes and other viewers read.
+
+One vertex for each splat, 62 little-endian floats: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44, opacity (a logit),
+scale_0..2 (logarithms), rot_0..3 (w x y z, of unit length). A viewer's colour is max(0, 1/2 + SH_C0 f_dc + ...), and
+f_rest is channel-major: 15 coefficients of red, then of green, then of blue. `harmonics_fit.py` says how a head's
+colours become harmonics; `ns-export gaussian-splat` gets them from the model's properties and writes the same numbers.
+"""
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyParseError
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+
+from nrfgs_ns.errors import InputError
+
+if TYPE_CHECKING:  # nerfstudio takes seconds to import: `nrfgs --help` answers at once
+    from nrfgs_ns.model.harmonics_fit import PlainSplats
+
+PROPERTIES = (
+    *("x", "y", "z", "nx", "ny", "nz"),
+    *(f"f_dc_{i}" for i in range(3)),
+    *(f"f_rest_{i}" for i in range(45)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+)
+"""The vertex properties of 3D Gaussian Splatting, in its order."""
+FAINTEST_LOGIT = -5.5373
+"""Splats with a smaller opacity logit are left out, as by ns-export: logit(1/255), below which nothing is drawn."""
+
+
+def export_ply(load_config: Path, output: Path, measure: bool, report_file: Path | None) -> None:
+    """See `nrfgs export --help`."""
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    from nrfgs_ns.export.loading import load_model
+
+    # Set up exactly as in ns-export, so that both fit over the same cameras.
+    fit = load_model(load_config, "inference").model.fit
+    written = write_splats(fit.splats, output)
+    report = {
+        "splats": len(fit.splats.means),
+        "written": written,
+        "bytes": output.stat().st_size,
+        "exact": fit.exact,
+        "ridge_views": fit.strength,
+        "training_views": fit.views,
+        "unseen_splats": fit.unseen,
+    }
+    how = "its harmonics as they are"
+    if not fit.exact:
+        how = f"harmonics fitted over {fit.views} training views (ridge {fit.strength:g} views)"
+    CONSOLE.print(
+        f"{output}: {written:,} of {report['splats']:,} splats, {how}, {report['bytes'] / 1e6:.1f} MB",
+        markup=False,
+        soft_wrap=True,
+    )
+    if not fit.exact and fit.unseen:
+        CONSOLE.print(f"{fit.unseen:,} splats are seen by no training view and have their base colour.")
+    if measure:
+        report |= measure_loss(load_model(load_config, "test"), output, fit.splats)
+        lost = round(report["loss_db"], 2) + 0.0  # without the sign of a -0.0
+        CONSOLE.print(
+            f"PSNR on {len(report['per_image'])} test views: model {report['psnr_model']:.2f} dB, "
+            f"file {report['psnr_file']:.2f} dB: it loses {lost:.2f} dB.\n"
+            f"With the model's own opacities in each view, the file's colours reach "
+            f"{report['psnr_colors']:.2f} dB; base colours and opacities {report['psnr_base']:.2f} dB.",
+            soft_wrap=True,
+        )
+    if report_file is not None:
+        report_file.parent.mkdir(parents=True, exist_ok=True)
+        report_file.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+def write_splats(splats: "PlainSplats", path: Path) -> int:
+    """Write a 3DGS PLY file, whole or not at all.
+
+    Splats that are not finite or too faint to be drawn are left out.
+
+    Returns:
+        How many were written.
+
+    Raises:
+        InputError: none would be left.
+    """
+    count = len(splats.means)
+    columns = torch.cat(
+        [
+            splats.means,
+            splats.means.new_zeros(count, 3),
+            splats.features_dc,
+            splats.features_rest.transpose(1, 2).reshape(count, -1),  # channel-major
+            splats.opacities,
+            splats.scales,
+            splats.quats,
+        ],
+        dim=1,
+    )
+    keep = torch.isfinite(columns).all(dim=1) & (splats.opacities[:, 0] >= FAINTEST_LOGIT)
+    if not keep.any():
+        raise InputError(f"{path} is not written: none of the {count} splats is finite and opaque enough to be drawn.")
+    table = np.ascontiguousarray(columns[keep].cpu().numpy(), dtype="<f4")
+    vertices = table.view([(name, "<f4") for name in PROPERTIES])[:, 0]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".writing")
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(aside))
+    os.replace(aside, path)
+    return len(vertices)
+
+
+def read_splats(path: Path) -> "PlainSplats":
+    """Read a 3DGS PLY file of any degree up to 3; lower ones are filled up with zeros.
+
+    Raises:
+        InputError: the file is not there, or has not the properties of one.
+    """
+    from nrfgs_ns.model.harmonics_fit import PlainSplats
+
+    try:
+        vertices = PlyData.read(str(path))["vertex"].data
+    except (OSError, KeyError, ValueError, PlyParseError) as error:
+        raise InputError(f"{path} cannot be read as a PLY file with vertices ({error}). Export it again.") from error
+    names = vertices.dtype.names
+    missing = [name for name in PROPERTIES if name not in names and name[0] not in "nf"]
+    missing += [f"f_dc_{i}" for i in range(3) if f"f_dc_{i}" not in names]
+    higher = sum(name.startswith("f_rest_") for name in names)
+    bases = math.isqrt(higher // 3 + 1) ** 2
+    if missing or higher != 3 * (bases - 1) or bases > 16:
+        raise InputError(
+            f"{path} is not a 3DGS file: {'no ' + ', '.join(missing) if missing else f'{higher} f_rest properties'}."
+        )
+
+    def table(*columns: str) -> Tensor:
+        return torch.from_numpy(np.stack([vertices[name] for name in columns], axis=1).astype(np.float32))
+
+    rest = torch.zeros(len(vertices), 15, 3)
+    if higher:
+        by_channel = table(*(f"f_rest_{i}" for i in range(higher))).reshape(len(vertices), 3, bases - 1)
+        rest[:, : bases - 1] = by_channel.transpose(1, 2)
+    return PlainSplats(
+        means=table("x", "y", "z"),
+        quats=table(*(f"rot_{i}" for i in range(4))),
+        scales=table(*(f"scale_{i}" for i in range(3))),
+        opacities=table("opacity"),
+        features_dc=table(*(f"f_dc_{i}" for i in range(3))),
+        features_rest=rest,
+    )
+
+
+@torch.no_grad()
+def render_splats(
+    splats: "PlainSplats", camera, background: Tensor, rasterize_mode: str = "classic", near_plane: float = 0.01
+) -> Tensor:
+    """Render a file's splats as any viewer would, with this project's rasterizer.
+
+    Args:
+        splats: on one device, which picks the rasterizer's back end.
+        camera: nerfstudio's, a batch of one.
+        background: [3] or [H, W, 3].
+        rasterize_mode: as the model was trained.
+        near_plane: smallest depth that is drawn, in the file's unit of length.
+
+    Returns:
+        [H, W, 3] in [0, 1].
+    """
+    from nrfgs_ns.appearance.sh import ShConfig
+    from nrfgs_ns.model.pinhole import pinhole
+    from nrfgs_ns.rasterizer import composite, project
+
+    device = splats.means.device
+    pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
+    seen_from = pinhole(camera, pose.to(device), 1)
+    projection = project(
+        splats.means,
+        splats.quats,
+        splats.scales.exp(),
+        seen_from.viewmat,
+        seen_from.K,
+        seen_from.width,
+        seen_from.height,
+        near_plane=near_plane,
+        rasterize_mode=rasterize_mode,
+    )
+    appearance = ShConfig(degree=3).setup()(splats._asdict(), projection.gaussian_ids, seen_from.center)
+    render, alphas, _ = composite(projection, appearance.colors, appearance.opacities)
+    return (render[0] + (1.0 - alphas[0]) * background.to(device)).clamp(0.0, 1.0)
+
+
+@torch.no_grad()
+def measure_loss(pipeline, path: Path, fitted: "PlainSplats") -> dict[str, Any]:
+    """What a file has lost against the model that it was written from, on the test views.
+
+    Args:
+        pipeline: of the model, with its test images.
+        fitted: what was written, one row for each of the model's splats.
+
+    Returns:
+        Means over the images, dB, inside their masks: psnr_model; psnr_file; psnr_colors, of the fitted colours with
+        the model's own opacities; psnr_base, of the model's base colours and opacities. loss_db: what the file lacks of
+        the model. per_image: each image's values.
+    """
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    from nrfgs_ns.appearance.sh import ShConfig
+    from nrfgs_ns.image.metrics import psnr
+    from nrfgs_ns.model.renderer import NEAR_PLANE
+
+    model = pipeline.model
+    near_plane = NEAR_PLANE * model.scene_unit
+    file = read_splats(path)
+    file, fitted = (type(file)(*(value.to(model.device) for value in splats)) for splats in (file, fitted))
+    harmonics = ShConfig(degree=3).setup()
+    names = [Path(name).name for name in pipeline.datamanager.eval_dataset.image_filenames]
+    images = list(zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True))
+    per_image = []
+    columns = TextColumn("Measuring the loss"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=CONSOLE, transient=True) as progress:
+        for image_name, (camera, batch) in progress.track(images):
+            outputs = model.get_outputs_for_camera(camera)
+            rendered = render_splats(file, camera, outputs["background"], model.config.rasterize_mode, near_plane)
+            truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
+            mask = model._mask(batch)
+            view = model.look(camera)
+            colors = harmonics(fitted._asdict(), view.visible, view.center).colors
+            appearance = model.head(view.splats, view.visible, view.center)._replace(colors=colors)
+            pictures = {
+                "model": outputs["rgb"],
+                "file": rendered,
+                "colors": model.paint(view, appearance)[0]["rgb"],
+                "base": model.get_base_color(camera),
+            }
+            scores = {f"psnr_{name}": psnr(picture, truth, mask) for name, picture in pictures.items()}
+            if None not in scores.values():  # nothing inside the mask
+                per_image.append({"image": image_name, **scores})
+    if not per_image:
+        raise InputError(f"{path} is written, but no test image has pixels inside its mask. Use --no-measure.")
+    means = {key: sum(image[key] for image in per_image) / len(per_image) for key in scores}
+    return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}

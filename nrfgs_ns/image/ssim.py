@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splatfacto's loss, (1 - lambda) L1 + lambda (1 - SSIM), in few operations and without permuted copies.
+
+SSIM is that of Wang et al. 2004 as pytorch_msssim computes it: moments under an 11 x 11 Gaussian of sigma 1.5, at all
+places where the window lies within the image, mean over places and channels. With a prediction x and a truth y,
+
+    S = A B / (C D)     A = 2 E[x] E[y] + C1        B = 2 (E[xy] - E[x] E[y]) + C2
+                        C = E[x]^2 + E[y]^2 + C1    D = (E[xx] - E[x]^2) + (E[yy] - E[y]^2) + C2
+
+The window is symmetric, so what S passes back through a moment is blurred like the moment itself: the gradient by x is
+blur(dS/dE[x]) + 2 x blur(dS/dE[xx]) + y blur(dS/dE[xy]). Forward keeps those three slopes and no moments. On CUDA one
+Triton kernel does each direction (`ssim_triton.py`); everywhere else, and for other dtypes than float32, PyTorch does,
+all moments in one convolution.
+
+Conventions: images are [H, W, 3] in [0, 1], of one floating dtype and on one device. The truth gets no gradient.
+Images with a side shorter than the window go to pytorch_msssim, which warns and leaves that side unblurred.
+"""
+
+import logging
+
+import torch
+import torch.nn.functional as F
+from pytorch_msssim import SSIM
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nrfgs_ns.image.metrics import SSIM_C1, SSIM_C2, WINDOW_SIGMA, WINDOW_SIZE
+from nrfgs_ns.kernels.trial import try_triton
+
+REACH = WINDOW_SIZE // 2
+"""Pixels from a window's centre to its edge."""
+LIBRARY = SSIM(data_range=1.0, size_average=True, channel=3, win_size=WINDOW_SIZE, win_sigma=WINDOW_SIGMA)
+"""pytorch_msssim's SSIM, of images [1, 3, H, W]."""
+WEIGHTS = tuple(LIBRARY.win[0].flatten().tolist())
+"""The window along one axis, rounded to float32 like the library's: where an image is bright and flat, E[xx] - E[x]^2
+feels that they do not quite add up to 1."""
+MAX_NUMBERS = 2**31
+"""The kernels index slopes with 32 bits: three slopes of an image must have fewer numbers."""
+
+logger = logging.getLogger(__name__)
+
+
+def ssim(prediction: Tensor, truth: Tensor) -> Tensor:
+    """Mean structural similarity, a scalar in [-1, 1]; 1 is identical.
+
+    Args:
+        prediction: [H, W, 3].
+        truth: [H, W, 3], without gradient.
+
+    Raises:
+        ValueError: the shapes differ or are no colour images, or the truth requires a gradient.
+    """
+    return _weighted_sum(prediction, truth, 0.0, 1.0, 0.0)
+
+
+def photometric_loss(prediction: Tensor, truth: Tensor, ssim_lambda: float) -> Tensor:
+    """(1 - ssim_lambda) mean |prediction - truth| + ssim_lambda (1 - SSIM), a scalar.
+
+    Args:
+        prediction: [H, W, 3].
+        truth: [H, W, 3], without gradient.
+        ssim_lambda: weight of SSIM, in [0, 1].
+
+    Raises:
+        ValueError: the shapes differ or are no colour images, or the truth requires a gradient.
+    """
+    return _weighted_sum(prediction, truth, 1.0 - ssim_lambda, -ssim_lambda, ssim_lambda)
+
+
+def _weighted_sum(prediction: Tensor, truth: Tensor, l1_weight: float, ssim_weight: float, constant: float) -> Tensor:
+    """l1_weight mean |prediction - truth| + ssim_weight SSIM + constant."""
+    shape = prediction.shape
+    if shape != truth.shape or len(shape) != 3 or shape[2] != 3:
+        raise ValueError(f"prediction {list(shape)} and truth {list(truth.shape)} must both be [H, W, 3].")
+    if truth.requires_grad:
+        raise ValueError("truth requires a gradient, and SSIM has none for it; pass truth.detach().")
+    if min(shape[0], shape[1]) < WINDOW_SIZE:
+        similarity = LIBRARY(prediction.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None])
+    elif _kernels_take(prediction, truth):
+        from nrfgs_ns.image.ssim_triton import WeightedSum
+
+        return WeightedSum.apply(prediction, truth, l1_weight, ssim_weight, constant)
+    else:
+        similarity = SsimInTorch.apply(prediction, truth)
+    total = ssim_weight * similarity + constant
+    return total if l1_weight == 0.0 else total + l1_weight * (prediction - truth).abs().mean()
+
+
+class SsimInTorch(torch.autograd.Function):
+    """SSIM in PyTorch: the kernels' twin, for images with both sides at least the window's."""
+
+    @staticmethod
+    def forward(ctx, prediction: Tensor, truth: Tensor) -> Tensor:
+        x, y = (image.detach().permute(2, 0, 1).contiguous() for image in (prediction, truth))
+        moments = _blur(torch.cat([x, y, x * x, y * y, x * y])).split(3)
+        similarity, *slopes = _similarity(*moments, slopes=ctx.needs_input_grad[0])
+        ctx.save_for_backward(x, y, *slopes)
+        return similarity.mean()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_mean: Tensor) -> tuple[Tensor, None]:
+        x, y, *slopes = ctx.saved_tensors
+        # With zeros around, every pixel lies in whole windows: the gradient is as large as the image.
+        by_x, by_xx, by_xy = _blur(F.pad(torch.cat(slopes), (WINDOW_SIZE - 1,) * 4)).split(3)
+        gradient = by_x.addcmul(x, by_xx, value=2.0).addcmul_(y, by_xy).mul_(d_mean / slopes[0].numel())
+        return gradient.permute(1, 2, 0), None
+
+
+def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor, slopes: bool) -> tuple[Tensor, ...]:
+    """S, and if asked for its slopes by E[x], E[xx], E[xy], from the moments; all [3, h, w]."""
+    product, squares = x * y, x * x + y * y
+    A, B = 2 * product + SSIM_C1, 2 * (xy - product) + SSIM_C2
+    C, D = squares + SSIM_C1, xx + yy - squares + SSIM_C2
+    scale = 1 / (C * D)
+    S = A * B * scale
+    if not slopes:
+        return (S,)
+    by_xx, by_xy = -S / D, 2 * A * scale
+    by_x = 2 * (y * B * scale - x * (S / C + by_xx)) - y * by_xy
+    return S, by_x, by_xx, by_xy
+
+
+def _blur(planes: Tensor) -> Tensor:
+    """Weighted means over all whole windows: [P, H, W] -> [P, H - 10, W - 10]."""
+    window = planes.new_tensor(WEIGHTS).expand(len(planes), 1, 1, -1)
+    down = F.conv2d(planes[None], window.transpose(2, 3), groups=len(planes))
+    return F.conv2d(down, window, groups=len(planes))[0]
+
+
+def _kernels_take(prediction: Tensor, truth: Tensor) -> bool:
+    """Whether the kernels compute this pair."""
+    return (
+        prediction.is_cuda
+        and truth.is_cuda
+        and prediction.dtype == truth.dtype == torch.float32
+        and 3 * prediction.numel() < MAX_NUMBERS
+        and _kernels_run_on(prediction.device)
+    )
+
+
+_RUNS: dict[torch.device, bool] = {}
+
+
+def _kernels_run_on(device: torch.device) -> bool:
+    """Whether Triton's kernels run on a CUDA device; tried once."""
+    if device not in _RUNS:
+        why_not = try_triton(lambda: _try_kernels(device))
+        if why_not is not None:
+            logger.warning("SSIM runs in plain PyTorch on %s: %s.", device, why_not)
+        _RUNS[device] = why_not is None
+    return _RUNS[device]
+
+
+def _try_kernels(device: torch.device) -> None:
+    """Compile and run both kernels on one window; raise whatever goes wrong."""
+    from nrfgs_ns.image.ssim_triton import WeightedSum
+
+    image = torch.zeros(WINDOW_SIZE, WINDOW_SIZE, 3, device=device, requires_grad=True)
+    WeightedSum.apply(image, torch.zeros_like(image), 0.5, 0.5, 0.0).backward()

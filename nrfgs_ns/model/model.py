@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splatfacto with an appearance head: what is trained, and how. `rendering.py` draws it.
+
+Loss, schedules and crop are nerfstudio's, and so is densification unless another protocol is asked for
+(`densification/`). What differs: colours and opacities come from the head, for the splats that the camera sees only;
+nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the parameter objects that the optimisers
+hold, so that an interrupted training can go on.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+import tyro
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
+from nerfstudio.utils.colors import get_color
+from torch import Tensor
+from torch.nn import Parameter
+
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.head import AppearanceHeadConfig
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.densification import (
+    McmcDensification,
+    OpacitySeen,
+    OriginalDensification,
+    Protocol,
+    build_densification,
+)
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.metrics import ImageMetrics
+from nrfgs_ns.image.ssim import photometric_loss
+from nrfgs_ns.model.checkpoint import check_compatible, reduced_config
+from nrfgs_ns.model.exported import ExportedTables
+from nrfgs_ns.model.renderer import Rendering
+from nrfgs_ns.model.warmup import warm_up
+from nrfgs_ns.training.pace import Pace
+from nrfgs_ns.viewer.panel import ViewerPanel
+
+VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+"""What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
+
+
+@dataclass
+class NrfgsModelConfig(SplatfactoModelConfig):
+    """Splatfacto's options, and the appearance head's."""
+
+    _target: type = field(default_factory=lambda: NrfgsModel)
+    """target class to instantiate"""
+    appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
+    """the appearance head: what a splat's colour and opacity are, seen from a camera"""
+    warmup_steps: int | None = None
+    """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
+    A head that adds nothing from the start skips them."""
+    warmup_lr: float = 1e-3
+    """learning rate of the warm-up's Adam"""
+    densification: Protocol = "splatfacto"
+    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
+    splat_budget"""
+    splat_budget: int = 1_000_000
+    """mcmc: the number of splats that it grows to and keeps"""
+    opacity_seen_by_densification: OpacitySeen | None = None
+    """which opacity makes a splat die when it depends on the view. base: the stored one. peak: the largest that a view
+    since the last refinement would show. None: peak for mcmc, base for the others"""
+    original: OriginalDensification = field(default_factory=OriginalDensification)
+    """thresholds of the densification 'original'"""
+    mcmc: McmcDensification = field(default_factory=McmcDensification)
+    """constants of the densification 'mcmc'"""
+    # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
+    sh_degree: tyro.conf.Suppress[int] = 3
+    sh_degree_interval: tyro.conf.Suppress[int] = 1000
+
+
+class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
+    """Gaussian splatting with an appearance head.
+
+    Args:
+        config: which head, and splatfacto's options.
+        seed_points: points [P, 3] in world units and their colours [P, 3] in 0..255, to start from.
+    """
+
+    config: NrfgsModelConfig
+    reduced_head: dict[str, Any] | None = None
+    """options of the head that a checkpoint was written with, where they are not the configuration's"""
+    pace: Pace | None = None
+    """how fast the training walks through its schedules; None: a step is a step"""
+
+    def populate_modules(self):
+        # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
+        if not isinstance(self.config.appearance, AppearanceHeadConfig):
+            raise InputError(
+                f"pipeline.model.appearance is {self.config.appearance!r}, which is not the configuration of an "
+                "appearance head. Use one from nrfgs_ns.appearance, such as NrfConfig or ShConfig."
+            )
+        self.scene_unit: float = (self.kwargs.get("metadata") or {}).get("scene_unit", 1.0)
+        """World units in a scene unit; lengths in the configuration are in scene units."""
+        self.head = self.config.appearance.setup()
+        self.head.scene_unit = self.scene_unit
+        self.config.sh_degree = self.head.sh_degree
+        self.gauss_params = torch.nn.ParameterDict(self._initial_splats())
+        self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        if self.config.use_bilateral_grid:
+            self.bil_grids = BilateralGrid(self.num_train_data, *self.config.grid_shape)
+
+        self.image_metrics = ImageMetrics()
+        self.step = 0
+        self.crop_box = None
+        self.viewer_panel = ViewerPanel(self)
+        self.background_color = (
+            torch.tensor(VISER_BACKGROUND)
+            if self.config.background_color == "random"
+            else get_color(self.config.background_color)
+        )
+        self.densification = build_densification(self.config, self.num_train_data, self.scene_unit)
+
+    def _initial_splats(self) -> dict[str, Parameter]:
+        """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
+        if self.seed_points is not None and not self.config.random_init:
+            means, rgb = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
+        else:
+            means = (torch.rand(self.config.num_random, 3) - 0.5) * self.config.random_scale * self.scene_unit
+            rgb = torch.rand(len(means), 3)
+        neighbours = min(3, len(means) - 1)
+        if neighbours > 0:
+            distances, _ = self.k_nearest_sklearn(means, neighbours)
+            width = torch.from_numpy(distances).mean(dim=-1, keepdim=True)
+        else:
+            width = torch.full((len(means), 1), self.config.densify_size_thresh * self.scene_unit)
+        return {
+            name: Parameter(value)
+            for name, value in {
+                "means": means.clone(),
+                # Duplicate points have distance 0.
+                "scales": width.clamp_min(1e-7 * self.scene_unit).log().repeat(1, 3),
+                "quats": random_quat_tensor(len(means)),
+                "opacities": torch.logit(torch.full((len(means), 1), 0.1)),
+                **self.head.splat_params(rgb),
+            }.items()
+        }
+
+    @property
+    def parameter_bytes(self) -> int:
+        """Bytes of all that a renderer needs: the splats' parameters, but the latents of diffuse ones, and the head."""
+        stored = [*self.gauss_params.values(), *self.head.parameters()]
+        whole = sum(parameter.numel() * parameter.element_size() for parameter in stored)
+        diffuse = self.num_diffuse
+        return whole - diffuse * self.gauss_params["latents"][0].nbytes if diffuse else whole
+
+    @property
+    def num_diffuse(self) -> int:
+        """How many splats have no residual."""
+        diffuse = self.densification.state.get(DIFFUSE)
+        return 0 if diffuse is None else int(diffuse.sum())
+
+    # Training.
+
+    def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
+        return {name: [parameter] for name, parameter in self.gauss_params.items()}
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """One group for each per-splat tensor, and "field" for the head's shared weights if it has any."""
+        groups = super().get_param_groups()
+        shared = list(self.head.parameters())
+        return {**groups, "field": shared} if shared else groups
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        cameras = attributes.pipeline.datamanager.train_dataset.cameras
+        self.densification.see_cameras(cameras.camera_to_worlds[:, :3, 3])
+
+        def before_first_step(step: int) -> None:
+            steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
+            warm_up(self, cameras, steps, self.config.warmup_lr)
+
+        return [
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before_first_step, iters=(0,)),
+            *super().get_training_callbacks(attributes),
+        ]
+
+    def step_cb(self, optimizers, step: int) -> None:
+        super().step_cb(optimizers, step)
+        self.head.set_step(self.schedule_step)
+
+    @property
+    def schedule_step(self) -> int:
+        """The step that the head and the resolution are scheduled by."""
+        return self.step if self.pace is None else int(self.pace.position)
+
+    def step_post_backward(self, step: int) -> None:
+        assert step == self.step
+        self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
+
+    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
+        """Splatfacto's losses, and in training what the densification protocol adds to them.
+
+        Terms that are zero in this step are left out. Nothing waits for the GPU.
+        """
+        losses = {"main_loss": self._photometric_loss(outputs, batch)}
+        if self.config.use_scale_regularization and self.step % 10 == 0:
+            scales = self.scales.exp()
+            ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
+            losses["scale_reg"] = 0.1 * (ratios - self.config.max_gauss_ratio).clamp_min(0.0).mean()
+        if self.training:
+            self.camera_optimizer.get_loss_dict(losses)
+            if self.config.use_bilateral_grid:
+                losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
+            losses |= self.densification.regularisation(self.gauss_params)
+            watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
+            self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
+            self.watched_image = batch.get("image_idx")
+        return losses
+
+    def _photometric_loss(self, outputs, batch) -> Tensor:
+        """Splatfacto's loss of an image against its photograph, a scalar."""
+        truth = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        rgb = outputs["rgb"]
+        if "mask" in batch:  # what is outside is black in both
+            mask = self._downscale_if_required(batch["mask"]).to(self.device)
+            truth, rgb = truth * mask, rgb * mask
+        return photometric_loss(rgb, truth, self.config.ssim_lambda)
+
+    def far_from_neutral(
+        self, camera: Cameras, weights: list[Parameter]
+    ) -> tuple[int, Tensor, tuple[Tensor, ...]] | None:
+        """How far the head is from adding nothing to what a camera sees, for the warm-up.
+
+        Args:
+            camera: a batch of one camera, [1].
+            weights: the head's shared weights.
+
+        Returns:
+            The number of visible splats; the head's neutral loss, NaN if that is 0; its gradients by the weights. None
+            if there is nothing that could be taught.
+        """
+        with torch.no_grad():
+            view = self.look(camera)
+        loss = self.head.neutral_loss(view.splats, view.visible, view.center)
+        if loss is None:
+            return None
+        # Only the shared weights learn: the splats' parameters keep no gradient from here.
+        return len(view.visible), loss.detach(), torch.autograd.grad(loss, weights)
+
+    # Metrics.
+
+    @torch.no_grad()
+    def get_metrics_dict(self, outputs, batch) -> dict[str, Any]:
+        """What is logged while training: PSNR (inside the mask) and the number of splats. Nothing waits for the GPU."""
+        truth = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        error = (outputs["rgb"] - truth).square().mean(dim=-1, keepdim=True)
+        mask = self._mask(batch)
+        mse = error.mean() if mask is None else (error * mask).sum() / mask.sum()
+        metrics = {"psnr": -10.0 * torch.log10(mse), "gaussian_count": self.num_points}
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics of one image, inside the mask if there is one, and truth and rendering side by side.
+
+        A metric that cannot be had (LPIPS without its weights, MS-SSIM of a small image) is left out.
+        """
+        truth = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        rgb = outputs["rgb"]
+        metrics = self.image_metrics(rgb, truth, self._mask(batch))
+        return (
+            {name: value for name, value in metrics.items() if value is not None},
+            {"img": torch.cat([truth, rgb], dim=1)},
+        )
+
+    def _mask(self, batch) -> Tensor | None:
+        """The image's mask at the rendered size, bool [H, W, 1], or None. A pixel half covered counts as inside."""
+        if "mask" not in batch:
+            return None
+        return self._downscale_if_required(batch["mask"]).to(self.device) >= 0.5
+
+    # Checkpoints.
+
+    def update_to_step(self, step: int) -> None:
+        self.step = step
+        self.head.set_step(step)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a checkpoint holds beside tensors: the head's name, and densification's running statistics."""
+        state = {
+            "head": self.head.name,
+            "densification": self.densification.name,
+            "strategy": dict(self.densification.state),
+        }
+        if self.reduced_head is not None:
+            state["capacity"] = {"head": self.reduced_head}
+        return state if self.pace is None else {**state, "pace": self.pace.state()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        written_by = state.get("densification", "splatfacto")  # older checkpoints do not say
+        if written_by != self.densification.name:
+            raise InputError(
+                f"The checkpoint was trained with --pipeline.model.densification {written_by}, this model with "
+                f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
+            )
+        self.densification.load_state(state["strategy"], self.device)
+        if "pace" in state:
+            self.pace = self.pace or Pace(state["pace"]["length"])
+            self.pace.load_state(state["pace"])
+            self.head.set_step(self.schedule_step)
+
+    def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):
+        """Load a checkpoint with any number of splats.
+
+        The parameters are resized in place: the optimisers were built on these very objects before the checkpoint was
+        read, and would go on training orphans if they were replaced.
+
+        Raises:
+            InputError: the checkpoint belongs to another head, or to another size of this one.
+        """
+        self._shape_head(state)
+        check_compatible(self, state)
+        self.forget_fit()
+        for name, parameter in self.gauss_params.items():
+            parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)
+        return super(SplatfactoModel, self).load_state_dict(state, strict=strict, **kwargs)
+
+    def _shape_head(self, state: dict[str, Any]) -> None:
+        """Take the head of a checkpoint that has a smaller one than the configuration; its weights come later."""
+        config = reduced_config(self.config.appearance, state)
+        self.reduced_head = state.get("_extra_state", {}).get("capacity", {}).get("head")
+        if config == self.head.config:
+            return
+        head = config.setup()
+        head.scene_unit = self.scene_unit
+        self.head = head.to(self.device).train(self.training)
+        for name, value in head.splat_params(self.gauss_params["means"]).items():
+            # In place: the optimiser was built on this very parameter.
+            self.gauss_params[name].data = value.to(self.device)

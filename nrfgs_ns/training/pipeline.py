@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pipeline: nerfstudio's, with early checks, evaluation that can say "no number", and exact resume."""
+
+import json
+import random
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import torch
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torchvision.utils import save_image
+
+from nrfgs_ns.compact.decode import model_state
+from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+from nrfgs_ns.distributed.config import ShardingConfig
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.metrics import METRIC_NAMES
+from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.training.averaging import ParameterMean
+
+
+@dataclass
+class NrfgsPipelineConfig(VanillaPipelineConfig):
+    """Nerfstudio's pipeline options."""
+
+    _target: type = field(default_factory=lambda: NrfgsPipeline)
+    """target class to instantiate"""
+    datamanager: NrfgsDatamanagerConfig = field(default_factory=NrfgsDatamanagerConfig)
+    """specifies the datamanager config"""
+    model: NrfgsModelConfig = field(default_factory=NrfgsModelConfig)
+    """specifies the model config"""
+    sharding: ShardingConfig = field(default_factory=ShardingConfig)
+    """with several devices: how the splats are spread over them, and what a step counts"""
+    compact: Path | None = None
+    """a file of `nrfgs export compact` that the model is read from instead of the checkpoint; not for a training"""
+
+
+class NrfgsPipeline(VanillaPipeline):
+    """VanillaPipeline with three differences.
+
+    Every image is read before the first step, so that a broken one costs no training time. Evaluation reports a metric
+    that cannot be had as null and the values of each image beside their mean. And a checkpoint holds the random
+    generators and the order of the cameras, so that a continued training is the unbroken one.
+    """
+
+    config: NrfgsPipelineConfig
+    images_per_step: int = 1
+    """images for which a step counts in the schedules (`distributed.schedules`)"""
+    parameter_mean: ParameterMean | None = None
+    """the trainer's, over the last steps; here because a checkpoint has the pipeline's state. None: there is none"""
+    loaded_mean: dict[str, Any] | None = None
+    """what the checkpoint that was loaded says of such a mean, until the trainer takes it"""
+
+    def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
+        allow_nerfstudio_checkpoints()
+        if test_mode == "val" and config.compact is not None:
+            raise InputError(
+                f"pipeline.compact is {config.compact}, but a training does not begin with a compact file. Leave it "
+                "out; --load-dir goes on from a checkpoint."
+            )
+        self.steps_per_log = 1  # the trainer knows better
+        super().__init__(config, device, test_mode, **kwargs)
+        if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
+            self.datamanager.load_all_images()
+        if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
+            self.model.fit_on(self.datamanager.train_dataset.cameras)
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint, or the compact file that the configuration names.
+
+        Raises:
+            InputError: either cannot be this model's.
+        """
+        if self.config.compact is not None:
+            state = model_state(self.model, self.config.compact)
+            loaded_state = {f"_model.{name}": value for name, value in state.items()}
+        super().load_pipeline(loaded_state, step)
+
+    def train(self, mode: bool = True):
+        # Nerfstudio asks before every step; to walk through all modules for nothing costs the host time.
+        return self if self.training == self.model.training == mode else super().train(mode)
+
+    def get_train_loss_dict(self, step: int):
+        """Nerfstudio's step, whose metrics are taken only when they are logged."""
+        camera, batch = self.datamanager.next_train(step)
+        outputs = self._model(camera)
+        metrics = self.model.get_metrics_dict(outputs, batch) if step % self.steps_per_log == 0 else {}
+        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """Evaluate all test images.
+
+        Args:
+            step: unused; nerfstudio passes it.
+            output_path: folder for the pictures, truth and rendering side by side, if they are wanted.
+            get_std: also report deviations, nulls and each image's values (what `ns-eval` writes); without it only
+                numbers, which a tensorboard can show.
+
+        Returns:
+            Mean over images of psnr, ssim, ms_ssim, l1, lpips; seconds_per_image (rendering alone, the first image
+            left out) and its inverse fps; splats; parameter_bytes.
+        """
+        self.eval()
+        if output_path is not None:
+            output_path.mkdir(exist_ok=True, parents=True)
+        images = self.datamanager.fixed_indices_eval_dataloader
+        names = [Path(name).name for name in self.datamanager.eval_dataset.image_filenames]
+        per_image: list[dict[str, Any]] = []
+        columns = TextColumn("Evaluating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=CONSOLE, transient=True) as progress:
+            for index, (name, (camera, batch)) in enumerate(progress.track(list(zip(names, images, strict=True)))):
+                start = perf_counter()
+                outputs = self.model.get_outputs_for_camera(camera=camera)
+                if outputs["rgb"].is_cuda:
+                    torch.cuda.synchronize()
+                seconds = perf_counter() - start
+                metrics, pictures = self.model.get_image_metrics_and_images(outputs, batch)
+                per_image.append({"image": name, **metrics, "seconds_per_image": seconds})
+                if output_path is not None:
+                    for key, picture in pictures.items():
+                        file = output_path / f"eval_{key}_{index:04d}_{Path(name).stem}.png"
+                        save_image(picture.permute(2, 0, 1).cpu(), file)
+        self.train()
+
+        result: dict[str, Any] = {}
+        for metric in METRIC_NAMES:
+            values = [image[metric] for image in per_image if metric in image]
+            if values or get_std:
+                result[metric] = _mean(values)
+            if get_std:
+                result[f"{metric}_std"] = _std(values)
+        timed = [image["seconds_per_image"] for image in per_image][1:] or [per_image[0]["seconds_per_image"]]
+        result["seconds_per_image"] = _mean(timed)
+        result["fps"] = 1.0 / result["seconds_per_image"]
+        result["splats"] = self.model.num_points
+        result["parameter_bytes"] = self.model.parameter_bytes
+        if get_std:
+            result["per_image"] = per_image
+        return result
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What decides the rest of a training beside its parameters: random generators, the order of the cameras, and
+        the mean over its last steps, if that has begun.
+
+        Plain numbers, strings and tensors only, which torch reads without trusting the file.
+        """
+        state = {
+            "torch_rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+            "python_rng": json.dumps(random.getstate()),
+            "sampling": self.datamanager.sampling_state(),
+        }
+        if self.parameter_mean is not None and self.parameter_mean.count > 0:
+            state["parameter_mean"] = self.parameter_mean.state()
+        return state
+
+    def check_schedules(self, state: dict[str, Any]) -> None:
+        """Raise InputError where a training goes on whose step numbers mean another number of images."""
+        written = state.get("images_per_step", 1)
+        if written != self.images_per_step:
+            raise InputError(
+                f"The checkpoint's steps count for {written} images of the schedules, this training's for "
+                f"{self.images_per_step}. Go on with --machine.num-devices {written} and the same "
+                "--pipeline.sharding.schedules."
+            )
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` gave, in a training; an evaluation ignores it."""
+        if self.test_mode != "val":
+            return
+        self.check_schedules(state)
+        torch.set_rng_state(state["torch_rng"].cpu())
+        if len(state["cuda_rng"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all([rng.cpu() for rng in state["cuda_rng"]])
+        version, numbers, gauss_next = json.loads(state["python_rng"])
+        random.setstate((version, tuple(numbers), gauss_next))
+        self.datamanager.load_sampling_state(state["sampling"])
+        self.loaded_mean = state.get("parameter_mean")
+
+
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _std(values: list[float]) -> float | None:
+    """Sample deviation; null for fewer than two values."""
+    return float(torch.tensor(values, dtype=torch.float64).std()) if len(values) > 1 else None

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder in nerfstudio's viewer whose controls say which picture of the appearance head is shown.
+
+A model renders by its panel only when one of the viewer's render threads asks (`asked_by_viewer`): what a browser sets
+cannot reach a training, an evaluation or ns-render, which run in other threads.
+"""
+
+import threading
+from typing import TYPE_CHECKING
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+from nerfstudio.viewer.viewer_elements import ViewerControl
+from torch import Tensor
+from viser.transforms import SO3
+
+from nrfgs_ns.viewer.pictures import FULL, LEGENDS, Shown, modes, offered_components, picture
+
+if TYPE_CHECKING:
+    from nrfgs_ns.model.model import NrfgsModel
+
+STEP_FORWARD = 5.0
+"""In sizes of the little cameras that mark the photographs: those of up to 30 degrees and more are behind."""
+MARKER_COLOR = (255, 211, 105)
+"""Of the frustum that stands where the view was frozen: the viewer's yellow."""
+
+
+def asked_by_viewer() -> bool:
+    """Whether this code runs for a browser: nerfstudio's viewer renders in a thread of its own for each."""
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+class ViewerPanel(ViewerControl):
+    """The folder "Appearance" at the top of nerfstudio's viewer.
+
+    Nerfstudio finds it because it is an attribute of the model. A control rather than elements: nerfstudio would put
+    elements at the foot of a tab, two folders deep.
+
+    Args:
+        model: the model that is shown.
+    """
+
+    def __init__(self, model: "NrfgsModel"):
+        self.model = model
+        self.background: Tensor | None = None
+        """the viewer's background colour, [3]"""
+        self.frozen_center: Tensor | None = None
+        """camera centre at the moment when the view was frozen, in world units, [3]"""
+        self.installed = False
+
+    def _setup(self, viewer) -> None:
+        """Nerfstudio calls this when the viewer has its own controls."""
+        super()._setup(viewer)
+        self.legends = self._legends()
+        gui = viewer.viser_server.gui
+        with gui.add_folder("Appearance", order=viewer.stats_markdown.order + 0.5):
+            self.mode = gui.add_dropdown("Show", list(self.legends), initial_value=FULL, hint="What is drawn")
+            self.legend = gui.add_markdown(self.legends[FULL])
+            self.gain = gui.add_slider(
+                "Residual gain",
+                min=0.0,
+                max=2.0,
+                step=0.05,
+                initial_value=1.0,
+                hint="How much of what depends on the view is added: 0 nothing, 1 as trained",
+            )
+            self.freeze = gui.add_checkbox(
+                "Freeze view",
+                initial_value=False,
+                hint="Keep the looks that the splats have from here, and walk around them",
+            )
+            self.count = gui.add_text("Splats", initial_value=f"{self.model.num_points:,}", disabled=True)
+        # One callback each: viser runs a control's callbacks in no particular order.
+        self.mode.on_update(lambda _: self._change_mode())
+        self.gain.on_update(lambda _: viewer._trigger_rerender())
+        self.freeze.on_update(lambda event: self._freeze(event.client))
+        self.marker = None
+        self.waiting: list = []  # browsers that came before the scene
+        viewer.viser_server.on_client_connect(self._welcome)
+        self.installed = True
+
+    def _welcome(self, client) -> None:
+        """Let a browser begin where the first of the training photographs was taken: nerfstudio's own first view may
+        see nothing at all. A little in front of it, so that the photograph, which hangs there, hides nothing.
+
+        Args:
+            client: who has come.
+        """
+        taken = list(getattr(self.viewer, "camera_handles", {}).values())
+        if not taken:  # the scene is not there yet: the first picture that is asked for is early enough
+            self.waiting.append(client)
+            return
+        first = taken[0]
+        forward = SO3(first.wxyz).as_matrix()[:, 2]
+        with client.atomic():
+            client.camera.position = first.position + STEP_FORWARD * self.viewer.config.camera_frustum_scale * forward
+            client.camera.wxyz = first.wxyz
+
+    def _welcome_waiting(self) -> None:
+        """Try again with those who came too early."""
+        waiting, self.waiting = self.waiting, []
+        for client in waiting:
+            self._welcome(client)
+
+    def _legends(self) -> dict[str, str]:
+        """What the line under the dropdown says in each mode."""
+        splats = dict(self.model.gauss_params.items())
+        kinds = offered_components(self.model.head, splats)
+        return {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(self.model.head, splats)}
+
+    def offer_modes(self) -> None:
+        """Offer what the model's head has to show, after it has become another one."""
+        if self.installed:
+            legends = self._legends()
+            if self.mode.value not in legends:
+                self.mode.value = FULL
+            self.mode.options, self.legends = list(legends), legends
+
+    @property
+    def shown(self) -> Shown:
+        """What the controls say now; the image as trained if there is no viewer."""
+        if not self.installed:
+            return Shown()
+        return Shown(self.mode.value, float(self.gain.value), self.frozen_center if self.freeze.value else None)
+
+    def render(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Render one camera as the controls say.
+
+        Args:
+            camera: a batch of one camera, [1].
+            obb_box: the viewer's crop.
+
+        Returns:
+            As `picture`.
+        """
+        if self.installed and self.count.value != (count := f"{self.model.num_points:,}"):
+            self.count.value = count
+        if self.installed:
+            self._welcome_waiting()
+        # As in nerfstudio: the viewer's background counts where the configuration leaves it open.
+        background = self.background if self.model.config.background_color == "random" else None
+        self.model.set_crop(obb_box)
+        try:
+            return picture(self.model, camera, self.shown, background)
+        finally:
+            self.model.set_crop(None)
+
+    def _change_mode(self) -> None:
+        self.legend.content = self.legends[self.mode.value]
+        self.viewer._trigger_rerender()
+
+    def _freeze(self, client) -> None:
+        """Remember where the client's camera is, and mark the place; or forget it.
+
+        Args:
+            client: who has clicked; None if a program did, which sets `frozen_center` itself.
+        """
+        if self.marker is not None:
+            self.marker.remove()
+            self.marker = None
+        if self.freeze.value and client is not None:
+            camera = client.camera
+            self.frozen_center = torch.tensor(camera.position / VISER_NERFSTUDIO_SCALE_RATIO, dtype=torch.float32)
+            self.marker = self.viser_server.scene.add_camera_frustum(
+                "/frozen_view",
+                fov=camera.fov,
+                aspect=camera.aspect,
+                scale=self.viewer.config.camera_frustum_scale,
+                color=MARKER_COLOR,
+                wxyz=camera.wxyz,
+                position=camera.position,
+            )
+        self.viewer._trigger_rerender()

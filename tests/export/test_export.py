@@ -1,0 +1,360 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The PLY file: its layout, what the fit keeps of the head, and that nerfstudio's exporter writes the same."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import tyro
+from plyfile import PlyData
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.head import SH_C0, SplatAppearance, base_colors
+from nrfgs_ns.appearance.sh import SphericalHarmonics
+from nrfgs_ns.appearance.spherical_harmonics import sh_bases
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.export.ply import read_splats, render_splats, write_splats
+from nrfgs_ns.model import harmonics_fit
+from nrfgs_ns.model.harmonics_fit import STRENGTHS, Moments, Observations, PlainSplats, fit_harmonics, observe
+from nrfgs_ns.training.run import parse, train
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+LAYOUT = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split()
+LAYOUT += [f"f_rest_{i}" for i in range(45)] + "opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+METHODS = {
+    # A network that was never quieted: its residual depends on the view in ways that degree 3 cannot follow.
+    "nrfgs": {"--pipeline.model.appearance.output-init": "default", "--pipeline.model.warmup-steps": 0},
+    "nrfgs-sh": {"--pipeline.model.appearance.degree-interval": 1},
+}
+
+
+def random_splats(count: int) -> PlainSplats:
+    torch.manual_seed(0)
+    quats = torch.nn.functional.normalize(torch.randn(count, 4), dim=-1)
+    shapes = {"scales": (3,), "opacities": (1,), "features_dc": (3,), "features_rest": (15, 3)}
+    return PlainSplats(torch.randn(count, 3), quats, *(torch.randn(count, *shape) for shape in shapes.values()))
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_scene, tmp_path_factory):
+    """config.yml of a finished 8-step training of each method."""
+    done = {}
+
+    def config_of(method: str) -> Path:
+        if method not in done:
+            options = {
+                "--data": tiny_scene,
+                "--output-dir": tmp_path_factory.mktemp(method),
+                "--max-num-iterations": 8,
+                "--vis": "tensorboard",
+                "--logging.local-writer.enable": False,
+                "--logging.profiler": "none",
+                **METHODS[method],
+            }
+            done[method] = Path(train([method, *(str(w) for option in options.items() for w in option)]).config_path)
+        return done[method]
+
+    return config_of
+
+
+def model_on(scene: Path, out: Path, method: str = "nrfgs", *options: str):
+    """An untrained model of 300 splats, and its training cameras."""
+    torch.manual_seed(0)
+    config = parse([method, "--data", str(scene), "--output-dir", str(out), *options])
+    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
+    pipeline.eval()
+    return pipeline.model, pipeline.datamanager.train_dataset.cameras
+
+
+# The file.
+
+
+def test_layout_is_that_of_3dgs(tmp_path):
+    splats = random_splats(7)
+    assert write_splats(splats, tmp_path / "deep" / "splats.ply") == 7
+    data = (tmp_path / "deep" / "splats.ply").read_bytes()
+    header, _, body = data.partition(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"] and "element vertex 7" in lines
+    assert re.findall(r"property (\w+) (\w+)", header.decode()) == [("float", name) for name in LAYOUT]
+    # Read without any PLY library: rows of 62 little-endian floats.
+    table = dict(zip(LAYOUT, np.frombuffer(body, dtype="<f4").reshape(7, 62).T, strict=True))
+    for axis, name in enumerate("xyz"):
+        assert (table[name] == splats.means[:, axis].numpy()).all() and (table["n" + name] == 0).all()
+    for channel in range(3):
+        assert (table[f"f_dc_{channel}"] == splats.features_dc[:, channel].numpy()).all()
+        for basis in range(15):
+            assert (table[f"f_rest_{15 * channel + basis}"] == splats.features_rest[:, basis, channel].numpy()).all()
+        assert (table[f"scale_{channel}"] == splats.scales[:, channel].numpy()).all()
+    assert (table["opacity"] == splats.opacities[:, 0].numpy()).all()
+    assert all((table[f"rot_{i}"] == splats.quats[:, i].numpy()).all() for i in range(4))
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    splats = random_splats(5)
+    write_splats(splats, tmp_path / "splats.ply")
+    for name, value in read_splats(tmp_path / "splats.ply")._asdict().items():
+        assert_close(value, getattr(splats, name), rtol=0, atol=0, msg=name)
+
+
+def test_splats_that_cannot_be_drawn_are_left_out(tmp_path):
+    splats = random_splats(6)
+    splats.quats[1] = math.nan  # there was no direction
+    splats.features_rest[2, 7, 1] = math.inf
+    splats.opacities[3] = -5.6  # below logit(1/255) = -5.537
+    splats.opacities[4] = -5.5
+    assert write_splats(splats, tmp_path / "splats.ply") == 3
+    assert_close(read_splats(tmp_path / "splats.ply").means, splats.means[[0, 4, 5]], rtol=0, atol=0)
+    splats.opacities[:] = -9.0
+    with pytest.raises(InputError, match="none of the 6 splats"):
+        write_splats(splats, tmp_path / "none.ply")
+    assert not list(tmp_path.glob("none.ply*"))
+
+
+def test_other_files_are_refused(tmp_path, tiny_scene):
+    with pytest.raises(InputError, match="not a 3DGS file: no opacity"):
+        read_splats(tiny_scene / "sparse.ply")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_splats(tiny_scene / "transforms.json")
+
+
+# The fit.
+
+
+def test_contributions_share_out_the_coverage_of_the_image(tiny_scene, tmp_path):
+    """Each pixel's alpha is the sum of its splats' alpha T."""
+    model, cameras = model_on(tiny_scene, tmp_path)
+    seen = observe(model, cameras[:1])
+    coverage = model.get_outputs_for_camera(cameras[:1])["accumulation"]
+    # 48 x 36 pixels and a few hundred splats, each sum rounded at 2^-24 of itself.
+    assert_close(seen.weights.sum(), coverage.sum(), rtol=1e-5, atol=0)
+    assert (seen.weights > 0).all() and len(seen.rows.unique()) == len(seen.rows)
+
+
+class HarmonicsByAnotherName(SphericalHarmonics):
+    """A head that is harmonics without saying so."""
+
+    is_harmonics = False
+
+
+def test_a_head_that_is_harmonics_is_fitted_exactly(tiny_scene, tmp_path):
+    model, cameras = model_on(tiny_scene, tmp_path, "nrfgs-sh")
+    model.head = HarmonicsByAnotherName(model.config.appearance)
+    # Below 0.5 in sum, so that no colour is clamped at zero: 15 harmonics of at most 1.2, coefficients around 0.02.
+    model.gauss_params["features_rest"].data.normal_(0.0, 0.02)
+    model.gauss_params["features_dc"].data.clamp_(-0.3, 0.3)
+    fit = fit_harmonics(model, cameras)
+    assert not fit.exact and fit.strength == STRENGTHS[0]
+
+    errors, weights = torch.zeros(len(fit.splats.means)), torch.zeros(len(fit.splats.means))
+    for index in range(len(cameras)):
+        seen = observe(model, cameras[index : index + 1])
+        delta = torch.cat([fit.splats.features_dc - model.features_dc, fit.splats.features_rest.flatten(1)], dim=1)
+        found = torch.einsum("mb,mbc->mc", seen.bases, delta[seen.rows].reshape(-1, 16, 3))
+        errors.index_add_(0, seen.rows, seen.weights * (found - seen.residuals).square().sum(-1))
+        weights.index_add_(0, seen.rows, seen.weights)
+    assert (weights > 0).sum() > 100
+    rms = (errors / weights.clamp_min(1e-30)).sqrt().max()
+    # Along an eigenvector of the gram matrix with eigenvalue e, a ridge s leaves e (s / (e + s))^2 k^2 <= s k^2 / 4 of
+    # the squared error; so at most sqrt(s) |k| / 2 in all, with |k|^2 = 45 coefficients of variance 0.02^2 (three
+    # deviations of their number: 75). To that, float32 colours and bases: 16 products rounded at 2^-24.
+    assert rms < math.sqrt(STRENGTHS[0]) / 2 * math.sqrt(75) * 0.02 + 16 * 2**-24
+
+
+def test_a_ridge_counts_in_views():
+    """Seen in one view only, a splat moves 16 / (4 pi) / (16 / (4 pi) + ridge) of the way, whatever its size."""
+    direction = torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, 0.8]]), dim=-1)
+    residual = torch.tensor([[0.1, -0.2, 0.05]])
+    power = 16 / (4 * math.pi)
+    for weight in (1e-3, 1e4):
+        for views in (1, 3):
+            moments = Moments(2, torch.device("cpu"))
+            for _ in range(views):
+                bases = sh_bases(3, direction)
+                moments.add(Observations(torch.tensor([1]), torch.tensor([weight]), bases, residual, torch.ones(1)))
+            delta = moments.solve(0.5)
+            assert (delta[0] == 0).all(), "what was not seen keeps its base colour"
+            reached = torch.einsum("mb,bc->mc", bases.double(), delta[1])
+            assert_close(reached, residual.double() * views * power / (views * power + 0.5), rtol=1e-6, atol=0)
+            assert moments.squared_error(delta) == pytest.approx(
+                views * weight * float((reached - residual).square().sum()), rel=1e-5
+            )
+
+
+def test_work_in_pieces_gives_the_same_fit(tiny_scene, tmp_path, monkeypatch):
+    model, cameras = model_on(tiny_scene, tmp_path, "nrfgs", "--pipeline.model.appearance.output-init", "default")
+    whole = fit_harmonics(model, cameras)
+    monkeypatch.setattr(harmonics_fit, "SPLATS_AT_ONCE", 70)
+    monkeypatch.setattr(harmonics_fit, "ROWS_AT_ONCE", 13)
+    pieces = fit_harmonics(model, cameras)
+    assert pieces[1:] == whole[1:]
+    # The same sums in float64, in another order of nothing but batched products.
+    for name, value in whole.splats._asdict().items():
+        assert_close(getattr(pieces.splats, name), value, rtol=1e-5, atol=1e-6, msg=name)
+
+
+class OpacityByHeight(SphericalHarmonics):
+    """Opacity 0.2 seen from below a height, 0.6 from above it."""
+
+    is_harmonics = False
+    height = 0.0
+
+    def forward(self, splats, visible, camera_centers):
+        appearance = super().forward(splats, visible, camera_centers)
+        return SplatAppearance(
+            appearance.colors, appearance.opacities * 0 + (0.6 if self.above(camera_centers) else 0.2)
+        )
+
+    def above(self, center):
+        return bool(center[2] > self.height)
+
+
+def test_opacity_is_the_mean_weighted_by_the_contributions(tiny_scene, tmp_path):
+    model, cameras = model_on(tiny_scene, tmp_path, "nrfgs-sh")
+    model.head = OpacityByHeight(model.config.appearance)
+    model.head.height = float(cameras.camera_to_worlds[:, 2, 3].median())
+    splats = fit_harmonics(model, cameras).splats
+    mean, total = torch.zeros(model.num_points), torch.zeros(model.num_points)
+    for index in range(len(cameras)):
+        seen = observe(model, cameras[index : index + 1])
+        opacity = 0.6 if model.head.above(cameras.camera_to_worlds[index, :3, 3]) else 0.2
+        mean.index_add_(0, seen.rows, seen.weights * opacity)
+        total.index_add_(0, seen.rows, seen.weights)
+    seen_once = total > 0
+    found = splats.opacities[:, 0].sigmoid()
+    assert_close(found[seen_once], (mean / total)[seen_once], rtol=1e-5, atol=1e-6)
+    between = (found[seen_once] > 0.25) & (found[seen_once] < 0.55)
+    assert between.any() and (found[~seen_once] == model.gauss_params["opacities"].sigmoid()[~seen_once, 0]).all()
+
+
+def test_the_fit_follows_a_random_field_closer_than_its_base_colour(trained):
+    pipeline = load_model(trained("nrfgs"), "inference")
+    model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
+    distance = {"file": 0.0, "base": 0.0}
+    for index in range(len(cameras)):
+        camera = cameras[index : index + 1]
+        outputs = model.get_outputs_for_camera(camera)
+        pictures = {
+            "file": render_splats(model.fit.splats, camera, outputs["background"]),
+            "base": model.get_base_color(camera),
+        }
+        for name, picture in pictures.items():
+            distance[name] += (picture - outputs["rgb"]).square().mean().item()
+    # A random field changes little within degree 3's resolution of 60 degrees: by far most of its residual is shown.
+    assert 0 < distance["file"] < 0.1 * distance["base"]
+
+
+# The verbs.
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_command_writes_the_splats_and_says_what_was_lost(method, trained, tmp_path):
+    config, ours, report = trained(method), tmp_path / "ours.ply", tmp_path / "deep" / "report.json"
+    words = ["ply", "--load-config", str(config), "--output", str(ours), "--report", str(report)]
+    tyro.cli(Export, args=words).main()
+    splats = PlyData.read(ours)["vertex"].data
+    assert list(splats.dtype.names) == LAYOUT
+    norms = sum(splats[f"rot_{i}"].astype(np.float64) ** 2 for i in range(4))
+    assert np.abs(norms - 1).max() < 1e-6
+
+    numbers = json.loads(report.read_text())
+    assert numbers["written"] == len(splats) <= numbers["splats"] and numbers["bytes"] == ours.stat().st_size
+    assert len(numbers["per_image"]) == 2
+    assert numbers["loss_db"] == pytest.approx(numbers["psnr_model"] - numbers["psnr_file"])
+    if method == "nrfgs-sh":  # nothing is lost but splats below 1/255, and float32's rounding at 16 dB
+        assert abs(numbers["loss_db"]) < 0.01
+    else:  # the file is nearer to the model than a tenth of the residual, which is worth the gap to the base colours
+        assert abs(numbers["loss_db"]) < abs(numbers["psnr_model"] - numbers["psnr_base"])
+    assert numbers["exact"] == (method == "nrfgs-sh")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_ns_export_writes_the_same_splats(method, trained, tmp_path, export_gaussian_splat):
+    config, ours = trained(method), tmp_path / "ours.ply"
+    words = ["ply", "--load-config", str(config), "--output", str(ours), "--no-measure"]
+    tyro.cli(Export, args=words).main()
+    export_gaussian_splat(load_config=config, output_dir=tmp_path, output_filename="theirs.ply").main()
+    a, b = (PlyData.read(tmp_path / f"{name}.ply")["vertex"].data for name in ("ours", "theirs"))
+    assert a.dtype == b.dtype
+    assert all((a[name] == b[name]).all() for name in LAYOUT)
+
+
+def test_options_of_nerfstudios_exporter_work(trained, tmp_path, export_gaussian_splat):
+    export = {"load_config": trained("nrfgs"), "output_dir": tmp_path}
+    export_gaussian_splat(**export, output_filename="all.ply").main()
+    whole = PlyData.read(tmp_path / "all.ply")["vertex"].data
+    middle = tuple(float(np.median(whole[axis])) for axis in "xyz")
+    box = {"obb_center": middle, "obb_rotation": (0.0, 0.0, 0.5), "obb_scale": (0.7, 0.7, 0.7)}
+    export_gaussian_splat(**export, output_filename="box.ply", **box).main()
+    export_gaussian_splat(**export, output_filename="rgb.ply", ply_color_mode="rgb").main()
+    cut, rgb = (PlyData.read(tmp_path / f"{name}.ply")["vertex"].data for name in ("box", "rgb"))
+    assert 0 < len(cut) < len(whole) and set(cut.tolist()) < set(whole.tolist())
+    expected = np.clip(0.5 + SH_C0 * whole["f_dc_1"], 0, 1) * 255
+    assert np.abs(rgb["green"] - expected).max() < 1 + 1e-3  # truncated to a byte
+
+
+def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
+    """plyfile's numbers, gsplat's own harmonics, and the model's picture."""
+    from gsplat.cuda._torch_impl import _spherical_harmonics
+
+    from nrfgs_ns.model.pinhole import pinhole
+    from nrfgs_ns.rasterizer import rasterization
+
+    config = trained("nrfgs-sh")
+    tyro.cli(
+        Export, args=["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--no-measure"]
+    ).main()
+    vertices = PlyData.read(tmp_path / "s.ply")["vertex"]
+
+    def table(*names: str) -> torch.Tensor:
+        return torch.from_numpy(np.stack([vertices[name] for name in names], axis=-1))
+
+    means = table("x", "y", "z")
+    rest = torch.stack([table(*(f"f_rest_{15 * c + b}" for b in range(15))) for c in range(3)], dim=-1)
+    coefficients = torch.cat([table("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest], dim=1)
+    model = load_model(config, "inference").model
+    assert float(rest.abs().max()) > 1e-4, "the training must have reached the higher degrees"
+    camera = load_model(config, "test").datamanager.eval_dataset.cameras[:1]
+    view = pinhole(camera, camera.camera_to_worlds, 1)
+    colors = (_spherical_harmonics(3, means - view.center, coefficients) + 0.5).clamp_min(0.0)
+    quats, scales = table("rot_0", "rot_1", "rot_2", "rot_3"), table("scale_0", "scale_1", "scale_2").exp()
+    opacities = table("opacity")[:, 0].sigmoid()
+    render, alphas, _ = rasterization(
+        means, quats, scales, opacities, colors, view.viewmat, view.K, view.width, view.height
+    )
+    outputs = model.get_outputs_for_camera(camera)
+    picture = (render[0] + (1 - alphas[0]) * outputs["background"]).clamp(0, 1)
+    # Both in float32 through the same compositing; quaternions are normalised once more, in a few ulp.
+    assert_close(picture, outputs["rgb"], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("mode", ["val", "test"])
+def test_trainings_and_viewers_see_the_stored_tables(mode, tiny_scene, tmp_path, monkeypatch):
+    """The viewer reads every property of the model several times at its start: nothing may be fitted there."""
+    config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path)])
+    model = config.pipeline.setup(device="cpu", test_mode=mode).model
+    monkeypatch.setattr("nrfgs_ns.model.exported.fit_harmonics", None)
+    assert model.fit is None and model.shs_rest.shape == (model.num_points, 0, 3)
+    for name in ("opacities", "quats", "features_dc"):
+        assert getattr(model, name) is model.gauss_params[name]
+    assert model.shs_0 is model.features_dc
+    assert (model.colors == base_colors(model.features_dc)).all()
+
+
+def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        Export("ply", tmp_path / "config.yml", tmp_path / "s.ply").main()
+    with pytest.raises(InputError, match="is a folder"):
+        Export("ply", trained("nrfgs"), tmp_path).main()
+    lost = tmp_path / "config.yml"
+    text = trained("nrfgs").read_text()
+    lost.write_text(text.replace("timestamp: ", "timestamp: no-"))
+    with pytest.raises(InputError, match="Run this in the folder"):
+        Export("ply", lost, tmp_path / "s.ply").main()

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hard trainings: each must end with finite numbers, and the unit of length must not decide how well.
+
+    python tests/helpers/hard_trainings.py --out docs/results/stability --work FOLDER
+
+trains on small procedural scenes: in millimetres and in kilometres with nerfstudio's scaling on and off, at ten times
+the learning rates, under many opacity resets, on black, white and single images. It writes `trainings.json` (one entry
+per run) and `trainings.md`, the table. A run that is in the JSON already is not repeated.
+"""
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+from plyfile import PlyData
+from rich.progress import track
+
+from nrfgs_ns.method_config import nrfgs
+from nrfgs_ns.scenes import SceneConfig, write_scene
+from nrfgs_ns.training.run import evaluate, machine, train
+
+SCENE = SceneConfig(views=16, width=48, height=36, points=600, samples=2)
+"""Small enough for a run a minute on one core."""
+RESETS = {"--pipeline.model.refine-every": 25, "--pipeline.model.reset-alpha-every": 2}
+"""Reset all opacities every 50th step; splatfacto then neither adds nor deletes splats for longer than that."""
+
+NO_SCREEN_SIZE = {"--pipeline.model.stop-screen-size-at": 0}
+"""Do not split splats for being wide on the screen: splatfacto's bound, a twentieth of the image, is 2.4 pixels here,
+less than the blur that every splat gets, and 600 points became 150,000 splats for 28,000 pixels within 1,100 steps."""
+
+
+@dataclass
+class HardTraining:
+    """One training that a user's capture could be."""
+
+    name: str
+    """row of the table, and key of the record"""
+    edit: Callable[[Path], None] = lambda folder: None
+    """what is done to the data set before the training"""
+    options: dict[str, Any] = field(default_factory=dict)
+    """options of ns-train"""
+    auto_scale: bool = True
+    """nerfstudio's scaling of poses into a unit cube"""
+    method: str = "nrfgs"
+    """what is trained"""
+    seeds: tuple[int, ...] = (42,)
+    """one training for each"""
+    steps: int | None = None
+    """its length where it is not that of the others"""
+
+
+def rescale(folder: Path, factor: float) -> None:
+    """Measure the scene in another unit: every length in poses and points times `factor`."""
+    path = folder / "transforms.json"
+    meta = json.loads(path.read_text())
+    for frame in meta["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] *= factor
+        frame["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(meta))
+    points = PlyData.read(str(folder / meta["ply_file_path"]), mmap=False)
+    for axis in "xyz":
+        points["vertex"][axis] *= factor
+    points.write(str(folder / meta["ply_file_path"]))
+
+
+def paint(folder: Path, value: int) -> None:
+    """Every image in one grey, 0 to 255."""
+    for path in (folder / "images").glob("*.png"):
+        Image.fromarray(np.full_like(np.array(Image.open(path)), value)).save(path)
+
+
+def keep(folder: Path, count: int, identical: bool = False) -> None:
+    """Keep the first `count` training frames, all with the first one's image and pose if `identical`."""
+    path = folder / "transforms.json"
+    meta = json.loads(path.read_text())
+    by_name = {frame["file_path"]: frame for frame in meta["frames"]}
+    names = meta["train_filenames"][:count]
+    for split in ("train", "val", "test"):
+        meta[f"{split}_filenames"] = names if split == "train" else []
+    if identical:
+        for name in names[1:]:
+            shutil.copy(folder / names[0], folder / name)
+            by_name[name]["transform_matrix"] = by_name[names[0]]["transform_matrix"]
+    meta["frames"] = [by_name[name] for name in names]
+    path.write_text(json.dumps(meta))
+
+
+def ten_times_faster() -> dict[str, Any]:
+    """Every learning rate times 10."""
+    groups = nrfgs.config.optimizers.items()
+    return {f"--optimizers.{name}.optimizer.lr": 10 * group["optimizer"].lr for name, group in groups}
+
+
+def hard_trainings() -> list[HardTraining]:
+    """All rows of the table."""
+    seeds = (42, 43, 44)
+    rows = []
+    for method in ("nrfgs", "nrfgs-sh"):
+        for auto_scale in (True, False):
+            for factor in (1.0, 1e-3, 1e3):
+                name = f"{method}, unit x {factor:g}, auto-scaling {'on' if auto_scale else 'off'}"
+                edit = partial(rescale, factor=factor)
+                rows.append(HardTraining(name, edit, auto_scale=auto_scale, method=method, seeds=seeds))
+    return [
+        *rows,
+        HardTraining("learning rates x 10", options=ten_times_faster()),
+        HardTraining("100,000 steps", options=NO_SCREEN_SIZE, steps=100_000),
+        HardTraining("opacity reset every 50 steps", options=RESETS),
+        HardTraining("black images", partial(paint, value=0)),
+        HardTraining("white images", partial(paint, value=255)),
+        HardTraining("one image", partial(keep, count=1)),
+        # With auto-scaling, cameras at one place are refused: they have no extent to scale by.
+        HardTraining("two identical images", partial(keep, count=2, identical=True), auto_scale=False),
+    ]
+
+
+def run(training: HardTraining, seed: int, steps: int, work: Path) -> dict[str, Any]:
+    """Train, evaluate, and look at every number that a user could get to see.
+
+    Args:
+        steps: training steps.
+        work: folder for the data set and the outputs; emptied.
+
+    Returns:
+        "psnr" and "l1" of the test images, "splats", and "finite": every tensor of the checkpoint and every number of
+        the evaluation.
+    """
+    shutil.rmtree(work, ignore_errors=True)
+    data = write_scene(SCENE, work / "scene")
+    training.edit(data)
+    chosen = {
+        "--data": data,
+        "--output-dir": work / "outputs",
+        "--max-num-iterations": steps,
+        "--machine.seed": seed,
+        "--vis": "tensorboard",
+        "--steps-per-eval-image": 10**6,
+        "--steps-per-eval-all-images": 10**6,
+        "--logging.local-writer.enable": False,
+        "--logging.profiler": "none",
+        "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.warmup-length": 100,
+        **training.options,
+    }
+    args = [training.method, *(str(word) for option in chosen.items() for word in option)]
+    args += ["nrfgs-data", "--auto-scale-poses", str(training.auto_scale)]
+    record = train(args)
+    results = evaluate(Path(record.config_path), work / "eval.json")
+    _, pipeline, _, _ = eval_setup(Path(record.config_path))
+    tensors = all(bool(torch.isfinite(value).all()) for value in pipeline.model.parameters())
+    numbers = [results[name] for name in ("psnr", "ssim", "l1")]
+    return {
+        "psnr": results["psnr"],
+        "l1": results["l1"],
+        "splats": results["splats"],
+        "finite": tensors and all(number is not None and not math.isnan(number) for number in numbers),
+    }
+
+
+def table(runs: dict[str, dict[str, dict[str, Any]]]) -> str:
+    """The records as a Markdown table: means over seeds, and the PSNR's sample deviation."""
+    lines = ["| training | seeds | PSNR | L1 | splats | all finite |", "|---|---|---|---|---|---|"]
+    for name, by_seed in runs.items():
+        records = list(by_seed.values())
+        psnr, l1, splats = (np.array([record[key] for record in records]) for key in ("psnr", "l1", "splats"))
+        spread = f" ± {psnr.std(ddof=1):.2f}" if len(psnr) > 1 else ""
+        finite = "yes" if all(record["finite"] for record in records) else "NO"
+        cells = f"{len(records)} | {psnr.mean():.2f}{spread} | {l1.mean():.4f} | {splats.mean():,.0f} | {finite}"
+        lines.append(f"| {name} | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
+def main(out: Path, work: Path, steps: int = 400, rows: tuple[str, ...] = ()) -> None:
+    """Run all hard trainings and write their table.
+
+    Args:
+        out: folder for trainings.json and trainings.md.
+        work: folder for data sets and checkpoints.
+        steps: steps of each training that has no length of its own.
+        rows: names of the trainings to run, if not all.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / "trainings.json"
+    record = json.loads(file.read_text()) if file.exists() else {"machine": machine(), "steps": steps, "runs": {}}
+    chosen = [training for training in hard_trainings() if not rows or training.name in rows]
+    todo = [(training, seed) for training in chosen for seed in training.seeds]
+    for index, (training, seed) in enumerate(track(todo, "Hard trainings")):
+        done = record["runs"].setdefault(training.name, {})
+        if str(seed) in done:
+            continue
+        # A folder each: tensorboard's writers outlive their training.
+        done[str(seed)] = run(training, seed, training.steps or steps, work / f"run-{index}")
+        file.write_text(json.dumps(record, indent=1) + "\n")
+        (out / "trainings.md").write_text(table(record["runs"]))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

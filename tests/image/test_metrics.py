@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import math
+
+import numpy as np
+import pytest
+import pytorch_msssim
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
+from torchmetrics.image import PeakSignalNoiseRatio
+
+from nrfgs_ns.image import metrics
+from nrfgs_ns.image.metrics import LPIPS_MIN_SIDE, METRIC_NAMES, ImageMetrics, l1, ms_ssim, psnr, ssim, ssim_maps
+
+SCALARS = (psnr, l1, ssim, ms_ssim)
+
+
+def pair(height: int, width: int, noise: float = 0.1, dtype=torch.float32) -> tuple[torch.Tensor, torch.Tensor]:
+    """A smooth image with some texture, and a noisy copy of it."""
+    generator = torch.Generator().manual_seed(height * 1000 + width)
+    y, x = torch.meshgrid(torch.linspace(0, 6, height), torch.linspace(0, 9, width), indexing="ij")
+    gt = 0.5 + 0.3 * torch.stack([torch.sin(x * y), torch.cos(x + y), torch.sin(3 * x)], dim=-1)
+    pred = gt + noise * torch.randn(gt.shape, generator=generator)
+    return pred.clamp(0, 1).to(dtype), gt.to(dtype)
+
+
+def disc(height: int, width: int, radius: float) -> torch.Tensor:
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    return ((y - height / 2) ** 2 + (x - width / 2) ** 2 < radius**2)[..., None]
+
+
+def batch(image: torch.Tensor) -> torch.Tensor:
+    return image.movedim(-1, 0)[None]
+
+
+# Without a mask.
+
+
+@pytest.mark.parametrize("height, width", [(11, 11), (40, 61), (161, 200), (230, 175)])
+@pytest.mark.parametrize("noise", [0.003, 0.1])
+def test_values_are_those_of_the_host(height, width, noise):
+    pred, gt = pair(height, width, noise)
+    # float32 sums of at most 10^5 terms: 1e-6 relative. PSNR takes 10 log10 of them: 4.3e-6 dB.
+    assert psnr(pred, gt) == pytest.approx(
+        PeakSignalNoiseRatio(data_range=1.0)(batch(pred), batch(gt)).item(), abs=1e-5
+    )
+    assert l1(pred, gt) == pytest.approx((pred - gt).abs().mean().item(), rel=1e-5)
+    assert ssim(pred, gt) == pytest.approx(pytorch_msssim.ssim(batch(pred), batch(gt), data_range=1.0).item(), abs=1e-5)
+    if min(height, width) > 160:
+        expected = pytorch_msssim.ms_ssim(batch(pred), batch(gt), data_range=1.0).item()
+        assert ms_ssim(pred, gt) == pytest.approx(expected, abs=1e-5)
+
+
+def test_inverted_contrast_is_worth_nothing():
+    """Negative contrast-structure terms are clamped: a power of them would not be a number."""
+    _, gt = pair(170, 190)
+    expected = pytorch_msssim.ms_ssim(batch(1 - gt), batch(gt), data_range=1.0).item()
+    assert ms_ssim(1 - gt, gt) == pytest.approx(expected, abs=1e-6) == 0.0
+
+
+def test_ssim_map_against_scipy():
+    pred, gt = pair(30, 27, dtype=torch.float64)
+    p, g = pred.numpy(), gt.numpy()
+
+    def blur(image):  # 5 pixels each way, the windows that lie inside
+        return gaussian_filter(image, sigma=(1.5, 1.5, 0), truncate=5 / 1.5)[5:-5, 5:-5]
+
+    mean_p, mean_g = blur(p), blur(g)
+    var_p, var_g, cov = blur(p * p) - mean_p**2, blur(g * g) - mean_g**2, blur(p * g) - mean_p * mean_g
+    cs = (2 * cov + 0.03**2) / (var_p + var_g + 0.03**2)
+    luminance = (2 * mean_p * mean_g + 0.01**2) / (mean_p**2 + mean_g**2 + 0.01**2)
+    maps = ssim_maps(*(image.movedim(-1, 0) for image in (pred, gt)))
+    for ours, expected in zip(maps, (cs * luminance, cs), strict=True):
+        np.testing.assert_allclose(ours.movedim(0, -1), expected, atol=1e-12)
+
+
+def test_perfect_prediction():
+    _, gt = pair(170, 165)
+    values = ImageMetrics()(gt, gt)
+    assert values["psnr"] == pytest.approx(100.0) and values["l1"] == 0.0  # capped: JSON has no infinity
+    # In float32 cs and ssim are quotients of equal numbers, each rounded once or twice.
+    assert values["ssim"] == pytest.approx(1.0, abs=1e-6) and values["ms_ssim"] == pytest.approx(1.0, abs=1e-6)
+    json.dumps(values, allow_nan=False)
+
+
+@given(st.integers(1, 14), st.integers(1, 14), st.booleans())
+@settings(max_examples=40)
+def test_small_images_give_a_number_or_none(height, width, masked):
+    pred, gt = pair(height, width)
+    values = ImageMetrics()(pred, gt, torch.ones(height, width, 1, dtype=torch.bool) if masked else None)
+    assert tuple(values) == METRIC_NAMES
+    assert math.isfinite(values["psnr"]) and math.isfinite(values["l1"])
+    assert (values["ssim"] is not None) == (min(height, width) >= 11)
+    assert values["ms_ssim"] is None and values["lpips"] is None
+
+
+def test_multi_scale_needs_more_than_160_pixels():
+    assert ms_ssim(*pair(160, 300)) is None
+    assert ms_ssim(*pair(161, 300)) is not None
+
+
+def test_a_diverged_prediction_shows():
+    pred, gt = pair(170, 170)
+    pred[80, 80] = float("nan")
+    assert all(math.isnan(metric(pred, gt)) for metric in SCALARS)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_other_dtypes(dtype):
+    pred, gt = (image.to(dtype) for image in pair(165, 170))
+    for metric in SCALARS:
+        assert metric(pred, gt) == pytest.approx(metric(pred.double(), gt.double()), rel=1e-5)
+
+
+def test_no_gradient_is_recorded_and_inputs_stay():
+    pred, gt = pair(165, 170)
+    pred.requires_grad_()
+    mask = disc(165, 170, 40)
+    copies = pred.detach().clone(), gt.clone(), mask.clone()
+    values = ImageMetrics()(pred, gt, mask)
+    assert all(isinstance(values[name], float) for name in ("psnr", "ssim", "ms_ssim", "l1"))
+    assert all(torch.equal(a, b) for a, b in zip((pred, gt, mask), copies, strict=True))
+    assert values == ImageMetrics()(pred, gt, mask)
+
+
+def test_nothing_enters_a_checkpoint():
+    module = torch.nn.Module()
+    module.metrics = ImageMetrics()
+    assert not module.state_dict() and not list(module.modules())[1:]
+
+
+@pytest.mark.parametrize("pred, gt, mask", [
+    (torch.zeros(4, 4, 3), torch.zeros(4, 5, 3), None),
+    (torch.zeros(4, 4, 4), torch.zeros(4, 4, 4), None),
+    (torch.zeros(0, 4, 3), torch.zeros(0, 4, 3), None),
+    (torch.zeros(4, 4, 3), torch.zeros(4, 4, 3, dtype=torch.uint8), None),
+    (torch.zeros(4, 4, 3), torch.zeros(4, 4, 3), torch.ones(4, 4, dtype=torch.bool)),
+    (torch.zeros(4, 4, 3), torch.zeros(4, 4, 3), torch.ones(4, 4, 1)),
+])  # fmt: skip
+def test_wrong_shapes_and_dtypes_are_refused(pred, gt, mask):
+    for metric in SCALARS:
+        with pytest.raises(ValueError, match="must be"):
+            metric(pred, gt, mask)
+
+
+# Under a mask.
+
+
+def test_a_full_mask_changes_nothing():
+    pred, gt = pair(173, 190)
+    mask = torch.ones(173, 190, 1, dtype=torch.bool)
+    for metric in SCALARS:  # the same numbers summed in another order: float32 rounding of 3e4 terms
+        assert metric(pred, gt, mask) == pytest.approx(metric(pred, gt), rel=1e-5)
+
+
+def test_an_empty_mask_gives_none():
+    pred, gt = pair(170, 165)
+    assert set(ImageMetrics()(pred, gt, torch.zeros(170, 165, 1, dtype=torch.bool)).values()) == {None}
+
+
+def test_a_mask_at_the_border_has_pixels_but_no_window():
+    pred, gt = pair(170, 165)
+    mask = torch.zeros(170, 165, 1, dtype=torch.bool)
+    mask[:5] = True
+    assert psnr(pred, gt, mask) is not None and l1(pred, gt, mask) is not None
+    assert ssim(pred, gt, mask) is None and ms_ssim(pred, gt, mask) is None
+
+
+def test_what_lies_outside_the_mask_does_not_count():
+    pred, gt = pair(170, 180)
+    mask = disc(170, 180, 50)
+    garbage = torch.where(mask, pred, torch.rand(pred.shape))
+    garbage[0, 0] = float("nan")
+    for metric in SCALARS:
+        assert metric(garbage, gt, mask) == metric(pred, gt, mask)
+
+
+def test_what_lies_inside_the_mask_counts_alone():
+    """Errors inside cost what they cost, however small the mask: no dilution by the pixels around."""
+    _, gt = pair(170, 180)
+    pred = gt + 0.1
+    for radius in (20, 60):
+        mask = disc(170, 180, radius)
+        assert psnr(pred, gt, mask) == pytest.approx(20.0, abs=1e-4)  # -10 log10(0.1^2)
+        assert l1(pred, gt, mask) == pytest.approx(0.1, rel=1e-5)
+
+
+def test_masked_ssim_is_the_mean_over_centres_inside():
+    pred, gt = pair(60, 70, dtype=torch.float64)
+    mask = disc(60, 70, 14)
+    filled = torch.where(mask, pred, gt)
+    ssim_map = ssim_maps(*(image.movedim(-1, 0) for image in (filled, gt)))[0]
+    expected = np.mean([ssim_map[:, i - 5, j - 5].mean() for i, j, _ in mask.nonzero().tolist()])
+    assert ssim(pred, gt, mask) == pytest.approx(expected, abs=1e-12)
+    # Far inside no window reaches the outside: filling does nothing there.
+    core = disc(60, 70, 6)
+    raw = ssim_maps(*(image.movedim(-1, 0) for image in (pred, gt)))[0].movedim(0, -1)
+    kept = ssim_map.movedim(0, -1)
+    inner = core[5:-5, 5:-5, 0]
+    torch.testing.assert_close(raw[inner], kept[inner])
+
+
+def test_masked_multi_scale_ssim_is_blind_to_flawless_surroundings():
+    """With errors inside only, masked MS-SSIM is lower than unmasked, and a worse inside lowers it further."""
+    _, gt = pair(200, 220)
+    mask = disc(200, 220, 45)
+    values = []
+    for noise in (0.05, 0.2):
+        pred, _ = pair(200, 220, noise)
+        pred = torch.where(mask, pred, gt)
+        values.append(ms_ssim(pred, gt, mask))
+        assert values[-1] < ms_ssim(pred, gt) < 1
+    assert values[1] < values[0]
+
+
+def test_a_thin_mask_survives_the_coarse_scales():
+    pred, gt = pair(200, 220)
+    mask = torch.zeros(200, 220, 1, dtype=torch.bool)
+    mask[:, 101] = True  # one pixel wide, odd: gone after one halving by majority
+    assert 0 < ms_ssim(pred, gt, mask) < 1
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("masked", [False, True])
+def test_cuda_agrees_with_cpu(masked):
+    pred, gt = pair(300, 400, noise=0.01)
+    mask = disc(300, 400, 100) if masked else None
+    on_cpu, on_cuda = ImageMetrics()(pred, gt, mask), ImageMetrics()(pred.cuda(), gt, mask)
+    for name in ("psnr", "ssim", "ms_ssim", "l1"):
+        assert on_cuda[name] == pytest.approx(on_cpu[name], rel=1e-5), name  # TF32 would be off by 1e-3
+
+
+# LPIPS.
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """An empty torch hub folder and a fresh warning."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(metrics, "_lpips_warned", False)
+    monkeypatch.setattr("torch.hub.download_url_to_file", lambda *_, **__: pytest.fail("a download was tried"))
+    folder = tmp_path / "hub" / "checkpoints"
+    folder.mkdir(parents=True)
+    return folder
+
+
+@pytest.fixture
+def weights(hub):
+    """Random AlexNet weights where torchvision looks for the trained ones."""
+    from torchvision.models import alexnet
+
+    torch.manual_seed(0)
+    path = hub / "alexnet-owt-7be5be79.pth"
+    torch.save(alexnet(weights=None).state_dict(), path)
+    return path
+
+
+def test_lpips_without_weights_warns_once_and_is_none(hub, capsys):
+    pred, gt = pair(40, 40)
+    for image_metrics in (ImageMetrics(), ImageMetrics()):
+        for _ in range(2):
+            values = image_metrics(pred, gt)
+            assert values["lpips"] is None and values["psnr"] is not None
+    printed = " ".join(capsys.readouterr().out.split())
+    assert printed.count("LPIPS is not reported") == 1
+    assert str(hub / "alexnet-owt-7be5be79.pth") in printed and "load_state_dict_from_url" in printed
+
+
+def test_lpips_with_broken_weights_warns_and_is_none(weights, capsys):
+    weights.write_bytes(weights.read_bytes()[:1000])
+    assert ImageMetrics()(*pair(40, 40))["lpips"] is None
+    assert "cannot be loaded" in capsys.readouterr().out
+
+
+def test_lpips_with_weights(weights):
+    """Random features do not judge images, but they tell equal from different, and inside from outside."""
+    image_metrics = ImageMetrics()
+    pred, gt = pair(64, 72)
+    mask = disc(64, 72, 20)
+
+    def lpips(*images):
+        return image_metrics(*images)["lpips"]
+
+    assert lpips(gt, gt) == 0.0
+    assert lpips(pred, gt) > 0
+    # Under a mask the truth stands outside.
+    assert lpips(pred, gt, mask) == lpips(torch.where(mask, pred, gt), gt) > 0
+    assert lpips(torch.where(mask, gt, pred), gt, mask) == 0.0
+    assert lpips(pred, gt, torch.zeros_like(mask)) is None
+    # Overshoot is clamped, not refused; a diverged prediction shows.
+    assert lpips(gt + 2, gt) == lpips(torch.ones_like(gt), gt)
+    assert math.isnan(lpips(torch.full_like(gt, float("nan")), gt))
+
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    reference = LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
+    assert lpips(pred, gt) == reference(batch(pred), batch(gt)).item()
+
+    # The smallest image is where the network's own limit is.
+    assert lpips(*pair(LPIPS_MIN_SIDE - 1, 64)) is None
+    assert math.isfinite(lpips(*pair(LPIPS_MIN_SIDE, 64)))
+    small = batch(pair(LPIPS_MIN_SIDE - 1, 64)[0])
+    with pytest.raises(RuntimeError):
+        reference(small, small)

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loss of L1 and SSIM: PyTorch's path against pytorch_msssim, and the kernels in Triton's interpreter."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from interpreted import passes_in_the_interpreter
+from pytorch_msssim import SSIM
+from ssim_cases import MOMENT_ROUNDINGS, TOLERANCE, ULP, assert_near, pair, reference
+
+from nrfgs_ns.image import ssim as module
+from nrfgs_ns.image.metrics import SSIM_C2
+from nrfgs_ns.image.ssim import photometric_loss, ssim
+from nrfgs_ns.kernels import trial
+
+INTERPRETED = Path(__file__).with_name("ssim_interpreted.py")
+DOUBLE_TOLERANCE = TOLERANCE * 2.0**-29
+"""The same bound for float64's 2^-53 instead of 2^-24."""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
+def test_kernels_in_the_interpreter():
+    passes_in_the_interpreter(INTERPRETED)
+
+
+@settings(max_examples=40, derandomize=True)
+@given(st.integers(11, 40), st.integers(11, 40), st.sampled_from([0.0, 0.2, 1.0]), st.integers(0, 9))
+def test_values_and_gradients_in_float64(height, width, ssim_lambda, seed):
+    prediction, truth = (image.detach().double() for image in pair(height, width, seed))
+    prediction.requires_grad_()
+    assert_near(photometric_loss(prediction, truth, ssim_lambda), prediction, truth, ssim_lambda, DOUBLE_TOLERANCE)
+
+
+@pytest.mark.parametrize("size", [(11, 11), (31, 64), (90, 70)])
+def test_values_and_gradients_in_float32(size):
+    prediction, truth = pair(*size)
+    assert_near(photometric_loss(prediction, truth, 0.2), prediction, truth, 0.2, TOLERANCE)
+
+
+def test_images_that_are_not_contiguous():
+    prediction, truth = pair(24, 17)
+    turned = prediction.transpose(0, 1)
+    assert_near(photometric_loss(turned, truth.transpose(0, 1), 0.2), turned, truth.transpose(0, 1), 0.2, TOLERANCE)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
+def test_flat_images_in_float32(value):
+    """Variances of 0 come out as rounding; D >= C2 bounds what that does, and the exact value is known."""
+    truth = torch.full((30, 40, 3), value)
+    prediction = truth.clone().requires_grad_()
+    similarity = ssim(prediction, truth)
+    similarity.backward()
+    flat = 2 * MOMENT_ROUNDINGS * ULP / SSIM_C2
+    assert (similarity - 1).abs() <= flat
+    # Slopes are at most 2 / C2; the gradient is made of three of them, which cancel but for their relative errors.
+    assert (prediction.grad * 3 * 20 * 30).abs().max() <= 3 * 2 / SSIM_C2 * flat
+
+
+def test_nearly_flat_images_lose_no_more_than_the_library():
+    generator = torch.Generator().manual_seed(3)
+    truth = 0.9 + 1e-3 * torch.randn(60, 50, 3, generator=generator)
+    prediction = (truth + 1e-3 * torch.randn(60, 50, 3, generator=generator)).requires_grad_()
+    loss = photometric_loss(prediction, truth, 1.0)
+    expected, gradient = reference(prediction, truth, 1.0)
+    flat = 2 * MOMENT_ROUNDINGS * ULP / SSIM_C2
+    assert (loss - expected).abs() <= flat
+    ours = (torch.autograd.grad(loss, prediction)[0] - gradient).abs().max()
+    library = prediction.detach().requires_grad_()
+    images = (image.permute(2, 0, 1)[None] for image in (library, truth))
+    (1 - SSIM(data_range=1.0, size_average=True, channel=3)(*images)).backward()
+    # Both round the same sums in another order; neither error is more than a draw from the same distribution.
+    assert ours <= 3 * (library.grad - gradient).abs().max()
+
+
+def test_black_against_white():
+    """Means 0 and 1, no variance: S = C1 / (1 + C1).
+
+    The float32 weights add up to 1 within 2^-24, those of both axes together within 2^-23: so much of E[yy] - E[y]^2 is
+    left, and divided by C2.
+    """
+    white = torch.ones(15, 12, 3, dtype=torch.float64)
+    black = torch.zeros_like(white).requires_grad_()
+    similarity = ssim(black, white)
+    assert (similarity - 1e-4 / 1.0001).abs() <= 1e-4 * 2.0**-23 / SSIM_C2
+    assert_near(1 - similarity, black, white, 1.0, 2 * MOMENT_ROUNDINGS * 2.0**-53 / SSIM_C2)
+
+
+def test_identical_images():
+    image = pair(20, 33)[0].detach().double().requires_grad_()
+    similarity = ssim(image, image.detach())
+    similarity.backward()
+    assert abs(similarity.item() - 1) <= DOUBLE_TOLERANCE
+    assert (image.grad * 3 * 10 * 23).abs().max() <= 3 * 2 / SSIM_C2 * DOUBLE_TOLERANCE
+
+
+@pytest.mark.parametrize("size", [(10, 30), (30, 10), (5, 4)])
+def test_small_images_are_the_librarys(size):
+    prediction, truth = pair(*size)
+    with pytest.warns(UserWarning, match="Skipping Gaussian Smoothing"):
+        loss = photometric_loss(prediction, truth, 0.2)
+        expected, gradient = reference(prediction, truth, 0.2)
+    # An axis that is not blurred leaves windows of hardly any variance.
+    flat = 2 * MOMENT_ROUNDINGS * ULP / SSIM_C2
+    assert (loss - expected).abs() <= flat
+    assert (torch.autograd.grad(loss, prediction)[0] - gradient).abs().max() <= flat * gradient.abs().max()
+
+
+def test_not_a_number_is_seen():
+    prediction, truth = pair(20, 20)
+    broken = prediction.detach().clone()
+    broken[10, 10, 1] = float("nan")
+    assert photometric_loss(broken, truth, 0.2).isnan()
+
+
+def test_bad_input():
+    prediction, truth = pair(20, 20)
+    with pytest.raises(ValueError, match=r"prediction \[20, 20, 3\] and truth \[20, 19, 3\] must both be \[H, W, 3\]"):
+        ssim(prediction, truth[:, :19])
+    with pytest.raises(ValueError, match=r"must both be \[H, W, 3\]"):
+        ssim(prediction[..., :1], truth[..., :1])
+    with pytest.raises(ValueError, match=r"truth.detach\(\)"):
+        ssim(truth, prediction)
+
+
+def test_without_triton_a_warning_and_torch(monkeypatch, caplog):
+    monkeypatch.setattr(module, "_RUNS", {})
+    monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: None)
+    assert not module._kernels_run_on(torch.device("cpu"))
+    assert not module._kernels_run_on(torch.device("cpu"))
+    assert [record.getMessage() for record in caplog.records] == [
+        "SSIM runs in plain PyTorch on cpu: Triton is not installed."
+    ]

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs inspect`: what is measured is what it says, and the residuals' sizes are bounds."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+import tyro
+from torch.testing import assert_close
+
+from nrfgs_ns.appearance.head import base_colors
+from nrfgs_ns.appearance.reduce import Field, latent_basis, with_diffuse, with_rank
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.inspect.ablate import changes, row, together
+from nrfgs_ns.inspect.command import Inspect
+from nrfgs_ns.inspect.report import advice
+from nrfgs_ns.simplify.field_views import FieldViews, dropped, slim
+from nrfgs_ns.simplify.residuals import EIGHT_BIT_STEP, look_over
+from nrfgs_ns.training.run import parse, train
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+LOUD = {
+    "--pipeline.model.appearance.output-init": "default",
+    "--pipeline.model.appearance.latent-dim": 6,
+    "--pipeline.model.warmup-steps": 0,
+}
+
+
+@pytest.fixture(scope="module")
+def loud(tiny_scene, tmp_path_factory):
+    """A pipeline whose field says something, untrained, and its splats."""
+    torch.manual_seed(0)
+    words = [str(word) for option in LOUD.items() for word in option]
+    config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path_factory.mktemp("x")), *words])
+    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
+    pipeline.eval()
+    model = pipeline.model
+    model.head.requires_grad_(False)
+    for branch in (model.head.low, model.head.high):
+        branch[2].weight.mul_(4.0)
+    model.gauss_params["opacities"].data.normal_(0.0, 2.0)
+    # Far from round: where components are alike, one more can bring a tanh further from its value, not nearer.
+    model.gauss_params["latents"].data.mul_(20.0 * 0.4 ** torch.arange(6))
+    return pipeline
+
+
+@pytest.fixture(scope="module")
+def field(loud):
+    return Field(loud.model.head, {name: value.detach() for name, value in loud.model.gauss_params.items()})
+
+
+@pytest.fixture(scope="module")
+def seen(loud):
+    return look_over(loud.model, loud.datamanager.train_dataset.cameras)
+
+
+def test_the_mean_appearance_is_weighted_by_contribution(loud, seen):
+    from nrfgs_ns.model.harmonics_fit import observe
+
+    model, cameras = loud.model, loud.datamanager.train_dataset.cameras
+    sums = torch.zeros(model.num_points, 5)
+    for index in range(len(cameras)):
+        one = observe(model, cameras[index : index + 1])
+        colors = one.residuals + base_colors(model.features_dc[one.rows])
+        columns = torch.cat([torch.ones(len(one.rows), 1), colors, one.opacities[:, None]], dim=1)
+        sums.index_add_(0, one.rows, one.weights[:, None] * columns)
+    some = sums[:, 0] > 1e-3
+    assert some.sum() > 100
+    mean = sums[some, 1:] / sums[some, :1]
+    assert_close(seen.weight[some], sums[some, 0], rtol=1e-5, atol=1e-6)
+    assert_close(base_colors(seen.features_dc[some]), mean[:, :3], rtol=0, atol=1e-5)
+    assert_close(seen.opacities[some].sigmoid(), mean[:, 3:], rtol=0, atol=1e-5)
+    unseen = seen.weight == 0
+    assert (seen.largest[unseen] == 0).all() and (seen.features_dc[unseen] == model.features_dc[unseen]).all()
+
+
+def test_the_largest_change_bounds_what_a_pixel_can_change(loud, field, seen):
+    """One splat made diffuse, all else as it is: no pixel of any training view moves further."""
+    cameras = loud.datamanager.train_dataset.cameras
+    model = loud.model
+    order = seen.largest.argsort(descending=True)[::37][:8]
+    assert seen.largest[order[0]] > 5, "a bound on nothing would hold"
+    views = [model.look(cameras[i : i + 1]) for i in range(len(cameras))]
+    with torch.no_grad():
+        before = [model.paint(v, field.head(field.splats, v.visible, v.center))[0]["rgb"] for v in views]
+        tightest = 0.0
+        for row in order.tolist():
+            lone = seen._replace(largest=torch.full_like(seen.largest, 1e9).index_fill(0, order.new_tensor([row]), 0.0))
+            small = dropped(field, lone, 0.5)
+            moved = 0.0
+            for view, picture in zip(views, before, strict=True):
+                now = model.paint(view, small.head(small.splats, view.visible, view.center))[0]["rgb"]
+                moved = max(moved, float((now - picture).abs().max()) / EIGHT_BIT_STEP)
+            # Colours beyond [0, 1] can contrast by more than 1; opacity of a splat in front also dims what is behind.
+            assert moved <= 1.5 * float(seen.largest[row]) + 1e-3
+            tightest = max(tightest, moved / max(float(seen.largest[row]), 1e-6))
+        assert tightest > 0.1, "a bound that is far from reached would tell nothing"
+
+
+def test_loss_falls_with_the_rank(loud, field, seen):
+    images = loud.datamanager.fixed_indices_eval_dataloader
+    views = FieldViews(loud.model, images)
+    model = loud.model
+    # The truth is the model's own picture: what is left out is an error, and nothing else is.
+    views.views = [
+        (view, model.paint(view, field.head(field.splats, view.visible, view.center))[0]["rgb"].detach(), None)
+        for view, _, _ in views.views
+    ]
+    basis = latent_basis(field, seen.weight)
+    scores = [views.psnr(with_rank(field, basis, rank)) for rank in range(1, 7)]
+    assert scores == sorted(scores) and scores[-1] > 80 > scores[0]
+    # The smallest that reaches a score is found, and no smaller one would do.
+    for wanted in (scores[0] - 1, 0.5 * (scores[1] + scores[2]), scores[4]):
+        slimmed = slim(field, seen, views, wanted, threshold=0.0)
+        assert views.psnr(slimmed.field) >= wanted
+        assert slimmed.rank == 1 or scores[slimmed.rank - 2] < wanted
+    assert slim(field, seen, views, -1e3).threshold == float("inf")
+
+
+def test_views_score_as_the_pipeline_does(loud, field):
+    views = FieldViews(loud.model, loud.datamanager.fixed_indices_eval_dataloader)
+    expected = loud.get_average_eval_image_metrics()["psnr"]
+    loud.eval()
+    assert views.psnr(field) == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_verb(tiny_scene, tmp_path, capsys):
+    options = {
+        "--data": tiny_scene,
+        "--output-dir": tmp_path,
+        "--max-num-iterations": 4,
+        "--vis": "tensorboard",
+        "--logging.local-writer.enable": False,
+        "--logging.profiler": "none",
+        **LOUD,
+    }
+    config = Path(train(["nrfgs", *(str(w) for option in options.items() for w in option)]).config_path)
+    tyro.cli(Inspect, args=["--load-config", str(config), "--views", "2"]).main()
+    result = json.loads((config.parent / "inspect" / "inspect.json").read_text())
+    assert (config.parent / "inspect" / "inspect.png").stat().st_size > 10_000
+    rows = {row["part"]: row for row in result["rows"]}
+    assert {"high branch", "low branch", "opacity residual", "distance", "band 0", "band 2", "direction"} < set(rows)
+    assert [row["rank"] for row in result["rows"] if row["group"] == "rank"] == [1, 2, 3, 4, 5, 6]
+    assert rows["latent rank 6"]["loss_db"] == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
+    assert rows["all residuals"]["diffuse"] == 1.0 and rows["all residuals"]["threshold"] is None
+    assert rows["latent rank 1"]["bytes"] < rows["latent rank 2"]["bytes"] < rows["nothing"]["bytes"]
+    assert result["together"]["loss_db"] <= 0.05 + 1e-6 and result["together"]["bytes"] <= rows["nothing"]["bytes"]
+    assert result["advice"] in " ".join(capsys.readouterr().out.split())
+
+    for words, says in (
+        (["--load-config", str(tmp_path / "no.yml")], "no such file"),
+        (["--load-config", str(config), "--views", "0"], "at least 1"),
+        (["--load-config", str(config), "--budget", "-1"], "zero or positive"),
+        (["--load-config", str(config), "--budget", "nan"], "zero or positive"),
+    ):
+        with pytest.raises(InputError, match=says):
+            tyro.cli(Inspect, args=words).main()
+
+
+def test_latents_of_diffuse_splats_do_not_count(loud, field, seen):
+    """Nobody sees them. Latents of the others lie on a line: one number is enough, whatever those of the rest are."""
+    diffuse = torch.arange(len(field.splats["means"])) % 2 == 0
+    splats = dict(field.splats)
+    line = torch.linspace(-3.0, 3.0, len(diffuse))[:, None] * torch.ones(6)
+    splats["latents"] = torch.where(diffuse[:, None], 9.0 * splats["latents"], line)
+    some = with_diffuse(Field(field.head, splats), diffuse, seen.features_dc, seen.opacities)
+    views = FieldViews(loud.model, loud.datamanager.fixed_indices_eval_dataloader)
+    basis = latent_basis(some, seen.weight)
+    (rank_1,) = [change for name, _, _, change in changes(some, seen, basis) if name == "latent rank 1"]
+    assert views.psnr(some) - views.psnr(rank_1(some)) == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
+
+
+def test_the_head_is_timed_with_diffuse_splats_last(loud, field, seen, monkeypatch):
+    """The fused kernels save the network of whole blocks: in the order of an untrained mask they would have none."""
+    camera, batch = next(iter(loud.datamanager.fixed_indices_eval_dataloader))
+    views = FieldViews(loud.model, [(camera, batch)])
+    diffuse = torch.rand(len(field.splats["means"]), generator=torch.Generator().manual_seed(0)) < 0.5
+    some = with_diffuse(field, diffuse, seen.features_dc, seen.opacities)
+    given = []
+    monkeypatch.setattr(type(some.head), "forward", lambda self, splats, visible, center: given.append(visible))
+    assert views.head_seconds(some) >= 0
+    visible = views.views[0][0].visible
+    assert torch.equal(given[0].sort().values, visible) and (diffuse[given[0]].int().diff() >= 0).all()
+    views.head_seconds(field)
+    assert torch.equal(given[-1], visible)
+
+
+def test_splats_that_are_diffuse_already_are_not_left_out_again(loud, field, seen):
+    every = dropped(field, seen, float("inf"))
+    views = FieldViews(loud.model, loud.datamanager.fixed_indices_eval_dataloader)
+    rows = [row("nothing", "full", every, views, None)]
+    _, left_out = together(every, rows, seen, views, 0.05, lambda _: None)
+    assert left_out == []
+
+
+def test_other_heads_are_refused(tiny_scene, tmp_path):
+    words = ["nrfgs-sh", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "1"]
+    config = Path(train([*words, "--vis", "tensorboard"]).config_path)
+    with pytest.raises(InputError, match="'sh' head has no parts"):
+        Inspect(config).main()
+
+
+def test_advice_names_what_to_leave_out():
+    def row(**changes):
+        return {"bytes": 100, "head_seconds": 1.0, "loss_db": 0.0, "threshold": None, "diffuse": 0.0} | changes
+
+    rows = [row(), row(threshold=float("inf"), loss_db=0.7)]
+    assert "is worth 0.70 dB" in advice(rows, row(), [], 0.05) and "Every part pays" in advice(rows, row(), [], 0.05)
+    assert "No splat of this model has a residual" in advice([row(diffuse=1.0), *rows[1:]], row(), [], 0.05)
+    said = advice(rows, row(bytes=40, head_seconds=0.7, loss_db=0.02), ["distance", "latents beyond rank 4"], 0.05)
+    assert (
+        "distance, latents beyond rank 4 cost 0.020 dB and save 60 % of the bytes and 30 % of the head's time" in said
+    )

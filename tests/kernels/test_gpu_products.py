@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What people touch, on a CUDA device: the viewer's pictures and the exported files. `pytest -m gpu`.
+
+Each check is a function of a device, and runs on the CPU too, in the default suite.
+"""
+
+import json
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from nrfgs_ns.compact.options import CompactOptions
+from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.ply import read_splats
+from nrfgs_ns.rasterizer import composite
+from nrfgs_ns.training.run import evaluate, parse, train
+from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture
+
+NO_GPU = "needs a CUDA device and gsplat's kernels"
+FROZEN = "full, as seen from another camera"
+STEPS = 60
+
+
+def model_with_something_to_show(device: str, scene: Path, out: Path):
+    """A model in evaluation mode whose field is drawn at random, the same on every device; and its cameras."""
+    config = parse(["nrfgs", "--data", str(scene), "--output-dir", str(out), "--machine.device-type", device])
+    config.pipeline.model.background_color = "black"
+    config.pipeline.model.appearance.precision = "fp32"  # as on the CPU
+    torch.manual_seed(0)
+    pipeline = config.pipeline.setup(device=device, test_mode="val")
+    model = pipeline.model
+    generator = torch.Generator().manual_seed(1)
+    drawn = {"latents": 0.3, "scales": 0.5}
+    for name, parameter in [*model.head.named_parameters(), *model.gauss_params.items()]:
+        if name in drawn or name not in model.gauss_params:
+            noise = torch.randn(parameter.shape, generator=generator).to(device) * drawn.get(name, 0.5)
+            parameter.data = noise if name != "scales" else parameter.data + noise
+    model.gauss_params["opacities"].data.fill_(1.0)  # a pixel shows few splats
+    model.update_to_step(10**6)
+    pipeline.eval()
+    return model, pipeline.datamanager.train_dataset.cameras.to(device)
+
+
+def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tensor]:
+    """The picture of every mode, and one whose view is frozen, on the CPU; what each must be is checked."""
+    model, cameras = model_with_something_to_show(device, scene, out)
+    camera, elsewhere = cameras[0:1], cameras[4:5].camera_to_worlds[0, :3, 3]
+    splats = dict(model.gauss_params.items())
+    shown = {mode: Shown(mode) for mode in modes(model.head, splats)} | {FROZEN: Shown(frozen_center=elsewhere)}
+    pictures = {}
+    for name, what in shown.items():
+        pictures[name] = picture(model, camera, what)["rgb"]
+        assert pictures[name].shape == (36, 48, 3) and pictures[name].device.type == device, name
+        assert ((pictures[name] >= 0) & (pictures[name] <= 1)).all(), name  # NaN is in no interval
+    assert torch.equal(pictures[FULL], model.get_outputs_for_camera(camera)["rgb"])
+    assert torch.equal(pictures[BASE], model.get_base_color(camera))
+    for one, other in combinations(pictures, 2):
+        assert (pictures[one] - pictures[other]).abs().max() > 0.02, (one, other)
+    return {name: value.cpu() for name, value in pictures.items()}
+
+
+def negative_colors(device: str, scene: Path, out: Path) -> None:
+    """The compositor takes signed colours as they are: those of the residual's picture are."""
+    model, cameras = model_with_something_to_show(device, scene, out)
+    with torch.no_grad():
+        view = model.look(cameras[0:1])
+        residual = model.head.components(view.splats, view.visible, view.center)["residual"].values
+        assert residual.min() < -0.05 and residual.max() > 0.05
+        opacities = model.head(view.splats, view.visible, view.center).opacities
+        render = composite(view.projection, residual, opacities)[0]
+        mirrored = composite(view.projection, -residual, opacities)[0]
+    assert render.min() < -0.01 and render.max() > 0.01
+    # A sum of products changes its sign with its factors', and nothing else: every rounding is symmetric.
+    assert torch.equal(mirrored, -render)
+
+
+def per_splat_centers(device: str, scene: Path, out: Path) -> None:
+    """A head that is told each splat's own centre answers as for one camera, if they are all the same."""
+    model, cameras = model_with_something_to_show(device, scene, out)
+    with torch.no_grad():
+        view = model.look(cameras[0:1])
+        center = cameras[4:5].camera_to_worlds[0, :3, 3]  # not the camera that looks: a frozen view
+        one = model.head(view.splats, view.visible, center)
+        each = model.head(view.splats, view.visible, center.expand(len(view.visible), 3).contiguous())
+    for name in ("colors", "opacities"):
+        # The same operations on the same numbers; a kernel may take another order of sums for another stride.
+        assert_close(getattr(each, name), getattr(one, name), rtol=0, atol=1e-6)
+
+
+def exported_files(device: str, scene: Path, out: Path) -> dict[str, dict]:
+    """Train, write both files, read them back; the reports of `nrfgs export`."""
+    args = ["nrfgs", "--data", scene, "--output-dir", out, "--max-num-iterations", STEPS, "--vis", "tensorboard"]
+    args += ["--machine.device-type", device, "--logging.profiler", "none", "--logging.local-writer.enable", False]
+    args += [
+        "--pipeline.model.num-downscales",
+        0,
+        "--steps-per-eval-image",
+        10**5,
+        "--steps-per-eval-all-images",
+        10**5,
+    ]
+    args += ["--optimizers.field.optimizer.lr", 0.05]  # a residual that matters after a few steps
+    config = Path(train(list(map(str, args))).config_path)
+    scores = evaluate(config, out / "eval.json")
+    reports = {}
+    kept = CompactOptions(threshold=0.0)  # so short a training could do without any view-dependent splat
+    for kind, name in (("ply", "splats.ply"), ("compact", "field.nrf")):
+        Export(kind, config, out / name, report=out / f"{kind}.json", compact=kept).main()
+        reports[kind] = json.loads((out / f"{kind}.json").read_text())
+        # The report's mean over the images is ns-eval's, which sums in another order.
+        assert reports[kind]["psnr_model"] == pytest.approx(scores["psnr"], abs=1e-3)
+    assert len(read_splats(out / "splats.ply").means) == reports["ply"]["written"] > 100
+    small = evaluate(out / "field" / "nrfgs" / "compact" / "config.yml", out / "small.json")
+    assert small["psnr"] == pytest.approx(reports["compact"]["psnr_file"], abs=1e-3)
+    return reports
+
+
+def close_to_the_model(reports: dict[str, dict]) -> None:
+    """Each file is as good as the model, to a third of what the residual is worth."""
+    ply, compact = reports["ply"], reports["compact"]
+    worth = ply["psnr_model"] - ply["psnr_base"]
+    assert worth > 0.5
+    assert abs(ply["loss_db"]) < worth / 3 and abs(compact["loss_db"]) < worth / 3
+    assert compact["view_dependent"] > 0 and compact["ply_ratio"] > 3
+
+
+CHECKS = [negative_colors, per_splat_centers]
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_splats_for_the_viewer(check, no_cuda, tiny_scene, tmp_path):
+    check("cpu", tiny_scene, tmp_path)
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: f"cuda-{check.__name__}")
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason=NO_GPU)
+def test_splats_for_the_viewer_on_the_gpu(check, tiny_scene, tmp_path):
+    check("cuda", tiny_scene, tmp_path)
+
+
+def test_every_mode(no_cuda, tiny_scene, tmp_path):
+    viewer_pictures("cpu", tiny_scene, tmp_path)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason=NO_GPU)
+def test_every_mode_on_the_gpu(tiny_scene, tmp_path):
+    """The pictures are the CPU's."""
+    gpu = viewer_pictures("cuda", tiny_scene, tmp_path)
+    cpu = viewer_pictures("cpu", tiny_scene, tmp_path)
+    assert gpu.keys() == cpu.keys() and {DEPTH, VIEW_DEPENDENCE, "gate weight", "opacity residual"} <= gpu.keys()
+    for name in gpu:
+        error = (gpu[name] - cpu[name]).abs()
+        # A contribution that one device cuts at alpha = 1/255 and the other keeps moves a blended number by 1/255 of
+        # its range; changes are drawn AMPLIFICATION times as large, and viridis is less steep than 2. All else is
+        # rounding in float32. Few pixels have such a contribution.
+        assert (error > 2 * AMPLIFICATION / 255).float().mean() < 0.01, name
+        assert error.mean() < 1e-3, name
+
+
+def test_exported_files(no_cuda, tiny_scene, tmp_path):
+    close_to_the_model(exported_files("cpu", tiny_scene, tmp_path))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason=NO_GPU)
+def test_exported_files_on_the_gpu(tiny_scene, tmp_path):
+    close_to_the_model(exported_files("cuda", tiny_scene, tmp_path))

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`Launcher`: when a compiled variant is launched again, and when Triton is asked anew. No GPU is needed for that."""
+
+import pytest
+import torch
+
+pytest.importorskip("triton")
+from nrfgs_ns.kernels import launch as module
+from nrfgs_ns.kernels.launch import Launcher
+
+
+class Kernel:
+    """Stands for a function under triton.jit: notes each launch, and the variants that were compiled."""
+
+    arg_names = ("x", "count", "scale", "B", "KIND")
+
+    def __init__(self, compiles: bool = True):
+        self.launches: list[tuple] = []
+        self.compiles = compiles
+
+    def __getitem__(self, grid):
+        def launch(*arguments, **constants):
+            self.launches.append(("triton", grid, arguments, constants))
+            return Compiled(self) if self.compiles else None
+
+        return launch
+
+
+class Compiled:
+    def __init__(self, kernel: Kernel):
+        self.kernel = kernel
+
+    def __getitem__(self, grid):
+        return lambda *arguments: self.kernel.launches.append(("compiled", grid, arguments))
+
+
+@pytest.fixture(autouse=True)
+def keeps_constants(monkeypatch):
+    monkeypatch.setattr(module, "KEEPS_CONSTANTS", True)
+
+
+CONSTANTS = {"KIND": "bf16", "B": 64, "num_warps": 4}
+
+
+def test_the_second_launch_is_the_compiled_variants_with_constants_in_the_kernels_order():
+    kernel, x = Kernel(), torch.zeros(8)
+    launch = Launcher(kernel)
+    launch((1, 1, 1), x, 8, 0.5, **CONSTANTS)
+    launch((2, 1, 1), x, 7, 0.25, **CONSTANTS)
+    assert kernel.launches == [
+        ("triton", (1, 1, 1), (x, 8, 0.5), CONSTANTS),
+        ("compiled", (2, 1, 1), (x, 7, 0.25, 64, "bf16")),
+    ]
+
+
+@pytest.mark.parametrize(
+    "arguments, constants",
+    [
+        ((torch.zeros(9)[1:], 8, 0.5), {}),  # 4 bytes into an allocation
+        ((torch.zeros(8), 2**31, 0.5), {}),
+        ((torch.zeros(8), 8, 1), {}),  # an integer where others had a float
+        ((torch.zeros(8), 8, 0.5), {"B": 128}),
+        ((torch.zeros(8), 8, 0.5), {"num_warps": 8}),
+    ],
+    ids=["unaligned", "64 bits", "another type", "another constant", "another option"],
+)
+def test_what_asks_for_another_variant_goes_to_triton(arguments, constants):
+    kernel = Kernel()
+    launch = Launcher(kernel)
+    launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
+    launch((1, 1, 1), *arguments, **{**CONSTANTS, **constants})
+    assert [kind for kind, *_ in kernel.launches] == ["triton", "triton"]
+    launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
+    assert kernel.launches[-1][0] == "compiled", "the ordinary one is still known"
+
+
+def test_an_unaligned_first_launch_is_not_what_later_ones_use():
+    kernel = Kernel()
+    launch = Launcher(kernel)
+    launch((1, 1, 1), torch.zeros(9)[1:], 8, 0.5, **CONSTANTS)
+    launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
+    assert [kind for kind, *_ in kernel.launches] == ["triton", "triton"]
+
+
+@pytest.mark.parametrize("old", [True, False])
+def test_the_interpreter_and_old_tritons_are_asked_each_time(monkeypatch, old):
+    monkeypatch.setattr(module, "KEEPS_CONSTANTS", not old)
+    kernel = Kernel(compiles=old)
+    launch = Launcher(kernel)
+    for _ in range(2):
+        launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
+    assert [kind for kind, *_ in kernel.launches] == ["triton", "triton"]

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`try_triton`: what is a verdict about Triton and what is not, and that its callers remember nothing else. No GPU is
+needed for that, nor Triton."""
+
+import pytest
+import torch
+
+from nrfgs_ns.appearance import hash_grid
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.image import ssim
+from nrfgs_ns.kernels import trial
+from nrfgs_ns.kernels.trial import try_triton
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def triton_is_installed(monkeypatch):
+    monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: name)
+
+
+def raises(error: BaseException):
+    def trial(*_, **__):
+        raise error
+
+    return trial
+
+
+def test_what_the_trial_returns():
+    assert try_triton(lambda: None) is None
+    assert try_triton(lambda: (1, 2)) == (1, 2)
+
+
+def test_without_triton_nothing_is_tried(monkeypatch):
+    monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: None)
+    assert try_triton(raises(AssertionError("tried"))) == "Triton is not installed"
+
+
+@pytest.mark.parametrize(
+    "error, told",
+    [
+        (RuntimeError("no compiler\nmore of it"), "RuntimeError: no compiler"),
+        (ImportError("no driver"), "ImportError: no driver"),
+        (AssertionError(), "AssertionError: "),
+    ],
+)
+def test_what_goes_wrong_is_told_in_a_line(error, told):
+    assert try_triton(raises(error)) == f"Triton's kernels do not run here ({told})"
+
+
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), KeyboardInterrupt()])
+def test_what_is_no_verdict_passes(error):
+    with pytest.raises(type(error)):
+        try_triton(raises(error))
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_gradients_whatever_the_caller_does_without(mode):
+    def trial():
+        x = torch.ones(1, requires_grad=True)
+        (x * x).sum().backward()
+        return x.grad.item()
+
+    with mode():
+        assert try_triton(trial) == 2.0
+        assert torch.is_inference_mode_enabled() == (mode is torch.inference_mode)
+        assert not torch.is_grad_enabled()
+
+
+@pytest.mark.parametrize("module, key", [(ssim, (CPU,)), (hash_grid, (CPU, 4))])
+def test_memory_that_is_out_is_not_remembered(module, key, monkeypatch, caplog):
+    monkeypatch.setattr(module, "_RUNS", {})
+    monkeypatch.setattr(module, "_try_kernels", raises(torch.OutOfMemoryError("CUDA out of memory")))
+    with pytest.raises(torch.OutOfMemoryError):
+        module._kernels_run_on(*key)
+    assert module._RUNS == {} and not caplog.records
+    monkeypatch.setattr(module, "_try_kernels", lambda *_: None)
+    assert module._kernels_run_on(*key)
+
+
+def test_nor_is_it_by_the_field(monkeypatch, caplog):
+    head = NrfConfig().setup()
+    monkeypatch.setattr(head.fused, "_launches", raises(torch.OutOfMemoryError("CUDA out of memory")))
+    with pytest.raises(torch.OutOfMemoryError):
+        head.fused._ready_on(CPU)
+    assert head.fused.ready == {} and not caplog.records

@@ -1,0 +1,451 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables, figure and crops from records made by hand."""
+
+import csv
+import io
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nrfgs_lab.bench.crops import crop_sheet, crop_side, largest_disagreement, numbered
+from nrfgs_lab.bench.report import draw_splats, pictures_of, report
+from nrfgs_lab.bench.spec import cells_of, identity, make_spec
+from nrfgs_lab.bench.table import (
+    COLUMNS,
+    SHOWN,
+    Row,
+    as_csv,
+    latex,
+    markdown,
+    ranks,
+    views_as_csv,
+    with_averages,
+)
+
+PSNR = next(column for column in COLUMNS if column.name == "PSNR")
+
+
+def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=1000, parts=1, device="a card"):
+    test = {"psnr": psnr, "ssim": ssim, "ms_ssim": None, "l1": 0.01, "lpips": lpips}
+    return {
+        "machine": {"device": device, "torch": "2.11"},
+        "jobs": jobs,
+        "train": {"seconds": seconds, "parts": parts, "splats": [[0, 100], [100, splats]]},
+        "measured": {
+            "test": test,
+            "train": None if train is None else {"psnr": train},
+            "fps": 50.0,
+            "splats": splats,
+            "parameter_bytes": 2_000_000,
+            "checkpoint_bytes": 6_000_000,
+        },
+    }
+
+
+def rows():
+    """Two scenes, two runs; NRF's second seed on the second scene failed."""
+    return [
+        Row("s", "SH", "mcmc", {1: record(30.0, train=31.0), 2: record(31.0, train=33.0)}).fill(),
+        Row("s", "NRF", "mcmc", {1: record(32.0, splats=500), 2: record(34.0, splats=700)}).fill(),
+        Row("t_1", "SH", "mcmc", {1: record(20.0), 2: record(22.0)}).fill(),
+        Row("t_1", "NRF", "mcmc", {1: record(21.0)}, {2: "FAILED"}).fill(),
+    ]
+
+
+def test_markdown():
+    """By hand: means, sample deviations |a - b| / sqrt(2), best bold, second in italics, averages seed by seed."""
+    lines = markdown(with_averages(rows())).splitlines()
+    psnr = [column.name for column in COLUMNS].index("PSNR")
+    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    assert table[0][: 4 + 3] == ["scene", "run", "protocol", "seeds", "splats", "time s", "SSIM"]
+    body = {(line[0], line[1]): line for line in table[2:]}
+    assert body["s", "SH"][4 + psnr] == "_30.50 ± 0.71_"
+    assert body["s", "NRF"][4 + psnr] == "**33.00 ± 1.41**"
+    assert body["s", "NRF"][4] == "**600 ± 141**" and body["s", "SH"][4] == "_1,000 ± 0_"
+    # Equal as written: no ranking.
+    assert body["s", "SH"][6] == body["s", "NRF"][6] == "0.9000 ± 0.0000"
+    assert (
+        body["s", "SH"][-1] == "1.50 ± 0.71" and body["s", "SH"][-2] == "32.00 ± 1.41" and body["s", "NRF"][-1] == "-"
+    )
+    assert body["t_1", "NRF"][3] == "1 (1 FAILED)" and body["t_1", "NRF"][4 + psnr] == "21.00"
+    assert body["average", "SH"][4 + psnr] == "_25.75 ± 1.06_"  # (30 + 20) / 2 and (31 + 22) / 2
+    assert body["average", "NRF"][3] == "1 (1 FAILED)" and body["average", "NRF"][4 + psnr] == "**26.50**"
+    assert any("Made on: a card, torch 2.11." in line for line in lines)
+    assert body["s", "SH"][8] == "-", "LPIPS was not measured"
+
+
+def test_latex():
+    text = latex(rows())
+    assert r"\textbf{33.00 $\pm$ 1.41}" in text and r"\underline{30.50 $\pm$ 0.71}" in text
+    assert "t\\_1 & SH & mcmc & 2 & " in text
+    width = text.splitlines()[2].count("&")
+    assert all(line.count(" & ") == width for line in text.splitlines() if line.endswith(r"\\"))
+
+
+def test_csv_has_plain_numbers():
+    lines = list(csv.DictReader(io.StringIO(as_csv(rows()))))
+    assert float(lines[1]["PSNR"]) == 33.0 and float(lines[1]["PSNR deviation"]) == pytest.approx(2**0.5)
+    assert float(lines[0]["MB"]) == 2.0 and lines[0]["LPIPS"] == "" and lines[3]["PSNR deviation"] == ""
+
+
+STRANGE = [
+    "a|b",
+    "50%",
+    "_x_",
+    "a & b",
+    "f_1 {2} ~^",
+    "$w^$",
+    "a*b*",
+    "<0.1>",
+    "back\\slash",
+    "two\nlines",
+    "[x](y)",
+    "*a--b",
+]
+
+
+def strange_rows():
+    return [Row("s", name, "own", {1: record(30.0 + i)}).fill() for i, name in enumerate(STRANGE)]
+
+
+def test_strange_names_break_no_table(tmp_path):
+    """Each line has the table's columns, no letter of a name means anything, and the CSV gives the names back."""
+    lines = [line for line in markdown(strange_rows()).splitlines() if line.startswith("|")]
+    assert len(lines) == 2 + len(STRANGE)
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4 + len(SHOWN) + 1}
+    names = [re.split(r"(?<!\\)\|", line)[2].strip() for line in lines[2:]]
+    assert names == [
+        *(r"a\|b", "50%", r"\_x\_", "a & b", "f_1 {2} ~^", "$w^$", r"a\*b\*", r"\<0.1>", r"back\\slash", "two lines"),
+        *(r"\[x](y)", r"\*a--b"),
+    ]
+    text = latex(strange_rows())
+    for name in (
+        *("a\\textbar{}b", "50\\%", "\\_x\\_", "a \\& b", "f\\_1 \\{2\\} \\textasciitilde{}\\textasciicircum{}"),
+        *("\\$w\\textasciicircum{}\\$", "\\textless{}0.1\\textgreater{}", "back\\textbackslash{}slash", "two lines"),
+        *("{[}x](y)", "{*}a-{}-b"),
+    ):
+        assert f"s & {name} & own & " in text
+    assert [line["run"] for line in csv.DictReader(io.StringIO(as_csv(strange_rows())))] == STRANGE
+    draw_splats([*strange_rows(), Row("$^$", "elsewhere", "own", {1: record(30.0)}).fill()], tmp_path)
+    svg = (tmp_path / "splats.svg").read_text()
+    assert "_x_</text>" in svg and ">$w^$</text>" in svg and ">$^$</text>" in svg
+    assert ">elsewhere</text>" in svg, "a run that the first scene lacks is not in the legend"
+
+
+def test_what_is_no_number_is_not_there():
+    rows = [Row("s", "a", "own", {1: record(float("nan"))}).fill(), Row("s", "b", "own", {1: record(30.0)}).fill()]
+    assert rows[0].text(PSNR) == "-" and ranks(rows, PSNR) == {}
+    assert "nan" not in as_csv(rows)
+
+
+def test_ranks_share_and_skip():
+    group = [Row("s", str(i), "own", {1: record(psnr)}).fill() for i, psnr in enumerate([20.0, 21.004, 21.001, 19.0])]
+    assert ranks(group, PSNR) == {0: 2, 1: 1, 2: 1}
+    l1 = next(column for column in COLUMNS if column.name == "L1")
+    assert ranks(group, l1) == {}
+    gap = next(column for column in COLUMNS if column.name == "gap")
+    assert gap.better == 0
+
+
+def test_times_only_of_runs_that_were_alone():
+    shared = Row("s", "SH", "own", {1: record(30.0, jobs=2)}).fill()
+    alone = Row("s", "NRF", "own", {1: record(30.0, parts=2)}).fill()
+    text = markdown([shared, alone])
+    time, fps = (next(column for column in COLUMNS if column.name == name) for name in ("time s", "FPS"))
+    assert shared.text(time) == shared.text(fps) == "-"
+    assert (alone.text(time), alone.text(fps)) == ("10.0", "50.0")
+    assert "shared their GPU" in text and "interrupted" in text
+
+
+def table_of(rows):
+    """Markdown's cells, (scene, run, protocol) -> column -> text; and the lines below."""
+    lines = markdown(rows).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    body = {tuple(line[:3]): dict(zip(cells[0], line, strict=True)) for line in cells[2:]}
+    return body, [line for line in lines if line and not line.startswith("|")]
+
+
+def test_marks_are_among_rows_of_one_protocol():
+    """A budget of a tenth is not best in bytes beside methods that chose their number themselves."""
+    plan = [("original", "SH", 30.0, 900), ("original", "NRF", 31.0, 400), ("mcmc@9", "SH", 20.0, 9)]
+    group = [Row("s", run, protocol, {1: record(psnr, splats=n)}).fill() for protocol, run, psnr, n in plan]
+    body, _ = table_of(group)
+    assert body["s", "SH", "mcmc@9"]["splats"] == "9" and body["s", "SH", "mcmc@9"]["PSNR"] == "20.00"
+    assert body["s", "SH", "original"]["splats"] == "_900_" and body["s", "NRF", "original"]["PSNR"] == "**31.00**"
+    lines = latex(group).splitlines()
+    assert lines[lines.index(r"\hline", 4) + 1].startswith("s & SH & mcmc@9"), "no line between the protocols"
+
+
+def test_times_of_different_machines_are_not_ranked():
+    one = Row("s", "SH", "own", {1: record(30.0, seconds=10.0)}).fill()
+    other = Row("s", "NRF", "own", {1: record(31.0, seconds=20.0, device="another")}).fill()
+    time = next(column for column in COLUMNS if column.name == "time s")
+    assert ranks([one, other], time) == {} and ranks([one, other], PSNR) == {0: 2, 1: 1}
+    assert ranks([one, Row("s", "NRF", "own", {1: record(31.0, seconds=20.0)}).fill()], time) == {0: 1, 1: 2}
+    body, below = table_of(
+        with_averages([one, other, *(Row("t", r.run, "own", r.records).fill() for r in (one, other))])
+    )
+    assert body["average", "SH", "own"]["time s"] == "10.0" and any("different machines" in line for line in below)
+
+
+def test_an_average_is_of_rows_that_have_all_scenes():
+    """NRF lacks seed 1 on one scene and failed it on the other; GS has no seed that both scenes have."""
+    plan = {
+        ("s", "SH"): ({1: record(30.0), 2: record(32.0)}, {}),
+        ("t", "SH"): ({1: record(20.0), 2: record(22.0)}, {}),
+        ("s", "NRF"): ({2: record(40.0)}, {1: "FAILED"}),
+        ("t", "NRF"): ({2: record(40.0)}, {1: "missing"}),
+        ("s", "GS"): ({1: record(50.0)}, {2: "missing"}),
+        ("t", "GS"): ({2: record(50.0)}, {1: "missing"}),
+    }
+    rows = [Row(*place, "own", records, absent).fill() for place, (records, absent) in plan.items()]
+    average = {row.run: row for row in with_averages(rows) if row.scene == "average"}
+    assert average["SH"].text(PSNR) == "26.00 ± 1.41"  # of 25 and 27
+    assert average["NRF"].absent == {1: "FAILED"} and average["NRF"].text(PSNR) == "40.00"
+    assert average["GS"].mean(PSNR) is None and ranks(list(average.values()), PSNR) == {0: 2, 1: 1}
+
+
+def test_what_failed_is_in_the_table_and_what_was_not_run_is_named_below():
+    plan = {"done": ({1: record(30.0)}, {}), "broke": ({}, {1: "FAILED"}), "not_yet": ({}, {1: "missing"})}
+    rows = [Row("s", run, "own", *what).fill() for run, what in plan.items()]
+    body, below = table_of(rows)
+    assert list(body) == [("s", "done", "own"), ("s", "broke", "own")]
+    assert body["s", "broke", "own"]["seeds"] == "0 (1 FAILED)"
+    assert below[0] == "Not run yet, and in no row: s, own: not_yet."
+    text = latex(rows)
+    assert "s & broke & own & 0 (1 FAILED) & -" in text and r"Not run yet, and in no row: s, own: not\_yet." in text
+    lines = list(csv.DictReader(io.StringIO(as_csv(rows))))
+    counts = [(line["run"], line["seeds"], line["FAILED"], line["missing"], line["stale"]) for line in lines]
+    assert counts == [("done", "1", "0", "0", "0"), ("broke", "0", "1", "0", "0"), ("not_yet", "0", "0", "1", "0")]
+
+
+def test_numbers_of_fewer_seeds_than_their_row_are_told():
+    rows = [Row("s", "SH", "own", {1: record(30.0, lpips=0.1), 2: record(31.0)}).fill()]
+    assert "fewer seeds than their row, on those that have them: LPIPS." in markdown(rows)
+    assert "fewer seeds" not in markdown([Row("s", "SH", "own", {1: record(30.0), 2: record(31.0)}).fill()])
+
+
+def test_negative_numbers_have_a_minus_in_latex():
+    assert "& $-$1.00 " in latex([Row("s", "SH", "own", {1: record(31.0, train=30.0)}).fill()])
+
+
+def test_every_test_view_has_a_line():
+    """Seeds one below the other, in numbers' order; a record without views has no lines."""
+    views = [{"image": "a.jpg", "psnr": 31.0, "ssim": 0.9}, {"image": "b, c.jpg", "psnr": 20.123456789, "ssim": None}]
+    runs = {2: record(25.0), 1: record(25.0)}
+    for seed, record_of_seed in runs.items():
+        record_of_seed["measured"]["test"]["per_image"] = views if seed == 1 else views[::-1]
+    found = list(csv.DictReader(io.StringIO(views_as_csv([Row("s", "A", "own", runs), *rows()]))))
+    assert [(line["seed"], line["image"], line["PSNR"]) for line in found] == [
+        ("1", "a.jpg", "31"),
+        ("1", "b, c.jpg", "20.1235"),
+        ("2", "b, c.jpg", "20.1235"),
+        ("2", "a.jpg", "31"),
+    ]
+    assert {(line["scene"], line["run"], line["protocol"]) for line in found} == {("s", "A", "own")}
+    assert found[1]["SSIM"] == "" and found[1]["L1"] == ""
+
+
+def test_metrics_of_training_views_are_in_the_files():
+    one = record(30.0, train=31.0)
+    one["measured"]["train"] |= {"ssim": 0.95, "l1": 0.02}
+    (line,) = csv.DictReader(io.StringIO(as_csv([Row("s", "SH", "own", {1: one}).fill()])))
+    assert (line["train SSIM"], line["train L1"], line["train LPIPS"]) == ("0.95", "0.02", "")
+    assert "train SSIM" not in markdown([Row("s", "SH", "own", {1: one}).fill()])
+
+
+def test_records_of_an_earlier_version_are_reported(tmp_path):
+    """What they lack is not there, and nothing else is lost."""
+    old = {"machine": {}, "jobs": 1, "train": {}, "measured": {"test": {"psnr": 30.0}}}
+    rows = [Row("s", "old", "own", {1: old}).fill(), Row("s", "new", "own", {1: record(31.0)}).fill()]
+    body, below = table_of(rows)
+    assert body["s", "old", "own"]["PSNR"] == "_30.00_" and body["s", "old", "own"]["time s"] == "-"
+    assert "Made on: unknown, torch unknown; a card, torch 2.11." in below
+    assert "same version" not in " ".join(below), "of neither is the version known"
+    rows[1].records[1]["machine"] = {**rows[1].records[1]["machine"], "source": "0123456789ab"}
+    assert "Not all were made with the same version of this package" in " ".join(table_of(rows)[1])
+    draw_splats(rows, tmp_path)
+    assert (tmp_path / "splats.png").exists()
+
+
+def test_one_scene_needs_no_average():
+    assert len(with_averages(rows()[:2])) == 2
+
+
+def test_figure_has_a_panel_for_each_scene_and_protocol(tmp_path, monkeypatch):
+    """Twelve runs, of which one has two seeds: a mean on a band; all told apart, and the legend covers nothing."""
+    from matplotlib import pyplot
+
+    many = [Row("s", f"run {n}", "original", {1: record(30.0, splats=500 + n)}).fill() for n in range(12)]
+    many[0] = Row("s", "run 0", "original", {1: record(30.0, splats=400), 2: record(30.0, splats=600)}).fill()
+    many += [Row("t_1", "run 3", "mcmc", {1: record(30.0)}).fill(), Row("t_1", "none", "mcmc").fill()]
+    monkeypatch.setattr(pyplot, "close", lambda figure: None)
+    draw_splats(many, tmp_path)
+    figure = pyplot.gcf()
+    monkeypatch.undo()
+    panels = {panel.get_title(): panel for panel in figure.axes}
+    assert list(panels) == ["s original", "s mcmc", "t_1 original", "t_1 mcmc"]
+    lines = panels["s original"].get_lines()
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 12
+    assert list(lines[0].get_ydata()) == [100, 500], "the mean over seeds"
+    (band,) = panels["s original"].collections
+    assert {y for _, y in band.get_paths()[0].vertices} == {100, 400, 600}
+    (elsewhere,) = panels["t_1 mcmc"].get_lines()
+    assert elsewhere.get_color() == lines[3].get_color(), "a run has one colour"
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [f"run {n}" for n in range(12)]
+    below = legend.get_window_extent()
+    assert not any(below.overlaps(panel.get_window_extent()) for panel in figure.axes)
+    pyplot.close(figure)
+
+
+def test_the_same_numbers_give_the_same_figure(tmp_path):
+    draw_splats(rows(), tmp_path)
+    svg = (tmp_path / "splats.svg").read_text()
+    assert ">SH<" in svg and ">NRF<" in svg and ">t_1 mcmc<" in svg
+    assert len(svg) < 100_000
+    draw_splats(rows(), tmp_path)
+    assert svg == (tmp_path / "splats.svg").read_text()
+
+
+# Crops.
+
+
+def picture(truth, render, path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.concatenate([truth, render], axis=1)).save(path)
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    """Three views, 60 x 80, of two runs. They differ in view 2 alone, at (40..50, 10..20); both are wrong in view 0."""
+    rng = np.random.default_rng(0)
+    for view in range(3):
+        truth = rng.integers(0, 200, size=(60, 80, 3), dtype=np.uint8)
+        for run in ("a", "b"):
+            render = truth.copy()
+            if view == 0:
+                render += 30
+            if view == 2 and run == "b":
+                render[40:50, 10:20] += 50
+            name = f"eval_img_{view:04d}" + ("_photo.png" if run == "a" else ".png")  # ours, and nerfstudio's
+            picture(truth, render, tmp_path / run / name)
+    return {"A": tmp_path / "a", "B": tmp_path / "b"}
+
+
+def test_disagreement_is_found(pictures):
+    """The window of 18 pixels must hold the whole patch of 10 where the errors differ, 50 / 255 against 0."""
+    files = {label: numbered(folder) for label, folder in pictures.items()}
+    pairs = [np.asarray(Image.open(found[2]), dtype=np.float32) / 255 for found in files.values()]
+    truth, renders = pairs[0][:, :80], [pair[:, 80:] for pair in pairs]
+    side = crop_side(60, 80)
+    assert side == 18
+    score, top, left = largest_disagreement(truth, renders, side)
+    assert top <= 40 and top + side >= 50 and left <= 10 and left + side >= 20
+    assert score == pytest.approx(0.5 * 50 / 255 * 100 / side**2, rel=1e-5)
+    _, top, left = largest_disagreement(truth, renders[1:], side)  # of one run: where it is wrong
+    assert top <= 40 and top + side >= 50
+
+
+def test_sheet_shows_the_views_where_runs_differ(pictures, tmp_path):
+    assert crop_sheet(pictures, tmp_path / "sheet.png")
+    two = Image.open(tmp_path / "sheet.png")
+    assert crop_sheet(pictures, tmp_path / "chosen.png", [2])
+    one = Image.open(tmp_path / "chosen.png")
+    assert two.height == 2 * one.height and two.width == one.width
+    # The best view comes first: the upper half of the automatic sheet is the sheet of view 2.
+    assert np.array_equal(np.asarray(two)[: one.height], np.asarray(one))
+    below = np.asarray(one)[-200:-10, -200:-10]  # inside B's error map: 4 x 50 in the patch, else black
+    assert set(np.unique(below)) == {0, 200}
+
+
+def test_many_runs_go_below_one_another(pictures, tmp_path):
+    """Nine runs and the truth: eight crops in the first line, two in the second, and no wider than eight."""
+    runs = {f"run {n}": pictures["AB"[n % 2]] for n in range(9)}
+    assert crop_sheet(runs, tmp_path / "many.png", [2])
+    assert crop_sheet(dict(list(runs.items())[:7]), tmp_path / "full.png", [2])
+    with Image.open(tmp_path / "many.png") as many, Image.open(tmp_path / "full.png") as full:
+        assert many.width == full.width
+        height = full.height - 16 - 4  # of the sheet's title and gap
+        assert many.height == full.height + height + 4
+        one, other = np.asarray(many), np.asarray(full)
+    assert np.array_equal(one[:height], other[:height])
+    # Run 8 is the first run's twin, in the second place of the second line.
+    step, left = 224, full.width - 8 * 224
+    line = height + 4
+    first, last = one[34:252, left + step :][:, :220], one[34 + line : 252 + line, left + step :][:, :220]
+    assert np.array_equal(first, last) and first.std() > 0
+
+
+def test_pictures_of_another_size_are_left_out(pictures, tmp_path):
+    """A run on photographs scaled down, beside the others."""
+    for file in numbered(pictures["A"]).values():
+        with Image.open(file) as one:
+            small = one.resize((80, 30))
+        (tmp_path / "small").mkdir(exist_ok=True)
+        small.save(tmp_path / "small" / file.name)
+    assert crop_sheet(pictures, tmp_path / "sheet.png")
+    assert crop_sheet({**pictures, "small": tmp_path / "small"}, tmp_path / "more.png")
+    assert (tmp_path / "more.png").read_bytes() == (tmp_path / "sheet.png").read_bytes()
+
+
+def test_no_pictures_no_sheet(tmp_path):
+    assert not crop_sheet({"A": tmp_path / "none"}, tmp_path / "sheet.png")
+    assert not (tmp_path / "sheet.png").exists()
+
+
+def test_crops_are_of_the_seed_that_was_run(tmp_path, pictures):
+    """A has seed 43 alone, B both, C no pictures; where the seeds differ the labels say them."""
+    content = {"runs": {"A": "nrfgs", "B": "nrfgs-sh", "C": "nrfgs-sg"}, "scenes": ["s"], "seeds": [42, 43]}
+    spec = make_spec(content, "test")
+    runs, work = tmp_path / "runs", tmp_path / "work"
+    runs.mkdir()
+
+    def found(*names, stale=()):
+        for name in names:
+            (runs / f"{name}.json").touch()
+            if name[0] != "C":
+                shutil.copytree(pictures[name[0]], work / name / "pictures")
+        shown = pictures_of(spec, spec.scenes[0], runs, work, dict.fromkeys(stale, "other options"))
+        return {text: folder.parent.name for text, folder in shown.items()}
+
+    assert found() == {}
+    assert found("A-own-s-43", "B-own-s-43", "C-own-s-42") == {"A": "A-own-s-43", "B": "B-own-s-43"}
+    assert found("B-own-s-42") == {"A, seed 43": "A-own-s-43", "B, seed 42": "B-own-s-42"}
+    assert found(stale=["B-own-s-42"]) == {"A": "A-own-s-43", "B": "B-own-s-43"}
+
+
+def test_a_picture_that_cannot_be_read_breaks_no_report(tmp_path, pictures, capsys):
+    spec = make_spec({"runs": {"A": "nrfgs"}, "scenes": ["s"]}, "test")
+    (tmp_path / "out" / "runs").mkdir(parents=True)
+    (tmp_path / "out" / "runs" / "A-own-s-42.json").write_text(json.dumps({**record(30.0), "identity": {}}))
+    (tmp_path / "work" / "A-own-s-42").mkdir(parents=True)
+    pictures["A"].rename(tmp_path / "work" / "A-own-s-42" / "pictures")
+    next((tmp_path / "work").rglob("eval_img_0001*.png")).write_bytes(b"torn")
+    report(spec, tmp_path / "out", tmp_path / "work", {})
+    said = capsys.readouterr().out
+    assert "No crops of s: cannot identify image file" in said and "30.00" in said
+
+
+def test_report_of_hand_made_records(tmp_path, pictures, capsys):
+    spec = make_spec({"runs": {"A": "nrfgs", "B": "nrfgs-sh"}, "scenes": ["x/s"], "protocols": ["mcmc@9"]}, "test")
+    for cell, psnr in zip(cells_of(spec), (30.0, 31.0), strict=True):
+        content = {**record(psnr), "identity": identity(spec, cell, None)}
+        (tmp_path / "out" / "runs").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "out" / "runs" / f"{cell.name}.json").write_text(json.dumps(content))
+        (tmp_path / "work" / cell.name).mkdir(parents=True)
+        pictures[cell.run.name].rename(tmp_path / "work" / cell.name / "pictures")
+    report(spec, tmp_path / "out", tmp_path / "work", {})
+    assert (tmp_path / "out" / "crops" / "x_s.png").exists()
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [row["PSNR"] for row in summary] == [[30.0, None], [31.0, None]]
+    assert (tmp_path / "out" / "views.csv").read_text().startswith("scene,run,protocol,seed,image,PSNR")
+    assert "**31.00**" in capsys.readouterr().out
+    # Pictures of records that are not to be used are not shown beside the others.
+    (tmp_path / "out" / "crops" / "x_s.png").unlink()
+    report(spec, tmp_path / "out", tmp_path / "work", {cell.name: "other options" for cell in cells_of(spec)})
+    assert not (tmp_path / "out" / "crops" / "x_s.png").exists()

@@ -1,0 +1,421 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a benchmark's file may say, the commands that come of it, and how data sets in each layout are read."""
+
+import json
+import re
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup  # noqa: F401  (registers the data parsers once, before the timing)
+from PIL import Image
+
+from nrfgs_lab.bench.data import parser_options
+from nrfgs_lab.bench.spec import (
+    PRESET_STEPS,
+    Scene,
+    cells_of,
+    command,
+    differences,
+    identity,
+    load_spec,
+    make_spec,
+    rows_of,
+    steps_of,
+)
+from nrfgs_lab.pages.options import methods
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.run import parse
+
+ROOT = Path(__file__).resolve().parents[3]
+SMALL = {"runs": {"SH": "nrfgs-sh", "NRF": "nrfgs"}, "scenes": ["bonsai"]}
+
+
+def spec(**more):
+    return make_spec({**SMALL, **more}, "test.yaml")
+
+
+# The file.
+
+
+@pytest.mark.parametrize("name", ["tiny", "paper"])
+def test_shipped_files_are_valid(name):
+    plan = make_spec(load_spec(ROOT / "docs" / "bench" / f"{name}.yaml"), name)
+    rows, cells = rows_of(plan), cells_of(plan)
+    assert len(cells) == len(rows) * len(plan.scenes) * len(plan.seeds)
+    assert {protocol for protocol, _ in rows} == set(plan.protocols)
+
+
+def test_seeds_come_one_after_the_other_and_protocols_together():
+    cells = cells_of(spec(protocols=["original", "mcmc@500"], seeds=[1, 2], scenes=["a", "b"]))
+    assert len(cells) == 16 and [cell.seed for cell in cells] == [1] * 8 + [2] * 8
+    assert [cell.name for cell in cells[:4]] == [
+        "SH-original-a-1",
+        "NRF-original-a-1",
+        "SH-mcmc@500-a-1",
+        "NRF-mcmc@500-a-1",
+    ]
+
+
+def test_methods_of_others_run_as_they_are():
+    plan = spec(runs={"NRF": "nrfgs", "host": "splatfacto"}, protocols=["original", "mcmc"])
+    assert [(protocol, run.name) for protocol, run in rows_of(plan)] == [
+        ("original", "NRF"),
+        ("mcmc", "NRF"),
+        ("own", "host"),
+    ]
+
+
+@pytest.mark.parametrize(
+    "content, says",
+    [
+        ({"colour": 3}, "colour"),
+        ({"runs": {}}, "runs"),
+        ({"scenes": []}, "scenes"),
+        ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
+        ({"runs": {"NRF": {"method": "nrfgs", "speed": 1}}}, "speed"),
+        ({"protocols": ["mcmc@many"]}, "mcmc@many"),
+        ({"protocols": ["original@5"]}, "original@5"),
+        ({"steps": 0}, "steps"),
+        ({"seeds": ["x"]}, "seeds"),
+        ({"jobs": True}, "jobs"),
+        ({"scenes": [{"folder": "x"}]}, "folder"),
+        ({"scenes": [{"path": "x", "downscale": 0}]}, "downscale"),
+        ({"scenes": ["a b", "a_b"]}, "twice"),
+        ({"options": "'open"}, "options"),
+        ({"crops": {"bonsai": 3}}, "crops"),
+        ({"runs": {"host": {"method": "splatfacto", "protocols": ["original"]}}}, "splatfacto knows no protocol"),
+        ({"runs": {"N": {"method": "nrfgs", "options": "--max-num-iterations 9"}}}, "N: options: --max-num.*use steps"),
+        ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
+        ({"options": "--time_budget 1"}, "--time-budget"),
+        ({"seeds": []}, "seeds is empty"),
+        ({"protocols": []}, "protocols is empty"),
+        ({"runs": {"NRF": {"method": "nrfgs", "protocols": []}}}, "NRF: protocols is empty"),
+        ({"seeds": [1, 1]}, "twice.*each protocol and seed once"),
+        ({"runs": {"NRF": "nrfgs --x 1"}}, "no single word"),
+        ({"runs": {"NRF": ""}}, "no single word"),
+        ({"options": {"--x": 1}}, "options must be a string or a list"),
+        ({"crops": {"bonsai": ["a"]}}, "crops"),
+        ({"scenes": ["average"]}, "rename it"),
+        ({"scenes": ["/data/bonsai"]}, "no folder below --scenes"),
+        ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
+        ({"scenes": ["."]}, "no folder below --scenes"),
+        ({"protocols": ["mcmc"], "options": "--pipeline.model.densification original"}, "densification is what.*mcmc"),
+        ({"protocols": ["mcmc@9"], "options": "--pipeline.model.splat_budget 5"}, "splat-budget is what.*mcmc@9"),
+        (
+            {"protocols": ["mcmc@9"], "runs": {"N": {"method": "nrfgs", "options": "--pipeline.model.splat-budget=5"}}},
+            "N: --pipeline.model.splat-budget is what.*mcmc@9",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named(content, says):
+    with pytest.raises(InputError, match=says):
+        spec(**content)
+
+
+def test_a_run_as_it_is_may_choose_its_densification():
+    run = {"method": "nrfgs", "options": "--pipeline.model.densification mcmc"}
+    assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}))] == ["own"]
+
+
+def test_a_budget_may_be_an_option_where_the_protocol_names_none():
+    run = {"method": "nrfgs", "options": "--pipeline.model.splat-budget 5"}
+    assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}, protocols=["mcmc"]))] == ["mcmc"]
+    run["options"] = "--pipeline.model.appearance.latent-dim 9"  # the budget's number, but another option's
+    assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}, protocols=["mcmc@9"]))] == ["mcmc@9"]
+
+
+@pytest.mark.parametrize("text", ["runs: [", "just words", None])
+def test_files_that_are_no_mapping_are_named(text, tmp_path):
+    file = tmp_path / "bad.yaml"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(InputError, match="bad.yaml"):
+        load_spec(file)
+
+
+@pytest.mark.parametrize("given, trained", [({}, 10_000), ({"steps": 77}, 77)])
+def test_a_preset_keeps_its_steps(given, trained):
+    """nrfgs-fast at the benchmark's 30,000 steps would be nrfgs under another name."""
+    plan = spec(runs={"fast": {"method": "nrfgs-fast", **given}, "NRF": "nrfgs"}, steps=30_000)
+    assert [steps_of(plan, run) for run in plan.runs] == [trained, 30_000]
+    fast = command(plan, cells_of(plan)[0], [], Path())
+    assert fast[fast.index("--max-num-iterations") + 1] == str(trained)
+
+
+def test_presets_steps_are_those_of_the_presets():
+    own = {one.config.method_name: one.config.max_num_iterations for one in methods()}
+    assert PRESET_STEPS == {name: steps for name, steps in own.items() if steps != own["nrfgs"]}
+
+
+# Commands.
+
+
+@pytest.mark.parametrize(
+    "protocol, densification, budget",
+    [("own", "splatfacto", 10**6), ("original", "original", 10**6), ("mcmc@77", "mcmc", 77)],
+)
+def test_the_command_means_what_the_file_says(protocol, densification, budget, tiny_scene, tmp_path):
+    runs = {"NRF": {"method": "nrfgs", "options": "--pipeline.model.appearance.latent-dim 9"}}
+    more = "--pipeline.model.num-downscales 0"
+    plan = spec(runs=runs, protocols=[protocol], steps=7, seeds=[5], options=more)
+    (cell,) = cells_of(plan)
+    parser = parser_options(tiny_scene.parent, Scene(tiny_scene.name), tmp_path)
+    config = parse(command(plan, cell, parser, tmp_path))
+    model = config.pipeline.model
+    assert (model.densification, model.splat_budget) == (densification, budget)
+    assert (config.max_num_iterations, config.machine.seed, model.num_downscales) == (7, 5, 0)
+    assert model.appearance.latent_dim == 9
+    assert config.pipeline.datamanager.dataparser.data == tiny_scene
+
+
+def ablations() -> list[tuple[str, list[str], int]]:
+    """Name, options and shared weights of each run in the guide's table of ablations."""
+    guide = (ROOT / "docs" / "bench.md").read_text(encoding="utf-8")
+    rows = re.search(r"## Ablations.*?\|---\|---\|---\|\n(.*?)\n\n", guide, re.DOTALL)[1].splitlines()
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    return [(name, options.strip("`").split(), int(count.replace(",", ""))) for name, options, count in cells]
+
+
+def test_ablations_are_what_the_guide_says(tiny_scene, tmp_path):
+    off = {}
+    for name, options, count in ablations():
+        model = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), *options]).pipeline.model
+        head = model.appearance.setup()
+        assert sum(weights.numel() for weights in head.parameters()) == count, name
+        loud = any(layers[-1].weight.any() for layers in (head.low, head.high) if layers is not None)
+        off[name.partition(":")[0]] = (
+            head.high is None,
+            not head.config.opacity_residual,
+            not head.config.use_distance,
+            loud,
+            model.warmup_steps == 0,
+        )
+    assert off == {
+        "the field": (False, False, False, False, False),
+        "no split": (True, False, False, False, False),
+        "no opacity residual": (False, True, False, False, False),
+        "no distance": (False, False, True, False, False),
+        "the paper's start, with its warm-up": (False, False, False, True, False),
+        "the paper's start, no warm-up": (False, False, False, True, True),
+    }
+
+
+def test_fingerprints_ignore_paths_and_see_the_rest():
+    plan = spec(options="--a 1")
+    cell = cells_of(plan)[0]
+    one = identity(plan, cell, ["nrfgs-data", "--data", "/here/bonsai", "--x", "1"])
+    assert "/here" not in json.dumps(one)
+    assert one == identity(plan, cell, ["nrfgs-data", "--data", "/there", "--x", "1"])
+    assert one["options"] == identity(spec(options="--a 1", checkpoint_every=3), cell, None)["options"]
+    assert not differences(one, identity(plan, cell, None)), "without the data their options are not compared"
+    for other in (
+        identity(spec(options="--a 2"), cell, None),
+        identity(spec(options="--a 1", steps=3), cell, None),
+        identity(spec(options="--a 1", train_views=3), cell, None),
+        identity(plan, cell, ["nrfgs-data", "--data", "/here/bonsai", "--x", "2"]),
+    ):
+        assert differences(one, other)
+    assert differences(one, identity(spec(options="--a 2"), cell, None)) == "options: --a 1"
+    # A value that another option has, too, and one that the seed had before.
+    assert differences(one, identity(spec(options="--a 42"), cell, None)) == "options: --a 1"
+    assert differences(one, identity(spec(options="--a 1 --b 1"), cell, None)) == "options: fewer words"
+
+
+# Data sets.
+
+VIEWS = 10
+FOCAL = 60.0
+
+
+def colmap_scene(folder: Path, text: bool, size=(96, 72), model="sparse/0") -> Path:
+    """A COLMAP data set of 10 cameras on a line looking along z, whose numbers run against their names."""
+    rng = np.random.default_rng(0)
+    (folder / "images").mkdir(parents=True)
+    (folder / model).mkdir(parents=True)
+    names = [f"frame_{view:02d}.png" for view in range(VIEWS)]
+    for view, name in enumerate(names):
+        Image.fromarray(np.full((size[1], size[0], 3), 20 * view, np.uint8)).save(folder / "images" / name)
+    poses = [(VIEWS - view, (0.1 * view, 0.05 * view, 3.0 + 0.02 * view**2), names[view]) for view in range(VIEWS)]
+    points = [(i + 1, rng.normal(size=3), rng.integers(0, 255, size=3)) for i in range(20)]
+    camera = (FOCAL, FOCAL, size[0] / 2, size[1] / 2)
+    out = folder / model
+    if text:
+        numbers = " ".join(map(str, camera))
+        (out / "cameras.txt").write_text(f"# cameras\n1 PINHOLE {size[0]} {size[1]} {numbers}\n")
+        lines = [f"{i} 1 0 0 0 {x} {y} {z} 1 {name}\n\n" for i, (x, y, z), name in poses]
+        (out / "images.txt").write_text("# images\n" + "".join(lines))
+        lines = [f"{i} {' '.join(map(str, xyz))} {' '.join(map(str, rgb))} 0.5\n" for i, xyz, rgb in points]
+        (out / "points3D.txt").write_text("# points\n" + "".join(lines))
+        return folder
+    pinhole = 1
+    cameras = struct.pack("<Q", 1) + struct.pack("<iiQQ4d", 1, pinhole, *size, *camera)
+    images = struct.pack("<Q", VIEWS)
+    for i, translation, name in poses:
+        images += struct.pack("<i7di", i, 1.0, 0.0, 0.0, 0.0, *translation, 1) + name.encode() + b"\0"
+        images += struct.pack("<Q", 0)
+    cloud = struct.pack("<Q", len(points))
+    for i, xyz, rgb in points:
+        cloud += struct.pack("<Q3d3Bd", i, *xyz, *(int(value) for value in rgb), 0.5) + struct.pack("<Q", 0)
+    for name, content in (("cameras", cameras), ("images", images), ("points3D", cloud)):
+        (out / f"{name}.bin").write_bytes(content)
+    return folder
+
+
+def load(parser: list[str], method: str = "nrfgs"):
+    """The data manager that ns-train would have, with all its images."""
+    data = parse([method, *parser]).pipeline.datamanager.setup(device="cpu", test_mode="val")
+    data.load_all_images()
+    return data
+
+
+def names_of(dataset) -> list[str]:
+    return sorted(Path(name).name for name in dataset.image_filenames)
+
+
+@pytest.mark.parametrize("text, model", [(True, "sparse/0"), (False, "sparse/0"), (False, "colmap/sparse/0")])
+def test_colmap_is_read_with_every_8th_by_name(text, model, tmp_path):
+    colmap_scene(tmp_path / "data" / "line", text, model=model)
+    before = sorted((tmp_path / "data").rglob("*"))
+    parser = parser_options(tmp_path / "data", Scene("line"), tmp_path / "mirrors")
+    assert parser[0] == "colmap"
+    data = load(parser)
+    assert names_of(data.eval_dataset) == ["frame_00.png", "frame_08.png"]
+    assert names_of(data.train_dataset) == [f"frame_{i:02d}.png" for i in range(10) if i not in (0, 8)]
+    for index, name in enumerate(data.train_dataset.image_filenames):
+        view = int(Path(name).stem[-2:])
+        assert data.cached_train[index]["image"].unique().tolist() == [20 * view], "an image and a pose are mixed up"
+    assert len(data.train_dataset.metadata["points3D_xyz"]) == 20
+    assert data.train_dataset.cameras.fx[0].item() == pytest.approx(FOCAL)
+    assert sorted((tmp_path / "data").rglob("*")) == before, "the data set was written to"
+    parser_options(tmp_path / "data", Scene("line"), tmp_path / "mirrors")  # a second time, over the first
+
+
+@pytest.mark.parametrize(
+    "size, factor, small, mode",
+    [
+        ((96, 72), 2, (48, 36), "floor"),
+        ((99, 73), 4, (25, 18), "round"),
+        ((99, 73), 4, (24, 18), "floor"),
+        ((97, 73), 8, (13, 10), "ceil"),
+    ],
+)
+def test_downscaled_folders_of_any_rounding(size, factor, small, mode, tmp_path):
+    scene = colmap_scene(tmp_path / "data" / "line", text=False, size=size)
+    shutil.copytree(scene / "images", scene / f"images_{factor}")
+    for file in (scene / f"images_{factor}").iterdir():
+        Image.open(file).resize(small).save(file)
+    parser = parser_options(tmp_path / "data", Scene("line", downscale=factor), tmp_path / "mirrors")
+    assert parser[parser.index("--downscale-rounding-mode") + 1] == mode
+    data = load(parser)
+    cameras = data.train_dataset.cameras
+    assert (cameras.width[0].item(), cameras.height[0].item()) == small
+    assert tuple(data.cached_train[0]["image"].shape[:2]) == small[::-1]
+    assert cameras.fx[0].item() == pytest.approx(FOCAL / factor, rel=0.02)
+
+
+def test_a_data_set_of_the_same_name_elsewhere_is_read_there(tmp_path):
+    """--scenes has changed, --work has not: a link to the first place would train on other photographs."""
+    for place in ("first", "second"):
+        colmap_scene(tmp_path / place / "line", text=False)
+        parser = parser_options(tmp_path / place, Scene("line"), tmp_path / "mirrors")
+        mirror = Path(parser[parser.index("--data") + 1])
+        assert (mirror / "images").resolve() == (tmp_path / place / "line" / "images").resolve()
+    assert sorted(entry.name for entry in mirror.iterdir()) == [
+        *("images", "sparse", "test_list.txt", "train_list.txt", "val_list.txt")
+    ]
+
+
+def test_what_is_no_image_is_not_measured(tmp_path):
+    """A file that a desktop leaves in a folder sorts before the photographs."""
+    scene = colmap_scene(tmp_path / "line", text=False)
+    shutil.copytree(scene / "images", scene / "images_2")
+    for file in (scene / "images_2").iterdir():
+        Image.open(file).resize((48, 36)).save(file)
+    (scene / "images" / ".DS_Store").write_text("no image")
+    parser = parser_options(tmp_path, Scene("line", downscale=2), tmp_path / "mirrors")
+    assert parser[parser.index("--downscale-rounding-mode") + 1] == "floor"
+
+
+def test_dl3dv_is_read_from_the_downscaled_images_alone(tmp_path):
+    """Its transforms.json names images of full size, whose sizes it gives, and which the download lacks."""
+    folder = tmp_path / "hash" / "nerfstudio"
+    (folder / "images_4").mkdir(parents=True)
+    frames = []
+    for view in range(VIEWS):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.1 * view, 0.05 * view, 0.02 * view**2
+        name = f"frame_{view:05d}.png"
+        Image.new("RGB", (24, 18), (20 * view,) * 3).save(folder / "images_4" / name)
+        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
+    sizes = {"w": 96, "h": 72, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 48.0, "cy": 36.0, "camera_model": "OPENCV"}
+    (folder / "transforms.json").write_text(json.dumps({**sizes, "frames": frames}))
+    data = load(parser_options(tmp_path, Scene("hash/nerfstudio", downscale=4), tmp_path / "mirrors"))
+    assert names_of(data.eval_dataset) == ["frame_00000.png", "frame_00008.png"]
+    cameras = data.train_dataset.cameras
+    assert (cameras.width[0].item(), cameras.height[0].item(), cameras.fx[0].item()) == (24, 18, FOCAL / 4)
+
+
+def test_nerfstudios_layout_is_read_by_our_parser(tiny_scene, tmp_path):
+    parser = parser_options(tiny_scene.parent, Scene(tiny_scene.name), tmp_path)
+    assert parser == ["nrfgs-data", "--data", str(tiny_scene)]
+    data = load(parser)
+    assert names_of(data.eval_dataset) == ["view_000.png", "view_008.png"]
+    assert torch.isfinite(data.train_dataset.cameras.camera_to_worlds).all()
+
+
+def test_nerfstudios_layout_without_a_split_has_every_8th_by_name(tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "plain")
+    file = tmp_path / "plain" / "transforms.json"
+    meta = json.loads(file.read_text())
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        del meta[key]
+    meta["frames"].reverse()
+    file.write_text(json.dumps(meta))
+    parser = parser_options(tmp_path, Scene("plain"), tmp_path / "mirrors")
+    assert parser == ["nrfgs-data", "--data", str(tmp_path / "plain"), "--eval-mode", "interval"]
+    data = load(parser)
+    assert names_of(data.eval_dataset) == ["view_000.png", "view_008.png"]
+
+
+def test_both_layouts_of_a_capture_have_the_same_test_images(captures, tmp_path):
+    meta = json.loads((captures / "fox" / "transforms.json").read_text())
+    assert parser_options(captures, Scene("fox"), tmp_path)[0] == "nrfgs-data"
+    (tmp_path / "data" / "fox").mkdir(parents=True)
+    for part in ("images", "sparse"):
+        (tmp_path / "data" / "fox" / part).symlink_to(captures / "fox" / part)
+    parser_options(tmp_path / "data", Scene("fox"), tmp_path / "mirrors")
+    listed = (tmp_path / "mirrors" / "fox" / "test_list.txt").read_text().split()
+    assert sorted(Path(name).name for name in meta["test_filenames"]) == listed
+
+
+@pytest.mark.parametrize(
+    "prepare, scene, says",
+    [
+        (lambda folder: folder.mkdir(parents=True), Scene("line"), "neither transforms.json nor"),
+        (lambda folder: colmap_scene(folder, True), Scene("line", downscale=4), "images_4 is missing"),
+        (lambda folder: wrong_size(colmap_scene(folder, True)), Scene("line", downscale=4), "however rounded"),
+        (lambda folder: torn(colmap_scene(folder, False), None), Scene("line"), "images.bin cannot be read"),
+        (lambda folder: torn(colmap_scene(folder, False), b"abc"), Scene("line"), "images.bin cannot be read"),
+    ],
+)
+def test_data_that_cannot_be_read_are_named(prepare, scene, says, tmp_path):
+    prepare(tmp_path / "line")
+    with pytest.raises(InputError, match=says):
+        parser_options(tmp_path, scene, tmp_path / "mirrors")
+
+
+def wrong_size(folder: Path) -> None:
+    (folder / "images_4").mkdir()
+    Image.new("RGB", (50, 20)).save(folder / "images_4" / "frame_00.png")
+
+
+def torn(folder: Path, content: bytes | None) -> None:
+    """Leave this of the list of images, or nothing."""
+    file = folder / "sparse/0/images.bin"
+    file.unlink()
+    if content is not None:
+        file.write_bytes(content)

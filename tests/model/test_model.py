@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model on the CPU: what it renders, crops, masks, and how it starts."""
+
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.models.splatfacto import SplatfactoModel
+from PIL import Image
+from pytorch_msssim import SSIM
+from torch.testing import assert_close
+
+from nrfgs_ns.model.model import NrfgsModel
+from nrfgs_ns.model.pinhole import pinhole, world_to_camera
+from nrfgs_ns.training.run import parse
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+
+@pytest.fixture
+def build(tiny_scene, tmp_path):
+    def pipeline(method="nrfgs", *options, data=tiny_scene):
+        config = parse([method, "--data", str(data), "--output-dir", str(tmp_path / "out"), *map(str, options)])
+        torch.manual_seed(0)
+        return config.pipeline.setup(device="cpu", test_mode="val")
+
+    return pipeline
+
+
+def begin_step(model, step: int) -> None:
+    """What the trainer does before a step."""
+    model.step_cb(Optimizers({}, {}), step)
+
+
+def first_view(pipeline):
+    return pipeline.datamanager.fixed_indices_eval_dataloader[0]
+
+
+def test_outputs_are_images(build):
+    pipeline = build()
+    pipeline.eval()
+    outputs = pipeline.model.get_outputs_for_camera(first_view(pipeline)[0])
+    # The viewer and ns-render show every output, and cannot show None.
+    assert {name: tuple(value.shape) for name, value in outputs.items()} == {
+        "rgb": (36, 48, 3),
+        "accumulation": (36, 48, 1),
+        "background": (36, 48, 3),
+        "depth": (36, 48, 1),
+    }
+    assert all(torch.isfinite(value).all() for value in outputs.values())
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_background_shows_where_splats_let_it(build, training):
+    """Over a colour: what black gives, and the colour times what is not covered. Three roundings of terms below 1."""
+    model = build().model.train(training)
+    pose = torch.eye(3, 4)[None] + torch.tensor([0.0, 0.0, 0.0, 1.0])
+    view = model.look(Cameras(pose, fx=40.0, fy=40.0, cx=24.0, cy=18.0, width=48, height=36))
+    appearance = model.head(view.splats, view.visible, view.center)
+    color = torch.tensor([0.9, 0.5, 0.1])
+    black, over = (model.paint(view, appearance, behind)[0] for behind in (torch.zeros(3), color))
+    assert 0.01 < over["accumulation"].mean() < 0.99
+    expected = (black["rgb"] + (1 - over["accumulation"]) * color).clamp(0, 1)
+    assert_close(over["rgb"], expected, rtol=0, atol=3 * 2.0**-23)
+
+
+def test_densification_over_asks_for_no_more_gradients(build):
+    """Gradients on the screen are kept until the last refinement, and no longer."""
+    pipeline = build("nrfgs", "--pipeline.model.stop-split-at", 5, "--pipeline.model.use-absgrad", True)
+    model = pipeline.model.train()
+    camera, batch = pipeline.datamanager.next_train(0)
+    for step in (4, 5):
+        begin_step(model, step)
+        outputs = model.get_outputs(camera)
+        sum(model.get_loss_dict(outputs, batch).values()).backward()
+        means2d = model.info["means2d"]
+        assert means2d.retains_grad == hasattr(means2d, "absgrad") == (step < 5)
+
+
+def test_a_field_that_adds_nothing_renders_its_base_colour(build):
+    pipeline = build()
+    pipeline.eval()
+    camera, _ = first_view(pipeline)
+    model = pipeline.model
+    assert torch.equal(model.get_base_color(camera), model.get_outputs_for_camera(camera)["rgb"])
+    torch.nn.init.normal_(model.head.low[-1].weight)
+    assert not torch.allclose(model.get_base_color(camera), model.get_outputs_for_camera(camera)["rgb"], atol=0.01)
+
+
+def test_the_head_sees_only_what_the_camera_sees(build, monkeypatch):
+    pipeline = build()
+    model = pipeline.model
+    model.eval()
+    asked = []
+    forward = model.head.forward
+    monkeypatch.setattr(
+        model.head,
+        "forward",
+        lambda splats, visible, centers: asked.append(visible) or forward(splats, visible, centers),
+    )
+    camera, _ = first_view(pipeline)
+    model.get_outputs_for_camera(camera)
+    to_camera = world_to_camera(camera.camera_to_worlds)[0]
+    z = model.means.detach() @ to_camera[2, :3] + to_camera[2, 3]
+    (visible,) = asked
+    assert 0 < len(visible) < model.num_points
+    assert (z[visible] >= 0.01).all()
+
+
+def test_crop_keeps_what_is_inside(build):
+    pipeline = build()
+    pipeline.eval()
+    model, (camera, _) = pipeline.model, first_view(pipeline)
+    centre = model.means.detach().mean(dim=0)
+    size = model.means.detach().std(dim=0)
+    everything = OrientedBox.from_params(tuple(centre.tolist()), (0.0, 0.0, 0.0), (1e3, 1e3, 1e3))
+    some = OrientedBox.from_params(tuple(centre.tolist()), (0.0, 0.0, 0.0), tuple(size.tolist()))
+    nothing = OrientedBox.from_params((1e3, 1e3, 1e3), (0.0, 0.0, 0.0), (1e-3, 1e-3, 1e-3))
+    whole = model.get_outputs_for_camera(camera)
+    assert torch.equal(model.get_outputs_for_camera(camera, obb_box=everything)["rgb"], whole["rgb"])
+    part = model.get_outputs_for_camera(camera, obb_box=some)
+    assert 0 < part["accumulation"].sum() < whole["accumulation"].sum()
+    # By hand: the same model with the splats outside taken away.
+    inside = some.within(model.means).reshape(-1)
+    for name, value in model.gauss_params.items():
+        model.gauss_params[name] = torch.nn.Parameter(value[inside])
+    assert_close(part["rgb"], model.get_outputs_for_camera(camera)["rgb"])
+    empty = model.get_outputs_for_camera(camera, obb_box=nothing)
+    assert empty["accumulation"].abs().max() == 0
+    assert torch.equal(empty["rgb"], empty["background"])
+
+
+@pytest.fixture
+def masked_scene(tiny_scene, tmp_path):
+    """The tiny scene with the left third of every image masked out and painted over in white."""
+    scene = shutil.copytree(tiny_scene, tmp_path / "masked")
+    meta = json.loads((scene / "transforms.json").read_text())
+    (scene / "masks").mkdir()
+    for frame in meta["frames"]:
+        image = np.array(Image.open(scene / frame["file_path"]))
+        mask = np.full(image.shape[:2], 255, np.uint8)
+        mask[:, :16], image[:, :16] = 0, 255
+        frame["mask_path"] = f"masks/{frame['file_path'].split('/')[-1]}"
+        Image.fromarray(mask).save(scene / frame["mask_path"])
+        Image.fromarray(image).save(scene / frame["file_path"])
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    return scene
+
+
+def test_metrics_count_only_what_is_inside_the_mask(build, masked_scene, tiny_scene):
+    masked, plain = build(data=masked_scene), build(data=tiny_scene)
+    for pipeline in (masked, plain):
+        pipeline.eval()
+    camera, batch = first_view(masked)
+    outputs = masked.model.get_outputs_for_camera(camera)
+    metrics, _ = masked.model.get_image_metrics_and_images(outputs, batch)
+    truth = first_view(plain)[1]["image"].float() / 255
+    inside = (outputs["rgb"] - truth)[:, 16:]
+    assert metrics["psnr"] == pytest.approx(-10 * math.log10(inside.square().mean()), abs=1e-3)
+    assert metrics["l1"] == pytest.approx(inside.abs().mean().item(), abs=1e-5)
+    assert masked.model.get_metrics_dict(outputs, batch)["psnr"].item() == pytest.approx(metrics["psnr"], abs=1e-3)
+
+
+def test_loss_counts_only_what_is_inside_the_mask(build, masked_scene):
+    pipeline = build(data=masked_scene)
+    begin_step(pipeline.model, 10**6)  # at full resolution
+    camera, batch = pipeline.datamanager.next_train(0)
+    outputs = pipeline.model(camera)
+    loss = pipeline.model.get_loss_dict(outputs, batch)["main_loss"]
+    outputs["rgb"] = outputs["rgb"].detach().clone()
+    outputs["rgb"][:, :16] = 0.123
+    assert_close(pipeline.model.get_loss_dict(outputs, batch)["main_loss"], loss.detach())
+
+
+def test_training_resolution_follows_the_schedule(build):
+    pipeline = build()
+    for step, size in ((0, (9, 12)), (3000, (18, 24)), (6000, (36, 48))):
+        begin_step(pipeline.model, step)
+        camera, batch = pipeline.datamanager.next_train(step)
+        outputs = pipeline.model(camera)
+        assert tuple(outputs["rgb"].shape[:2]) == size
+        assert torch.isfinite(pipeline.model.get_loss_dict(outputs, batch)["main_loss"])
+
+
+def test_intrinsics_shrink_with_the_image():
+    camera = Cameras(torch.eye(4)[None, :3], fx=100.0, fy=90.0, cx=50.0, cy=31.0, width=101, height=63)[0:1]
+    seen_from = pinhole(camera, camera.camera_to_worlds, 2)
+    assert (seen_from.width, seen_from.height) == (50, 31)
+    assert_close(seen_from.K[0], torch.tensor([[50.0, 0, 25], [0, 45, 15.5], [0, 0, 1]]))
+
+
+def test_world_to_camera_inverts_the_pose_and_flips_y_and_z():
+    rotation = torch.linalg.qr(torch.randn(3, 3))[0]
+    pose = torch.cat([rotation, torch.randn(3, 1)], dim=1)[None]
+    matrix = world_to_camera(pose)[0]
+    ahead = pose[0, :, 3] - 2 * rotation[:, 2]  # nerfstudio looks along -z
+    assert_close(matrix @ torch.cat([ahead, torch.ones(1)]), torch.tensor([0.0, 0, 2, 1]), atol=1e-5, rtol=0)
+    above = pose[0, :, 3] + rotation[:, 1]
+    assert_close(matrix @ torch.cat([above, torch.ones(1)]), torch.tensor([0.0, -1, 0, 1]), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_few_or_duplicate_points_start_finite(build, count):
+    """Splatfacto asks for three neighbours and takes the logarithm of their distance."""
+    pipeline = build()
+    model = pipeline.model
+    model.seed_points = (torch.zeros(count, 3), torch.full((count, 3), 100, dtype=torch.uint8))
+    splats = model._initial_splats()
+    assert all(len(value) == count and torch.isfinite(value).all() for value in splats.values())
+
+
+def test_random_start(build):
+    pipeline = build("nrfgs", "--pipeline.model.random-init", True, "--pipeline.model.num-random", 123)
+    assert pipeline.model.num_points == 123
+
+
+@pytest.mark.parametrize("mode", ["antialiased", "classic"])
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+def test_gradients_reach_every_parameter(build, method, mode):
+    pipeline = build(method, "--pipeline.model.rasterize-mode", mode)
+    model = pipeline.model
+    begin_step(model, 10**6)
+    if method == "nrfgs":  # zero output layers would let nothing through to the layers before them
+        for branch in (model.head.low, model.head.high):
+            torch.nn.init.normal_(branch[-1].weight, std=0.1)
+    camera, batch = pipeline.datamanager.next_train(0)
+    sum(model.get_loss_dict(model(camera), batch).values()).backward()
+    for name, parameter in [*model.gauss_params.items(), *model.head.named_parameters()]:
+        assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+        assert torch.isfinite(parameter.grad).all(), name
+
+
+@pytest.mark.parametrize("regularised", [False, True])
+@pytest.mark.parametrize("masked", [False, True])
+def test_losses_are_splatfactos(build, masked, regularised):
+    """Value and gradient of the sum; nerfstudio's own code, given its own SSIM, is the twin."""
+    pipeline = build("nrfgs-sh", "--pipeline.model.use-scale-regularization", str(regularised))
+    pipeline.model.config.num_downscales = 0
+    model = pipeline.model
+    model.gauss_params["scales"].data[:50, 0] += 4.0  # beyond the ratio that is let through
+    camera, batch = pipeline.datamanager.next_train(0)
+    if masked:
+        batch["mask"] = torch.rand(*batch["image"].shape[:2], 1) > 0.3
+    model.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+    results = []
+    for losses_of in (NrfgsModel.get_loss_dict, SplatfactoModel.get_loss_dict):
+        model.zero_grad()
+        torch.manual_seed(0)  # the random background
+        loss = sum(losses_of(model, model(camera), batch).values())
+        loss.backward()
+        results.append((loss.detach(), {name: value.grad for name, value in model.gauss_params.items()}))
+    (loss, gradients), (expected, expected_gradients) = results
+    # SSIM divides by variances that vanish in flat places: rounding at 2^-24 is amplified by up to 1 / C2 = 1,100.
+    assert_close(loss, expected, rtol=0, atol=1e-4)
+    for name, gradient in gradients.items():
+        error = (gradient - expected_gradients[name]).norm() / expected_gradients[name].norm()
+        assert error < 1e-3, (name, error)

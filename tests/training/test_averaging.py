@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mean over a training's last steps: of which steps it is, when it begins anew, and that it resumes to the bit."""
+
+import shutil
+from types import SimpleNamespace
+
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.utils.rich_utils import CONSOLE
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+from torch.testing import assert_close
+
+from nrfgs_ns.densification import relocation
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.averaging import ParameterMean
+from nrfgs_ns.training.guard import TrainingStopped, remove_splats
+from nrfgs_ns.training.pace import Pace, TimedPace
+from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer import NrfgsTrainer
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+CALM = {
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.refine-every": 1000,
+    "--pipeline.model.warmup-steps": 0,
+}
+"""Nothing but the optimisers changes parameters, after the reset of opacity at step 0."""
+RESET = {"--pipeline.model.refine-every": 2, "--pipeline.model.reset-alpha-every": 4}
+"""Opacity is reset at steps 0 and 8. Splats neither come nor go: they wait for longer than that after a reset."""
+
+
+def set_up(scene, out, *more: dict, steps: int = 10) -> NrfgsTrainer:
+    """A trainer that has not begun."""
+    trainer = parse(command_line("nrfgs", scene, out, steps, CALM, *more)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def ready(tiny_scene, tmp_path_factory) -> NrfgsTrainer:
+    """A trainer before its first step, whose optimisers have made one."""
+    trainer = set_up(tiny_scene, tmp_path_factory.mktemp("ready"), {"--average-steps": 4})
+    a_step(trainer.pipeline.model, trainer.pipeline.datamanager, trainer.optimizers)
+    return trainer
+
+
+@pytest.fixture
+def trainer(ready) -> NrfgsTrainer:
+    """The same one with an empty mean and without a pace."""
+    ready.pipeline.parameter_mean.forget()
+    ready.pace, ready._start_step, ready.stop_training = None, 0, False
+    ready.config.average_steps, ready.config.max_num_iterations = 4, 10
+    return ready
+
+
+def little_training(*values: float):
+    """Something like a model and its optimisers, whose one parameter has two numbers."""
+    parameter = torch.nn.Parameter(torch.tensor(values))
+    return parameter, SimpleNamespace(densification=SimpleNamespace(state={})), {"means": torch.optim.Adam([parameter])}
+
+
+def test_mean_of_known_numbers():
+    parameter, model, optimizers = little_training(0.0, 0.0)
+    mean = ParameterMean()
+    mean.install()
+    assert parameter.tolist() == [0.0, 0.0]  # there is none yet
+    for numbers in ([1.0, 3e38], [2.0, 3e38], [6.0, 3e38]):  # whose sum float32 does not hold
+        parameter.data.copy_(torch.tensor(numbers))
+        mean.add(model, optimizers)
+    assert mean.count == 3 and parameter.tolist() == [6.0, torch.tensor(3e38).item()]
+    mean.install()
+    # Three roundings of numbers up to 6, and of numbers up to 3e38.
+    assert_close(parameter.detach(), torch.tensor([3.0, 3e38]), rtol=1e-6, atol=0.0)
+    assert mean.count == 0
+
+
+def relocated(model, data, optimizers):
+    dead = torch.arange(len(model.means)) < 3
+    relocation.relocate(model.gauss_params, optimizers.optimizers, dead, 0.005)
+
+
+def reset(model, data, optimizers):
+    from gsplat.strategy.ops import reset_opa
+
+    reset_opa(model.gauss_params, optimizers.optimizers, {}, 0.2)
+
+
+def removed(model, data, optimizers):
+    remove_splats(model, optimizers.optimizers, torch.arange(len(model.means)) < 1)
+
+
+def another_field(model, data, optimizers):
+    model.gauss_params["latents"] = torch.nn.Parameter(model.gauss_params["latents"].detach().clone())
+    optimizers.hold("latents", [model.gauss_params["latents"]])
+
+
+def noise(model, data, optimizers):
+    relocation.diffuse(model.gauss_params, 1.0, torch.zeros(len(model.means)))
+
+
+def a_step(model, data, optimizers):
+    for parameter in model.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    optimizers.optimizer_step_all()
+
+
+@pytest.mark.parametrize(
+    "change, anew",
+    [(relocated, True), (reset, True), (removed, True), (noise, False), (a_step, False), (another_field, True)],
+)
+def test_what_gives_rows_another_meaning_begins_anew(change, anew, trainer):
+    """The real changes on a real model."""
+    model, mean = trainer.pipeline.model, ParameterMean()
+    for _ in range(2):
+        mean.add(model, trainer.optimizers.optimizers)
+    change(model, trainer.pipeline.datamanager, trainer.optimizers)
+    mean.add(model, trainer.optimizers.optimizers)
+    assert (mean.count, mean.began_anew) == ((1, True) if anew else (3, False))
+    if anew:  # nothing of the earlier rows is left in it
+        now = {name: value.detach().clone() for name, value in model.gauss_params.items()}
+        mean.install()
+        assert_close(dict(model.gauss_params.items()), now, rtol=0, atol=0, check_stride=False)
+
+
+def counts(trainer: NrfgsTrainer, steps: range) -> list[int]:
+    """How many steps are in the mean after each of these."""
+    found = []
+    for step in steps:
+        trainer._average(step)
+        found.append(trainer.pipeline.parameter_mean.count)
+    return found
+
+
+@pytest.mark.parametrize("pace", [None, Pace(40, rate=4.0)])
+def test_the_window_of_a_training_with_known_length(pace, trainer):
+    trainer.pace = pace
+    assert counts(trainer, range(10)) == [0, 0, 0, 0, 0, 0, 1, 2, 3, 4]
+    trainer.pipeline.parameter_mean.forget()
+    trainer.config.average_steps = 100
+    assert counts(trainer, range(10)) == list(range(1, 11))  # all that there are
+
+
+def test_the_window_of_a_training_that_goes_on(trainer):
+    """Interrupted after step 7 of 10. Ten steps more instead of two: the last is 17, and what was in the mean is old.
+    Three more instead of two: the window is 7 to 10, and the mean of 6 and 7 is not of that window."""
+    for more, expected in ((10, [0] * 6 + [1, 2, 3, 4]), (3, [1, 2, 3]), (2, [3, 4])):
+        trainer.pipeline.parameter_mean.forget()
+        trainer._start_step, trainer.config.max_num_iterations = 0, 10
+        assert counts(trainer, range(8))[-1] == 2
+        trainer._start_step, trainer.config.max_num_iterations = 8, more
+        assert counts(trainer, range(8, 8 + more)) == expected
+
+
+def walk(trainer, budget: float, length: int, window: int, cost) -> list[int]:
+    """The counts of a timed training whose step s takes cost(s) seconds."""
+    now = [0.0]
+    pace = trainer.pace = TimedPace(length, budget, clock=lambda: now[0])
+    trainer.config.average_steps = window
+    pace.start()
+    found = []
+    while not pace.is_spent:
+        pace.begin_step()
+        now[0] += cost(len(found))
+        pace.advance()
+        found += counts(trainer, range(len(found), len(found) + 1))
+    return found
+
+
+def test_the_window_of_a_timed_training(trainer):
+    """At a constant pace it has as many steps as were asked for, but for one: the pace's last position is the last
+    step's. At a changing pace it has about as many, and none is left out once it has begun."""
+    even = walk(trainer, 300.0, 3000, 40, lambda step: 1.0)
+    assert len(even) == 300 and abs(even[-1] - 40) <= 1
+    trainer.pipeline.parameter_mean.forget()
+    uneven = walk(trainer, 300.0, 3000, 40, lambda step: 1.0 if step < 262 else 0.5)
+    begun = uneven.index(1)
+    assert uneven[begun:] == list(range(1, len(uneven) - begun + 1)) and 60 < uneven[-1] < 80
+
+
+def test_a_timed_window_that_begins_much_too_early_is_given_up(trainer):
+    """In its first ten steps a training has not planned yet, and thinks that it ends when its schedules do."""
+    found = walk(trainer, 300.0, 40, 35, lambda step: 1.0)
+    assert 0 < found[9] and 0 in found[9:20]
+    assert abs(found[-1] - 35) <= 1
+
+
+@pytest.fixture(scope="module")
+def averaged(tiny_scene, tmp_path_factory):
+    """Trainings of 12 steps that average over the last 6, with their parameters after each step, what they have said,
+    and the checkpoint of step 7."""
+    done = {}
+
+    def train(name: str, *more: dict):
+        if name in done:
+            return done[name]
+        out, after = tmp_path_factory.mktemp("averaged"), {}
+        with pytest.MonkeyPatch.context() as patch, CONSOLE.capture() as log:
+            original, average = NrfgsTrainer._write_checkpoint, NrfgsTrainer._average
+
+            def keep(trainer, step):
+                original(trainer, step)
+                if step == 7:
+                    shutil.copytree(trainer.checkpoint_dir, out / "kept")
+
+            def note(trainer, step):
+                average(trainer, step)
+                after[step] = {
+                    name: value.clone()
+                    for name, value in trainer.pipeline.model.state_dict().items()
+                    if isinstance(value, torch.Tensor)
+                }
+
+            patch.setattr(NrfgsTrainer, "_write_checkpoint", keep)
+            patch.setattr(NrfgsTrainer, "_average", note)
+            windows = {"--average-steps": 6, "--steps-per-save": 7}
+            config = trained(command_line("nrfgs", tiny_scene, out, 12, CALM, windows, *more))
+        done[name] = SimpleNamespace(config=config, after=after, kept=out / "kept", said=log.get())
+        return done[name]
+
+    return train
+
+
+def mean_after(after: dict, steps: range) -> dict:
+    """The hand-made mean, in float64."""
+    return {
+        f"_model.{name}": torch.stack([after[step][name].double() for step in steps]).mean(dim=0) for name in after[0]
+    }
+
+
+def test_the_trained_model_is_the_mean(averaged):
+    """Parameters are up to 10; six float32 roundings of that, 6 * 10 * 6e-8."""
+    training = averaged("calm")
+    saved = checkpoint_of(training.config)["pipeline"]
+    expected = mean_after(training.after, range(6, 12))
+    assert_close({name: saved[name].double() for name in expected}, expected, rtol=0, atol=4e-6)
+    assert (saved["_model.gauss_params.means"] - training.after[11]["gauss_params.means"]).abs().max() > 1e-5
+    assert "parameter_mean" not in saved["_extra_state"]
+    assert "over the last 6 steps." in training.said
+
+    _, pipeline, _, _ = eval_setup(training.config)
+    trained_psnr = pipeline.get_average_eval_image_metrics()["psnr"]
+
+    def psnr_with(state: dict) -> float:
+        values = {name.removeprefix("_model."): value.float() for name, value in state.items()}
+        pipeline.model.load_state_dict({**pipeline.model.state_dict(), **values})
+        return pipeline.get_average_eval_image_metrics()["psnr"]
+
+    assert trained_psnr == pytest.approx(psnr_with(expected), abs=1e-3)
+    assert abs(trained_psnr - psnr_with(training.after[11])) > 1e-2
+
+
+def test_splats_that_change_cut_the_window_short(averaged):
+    training = averaged("reset", RESET)
+    saved = checkpoint_of(training.config)["pipeline"]
+    expected = mean_after(training.after, range(8, 12))
+    assert_close({name: saved[name].double() for name in expected}, expected, rtol=0, atol=4e-6)
+    assert "over the last 4 steps, not 6" in training.said
+
+
+@pytest.mark.parametrize("name, more", [("calm", {}), ("reset", RESET)])
+def test_a_mean_continues_to_the_bit(name, more, averaged, tiny_scene, tmp_path):
+    """From the middle of the window; and where opacity is reset in the first step that is made then."""
+    training = averaged(name, more)
+    (path,) = training.kept.glob("*.ckpt")
+    state = torch.load(path, weights_only=True)["pipeline"]["_extra_state"]["parameter_mean"]
+    assert state["count"] == 2  # steps 6 and 7
+    words = {"--average-steps": 6, "--load-dir": training.kept}
+    rest = trained(command_line("nrfgs", tiny_scene, tmp_path, 4, CALM, words, more))
+    one, other = checkpoint_of(training.config), checkpoint_of(rest)
+    assert one["step"] == 11
+    assert_same_training(one, other, rtol=0, atol=0)
+
+
+def test_checkpoints_with_and_without_a_mean_load(averaged, tiny_scene, tmp_path):
+    """In an evaluation, and in a training that does not average; and one without, where it does."""
+    training = averaged("calm")
+
+    def from_the_window(config):
+        config.relative_model_dir = training.kept
+        return config
+
+    _, pipeline, _, step = eval_setup(training.config, update_config_callback=from_the_window)
+    assert step == 7
+    assert_close(pipeline.model.means.detach(), training.after[7]["gauss_params.means"], rtol=0, atol=0)
+    loaded = set_up(tiny_scene, tmp_path, {"--load-dir": training.kept})
+    assert loaded._start_step == 8 and loaded.pipeline.parameter_mean is loaded.pipeline.loaded_mean is None
+    loaded = set_up(tiny_scene, tmp_path, {"--load-dir": models_of(training.config), "--average-steps": 6})
+    assert loaded._start_step == 12 and loaded.pipeline.parameter_mean.count == 0
+
+
+def test_averaging_changes_no_step(averaged, tiny_scene, tmp_path):
+    """A training without it ends where one with it was before the mean took its place, moments included, and its
+    checkpoint has nothing more than before."""
+    training = averaged("calm")
+    plain = checkpoint_of(trained(command_line("nrfgs", tiny_scene, tmp_path, 12, CALM)))
+    last = {f"_model.{name}": value for name, value in training.after[11].items()}
+    assert_close({name: plain["pipeline"][name] for name in last}, last, rtol=0, atol=0)
+    with_it = checkpoint_of(training.config)
+    with_it["pipeline"] = plain["pipeline"]
+    assert_same_training(plain, with_it, rtol=0, atol=0)
+    assert set(plain["pipeline"]["_extra_state"]) == {"torch_rng", "cuda_rng", "python_rng", "sampling"}
+
+
+class Seconds(TimedPace):
+    """A clock on which each step takes a second."""
+
+    def __init__(self, *args):
+        self.now = 0.0
+        super().__init__(*args, clock=lambda: self.now)
+
+    def advance(self):
+        self.now += 1.0
+        super().advance()
+
+
+def test_a_timed_training_is_averaged(tiny_scene, tmp_path, monkeypatch):
+    """20 steps, of which the pace sees one less to come than there is: its last position is the last step's. Going on
+    from there is over at once, has nothing to average and says so."""
+    monkeypatch.setattr("nrfgs_ns.training.trainer.TimedPace", Seconds)
+    timed = {"--average-steps": 5, "--time-budget": 20.0 / 60.0}
+    with CONSOLE.capture() as log:
+        config = trained(command_line("nrfgs", tiny_scene, tmp_path / "a", 400, CALM, timed))
+    assert checkpoint_of(config)["step"] == 19 and "over the last 6 steps." in log.get()
+    again = {"--load-dir": models_of(config)}
+    with CONSOLE.capture() as log:
+        rest = trained(command_line("nrfgs", tiny_scene, tmp_path / "b", 400, CALM, timed, again))
+    assert "nothing was averaged: no step was made" in log.get()
+    assert_same_training(checkpoint_of(config), checkpoint_of(rest), rtol=0, atol=0)
+
+
+def test_what_ends_early_stays_the_last_steps(trainer, monkeypatch):
+    """Stopped from outside, timed out before its window, or condemned in its last step."""
+    mean, means = trainer.pipeline.parameter_mean, trainer.pipeline.model.means
+    monkeypatch.setattr("nrfgs_ns.training.trainer.Trainer._after_train", lambda trainer: None)
+
+    def end() -> str:
+        before = means.detach().clone()
+        with CONSOLE.capture() as log:
+            trainer._after_train()
+        assert_close(means.detach(), before, rtol=0, atol=0)
+        return log.get()
+
+    counts(trainer, range(8))
+    with torch.no_grad():
+        trainer.pipeline.model.means.add_(1.0)
+    means, trainer.stop_training = trainer.pipeline.model.means, True
+    assert "stopped before its last step" in end() and mean.count == 2
+    trainer.stop_training = False
+
+    def condemned():
+        raise TrainingStopped("a number", 9, savable=False)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer.guard, "settle", condemned)
+        with pytest.raises(TrainingStopped):
+            end()
+    assert mean.count == 2
+    mean.forget()
+    trainer.pace, trainer.step = TimedPace(100, 0.0, clock=lambda: 1.0), 3
+    assert "sooner than foreseen" in end()
+
+
+def test_what_cannot_be_averaged_is_refused(tiny_scene, tmp_path):
+    def config(value):
+        return parse(command_line("nrfgs", tiny_scene, tmp_path, 5, {"--average-steps": value}))
+
+    with pytest.raises(InputError, match="average_steps is -1"):
+        config(-1).setup(local_rank=0, world_size=1)

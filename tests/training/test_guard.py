@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The guard: what stops a training, what is said, and what is left on disk."""
+
+import math
+
+import pytest
+import torch
+from short_trainings import command_line
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.guard import MAX_GRADIENT, PARAMETERS_EVERY, TrainingStopped
+from nrfgs_ns.training.run import _set_random_seed, parse
+
+
+@pytest.fixture(autouse=True)
+def device(request):
+    """CUDA is out of reach, but for the test that is about it."""
+    if request.node.get_closest_marker("gpu") is None:
+        request.getfixturevalue("no_cuda")
+
+
+NAN, INF = math.nan, math.inf
+FULL_SIZE = {"--pipeline.model.num-downscales": 0}
+
+
+@pytest.fixture
+def start(tiny_scene, tmp_path):
+    """A trainer that is ready for its first step; `fused` makes its CPU optimisers skip like those on a GPU."""
+
+    def trainer(*more: dict, steps: int = 10, fused: bool = False):
+        config = parse(command_line("nrfgs", tiny_scene, tmp_path, steps, FULL_SIZE, *more))
+        _set_random_seed(config.machine.seed)
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        if fused:
+            for optimizer in trainer.optimizers.optimizers.values():
+                for group in optimizer.param_groups:
+                    group["fused"], group["foreach"] = True, False
+            assert trainer.optimizers.all_fused
+        return trainer
+
+    return trainer
+
+
+def poison(trainer, at: int, name: str, value: float, row: int = 7) -> None:
+    """Put a value into the gradient of a per-splat tensor, or into the loss if the name is "loss", at one step."""
+    model, original = trainer.pipeline.model, trainer.pipeline.get_train_loss_dict
+
+    def spoilt(step):
+        outputs, losses, metrics = original(step=step)
+        if step == at and name == "loss":
+            losses["main_loss"] = losses["main_loss"] * value
+            model.watched["loss main_loss"] = losses["main_loss"].detach()
+        elif step == at:
+            hit = torch.zeros_like(model.gauss_params[name])
+            hit[row] = value
+            # Adds 0 to the loss and `hit` to the gradient.
+            losses["main_loss"] = losses["main_loss"] + _Plant.apply(model.gauss_params[name], hit)
+        return outputs, losses, metrics
+
+    trainer.pipeline.get_train_loss_dict = spoilt
+
+
+class _Plant(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, parameter, gradient):
+        ctx.save_for_backward(gradient)
+        return parameter.new_zeros(())
+
+    @staticmethod
+    def backward(ctx, grad):
+        return ctx.saved_tensors[0], None
+
+
+def checkpoints(trainer) -> dict[int, dict]:
+    files = trainer.checkpoint_dir.glob("*.ckpt")
+    return {int(file.stem.split("-")[1]): torch.load(file, weights_only=True) for file in files}
+
+
+def numbers(state) -> dict[str, torch.Tensor]:
+    """Every floating point tensor of a checkpoint, by path."""
+    found = {}
+
+    def walk(path, value):
+        if isinstance(value, torch.Tensor) and value.is_floating_point():
+            found[path] = value
+        elif isinstance(value, dict):
+            for key, inner in value.items():
+                walk(f"{path}/{key}", inner)
+
+    walk("", {name: state[name] for name in ("pipeline", "optimizers")})
+    return found
+
+
+@pytest.mark.parametrize(
+    ("fused", "name", "value"),
+    [(False, "means", NAN), (False, "loss", NAN), (True, "latents", INF), (True, "scales", 1e19), (True, "loss", NAN)],
+)
+def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fused, name, value):
+    trainer = start(fused=fused)
+    poison(trainer, at=3, name=name, value=value)
+    before = {}
+    original = trainer.optimizers.optimizer_scaler_step_some
+
+    def remember(*args):
+        if trainer.step == 3:
+            before.update({path: tensor.clone() for path, tensor in numbers(state_of(trainer)).items()})
+        original(*args)
+
+    trainer.optimizers.optimizer_scaler_step_some = remember
+    with pytest.raises(TrainingStopped, match="stopped at step 3") as stopped:
+        trainer.train()
+    assert stopped.value.step == 3
+    ((step, state),) = checkpoints(trainer).items()
+    assert step == 3
+    after = numbers(state)
+    statistics = "_extra_state/"  # densification counted the step; its numbers must be finite, not the same
+    same = {path for path in after if statistics not in path}
+    assert same == {path for path in before if statistics not in path}
+    assert any("exp_avg_sq" in path for path in same)
+    for path in same:
+        assert torch.equal(after[path], before[path]), path
+    assert all(torch.isfinite(tensor).all() for tensor in after.values())
+
+
+@pytest.mark.parametrize("fused", [False, True], ids=["on the host", "on the device"])
+def test_training_goes_on_from_where_it_stopped(start, fused):
+    trainer = start(fused=fused)
+    poison(trainer, at=3, name="means", value=NAN)
+    with pytest.raises(TrainingStopped):
+        trainer.train()
+    again = start({"--load-dir": trainer.checkpoint_dir})
+    assert again._start_step == 4
+    again.train()
+    assert max(checkpoints(again)) == 13
+
+
+@pytest.mark.parametrize("fused", [False, True], ids=["on the host", "on the device"])
+def test_a_condemned_last_step_is_reported_too(start, fused):
+    trainer = start(fused=fused)
+    poison(trainer, at=9, name="quats", value=INF)
+    with pytest.raises(TrainingStopped, match="step 9"):
+        trainer.train()
+    assert set(checkpoints(trainer)) == {9}
+
+
+def test_large_gradients_that_adam_can_square_pass(start):
+    trainer = start()
+    poison(trainer, at=3, name="scales", value=MAX_GRADIENT / 2)
+    trainer.train()
+    moments = trainer.optimizers.optimizers["scales"].state_dict()["state"][0]["exp_avg_sq"]
+    assert torch.isfinite(moments).all() and moments.max() > 1e33
+
+
+def test_the_message_names_tensor_rows_values_and_cause(start):
+    trainer = start()
+    poison(trainer, at=2, name="latents", value=NAN, row=5)
+    with pytest.raises(TrainingStopped) as stopped:
+        trainer.train()
+    message = str(stopped.value)
+    model = trainer.pipeline.model
+    mean = " ".join(f"{x:.4g}" for x in model.means[5].tolist())
+    for part in (
+        "Training stopped at step 2: the gradient of gauss_params.latents has NaN.",
+        f"1 of {model.num_points} splats, first 5.",
+        f"splat 5: mean ({mean}), scales (",
+        "Likely cause: ",
+        "The update of step 2 was not made.",
+    ):
+        assert part in message, message
+
+
+def test_the_cause_splat_on_the_camera(start):
+    trainer = start()
+    model = trainer.pipeline.model
+    poison(trainer, at=2, name="means", value=NAN, row=5)
+    original = model.get_outputs
+
+    def planted(camera):
+        outputs = original(camera)
+        model.info["gaussian_ids"], model.info["depths"] = torch.tensor([5]), torch.tensor([0.011])
+        return outputs
+
+    trainer.guard.begin(0, trainer.optimizers)
+    model.get_outputs = planted
+    trainer.callbacks.clear()  # densification has no use for that info
+    with pytest.raises(TrainingStopped, match=r"splat on the camera, at depth 0.011 in image .*view_\d+.png"):
+        trainer.train()
+
+
+def test_the_cause_broken_image(start):
+    trainer = start()
+    poison(trainer, at=2, name="loss", value=NAN)
+    with pytest.raises(TrainingStopped, match=r"the image or mask is broken: .*view_\d+.png"):
+        trainer.train()
+
+
+def test_the_cause_learning_rate(start):
+    trainer = start()
+    trainer.pipeline.model.scales.data[3] = 25.0
+    poison(trainer, at=2, name="scales", value=INF, row=3)
+    with pytest.raises(TrainingStopped, match="Lower --optimizers.scales.optimizer.lr"):
+        trainer.train()
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "opacities", "latents"])
+def test_a_splat_that_is_not_finite_is_named_and_left_out(start, name):
+    trainer = start(steps=3)
+    count = trainer.pipeline.model.num_points
+    trainer.pipeline.model.gauss_params[name].data[11] = NAN
+    with pytest.raises(TrainingStopped, match=f"gauss_params.{name} has NaN") as stopped:
+        trainer.train()
+    assert f"1 of {count} splats, first 11." in str(stopped.value)
+    ((_, state),) = checkpoints(trainer).items()
+    found = numbers(state)
+    assert len(state["pipeline"]["_model.gauss_params.means"]) == count - 1
+    assert all(torch.isfinite(tensor).all() for tensor in found.values())
+    start({"--load-dir": trainer.checkpoint_dir}).train()
+
+
+def test_parameters_are_looked_at_now_and_then(start):
+    trainer = start(steps=PARAMETERS_EVERY + 5)
+    trainer.train_iteration(1)
+    trainer.pipeline.model.gauss_params["means"].data[2] = NAN
+    trainer.train_iteration(2)  # the splat is not drawn, so nothing else becomes NaN
+    assert torch.isfinite(trainer.pipeline.model.watched["the rendered image"]).all()
+    with pytest.raises(TrainingStopped, match="gauss_params.means has NaN"):
+        trainer.train_iteration(PARAMETERS_EVERY)
+
+
+def test_shared_weights_that_are_not_finite_are_never_written(start):
+    trainer = start(steps=2)
+    trainer.train()
+    good = set(checkpoints(trainer))
+    trainer.pipeline.model.head.low[0].weight.data[0, 0] = NAN
+    with pytest.raises(TrainingStopped, match="head.low.0.weight has NaN"):
+        trainer.save_checkpoint(5)
+    assert set(checkpoints(trainer)) == good
+
+
+@pytest.mark.parametrize("name", ["gauss_params.means", "head.low.0.weight"])
+def test_a_checkpoint_that_is_not_finite_is_refused(start, name):
+    trainer = start(steps=2)
+    trainer.train()
+    ((step, state),) = checkpoints(trainer).items()
+    state["pipeline"][f"_model.{name}"].view(-1)[4] = INF
+    torch.save(state, trainer.checkpoint_dir / f"step-{step:09d}.ckpt")
+    with pytest.raises(InputError, match=f"'{name}'.*not finite"):
+        start({"--load-dir": trainer.checkpoint_dir})
+
+
+def test_weights_that_overflow_stop_the_training(start):
+    """Hidden units that overflow, and second weights of both signs: NaN. Splats whose colours are NaN are not drawn,
+    but heard. (1e20 in both layers is NaN or saturated, by the order in which a machine adds with fused products.)"""
+    trainer = start({"--pipeline.model.warmup-steps": 0})
+    first, second = trainer.pipeline.model.head.low[0], trainer.pipeline.model.head.low[2]
+    for layer, scale in ((first, 1e38), (second, 1.0)):
+        torch.nn.init.uniform_(layer.weight.data, -3.0, 3.0)
+        layer.weight.data *= scale
+    with pytest.raises(TrainingStopped, match="Lower --optimizers.field.optimizer.lr"):
+        trainer.train()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+@pytest.mark.parametrize(("name", "value"), [("means", NAN), ("latents", INF), ("loss", NAN)])
+def test_on_a_gpu(start, name, value):
+    """The verdict stays on the device; parameters and moments are those of before, and training goes on."""
+    trainer = start()
+    assert trainer.optimizers.all_fused
+    poison(trainer, at=3, name=name, value=value)
+    for step in range(3):
+        trainer.train_iteration(step)
+    before = {path: tensor.cpu().clone() for path, tensor in numbers(state_of(trainer)).items()}
+    trainer.train_iteration(3)
+    with pytest.raises(TrainingStopped, match="step 3"):
+        trainer.train_iteration(4)
+    ((step, state),) = checkpoints(trainer).items()
+    after = {path: tensor.cpu() for path, tensor in numbers(state).items()}
+    assert step == 3 and after.keys() == before.keys()
+    for path in before:
+        if "_extra_state" not in path:
+            assert torch.equal(after[path], before[path]), path
+    start({"--load-dir": trainer.checkpoint_dir}).train()
+
+
+def state_of(trainer) -> dict:
+    """What a checkpoint would hold now."""
+    optimizers = {name: optimizer.state_dict() for name, optimizer in trainer.optimizers.optimizers.items()}
+    return {"pipeline": trainer.pipeline.state_dict(), "optimizers": optimizers}

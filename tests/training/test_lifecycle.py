@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train, evaluate, render, resume, refuse: nerfstudio's own commands on a tiny scene, with CUDA out of reach."""
+
+import gc
+import json
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.scripts.render import DatasetRender
+from nerfstudio.utils import writer
+from nerfstudio.utils.eval_utils import eval_setup
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.run import evaluate, parse
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+BUSY = {
+    "--pipeline.model.warmup-length": 2,
+    "--pipeline.model.refine-every": 4,
+    "--pipeline.model.reset-alpha-every": 6,
+    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.resolution-schedule": 10,
+    "--pipeline.model.num-downscales": 1,
+    "--pipeline.model.stop-split-at": 100,
+}
+"""Densify every 4th step, reset opacity every 24th. 8 training views hold densification back for 12 steps after it."""
+
+
+METHODS = {
+    "nrfgs": {},
+    "nrfgs-sh": {},
+    "nrfgs-vdgs": {},
+    "nrfgs-gsnb": {"--pipeline.model.appearance.ramp-steps": 30},
+    "nrfgs-sg": {"--pipeline.model.appearance.start-step": 10},
+}
+"""Each method, with the options that let its schedule happen within a test: the first lobes come after splits."""
+STORED = {
+    "nrfgs": (3 + 32, 6664),
+    "nrfgs-sh": (48, 0),
+    "nrfgs-vdgs": (48, 524_288 + 1729),
+    "nrfgs-gsnb": (48, 7760),
+    "nrfgs-sg": (24, 0),
+}
+"""Colour numbers per splat, and shared weights."""
+
+
+def options(scene: Path, out: Path, method: str = "nrfgs", *more: dict, steps: int = 20) -> list[str]:
+    """A command line for ns-train."""
+    return command_line(method, scene, out, steps, BUSY, METHODS[method], *more)
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_scene, tmp_path_factory):
+    """config.yml of a finished 20-step training of each method."""
+    done = {}
+
+    def config_of(method: str) -> Path:
+        if method not in done:
+            done[method] = trained(options(tiny_scene, tmp_path_factory.mktemp(method), method))
+        return done[method]
+
+    return config_of
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_train_eval_render(method, finished, tmp_path, tiny_scene):
+    config = finished(method)
+    results = evaluate(config, tmp_path / "eval.json")
+    images = results["per_image"]
+    assert len(images) == 2
+    assert results["psnr"] == pytest.approx(sum(image["psnr"] for image in images) / 2)
+    assert 8 < results["psnr"] < 40 and 0 < results["ssim"] < 1 and 0 < results["l1"] < 1
+    # 48 x 36 is too small for MS-SSIM's five scales, and LPIPS has no weights here: no number, and no crash.
+    assert results["ms_ssim"] is None and results["lpips"] is None
+    _, pipeline, path, step = eval_setup(config)
+    assert step == 19
+    assert results["splats"] == pipeline.model.num_points
+    assert results["parameter_bytes"] == pipeline.model.parameter_bytes
+    colors, shared = STORED[method]
+    assert results["parameter_bytes"] == 4 * (pipeline.model.num_points * (3 + 3 + 4 + 1 + colors) + shared)
+
+    ComputePSNR(config, tmp_path / "again.json", render_output_path=tmp_path / "pairs").main()
+    assert [file.name[:13] for file in sorted((tmp_path / "pairs").iterdir())] == ["eval_img_0000", "eval_img_0001"]
+    DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
+    names = json.loads((tiny_scene / "transforms.json").read_text())["test_filenames"]
+    for output in ("rgb", "depth", "accumulation", "gt-rgb"):
+        folder = tmp_path / "renders" / "test" / output
+        assert sorted(file.stem for file in folder.rglob("*.png")) == sorted(Path(name).stem for name in names)
+
+
+def test_training_changes_everything_and_densifies(finished, tiny_scene):
+    _, pipeline, _, _ = eval_setup(finished("nrfgs"))
+    model = pipeline.model
+    points = json.loads((tiny_scene / "scene.json").read_text())["config"]["points"]
+    assert model.num_points != points
+    assert {len(value) for value in model.gauss_params.values()} == {model.num_points}
+    # A field that had not learnt would still have zero output layers.
+    assert model.head.low[-1].weight.abs().max() > 0 and model.head.high[-1].weight.abs().max() > 0
+
+
+@pytest.mark.parametrize(
+    "method, groups",
+    [
+        ("nrfgs", ["latents", "field"]),
+        ("nrfgs-vdgs", ["field"]),
+        ("nrfgs-gsnb", ["features_rest", "field"]),
+        ("nrfgs-sg", ["sg_axes", "sg_sharpness", "sg_colors"]),
+    ],
+)
+def test_all_that_a_head_adds_is_learning(method, groups, finished):
+    """Adam's running mean of every tensor's gradient has moved, and there is one for each of the tensor's numbers."""
+    state = checkpoint_of(finished(method))
+    for group in groups:
+        learning = state["optimizers"][group]["state"]
+        assert learning and all((of_one["exp_avg"] != 0).any() for of_one in learning.values()), group
+        if group != "field":
+            assert learning[0]["exp_avg"].shape == state["pipeline"][f"_model.gauss_params.{group}"].shape
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_resumed_training_is_the_unbroken_one(method, finished, tiny_scene, tmp_path):
+    """40 steps at once, against 20 and 20 more from the checkpoint.
+
+    In both halves splats are split (with random samples), pruned and their Adam state carried along; step 24 resets
+    opacities.
+    """
+    whole = trained(options(tiny_scene, tmp_path / "whole", method, steps=40))
+    half = finished(method)
+    rest = trained(options(tiny_scene, tmp_path / "rest", method, {"--load-dir": models_of(half)}, steps=20))
+    assert checkpoint_of(rest)["step"] == 39
+    counts = [len(checkpoint_of(run)["pipeline"]["_model.gauss_params.means"]) for run in (half, whole)]
+    assert counts[0] != counts[1], "nothing was densified in the second half: the test would prove nothing"
+    assert_same_training(checkpoint_of(rest), checkpoint_of(whole))
+
+
+def test_optimisers_hold_the_loaded_parameters(finished, tiny_scene, tmp_path):
+    """The host's way, replacing parameters on load, would leave the optimisers with orphans."""
+    config = parse(options(tiny_scene, tmp_path, "nrfgs", {"--load-dir": models_of(finished("nrfgs"))}))
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    for name, parameter in trainer.pipeline.model.gauss_params.items():
+        (held,) = trainer.optimizers.optimizers[name].param_groups[0]["params"]
+        assert held is parameter
+        assert trainer.optimizers.optimizers[name].state[held]["exp_avg"].shape == parameter.shape
+
+
+@pytest.mark.parametrize(
+    "method, more, says",
+    [
+        ("nrfgs-sh", {}, "written by the 'nrf' head"),
+        ("nrfgs", {"--pipeline.model.appearance.latent-dim": 8}, "latents"),
+        ("nrfgs", {"--pipeline.model.appearance.hidden-width": 32}, "head.low"),
+        ("nrfgs", {"--pipeline.model.appearance.split-bands": False}, "head."),
+    ],
+)
+def test_checkpoint_of_another_head_is_refused(method, more, says, finished, tiny_scene, tmp_path):
+    config = parse(options(tiny_scene, tmp_path, method, {"--load-dir": models_of(finished("nrfgs"))}, more))
+    trainer = config.setup(local_rank=0, world_size=1)
+    with pytest.raises(InputError, match=says) as error:
+        trainer.setup()
+    assert "--load-config" in str(error.value)
+
+
+def test_unknown_head_is_refused_before_training(tiny_scene, tmp_path):
+    config = parse(options(tiny_scene, tmp_path))
+    config.pipeline.model.appearance = "sparkle"
+    with pytest.raises(InputError, match="sparkle"):
+        config.setup(local_rank=0, world_size=1).setup()
+
+
+def test_impossible_setting_is_refused_before_training(tiny_scene, tmp_path):
+    config = parse(options(tiny_scene, tmp_path, "nrfgs", {"--pipeline.model.appearance.num-bands": 0}))
+    with pytest.raises(ValueError, match="num_bands is 0"):
+        config.setup(local_rank=0, world_size=1).setup()
+
+
+def test_saved_config_is_the_run(finished):
+    config = yaml.load(finished("nrfgs").read_text(), Loader=yaml.Loader)
+    assert config.pipeline.model.appearance.latent_dim == 32
+    assert config.machine.device_type == "cpu" or torch.cuda.is_available()
+    assert config.pipeline.model.refine_every == BUSY["--pipeline.model.refine-every"]
+
+
+def test_a_training_writes_into_no_log_of_an_earlier_one(tiny_scene, tmp_path):
+    earlier = []
+    for name in ("first", "second"):
+        parse(options(tiny_scene, tmp_path / name, steps=1)).setup(local_rank=0, world_size=1).setup()
+        assert "lost" not in [event["name"] for event in writer.EVENT_STORAGE]
+        writer.put_scalar(name="lost", scalar=1.0, step=0)
+        assert writer.EVENT_WRITERS and not set(map(id, earlier)) & set(map(id, writer.EVENT_WRITERS))
+        earlier = list(writer.EVENT_WRITERS)
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_the_collector_is_held_off_while_training_and_no_longer(ends, tiny_scene, tmp_path, monkeypatch):
+    trainer = parse(options(tiny_scene, tmp_path, steps=1)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    calls = []
+    for name in ("collect", "freeze", "unfreeze"):
+        monkeypatch.setattr(gc, name, lambda name=name: calls.append(name))
+    step = trainer.train_iteration
+
+    def train_iteration(number: int):
+        calls.append("step")
+        if not ends:
+            raise KeyboardInterrupt
+        return step(number)
+
+    monkeypatch.setattr(trainer, "train_iteration", train_iteration)
+    with nullcontext() if ends else pytest.raises(KeyboardInterrupt):
+        trainer.train()
+    assert calls == ["collect", "freeze", "step", "unfreeze"]
+
+
+def test_checkpoint_is_written_aside_and_moved(tiny_scene, tmp_path, monkeypatch):
+    """A save that is cut short leaves the older checkpoint, and nothing that --load-dir would take for a newer one."""
+    config = parse(options(tiny_scene, tmp_path, steps=1))
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.train()
+    folder = trainer.checkpoint_dir
+    before = sorted(folder.iterdir())
+
+    def torn(state, path):
+        Path(path).write_bytes(b"half a check")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(torch, "save", torn)
+    with pytest.raises(OSError, match="disk full"):
+        trainer.save_checkpoint(5)
+    assert sorted(folder.iterdir()) == before

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lean optimisers step as torch's own."""
+
+import warnings
+
+import pytest
+import torch
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from torch.amp import GradScaler
+from torch.testing import assert_close
+
+from nrfgs_ns.training.optimizers import LeanOptimizers, fused_adam_step
+
+
+def twins(**options):
+    """The same three parameters twice, each with an Adam of its own learning rate."""
+    sides = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        parameters = [torch.nn.Parameter(torch.randn(shape)) for shape in [(7, 3), (4,), (2, 5)]]
+        optimizers = [
+            torch.optim.Adam([parameter], lr=10.0**-power, eps=1e-15, fused=True, **options)
+            for power, parameter in enumerate(parameters, start=1)
+        ]
+        sides.append((parameters, optimizers))
+    return sides
+
+
+def set_gradients(sides, seed):
+    for parameters, _ in sides:
+        torch.manual_seed(seed)
+        for parameter in parameters:
+            parameter.grad = torch.randn_like(parameter)
+
+
+def assert_same(sides):
+    (left, left_optimizers), (right, right_optimizers) = sides
+    for a, b, mine, theirs in zip(left, right, left_optimizers, right_optimizers, strict=True):
+        assert torch.equal(a, b)
+        for name, value in theirs.state[b].items():
+            assert torch.equal(mine.state[a][name], value), name
+
+
+@pytest.mark.parametrize("options", [{}, {"weight_decay": 0.1}, {"betas": (0.5, 0.9)}])
+def test_steps_are_torchs(options):
+    sides = twins(**options)
+    for step in range(5):
+        set_gradients(sides, step)
+        if step == 0:
+            for optimizer in sides[0][1]:
+                optimizer.step()
+        else:
+            fused_adam_step(sides[0][1])
+        for optimizer in sides[1][1]:
+            optimizer.step()
+        assert_same(sides)
+
+
+def test_a_condemned_step_changes_nothing():
+    sides = twins()
+    set_gradients(sides, 0)
+    for optimizer in sides[0][1] + sides[1][1]:
+        optimizer.step()
+    before = [parameter.detach().clone() for parameter in sides[0][0]]
+    set_gradients(sides, 1)
+    sides[0][0][0].grad[0, 0] = float("nan")
+    for _, optimizers in sides:
+        for optimizer in optimizers:
+            optimizer.found_inf = torch.tensor(1.0)
+    fused_adam_step(sides[0][1])
+    assert all(torch.equal(parameter, old) for parameter, old in zip(sides[0][0], before, strict=True))
+    assert all(optimizer.state[p]["step"] == 1 for (p, optimizer) in zip(*sides[0], strict=True))
+
+
+def test_a_parameter_without_gradient_rests():
+    sides = twins()
+    set_gradients(sides, 0)
+    for optimizer in sides[0][1]:
+        optimizer.step()
+    set_gradients(sides, 1)
+    parameter, optimizer = sides[0][0][1], sides[0][1][1]
+    parameter.grad = None
+    before = parameter.detach().clone()
+    fused_adam_step(sides[0][1])
+    assert torch.equal(parameter, before)
+    assert optimizer.state[parameter]["step"] == 1
+
+
+def group(fused: bool):
+    """Nerfstudio's optimisers over one parameter; on a CPU fused has to be asked for."""
+    config = {
+        "means": {
+            "optimizer": AdamOptimizerConfig(lr=0.1, eps=1e-15),
+            "scheduler": ExponentialDecaySchedulerConfig(lr_final=0.001, max_steps=10),
+        }
+    }
+    torch.manual_seed(0)
+    parameter = torch.nn.Parameter(torch.randn(5, 3))
+    optimizers = LeanOptimizers(config, {"means": [parameter]})
+    for settings in optimizers.optimizers["means"].param_groups:
+        settings["fused"] = True if fused else None
+    return parameter, optimizers
+
+
+def test_training_with_a_schedule_is_nerfstudios():
+    results = []
+    for fused in (True, False):
+        parameter, optimizers = group(fused)
+        scaler = GradScaler(enabled=False)
+        for step in range(6):
+            optimizers.zero_grad_some(["means"])
+            (parameter - 1).square().sum().backward()
+            optimizers.optimizer_scaler_step_some(scaler, ["means"])
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # torch warns if a schedule runs ahead of its optimiser
+                optimizers.scheduler_step_all(step)
+        results.append(parameter.detach())
+    assert_close(*results)
+
+
+def test_a_group_that_rests_is_left_alone():
+    parameter, optimizers = group(fused=True)
+    scaler = GradScaler(enabled=False)
+    for step in range(3):
+        optimizers.zero_grad_some(["means"])
+        assert parameter.grad is None
+        parameter.square().sum().backward()
+        before = parameter.detach().clone()
+        optimizers.optimizer_scaler_step_some(scaler, [] if step == 1 else ["means"])
+        assert torch.equal(parameter, before) == (step == 1)
+
+
+def test_a_first_gradient_may_come_late():
+    parameter, optimizers = group(fused=True)
+    scaler = GradScaler(enabled=False)
+    optimizers.optimizer_scaler_step_some(scaler, ["means"])
+    before = parameter.detach().clone()
+    parameter.square().sum().backward()
+    optimizers.optimizer_scaler_step_some(scaler, ["means"])
+    assert not torch.equal(parameter, before)
+
+
+def test_a_loaded_state_is_moved_to_what_the_optimiser_runs_on():
+    parameter, optimizers = group(fused=False)
+    parameter.square().sum().backward()
+    optimizers.optimizer_scaler_step_some(GradScaler(enabled=False), ["means"])
+    state = {name: optimizer.state_dict() for name, optimizer in optimizers.optimizers.items()}
+    state["means"]["param_groups"][0]["fused"] = True  # as written on a GPU
+    other, loaded = group(fused=False)
+    loaded.load_optimizers(state)
+    assert not loaded.optimizers["means"].param_groups[0]["fused"]
+    assert not loaded.all_fused
+    other.square().sum().backward()
+    loaded.optimizer_scaler_step_some(GradScaler(enabled=False), ["means"])
+    assert loaded.optimizers["means"].state[other]["step"] == 2

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A time budget is kept whatever steps cost, stretched schedules are the plain ones elsewhere, and both continue."""
+
+import math
+import shutil
+from pathlib import Path
+from time import process_time
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.utils.eval_utils import eval_setup
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.optimizers import LeanOptimizers
+from nrfgs_ns.training.pace import STEPS_BEFORE_PLANNING, Pace, TimedPace, resolution_phases
+from nrfgs_ns.training.run import parse, train
+
+LENGTH = 30_000
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def walk(budget, cost, phases=None, limit=200_000):
+    """A training whose step at a position costs `cost(position, step)` seconds; the pace, its steps and positions."""
+    clock = Clock()
+    pace = TimedPace(LENGTH, budget, phases, clock)
+    pace.start()
+    positions = []
+    while len(positions) < limit:
+        pace.begin_step()
+        positions.append(pace.position)
+        clock.now += cost(pace.position, len(positions))
+        pace.advance()
+        if pace.is_spent:
+            return pace, clock.now - 100.0, positions
+    raise AssertionError("training did not end")
+
+
+def test_constant_speed_is_an_even_walk():
+    """1 s a step, 1,010 s: the first ten at rate 1, then (30,000 - 10) / 1,000 a step. It ends at the end of both."""
+    pace, seconds, positions = walk(1010.0, lambda position, step: 1.0)
+    assert abs(seconds - 1010.0) <= 1.0 and len(positions) == 1010
+    rates = [b - a for a, b in zip(positions, positions[1:], strict=False)]
+    assert rates[:STEPS_BEFORE_PLANNING] == [1.0] * STEPS_BEFORE_PLANNING
+    # A step's duration is known when the next begins, so the rate is that of a walk one step longer or shorter.
+    assert rates[20:-20] == pytest.approx([29.99] * (len(rates) - 40), rel=0.01)
+    assert pace.position == pytest.approx(LENGTH, rel=0.002)
+
+
+@given(
+    st.floats(0.001, 0.5),  # seconds a step
+    st.floats(0.2, 5.0),  # by how much steps become dearer towards the end
+    st.floats(0.0, 3.0),  # seconds that an evaluation takes every hundredth step
+    st.integers(200, 2000),  # how many steps of the first kind would fit in
+)
+def test_the_budget_is_kept(first, growth, pause, fits):
+    """The end is within half a step and one pause of the budget, whatever happens: training stops by the clock. And
+    the schedules are walked to their end, to 2 %, unless a pause comes as a surprise in the last steps."""
+    budget = first * fits
+
+    def cost(position, step):
+        return first * growth ** (position / LENGTH) + (pause if step % 100 == 0 else 0.0)
+
+    pace, seconds, positions = walk(budget, cost)
+    longest = first * max(1.0, growth)
+    assert budget - longest <= seconds <= budget + longest + pause
+    assert positions == sorted(positions) and positions[-1] <= LENGTH
+    if pause < 0.02 * budget:
+        assert pace.position >= 0.9 * LENGTH
+
+
+def test_what_steps_cost_decides_how_evenly_they_are_spread():
+    """Steps at half the resolution take half the time, as the phases say: as many positions for each step early on as
+    later. Without the phases the early steps look cheap for ever, and more of them are made."""
+    phases = resolution_phases(1, 15_000)
+    assert phases == [(15_000.0, 0.5), (math.inf, 1.0)]
+
+    def cost(position, step):
+        return 0.5 if position < 15_000 else 1.0
+
+    def early(positions):
+        return sum(position < 15_000 for position in positions) / len(positions)
+
+    assert early(walk(3000.0, cost, phases)[2]) == pytest.approx(0.5, abs=0.01)
+    assert early(walk(3000.0, cost)[2]) > 0.55
+    assert resolution_phases(2, 3000) == [(3000.0, 0.25), (6000.0, 0.5), (math.inf, 1.0)]
+
+
+def test_a_slow_first_step_changes_nothing():
+    """Compiling for half the budget is lost, and what is left is walked as evenly as ever."""
+    pace, seconds, positions = walk(1000.0, lambda position, step: 500.0 if step == 1 else 1.0)
+    assert abs(seconds - 1000.0) <= 1.0 and len(positions) == 501
+    assert pace.position == pytest.approx(LENGTH, rel=0.005)
+
+
+def test_a_timed_training_goes_on_where_it_was():
+    """Interrupted after 300 s of 1,000: 700 s are left, for the rest of the schedules."""
+    clock = Clock()
+    pace = TimedPace(LENGTH, 1000.0, None, clock)
+
+    def steps(pace, count):
+        for _ in range(count):
+            pace.begin_step()
+            clock.now += 1.0
+            pace.advance()
+
+    pace.start()
+    steps(pace, 300)
+    clock.now += 12345.0
+    again = TimedPace(7, 1000.0, None, clock)
+    state = pace.state()
+    again.load_state({**state, "seconds": 300.0})
+    again.start()
+    assert again.length == LENGTH and again.position == pace.position and again.elapsed == 300.0
+    steps(again, 699)
+    assert not again.is_spent
+    steps(again, 1)
+    assert again.is_spent and again.position == pytest.approx(LENGTH, rel=0.005)
+
+
+def test_steps_of_positions():
+    pace = Pace(LENGTH, rate=30.0)
+    assert pace.step_at(0, 0) == 0 and pace.step_at(1, 0) == 1 and pace.step_at(500, 0) == 17  # 17 * 30 = 510
+    for _ in range(20):
+        pace.advance()
+    assert pace.position == 600.0
+    assert pace.step_at(500, 20) == 0 and pace.step_at(600, 20) == 20  # behind, and here
+    assert pace.step_at(15_000, 20) == 500 and pace.step_at(15_001, 20) == 501
+    for _ in range(2000):
+        pace.advance()
+    assert pace.position == LENGTH
+
+
+def test_learning_rates_are_those_of_the_position():
+    """Step s of N has the learning rate of step s L / N of the L that the schedule is laid out for."""
+    config = {
+        "means": {
+            "optimizer": AdamOptimizerConfig(lr=0.1, eps=1e-15),
+            "scheduler": ExponentialDecaySchedulerConfig(lr_final=0.001, max_steps=100),
+        }
+    }
+    optimizers = LeanOptimizers(config, {"means": [torch.nn.Parameter(torch.zeros(1))]})
+    optimizers.pace = Pace(100, rate=2.5)
+    optimizers.optimizers["means"].step()  # torch warns if a schedule runs ahead of its optimiser
+    rates = []
+    for step in range(40):
+        rates.append(optimizers.optimizers["means"].param_groups[0]["lr"])
+        optimizers.scheduler_step_all(step)
+    assert rates == pytest.approx([0.1 * 0.01 ** (2.5 * step / 100) for step in range(40)])
+
+
+SCHEDULES = {
+    "--pipeline.model.warmup-length": 8,
+    "--pipeline.model.refine-every": 2,
+    "--pipeline.model.reset-alpha-every": 100,
+    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.resolution-schedule": 10,
+    "--pipeline.model.num-downscales": 1,
+    "--pipeline.model.stop-split-at": 30,
+}
+"""All that has a schedule, laid out for 40 steps."""
+SH = {"--pipeline.model.appearance.degree-interval": 10}
+CALM = {"--pipeline.model.refine-every": 1000}
+"""No densification, which every second step would double the splats until a step takes a second."""
+MCMC = {
+    "--pipeline.model.densification": "mcmc",
+    "--pipeline.model.splat-budget": 400,
+    "--pipeline.model.mcmc.stop-at": 20,
+    "--pipeline.model.reset-alpha-every": None,
+    "--pipeline.model.densify-grad-thresh": None,
+    "--pipeline.model.stop-split-at": None,
+}
+"""MCMC, without the options that it refuses."""
+
+
+def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> list[str]:
+    """A command line for ns-train."""
+    return command_line(method, scene, out, steps, SCHEDULES, *more)
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_a_stretched_training(tiny_scene, tmp_path):
+    """20 steps of the 40: degree 3 is reached at step 15, and its harmonics are there when it is evaluated; splats
+    come only before step 15."""
+    whole = trained(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, SH, {"--schedule-steps": 40}))
+    _, pipeline, _, step = eval_setup(whole)
+    assert step == 19 and pipeline.model.head.active_degree == 3
+    assert pipeline.model.pace.position == 40.0
+    # 8 training images hold densification back for 8 + 2 steps after the reset at 0: it acts at steps 10, 12 and 14.
+    short = train(options(tiny_scene, tmp_path / "short", "nrfgs-sh", 12, SH, {"--schedule-steps": 24}))
+    assert short.splats[-1][1] > short.splats[0][1] and short.splats[-1][1] < pipeline.model.num_points
+    state = checkpoint_of(whole)["pipeline"]["_model._extra_state"]
+    assert state["pace"] == {"length": 40, "rate": 2.0, "position": 40.0}
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_a_stretched_training_continues_to_the_bit(tiny_scene, tmp_path, monkeypatch):
+    from nrfgs_ns.training.trainer import NrfgsTrainer
+
+    original, kept = NrfgsTrainer._write_checkpoint, tmp_path / "kept"
+
+    def keep(trainer, step):
+        original(trainer, step)
+        if step == 9:
+            shutil.copytree(trainer.checkpoint_dir, kept)
+
+    monkeypatch.setattr(NrfgsTrainer, "_write_checkpoint", keep)
+    stretched = {"--schedule-steps": 40, "--steps-per-save": 9}
+    whole = trained(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, SH, stretched))
+    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 10, SH, stretched, {"--load-dir": kept}))
+    one, other = checkpoint_of(whole), checkpoint_of(rest)
+    assert one["step"] == 19
+    assert_same_training(one, other, rtol=0, atol=0)
+    assert one["schedulers"] == other["schedulers"]
+    with pytest.raises(InputError, match="schedule-steps"):
+        train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 10, SH, {"--load-dir": kept}))
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_mcmc_begins_and_ends_with_the_pace(tiny_scene, tmp_path):
+    record = train(options(tiny_scene, tmp_path, "nrfgs", 20, MCMC, {"--schedule-steps": 40}))
+    # Relocations at steps 6 and 8, between 8 / 2 and 20 / 2: 300, 315, 330.
+    assert record.splats[-1] == [19, 330]
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
+    """3 s of this process's own time, which other processes cannot lengthen; a step takes some 20 ms, so 10 % is many
+    steps. The checkpoint is named after the last step, going on from it with the same budget is over at once, and with
+    1.2 s more it takes those."""
+    import nrfgs_ns.training.trainer
+
+    monkeypatch.setattr(nrfgs_ns.training.trainer, "TimedPace", ProcessTime)
+
+    def run(name, minutes, *more):
+        record = train(options(tiny_scene, tmp_path / name, "nrfgs", 40, CALM, {"--time-budget": minutes}, *more))
+        config = Path(record.config_path)
+        state = checkpoint_of(config)
+        return record.steps, models_of(config), state["step"], state["pipeline"]["_model._extra_state"]["pace"]
+
+    steps, folder, last, pace = run("a", 0.05)
+    assert last == steps - 1
+    assert pace["position"] > 39 and pace["seconds"] == pytest.approx(3.0, rel=0.1)
+    assert run("b", 0.05, {"--load-dir": folder})[0] == 0
+    more, _, end, pace = run("c", 0.07, {"--load-dir": folder})
+    assert more > 0 and end == last + more and pace["seconds"] == pytest.approx(4.2, rel=0.1)
+
+
+class ProcessTime(TimedPace):
+    def __init__(self, *args):
+        super().__init__(*args, clock=process_time)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_cuda")
+def test_a_minute_is_a_minute(tiny_scene, tmp_path):
+    """By the clock on the wall, which other processes do lengthen: only within a step of 6 s is this fair."""
+    record = train(options(tiny_scene, tmp_path, "nrfgs", 400, CALM, {"--time-budget": 1}))
+    assert record.seconds == pytest.approx(60.0, rel=0.1)
+
+
+@pytest.mark.parametrize("option, bad", [("--time-budget", 0), ("--schedule-steps", -5), ("--time-budget", "nan")])
+def test_bad_options_are_named(option, bad, tiny_scene, tmp_path):
+    with pytest.raises(InputError, match=option[2:].replace("-", "_")):
+        parse(options(tiny_scene, tmp_path, "nrfgs", 5, {option: bad})).setup(local_rank=0, world_size=1)
+    with pytest.raises(InputError, match="one device"):
+        parse(options(tiny_scene, tmp_path, "nrfgs", 5, {option: 5})).setup(local_rank=0, world_size=2)
+
+
+def test_without_them_there_is_no_pace(tiny_scene, tmp_path):
+    trainer = parse(options(tiny_scene, tmp_path, "nrfgs", 5)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    assert trainer.pace is None and trainer.pipeline.model.pace is None and trainer.optimizers.pace is None
+    assert trainer.pipeline.model.schedule_step == 0

@@ -1,0 +1,513 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The viewer without a GPU or a browser: what each mode shows, and that a browser's wishes reach no training.
+
+`test_browser_viewer.py` clicks through the same in a real browser.
+"""
+
+import shutil
+import threading
+import urllib.request
+from contextlib import nullcontext
+from itertools import combinations
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.scripts.train import _set_random_seed
+from nerfstudio.scripts.viewer import run_viewer
+from nerfstudio.utils import colormaps
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.utils import CameraState
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from torch.testing import assert_close
+from viser.transforms import SO3
+
+import nrfgs_ns.training.trainer
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.gsnb import GsnbConfig
+from nrfgs_ns.appearance.head import SplatAppearance, base_colors
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.sg import SgConfig
+from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.appearance.vdgs import VdgsConfig
+from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.ply import read_splats
+from nrfgs_ns.scenes import SceneConfig, write_scene
+from nrfgs_ns.training.run import parse
+from nrfgs_ns.viewer.pictures import (
+    BASE,
+    DEPTH,
+    FULL,
+    VIEW_DEPENDENCE,
+    Shown,
+    modes,
+    picture,
+    scaled_depth,
+    view_dependence,
+)
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+FIELD = ["residual", "low branch", "high branch", "gate weight", "opacity residual"]
+"""What the default field shows of itself."""
+
+
+@pytest.fixture
+def build(tiny_scene, tmp_path):
+    """Pipeline of a method whose head has learnt something: its weights are drawn at random."""
+
+    def pipeline(method="nrfgs", *options):
+        config = parse([method, "--data", str(tiny_scene), "--output-dir", str(tmp_path), *map(str, options)])
+        torch.manual_seed(0)
+        pipeline = config.pipeline.setup(device="cpu", test_mode="val")
+        give_it_something_to_show(pipeline.model)
+        pipeline.eval()
+        return pipeline
+
+    return pipeline
+
+
+def give_it_something_to_show(model) -> None:
+    """Random output layers and latents, or harmonics; and opacities at which a pixel shows few splats."""
+    for parameter in model.head.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    for name, parameter in model.gauss_params.items():
+        if name in ("latents", "features_rest", "sg_colors"):
+            torch.nn.init.normal_(parameter, std=0.3)
+    model.gauss_params["opacities"].data.fill_(1.0)
+    model.update_to_step(10**6)
+
+
+def two_cameras(pipeline):
+    """Two training cameras that see the scene from different sides."""
+    cameras = pipeline.datamanager.train_dataset.cameras
+    return cameras[0:1], cameras[4:5]
+
+
+def test_a_head_offers_what_it_has():
+    def offered(config):
+        head = config.setup()
+        splats = {"means": torch.zeros(4, 3), "opacities": torch.zeros(4, 1), **head.splat_params(torch.zeros(4, 3))}
+        shown = modes(head, splats)
+        assert (shown[0], shown[1], shown[-2], shown[-1]) == (FULL, BASE, VIEW_DEPENDENCE, DEPTH)
+        return shown[2:-2]
+
+    assert offered(NrfConfig()) == FIELD
+    assert offered(NrfConfig(split_bands=False)) == ["residual", "opacity residual"]
+    assert offered(NrfConfig(num_bands=1)) == ["residual", "opacity residual"]
+    assert offered(NrfConfig(opacity_residual=False)) == FIELD[:-1]
+    for config in (ShConfig(), VdgsConfig(mode="sh"), GsnbConfig(), SgConfig()):
+        assert offered(config) == ["residual"]
+    for mode in ("opacity", "both"):
+        assert offered(VdgsConfig(mode=mode)) == ["residual", "opacity residual"]
+
+
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"])
+def test_every_mode_is_a_picture_of_its_own(build, method):
+    pipeline = build(method)
+    model, (camera, _) = pipeline.model, two_cameras(pipeline)
+    pictures = {}
+    for mode in modes(model.head, dict(model.gauss_params.items())):
+        outputs = picture(model, camera, Shown(mode))
+        assert outputs.keys() == model.get_outputs(camera).keys()
+        rgb = outputs["rgb"]
+        assert rgb.shape == (36, 48, 3) and torch.isfinite(rgb).all() and 0 <= rgb.min() and rgb.max() <= 1
+        pictures[mode] = rgb
+    for one, other in combinations(pictures, 2):
+        # Browsers get 8 bits: what differs by less than one level on average looks the same.
+        assert (pictures[one] - pictures[other]).abs().mean() > 1 / 255, (one, other)
+
+
+def test_a_mode_that_the_head_does_not_offer_is_refused(build):
+    pipeline = build("nrfgs-sh")
+    with pytest.raises(ValueError, match="'sh' head does not show 'gate weight'; it offers 'full'"):
+        picture(pipeline.model, two_cameras(pipeline)[0], Shown("gate weight"))
+
+
+def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(build):
+    pipeline = build()
+    model, (camera, _) = pipeline.model, two_cameras(pipeline)
+    assert torch.equal(picture(model, camera, Shown(gain=0.0))["rgb"], model.get_base_color(camera))
+    assert torch.equal(picture(model, camera, Shown(BASE, gain=2.0))["rgb"], model.get_base_color(camera))
+    assert torch.equal(picture(model, camera, Shown(gain=1.0))["rgb"], model.get_outputs(camera)["rgb"])
+    view = model.look(camera)
+    base, trained = (
+        model.head.base_appearance(view.splats, view.visible),
+        model.head(view.splats, view.visible, view.center),
+    )
+    doubled = SplatAppearance(
+        (2 * trained.colors - base.colors).clamp_min(0), (2 * trained.opacities - base.opacities).clamp(0, 1)
+    )
+    # The same to rounding: 2^-24 in each of at most 300 splats that a pixel adds up.
+    by_hand = model.paint(view, doubled)[0]["rgb"]
+    assert_close(picture(model, camera, Shown(gain=2.0))["rgb"], by_hand, rtol=0, atol=300 * 2**-24)
+
+
+@pytest.mark.parametrize("mode", ["residual", "low branch", "high branch", "opacity residual"])
+def test_gain_scales_what_it_shows(build, mode):
+    """Without any gain a change is grey, where the splats are as where they are not."""
+    pipeline = build()
+    model, (camera, _) = pipeline.model, two_cameras(pipeline)
+    # alpha + (1 - alpha), summed over at most 300 splats
+    grey = picture(model, camera, Shown(mode, gain=0.0))["rgb"]
+    assert_close(grey, torch.full_like(grey, 0.5), rtol=0, atol=300 * 2**-24)
+    half, whole = (picture(model, camera, Shown(mode, gain=gain))["rgb"] - 0.5 for gain in (0.5, 1.0))
+    assert half.abs().mean() < whole.abs().mean()
+
+
+def test_frozen_view_is_the_head_seen_from_elsewhere(build):
+    pipeline = build()
+    model, (here, there) = pipeline.model, two_cameras(pipeline)
+    center = model.look(there).center
+    view = model.look(here)
+    expected = model.paint(view, model.head(view.splats, view.visible, center))[0]["rgb"]
+    frozen = picture(model, here, Shown(frozen_center=center))["rgb"]
+    assert torch.equal(frozen, expected)
+    unfrozen = picture(model, here, Shown())["rgb"]
+    assert (frozen - unfrozen).abs().mean() > 1 / 255
+    assert torch.equal(picture(model, here, Shown(frozen_center=view.center))["rgb"], unfrozen)
+    residuals = [picture(model, here, Shown("residual", frozen_center=o))["rgb"] for o in (None, center)]
+    assert (residuals[0] - residuals[1]).abs().mean() > 1 / 255
+
+
+def test_branches_add_up_to_the_residual_and_the_residual_to_the_head(build):
+    model = build().model
+    splats = {name: value.detach() for name, value in model.gauss_params.items()}
+    splats["features_dc"] = torch.zeros_like(splats["features_dc"])  # mid grey: no colour is clamped
+    visible, center = torch.arange(0, 300, 2), torch.tensor([0.3, -1.0, 0.5])
+    with torch.no_grad():
+        parts = model.head.components(splats, visible, center)
+        trained, base = model.head(splats, visible, center), model.head.base_appearance(splats, visible)
+    # Sums and differences of a few numbers of at most 1.
+    close = {"rtol": 0, "atol": 4 * 2**-24}
+    assert_close(parts["low branch"].values + parts["high branch"].values, parts["residual"].values, **close)
+    assert_close(parts["residual"].values, trained.colors - base.colors, **close)
+    change = (trained.opacities - base.opacities)[:, None]
+    assert_close(parts["opacity residual"].values, change, **close)
+    assert parts["low branch"].values.abs().max() <= 0.2 and change.abs().max() > 0.05
+    gate = parts["gate weight"].values
+    assert gate.shape == (150, 1) and 0 <= gate.min() < gate.max() <= 1
+    with torch.no_grad():  # a shut gate leaves the low branch
+        model.head.high[-1].bias[3], model.head.high[-1].weight[3] = -100.0, 0.0
+        shut = model.head.components(splats, visible, center)
+    assert torch.equal(shut["residual"].values, parts["low branch"].values)
+    assert shut["high branch"].values.abs().max() == 0
+
+
+def test_view_dependence_is_the_deviation_over_the_sphere():
+    """For harmonics of degree 1, k Y_1, the deviation is known: the mean square of each is 1 / (4 pi)."""
+    head = ShConfig(degree=1).setup()
+    means = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+    splats = {"means": means, "opacities": torch.zeros(5, 1), **head.splat_params(torch.full((5, 3), 0.5))}
+    visible, center = torch.tensor([0, 2, 3]), torch.tensor([4.0, 0.0, 1.0])
+    assert view_dependence(head, splats, visible, center).abs().max() == 0
+    splats["features_rest"][2, :, 1] = torch.tensor([0.3, -0.2, 0.1])
+    # sqrt(k . k / (4 pi)) in one channel; a third of its square over three channels.
+    expected = torch.tensor([0.0, (0.14 / (12 * torch.pi)) ** 0.5, 0.0])[:, None]
+    # 12 colours near 1/2 are rounded at 2^-25 each.
+    assert_close(view_dependence(head, splats, visible, center), expected, rtol=0, atol=12 * 2**-25)
+
+
+def test_depth_is_dark_near_and_bright_far():
+    depth = torch.tensor([[1.0, 2.0, 3.0, 50.0]])[..., None]
+    opaque = torch.tensor([[1.0, 1.0, 1.0, 0.1]])[..., None]
+    # The quantile of three is the second; what is hardly there does not count.
+    assert scaled_depth(depth, opaque).flatten().tolist() == [0.0, 1.0, 1.0, 1.0]
+    assert scaled_depth(depth, 0 * opaque).abs().max() == 0
+
+
+# In nerfstudio's viewer.
+
+
+class Browser(RenderStateMachine):
+    """One of the viewer's render threads, which renders one image as it would for a browser, and ends."""
+
+    def __init__(self, viewer, pose):
+        super().__init__(viewer, VISER_NERFSTUDIO_SCALE_RATIO, client=None)
+        self.camera = CameraState(fov=0.9, aspect=4 / 3, c2w=pose, camera_type=CameraType.PERSPECTIVE)
+        self.state = "low_move"
+
+    def run(self):
+        self.outputs = self._render_img(self.camera)
+
+    @classmethod
+    def sees(cls, viewer, pose) -> dict[str, torch.Tensor]:
+        thread = cls(viewer, pose)
+        thread.start()
+        thread.join()
+        return thread.outputs
+
+
+@pytest.fixture
+def open_viewer(tiny_scene, tmp_path):
+    opened = []
+
+    def start(pipeline):
+        viewer = Viewer(
+            ViewerConfig(websocket_host="127.0.0.1"),
+            log_filename=tmp_path / "viewer.txt",
+            datapath=tiny_scene,
+            pipeline=pipeline,
+            train_lock=threading.Lock(),
+        )
+        opened.append(viewer)
+        viewer.init_scene(pipeline.datamanager.train_dataset, "completed", pipeline.datamanager.eval_dataset)
+        return viewer
+
+    yield start
+    for viewer in opened:
+        viewer.viser_server.stop()
+
+
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+def test_page_is_served_and_every_output_can_be_shown(build, open_viewer, method):
+    viewer = open_viewer(build(method))
+    url = f"http://127.0.0.1:{viewer.viser_server.get_port()}"
+    with urllib.request.urlopen(url, timeout=20) as page:
+        assert page.status == 200 and b"<html" in page.read(4096).lower()
+
+    model, pose = viewer.pipeline.model, two_cameras(viewer.pipeline)[0].camera_to_worlds[0]
+    model.train()
+    for mode in model.viewer_panel.legends:
+        model.viewer_panel.mode.value = mode
+        outputs = Browser.sees(viewer, pose)
+        assert model.training, "rendering for the viewer must leave a training in training mode"
+        assert {"rgb", "depth", "accumulation"} <= set(outputs)
+        for name, image in outputs.items():
+            shown = colormaps.apply_colormap(image=image, colormap_options=viewer.control_panel.colormap_options)
+            assert shown.shape[-1] == 3 and torch.isfinite(shown).all(), name
+
+
+@pytest.fixture
+def reduced(tmp_path, monkeypatch):
+    """config.yml of a training that left a reduced field, of whose splats some are diffuse."""
+    write_scene(SceneConfig(views=10, width=48, height=36, points=60, samples=1), tmp_path / "scene")
+    config = Path("outputs/reduced/nrfgs/before/config.yml")
+    shutil.copytree(Path(__file__).parents[1] / "fixtures" / "saved_0_1_0" / "reduced", tmp_path / config.parent)
+    monkeypatch.chdir(tmp_path)
+    return config
+
+
+def test_ns_viewer_and_export_take_a_reduced_checkpoint(reduced, tmp_path, monkeypatch):
+    """ns-viewer's own main function, and our command."""
+    opened, seen = [], {}
+
+    def viewer(*args, **more):
+        opened.append(Viewer(*args, **more))
+        return opened[-1]
+
+    def look(_):
+        """Instead of waiting for a browser: be one."""
+        with urllib.request.urlopen(f"http://127.0.0.1:{opened[0].viser_server.get_port()}", timeout=20) as page:
+            assert page.status == 200 and b"<html" in page.read(4096).lower()
+        model, pose = opened[0].pipeline.model, two_cameras(opened[0].pipeline)[0].camera_to_worlds[0]
+        for mode in model.viewer_panel.legends:
+            model.viewer_panel.mode.value = mode
+            seen[mode] = Browser.sees(opened[0], pose)["rgb"]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_viewer, "ViewerState", viewer)
+    monkeypatch.setattr(run_viewer, "time", SimpleNamespace(sleep=look))
+    options = run_viewer.ViewerConfigWithoutNumRays(websocket_host="127.0.0.1")
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_viewer.RunViewer(reduced, options).main()
+    finally:
+        for one in opened:
+            one.viser_server.stop()
+    assert set(seen) == {FULL, BASE, "residual", VIEW_DEPENDENCE, DEPTH}, "of the branches one is left"
+    assert all(torch.isfinite(rgb).all() for rgb in seen.values()) and seen[FULL].std() > 0.01
+    model = opened[0].pipeline.model
+    assert model.head.high is None and 0 < int(model.densification.state[DIFFUSE].sum()) < model.num_points
+
+    Export("ply", reduced, tmp_path / "splats.ply", measure=False).main()
+    exported = read_splats(tmp_path / "splats.ply")
+    assert 0 < len(exported.means) <= model.num_points and torch.isfinite(exported.features_dc).all()
+
+
+def test_ns_export_takes_a_reduced_checkpoint(reduced, tmp_path, export_gaussian_splat):
+    export_gaussian_splat(load_config=reduced, output_dir=tmp_path / "ply").main()
+    exported = read_splats(tmp_path / "ply" / "splat.ply")
+    assert len(exported.means) > 0 and torch.isfinite(exported.features_dc).all()
+
+
+def coarse(rgb: torch.Tensor) -> torch.Tensor:
+    """Means over an 8 x 8 grid: nerfstudio picks the size of a picture by how fast the last ones were."""
+    return torch.nn.functional.adaptive_avg_pool2d(rgb.permute(2, 0, 1), 8)
+
+
+def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
+    pipeline = build()
+    model, (camera, elsewhere) = pipeline.model, two_cameras(pipeline)
+    batch = pipeline.datamanager.fixed_indices_eval_dataloader[0][1]
+    before = model.get_outputs_for_camera(camera)
+    before_metrics = model.get_image_metrics_and_images(before, batch)[0]
+
+    viewer, panel, pose = open_viewer(pipeline), model.viewer_panel, camera.camera_to_worlds[0]
+    plain = coarse(Browser.sees(viewer, pose)["rgb"])
+    assert panel.count.value == "300"
+    panel.mode.value, panel.gain.value = "residual", 1.5
+    panel.frozen_center, panel.freeze.value = model.look(elsewhere).center, True
+    viewer.control_panel.background_color = (255, 0, 0)
+    viewer.control_panel.crop_viewport = True
+    assert panel.shown.mode == "residual" and panel.shown.gain == 1.5
+    assert (coarse(Browser.sees(viewer, pose)["rgb"]) - plain).abs().mean() > 0.05
+    assert model.crop_box is None
+    # The viewer's crop box is one unit wide, and the scene is larger: there is less to see.
+    cropped = Browser.sees(viewer, pose)["accumulation"].mean()
+    viewer.control_panel.crop_viewport = False
+    assert 0 < cropped < Browser.sees(viewer, pose)["accumulation"].mean()
+    panel.mode.value = FULL  # transparent pixels show the viewer's background now
+    assert Browser.sees(viewer, pose)["background"][0, 0].tolist() == [1.0, 0.0, 0.0]
+
+    after = model.get_outputs_for_camera(camera)
+    assert all(torch.equal(after[name], before[name]) for name in before)
+    assert model.get_image_metrics_and_images(after, batch)[0] == before_metrics
+
+
+STEPS = 18
+"""Two refinements and a change of resolution."""
+
+
+def watched_training(scene, out, each_step, **more) -> dict:
+    """Train for STEPS and call each_step(trainer) after each; parameters, optimisers and random state at the end."""
+    options = {
+        "--max-num-iterations": STEPS,
+        "--vis": "tensorboard",
+        "--steps-per-eval-image": 1000,
+        "--steps-per-eval-all-images": 1000,
+        "--logging.local-writer.enable": False,
+        "--logging.profiler": "none",
+        "--pipeline.model.warmup-length": 2,
+        "--pipeline.model.refine-every": 4,
+        "--pipeline.model.reset-alpha-every": 100,
+        "--pipeline.model.densify-grad-thresh": 1e-6,
+        "--pipeline.model.resolution-schedule": 9,
+        "--pipeline.model.num-downscales": 1,
+        **more,
+    }
+    words = [str(word) for option in options.items() for word in option]
+    config = parse(["nrfgs", "--data", str(scene), "--output-dir", str(out), *words])
+    _set_random_seed(config.machine.seed)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer._update_viewer_state = lambda step: each_step(trainer)
+    trainer.train()
+    held = [p for o in trainer.optimizers.optimizers.values() for s in o.state.values() for p in s.values()]
+    return {
+        "parameters": dict(trainer.pipeline.model.state_dict()),
+        "optimisers": [value for value in held if isinstance(value, torch.Tensor)],
+        "random": torch.get_rng_state(),
+        "folder": trainer.base_dir,
+    }
+
+
+def assert_same_training(a: dict, b: dict) -> None:
+    tensors = [name for name, value in a["parameters"].items() if isinstance(value, torch.Tensor)]
+    assert all(torch.equal(a["parameters"][name], b["parameters"][name]) for name in tensors)
+    assert len(a["optimisers"]) == len(b["optimisers"]) > 0
+    assert all(torch.equal(one, other) for one, other in zip(a["optimisers"], b["optimisers"], strict=True))
+    assert torch.equal(a["random"], b["random"])
+
+
+def test_a_training_does_not_notice_who_watches(tiny_scene, tmp_path, open_viewer):
+    """To the bit: the same training with a browser that looks at something else after every second step."""
+    wishes = [
+        (mode, gain, frozen) for gain, frozen in ((0.0, True), (2.0, False)) for mode in [FULL, *FIELD, VIEW_DEPENDENCE]
+    ]
+    viewers, seen = [], []
+
+    def watch(trainer):
+        model = trainer.pipeline.model
+        if trainer.step % 2:
+            return
+        if not viewers:
+            viewers.append(open_viewer(trainer.pipeline))
+        panel, cameras = model.viewer_panel, trainer.pipeline.datamanager.train_dataset.cameras
+        panel.mode.value, panel.gain.value, panel.freeze.value = wishes[len(seen) % len(wishes)]
+        panel.frozen_center = cameras.camera_to_worlds[3, :3, 3]
+        viewers[0].control_panel.background_color = (255, 0, 0)
+        seen.append(Browser.sees(viewers[0], cameras.camera_to_worlds[len(seen) % 8])["rgb"].mean().item())
+
+    alone = watched_training(tiny_scene, tmp_path / "alone", lambda trainer: None)
+    watched = watched_training(tiny_scene, tmp_path / "watched", watch)
+    assert len(seen) == STEPS // 2 and len(set(seen)) > 1
+    assert len(alone["parameters"]["gauss_params.means"]) != 300, "nothing was densified: the test would prove less"
+    assert_same_training(alone, watched)
+
+
+def test_tensorboard_is_told_about_the_head_and_the_training_does_not_notice(tiny_scene, tmp_path, monkeypatch):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    # The same evaluations in both, since nerfstudio draws their images with the generator that orders the training's.
+    often = {"--steps-per-eval-image": 4, "--steps-per-eval-all-images": 8}
+    tracked = watched_training(tiny_scene, tmp_path / "tracked", lambda trainer: None, **often)
+    monkeypatch.setattr(nrfgs_ns.training.trainer, "track", lambda *_: None)
+    quiet = watched_training(tiny_scene, tmp_path / "quiet", lambda trainer: None, **often)
+    assert_same_training(quiet, tracked)
+
+    def logged(run):
+        events = EventAccumulator(str(run["folder"])).Reload()
+        ours = {
+            kind: sorted(tag for tag in events.Tags()[kind] if tag.startswith("Appearance/"))
+            for kind in ("scalars", "histograms", "images")
+        }
+        return events, ours
+
+    events, ours = logged(tracked)
+    numbers = [
+        "residual (rms)",
+        "low branch (rms)",
+        "high branch (rms)",
+        "opacity residual (rms)",
+        "gate weight (mean)",
+    ]
+    expected = sorted(f"Appearance/{name}" for name in [*numbers, "splats", "visible splats"])
+    assert ours == {
+        "scalars": expected,
+        "histograms": sorted(f"Appearance/{name}" for name in FIELD),
+        "images": sorted(f"Appearance/{name}" for name in [BASE, *FIELD]),
+    }
+    assert [event.step for event in events.Images("Appearance/residual")] == [8, 16]
+    assert [event.step for event in events.Scalars("Appearance/splats")] == [4, 8, 12, 16]
+    splats = [event.value for event in events.Scalars("Appearance/splats")]
+    assert splats[0] == 300 and splats[-1] == len(tracked["parameters"]["gauss_params.means"])
+    residual = [event.value for event in events.Scalars("Appearance/residual (rms)")]
+    assert 0 < residual[-1] <= 0.2 * 3**0.5
+    visible = events.Scalars("Appearance/visible splats")[-1].value
+    histogram = events.Histograms("Appearance/gate weight")[-1].histogram_value
+    assert histogram.num == visible and 0 < histogram.min < histogram.max < 1
+    assert logged(quiet)[1] == {"scalars": [], "histograms": [], "images": []}
+
+
+def test_base_class_shows_what_forward_adds():
+    head = ShConfig(degree=1).setup()
+    splats = {"means": torch.zeros(4, 3), "opacities": torch.zeros(4, 1), **head.splat_params(torch.full((4, 3), 0.5))}
+    splats["features_rest"] = torch.full((4, 3, 3), 0.1)
+    visible, center = torch.tensor([1, 3]), torch.tensor([0.0, 0.0, 2.0])
+    (component,) = head.components(splats, visible, center).values()
+    added = head(splats, visible, center).colors - base_colors(splats["features_dc"][visible])
+    assert component.kind == "color" and torch.equal(component.values, added) and added.abs().max() > 0.01
+
+
+def test_a_browser_begins_at_the_first_photograph(build):
+    """Near where it was taken, in front of it, looking where it looks; as soon as there are any."""
+    panel = build().model.viewer_panel
+    turned = SO3.from_y_radians(0.5) @ SO3.from_x_radians(-0.3)
+    looks = [turned if i == 0 else turned.inverse() for i in range(4)]
+    taken = [SimpleNamespace(position=np.full(3, 1.0 + i), wxyz=look.wxyz) for i, look in enumerate(looks)]
+    client = SimpleNamespace(camera=SimpleNamespace(position=None, wxyz=None), atomic=nullcontext)
+    panel.viewer, panel.waiting = SimpleNamespace(config=ViewerConfig(), camera_handles={}), []
+    panel._welcome(client)
+    assert client.camera.position is None and panel.waiting == [client]
+    panel.viewer.camera_handles = dict(enumerate(taken))
+    panel._welcome_waiting()
+    assert panel.waiting == []
+    np.testing.assert_array_equal(client.camera.wxyz, turned.wxyz)
+    ahead = turned.inverse() @ (client.camera.position - taken[0].position)
+    # z is forwards; the photograph's plane is at 1.9 sizes for a field of 60 degrees (viser keeps the volume).
+    np.testing.assert_allclose(ahead, [0, 0, 5 * ViewerConfig().camera_frustum_scale], atol=1e-6)
