@@ -211,7 +211,8 @@ def recovered(checkpoint: Path, truth: Path) -> dict[str, Any] | None:
             "white_balance_rms_error_stops": _rms(_ratios(stops) - _ratios(wanted)),
         }
     names = [Path(name).stem for name in model.names]
-    return {**result, "stops": {name: [round(x, 4) for x in row] for name, row in zip(names, stops.tolist())}}  # noqa: B905
+    rows = zip(names, stops.round(4).tolist(), strict=True)
+    return {**result, "stops": dict(rows)}
 
 
 def _ratios(stops: np.ndarray) -> np.ndarray:
@@ -229,9 +230,9 @@ def _correlation(one: np.ndarray, other: np.ndarray) -> float | None:
 
 def summary(case: str, record: dict[str, Any]) -> str:
     """One line."""
-    test, learnt = record["measured"]["test"], record["photographs"]
+    test, learnt, train = record["measured"]["test"], record["photographs"], record["train"]
     text = f"{record['study']['scene']:10} {case:11} PSNR {test['psnr']:.2f} cc {test['cc_psnr']:.2f} "
-    text += f"SSIM {test['ssim']:.4f} cc {test['cc_ssim']:.4f} {1e3 * record['train']['seconds'] / record['train']['steps']:.2f} ms/step"
+    text += f"SSIM {test['ssim']:.4f} cc {test['cc_ssim']:.4f} {1e3 * train['seconds'] / train['steps']:.2f} ms/step"
     if learnt:
         text += f" | rms {learnt['rms_stops']:.3f} stops"
         if "correlation" in learnt:

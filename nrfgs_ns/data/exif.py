@@ -8,6 +8,7 @@ from typing import Any
 from PIL import ExifTags, Image
 
 from nrfgs_ns.data.pictures import open_picture
+from nrfgs_ns.errors import InputError
 
 NUMBERS = {
     "exposure_time": ExifTags.Base.ExposureTime,
@@ -33,6 +34,26 @@ def read_exif(path: Path) -> dict[str, float | str]:
             return known(image.getexif())
     except Exception:  # PIL lets out whatever it meets in a broken file
         return {}
+
+
+def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, float | str]:
+    """The same from a frame of transforms.json, as `nrfgs prepare` writes it; nothing where there is no "exif".
+
+    Raises:
+        InputError: it is no dictionary, or one of its numbers is none above 0.
+    """
+    told = frame.get("exif", {})
+    good = isinstance(told, dict) and all(
+        isinstance(told[name], int | float) and math.isfinite(told[name]) and told[name] > 0
+        for name in NUMBERS
+        if name in told
+    )
+    if not good:
+        raise InputError(
+            f'{source}: "exif" of the frame {frame.get("file_path")} must hold numbers above 0 ({", ".join(NUMBERS)}). '
+            "Correct or remove it."
+        )
+    return told
 
 
 def known(exif: Image.Exif) -> dict[str, float | str]:

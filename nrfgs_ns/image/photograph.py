@@ -19,7 +19,7 @@ its own and the mean of all is the scene's.
 
 What all photographs have in common belongs to the scene: exposure and white balance have mean zero over the
 photographs (`center_`, after each step), so that the scene, and what is exported of it, has the photographs' mean look.
-All parameters are zero where nothing happens, so that weight decay holds back what the photographs say little about.
+All parameters are zero where nothing happens.
 
 The parts are those of PPISP (Deutsch et al., arXiv 2601.18336), in the pixels' own space instead of a linear one.
 """
@@ -51,6 +51,8 @@ BASIS = {
 """Stops of red, green and blue for one stop of each number of a photograph."""
 TOE_STEP = 0.05
 """The toe's unit where it is learnt."""
+PENALTY = 0.01
+"""Weight of the squared stops in the loss."""
 
 
 class PhotographModel(nn.Module):
@@ -151,6 +153,18 @@ class PhotographModel(nn.Module):
         return self._radii[key]
 
     # What is learnt.
+
+    def penalty(self, index: int) -> Tensor:
+        """What a photograph's numbers, and its camera's, cost in the loss, a scalar: nothing for what does nothing.
+
+        The photometric loss grows with the error and this with the square, so that it holds back what the pictures say
+        little about, and little else.
+        """
+        camera = self.camera_of[index]
+        numbers = [] if self.shots is None else [self.shots[index]]
+        numbers += [table[camera] for table in (self.falloff, self.curves) if table is not None]
+        own = numbers[0] if len(numbers) == 1 else torch.cat(numbers)
+        return PENALTY * torch.dot(own, own)
 
     @torch.no_grad()
     def center_(self) -> None:

@@ -47,10 +47,10 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
         return None
     dataset = datamanager.train_dataset
     paths, cameras = dataset.image_filenames, dataset.cameras
-    exif = exif_of(paths, datamanager.train_dataparser_outputs.metadata.get("exif", {}))
+    told = datamanager.train_dataparser_outputs.metadata
+    exif = exif_of(paths, told.get("exif"))
     known = torch.tensor([exposure(of_one) for of_one in exif])
-    points = datamanager.train_dataparser_outputs.metadata.get("points3D_xyz")
-    pairs = compare_photographs(points, cameras, datamanager.cached_train)
+    pairs = compare_photographs(told.get("points3D_xyz"), cameras, datamanager.cached_train)
     wanted, why = verdict(config.photographs, pairs, known)
     what = " and ".join(part.replace("-", " ") for part in config.photograph_parts)
     CONSOLE.print(f"Photographs: {what} {'learnt' if wanted else 'not learnt'}: {why}.", soft_wrap=True, markup=False)
@@ -88,9 +88,33 @@ def verdict(choice: Choice, pairs: Pairs, known: Tensor) -> tuple[bool, str]:
     return needed or choice == "on", f"{asked}{seen}{enough}; {told}"
 
 
-def exif_of(paths: Sequence[Path], stored: Mapping[Path, Exif]) -> list[Exif]:
+def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
+    """Raise InputError where a training goes on that had learnt other photographs, or other parts of them.
+
+    Args:
+        own: of the training that goes on.
+        written: what the checkpoint says of its own, None if it learnt none.
+    """
+    if (own is None) != (written is None):
+        theirs, ours = ("on", "off") if own is None else ("off", "on")
+        raise InputError(
+            f"The checkpoint was trained with photographs {theirs}, this training has them {ours}. Set "
+            f"--pipeline.model.photographs {theirs}, or train anew."
+        )
+    if own is None:
+        return
+    if list(own.parts) != written["parts"]:
+        raise InputError(
+            "The checkpoint's training learnt other parts of its photographs. Set "
+            f"--pipeline.model.photograph-parts {' '.join(written['parts'])}, or train anew."
+        )
+    if own.names != written["names"]:
+        raise InputError("The checkpoint was trained on other photographs. Go on with the same ones, or train anew.")
+
+
+def exif_of(paths: Sequence[Path], stored: Sequence[Exif] | None) -> list[Exif]:
     """What the data set says of each photograph, or else its file. [V]"""
-    return [stored.get(path) or read_exif(path) for path in paths]
+    return [told or read_exif(path) for path, told in zip(paths, stored or [{}] * len(paths), strict=True)]
 
 
 def exposure(exif: Exif) -> float:

@@ -4,7 +4,7 @@
 import pytest
 import torch
 
-from nrfgs_ns.image.photograph import GAMMA, PARTS, TOE, TOE_STEP, PhotographModel, exposed
+from nrfgs_ns.image.photograph import GAMMA, PARTS, PENALTY, TOE, TOE_STEP, PhotographModel, exposed
 
 LENSES = torch.tensor([[0.5, 0.5, 1.0, 1.5], [0.4, 0.6, 2.0, 3.0]])
 CHOICES = [("exposure",), ("white-balance",), ("exposure", "white-balance"), ("vignetting",), ("response",), PARTS]
@@ -97,7 +97,7 @@ def test_gradients_against_finite_differences(parts):
 
     def taken(image, *values):
         with torch.nn.utils.stateless._reparametrize_module(model, dict(zip(names, values, strict=True))):
-            return model(image, 3)
+            return model(image, 3), model.penalty(3)
 
     inputs = (image, *(value.detach().requires_grad_(True) for value in values))
     assert torch.autograd.gradcheck(taken, inputs)
@@ -138,6 +138,15 @@ def test_bounds_hold_after_a_step():
     assert torch.isfinite(model(torch.rand(3, 3, 3) * 4, 0)).all()
 
 
+def test_penalty_is_the_squared_stops_and_nothing_at_the_start():
+    model = model_of(("exposure", "white-balance"))
+    assert model.penalty(2) == 0.0 and model_of(PARTS).penalty(0) == 0.0
+    with torch.no_grad():
+        model.shots[2] = torch.tensor([1.0, 0.5, -0.5])
+    assert model.penalty(2).item() == pytest.approx(PENALTY * 1.5)
+    assert model.penalty(1) == 0.0
+
+
 def test_recovers_known_exposures_from_the_photographs_alone():
     torch.manual_seed(3)
     scene, truth = torch.rand(24, 24, 3) * 0.6 + 0.1, torch.randn(6, 3) * 0.4
@@ -150,7 +159,7 @@ def test_recovers_known_exposures_from_the_photographs_alone():
         optimizer.zero_grad()
         index = step % 6
         error = (model(guess, index).clamp(0.0, 1.0) - photographs[index]).abs().mean()
-        error.backward()
+        (error + model.penalty(index)).backward()
         optimizer.step()
         model.center_()
     assert (model.stops() - truth).abs().max() < 0.1
