@@ -50,7 +50,7 @@ def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, float | str]:
     )
     if not good:
         raise InputError(
-            f'{source}: "exif" of the frame {frame.get("file_path")} must hold numbers above 0 ({", ".join(NUMBERS)}). '
+            f'{source}: "exif" of {frame.get("file_path")} must hold numbers above 0 ({", ".join(NUMBERS)}). '
             "Correct or remove it."
         )
     return told

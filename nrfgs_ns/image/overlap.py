@@ -42,6 +42,8 @@ ENOUGH_PAIRS = 0.2
 """Share of the pairs beyond noise from which on the capture's exposure varies. Captures with fixed exposure have 0.02
 to 0.15 (what is left is gloss), those of cameras that choose it by themselves 0.25 to 0.5."""
 
+FEWEST_PAIRS = 8
+
 SMALLEST_SPREAD = 0.02
 """Stops; regions that agree by chance do not make a pair certain."""
 USUAL_STOPS = 0.5, 0.2, 0.2
@@ -62,8 +64,9 @@ class Pairs(NamedTuple):
 
     @property
     def share_beyond_noise(self) -> float:
-        """Share of the pairs whose exposure or white balance differs by more than noise: the largest column's."""
-        if len(self.first) == 0:
+        """Share of the pairs whose exposure or white balance differs by more than noise: the largest column's. 0 for so
+        few pairs that they tell nothing."""
+        if len(self.first) < FEWEST_PAIRS:
             return 0.0
         size = self.shift.abs()
         return float(((size > SMALLEST_SHIFT) & (size > BEYOND_NOISE * self.spread)).double().mean(dim=0).max())

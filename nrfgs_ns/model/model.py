@@ -173,8 +173,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         return {name: [parameter] for name, parameter in self.gauss_params.items()}
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """One group for each per-splat tensor, "field" for the head's shared weights if it has any, "photograph" for what
-        happened to the photographs if that is learnt."""
+        """One group for each per-splat tensor, "field" for the head's shared weights if it has any, "photograph" for
+        the photographs' exposures if they are learnt."""
         groups = super().get_param_groups()
         others = {"field": list(self.head.parameters())}
         if self.photograph is not None:
@@ -299,6 +299,15 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             {name: value for name, value in metrics.items() if value is not None},
             {"img": torch.cat([truth, rgb], dim=1)},
         )
+
+    def as_photographed(self, outputs: dict[str, Tensor], camera: Cameras) -> dict[str, Tensor]:
+        """What the mean look becomes in the camera that took a test photograph: its vignetting and response, if learnt.
+        Exposure and white balance of that photograph stay unknown."""
+        if self.photograph is None:
+            return outputs
+        sizes = (float(value.flatten()[0]) for value in (camera.width, camera.height, camera.fx, camera.fy))
+        rgb = self.photograph.by_camera(outputs["rgb"], self.photograph.camera_like(*sizes))
+        return {**outputs, "rgb": rgb.clamp(0.0, 1.0)}
 
     def _mask(self, batch) -> Tensor | None:
         """The image's mask at the rendered size, bool [H, W, 1], or None. A pixel half covered counts as inside."""

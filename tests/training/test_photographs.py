@@ -3,7 +3,6 @@
 
 import json
 import math
-import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -43,6 +42,7 @@ SAME, DIFFERENT = pairs_with([0.01] * 10), pairs_with([0.5, -0.5] * 5)
         ("auto", DIFFERENT, [NAN] * 11, True, "100% of 10 neighbouring pairs"),
         ("auto", pairs_with([0.5, -0.5] * 5, spread=0.5), [NAN] * 11, False, "0% of 10"),
         ("auto", pairs_with([]), [NAN] * 11, False, "no points to compare them by; EXIF says nothing"),
+        ("auto", pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "0% of 3"),
         ("auto", pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 1.5 stops"),
         ("auto", SAME, [0.3] * 11, False, "EXIF says that exposure is the same"),
         ("auto", DIFFERENT, [0.0, 0.5] * 5 + [0.0], True, "which explains 100% of their difference"),
@@ -93,11 +93,11 @@ def test_cameras_are_told_apart_by_exif_or_by_their_angle():
 
 @pytest.fixture(scope="module")
 def exposed_scene(tmp_path_factory):
-    """A procedural data set of 24 photographs, 64 x 48, with known stops, and those stops by name."""
+    """A procedural data set of 24 photographs, 128 x 96, with known stops, and those stops by name."""
     from nrfgs_lab.exposure import exposed
     from nrfgs_ns.scenes import SceneConfig, write_scene
 
-    config = SceneConfig(views=24, width=64, height=48, points=3000, samples=1)
+    config = SceneConfig(views=24, width=128, height=96, points=4000, samples=1)
     scene = write_scene(config, tmp_path_factory.mktemp("data") / "exposed")
     meta = json.loads((scene / "transforms.json").read_text())
     random, stops = np.random.default_rng(0), {}
@@ -112,35 +112,36 @@ def exposed_scene(tmp_path_factory):
 
 
 QUICK = {
-    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.num-downscales": 1,
     "--pipeline.model.background-color": "black",
     "--pipeline.model.warmup-steps": 0,
     "--pipeline.model.refine-every": 1000,
 }
 
 
-def test_known_exposures_are_found_and_told(exposed_scene, tmp_path, capsys):
-    scene, stops = exposed_scene
-    config = trained(command_line("nrfgs-sh", scene, tmp_path, 30, QUICK))
-    told = capsys.readouterr().out
-    assert "Photographs: exposure and white balance learnt" in " ".join(told.split())
-    state = checkpoint_of(config)["pipeline"]
+@pytest.fixture(scope="module")
+def finished(exposed_scene, tmp_path_factory):
+    """config.yml of a training of four steps, whose exposures come from the photographs themselves."""
+    return trained(command_line("nrfgs-sh", exposed_scene[0], tmp_path_factory.mktemp("whole"), 4, QUICK))
+
+
+def test_known_exposures_are_found(exposed_scene, finished):
+    _, stops = exposed_scene
+    state = checkpoint_of(finished)["pipeline"]
     names = state["_model.photograph._extra_state"]["names"]
     learnt = state["_model.photograph.shots"][:, 0].numpy()
     truth = np.array([np.mean(stops[name]) for name in names])
     assert np.corrcoef(learnt, truth)[0, 1] > 0.95
-    assert np.abs(learnt - (truth - truth.mean())).mean() < 0.25
+    assert np.abs(learnt - (truth - truth.mean())).mean() < 0.15
     assert abs(learnt.mean()) < 1e-6
 
 
-def test_resumed_is_the_unbroken_one(exposed_scene, tmp_path):
+def test_resumed_is_the_unbroken_one(exposed_scene, finished, tmp_path, capsys):
     scene, _ = exposed_scene
-    whole = trained(command_line("nrfgs-sh", scene, tmp_path / "whole", 12, QUICK))
-    half = trained(command_line("nrfgs-sh", scene, tmp_path / "half", 6, QUICK))
-    rest = trained(
-        command_line("nrfgs-sh", scene, tmp_path / "rest", 6, QUICK, {"--load-dir": models_of(half)}),
-    )
-    assert_same_training(checkpoint_of(whole), checkpoint_of(rest), rtol=0, atol=0)
+    half = trained(command_line("nrfgs-sh", scene, tmp_path / "half", 2, QUICK))
+    assert "Photographs: exposure and white balance learnt: " in " ".join(capsys.readouterr().out.split())
+    rest = trained(command_line("nrfgs-sh", scene, tmp_path / "rest", 2, QUICK, {"--load-dir": models_of(half)}))
+    assert_same_training(checkpoint_of(finished), checkpoint_of(rest), rtol=0, atol=0)
 
 
 def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path):
@@ -163,12 +164,11 @@ def test_both_corrections_at_once_are_refused(tiny_scene, tmp_path):
         trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 2, QUICK, both))
 
 
-def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, tmp_path, monkeypatch):
+def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished, monkeypatch):
     from nerfstudio.utils.eval_utils import eval_setup
 
-    scene, stops = exposed_scene
-    config = trained(command_line("nrfgs-sh", scene, tmp_path, 5, QUICK))
-    _, pipeline, _, _ = eval_setup(config)
+    _, stops = exposed_scene
+    _, pipeline, _, _ = eval_setup(finished)
     model = pipeline.model
     camera = pipeline.datamanager.train_dataset.cameras[:1]
     mean = model.get_outputs_for_camera(camera)["rgb"]
@@ -178,4 +178,3 @@ def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, tmp_path,
     monkeypatch.setenv("NRFGS_LOOK", "nobody.jpg")
     with pytest.raises(InputError, match="nobody.jpg"):
         model.get_outputs_for_camera(camera)
-    shutil.rmtree(tmp_path)
