@@ -31,13 +31,7 @@ def export_compact(
     load_config: Path, output: Path, options: CompactOptions, measure: bool, report: Path | None
 ) -> None:
     """See `nrfgs export --help`."""
-    options.precision.validate()
-    if options.views < 1:
-        raise InputError(f"--compact.views is {options.views}; it must be at least 1.")
-    for name in ("budget", "threshold"):
-        value = getattr(options, name)
-        if value is not None and not value >= 0:
-            raise InputError(f"--compact.{name} is {value}; it must be zero or positive.")
+    check_options(options)
     pipeline = load_model(load_config, "test")
     field, threshold = chosen_field(pipeline, load_config, options)
     model = pipeline.model
@@ -76,6 +70,17 @@ def export_compact(
     if report is not None:
         report.parent.mkdir(parents=True, exist_ok=True)
         report.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+
+
+def check_options(options: CompactOptions) -> None:
+    """Raise InputError, naming the option, if a value cannot work."""
+    options.precision.validate()
+    if options.views < 1:
+        raise InputError(f"--compact.views is {options.views}; it must be at least 1.")
+    for name in ("budget", "threshold"):
+        value = getattr(options, name)
+        if value is not None and not value >= 0:
+            raise InputError(f"--compact.{name} is {value}; it must be zero or positive.")
 
 
 def chosen_field(pipeline, load_config: Path, options: CompactOptions) -> tuple[Field, float]:
