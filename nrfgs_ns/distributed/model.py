@@ -48,6 +48,7 @@ class ShardedModel(NrfgsModel):
         super().populate_modules()
         if self.trimming is not None:
             raise InputError("pipeline.model.robust_loss is for one device. Leave it out, or use one.")
+        self.view_noise.seed += comm.rank()  # each device has other splats
         self.sizes: list[tuple[int, int]] = []
         if isinstance(self.densification, Mcmc):
             budget, rank = self.densification.budget, comm.rank()
@@ -88,7 +89,8 @@ class ShardedModel(NrfgsModel):
         splats = self._splats_to_draw()
         projection = self._project_everywhere(splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
-        appearance = self.head(splats, projection.gaussian_ids, centers)
+        seen = self.view_noise.moved(splats, self.step) if self.training else splats
+        appearance = self.head(seen, projection.gaussian_ids, centers)
 
         absgrad = self.training and self.densification.needs_absgrad(self.step)
         own, colored = send_to_cameras(projection, appearance, *self.sizes[comm.rank()], absgrad)

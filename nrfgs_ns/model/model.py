@@ -7,6 +7,7 @@ nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the pa
 hold, so that an interrupted training can go on.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -38,6 +39,7 @@ from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.checkpoint import check_compatible, reduced_config
 from nrfgs_ns.model.exported import ExportedTables
 from nrfgs_ns.model.renderer import Rendering
+from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.training.pace import Pace
 from nrfgs_ns.viewer.panel import ViewerPanel
@@ -54,6 +56,9 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """target class to instantiate"""
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
+    view_noise: float = 0.0
+    """in training the head sees each splat from a camera centre of its own, moved by noise this many times as long as
+    neighbouring training cameras are apart (docs/captures.md). 0: from the camera's"""
     warmup_steps: int | None = None
     """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
     A head that adds nothing from the start skips them."""
@@ -95,6 +100,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     config: NrfgsModelConfig
     reduced_head: dict[str, Any] | None = None
     """options of the head that a checkpoint was written with, where they are not the configuration's"""
+    camera_spacing: float = 0.0
+    """world units between neighbouring training cameras; 0 until a training begins"""
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
 
@@ -127,6 +134,9 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             else get_color(self.config.background_color)
         )
         self.densification = build_densification(self.config, self.num_train_data, self.scene_unit)
+        if not self.config.view_noise >= 0.0:
+            raise InputError(f"pipeline.model.view_noise is {self.config.view_noise}; it must be zero or positive.")
+        self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
 
     def _initial_splats(self) -> dict[str, Parameter]:
         """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
@@ -183,7 +193,10 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
-        self.densification.see_cameras(cameras.camera_to_worlds[:, :3, 3])
+        centers = cameras.camera_to_worlds[:, :3, 3]
+        self.densification.see_cameras(centers)
+        self.camera_spacing = camera_spacing(centers)
+        self.view_noise.sigma = self.config.view_noise * self.camera_spacing / math.sqrt(3.0)
 
         def before_first_step(step: int) -> None:
             steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps

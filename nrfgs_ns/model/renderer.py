@@ -122,7 +122,8 @@ class Rendering:
             and "depth" [H, W, 1], which is left out of training unless `output_depth_during_training`.
         """
         view = self.look(camera)
-        appearance = self.head(view.splats, view.visible, view.center)
+        splats = self.view_noise.moved(view.splats, self.step) if self.training else view.splats
+        appearance = self.head(splats, view.visible, view.center)
         outputs, self.info = self.paint(view, appearance, photograph=self._photograph_of(camera))
         if self.training:
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
