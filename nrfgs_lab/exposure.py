@@ -189,7 +189,7 @@ def recovered(checkpoint: Path, truth: Path) -> dict[str, Any] | None:
     import torch
 
     from nrfgs_ns.image.photograph import PhotographModel
-    from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
+    from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 
     allow_nerfstudio_checkpoints()
     prefix = "_model.photograph."

@@ -41,7 +41,6 @@ from nrfgs_ns.model.exported import ExportedTables
 from nrfgs_ns.model.renderer import Rendering
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.training.pace import Pace
 from nrfgs_ns.viewer.panel import ViewerPanel
 
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
@@ -102,8 +101,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     """options of the head that a checkpoint was written with, where they are not the configuration's"""
     camera_spacing: float = 0.0
     """world units between neighbouring training cameras; 0 until a training begins"""
-    pace: Pace | None = None
-    """how fast the training walks through its schedules; None: a step is a step"""
+    _scheduled: int | None = None
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
@@ -218,7 +216,11 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     @property
     def schedule_step(self) -> int:
         """The step that the head and the resolution are scheduled by."""
-        return self.step if self.pace is None else int(self.pace.position)
+        return self.step if self._scheduled is None else self._scheduled
+
+    def schedule_at(self, step: int) -> None:
+        """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
+        self._scheduled = step
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
@@ -343,7 +345,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         }
         if self.reduced_head is not None:
             state["capacity"] = {"head": self.reduced_head}
-        return state if self.pace is None else {**state, "pace": self.pace.state()}
+        return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         written_by = state.get("densification", "splatfacto")  # older checkpoints do not say
@@ -353,9 +355,10 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
-        if "pace" in state:
-            self.pace = self.pace or Pace(state["pace"]["length"])
-            self.pace.load_state(state["pace"])
+        if "pace" in state:  # of version 0.1.0
+            state = {**state, "schedule_step": int(state["pace"]["position"])}
+        if "schedule_step" in state:
+            self.schedule_at(state["schedule_step"])
             self.head.set_step(self.schedule_step)
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):
