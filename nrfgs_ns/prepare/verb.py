@@ -75,6 +75,11 @@ class Prepare:
             run.verdict()
         except OSError as error:  # no permission, no space, ...
             raise InputError(f"{error.filename or self.out}: {error.strerror or error}.") from error
+        except RuntimeError as error:  # COLMAP's
+            work = self.out / "work"
+            raise InputError(
+                f"{work}: COLMAP stops with {str(error)!r}. If the disk has room, delete {work} and run this again."
+            ) from error
 
 
 class Run:
@@ -96,8 +101,8 @@ class Run:
         if self.out.exists() and not self.state_file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
         try:
-            self.state = json.loads(self.state_file.read_text()) if self.state_file.is_file() else {}
-        except ValueError as error:
+            self.state = dict(json.loads(self.state_file.read_text())) if self.state_file.is_file() else {}
+        except (ValueError, TypeError) as error:
             raise InputError(f"{self.state_file} is damaged ({error}). Delete {self.out} and begin again.") from error
         self.key = files.digest(self.inputs)
 

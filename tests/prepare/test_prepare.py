@@ -329,6 +329,23 @@ def test_the_verb_says_it_in_one_line(tmp_path, monkeypatch):
         entrypoint()
 
 
+@pytest.mark.parametrize(
+    ("file", "content", "said"),
+    [
+        ("state.json", "[1, 2]", "state.json is damaged"),
+        ("state.json", "{", "state.json is damaged"),
+        ("database.db", "no database", "COLMAP stops with"),
+    ],
+)
+def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, content, said):
+    out = tmp_path / "scene"
+    shutil.copytree(prepared, out)
+    shutil.rmtree(out / "work" / "model")
+    (out / "work" / file).write_text(content)
+    with pytest.raises(InputError, match=said):
+        Prepare(walls, out).main()
+
+
 # Collecting.
 
 
