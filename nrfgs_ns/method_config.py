@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -56,6 +56,7 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
             steps_per_save=2000,
             steps_per_eval_all_images=1000,
             mixed_precision=False,
+            logging=LoggingConfig(profiler="none"),  # its table of durations would end every command
             machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
             pipeline=NrfgsPipelineConfig(model=NrfgsModelConfig(appearance=appearance)),
             optimizers={
@@ -67,6 +68,7 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
                 **optimizers,
                 "camera_opt": adam(1e-4, lr_final=5e-7, warmup_steps=1000, lr_pre_warmup=0),
                 "bilateral_grid": adam(2e-3, lr_final=1e-4, warmup_steps=1000, lr_pre_warmup=0),
+                "photograph": adam(5e-3, lr_final=1e-4, warmup_steps=500, lr_pre_warmup=0),
             },
             viewer=LocalViewerConfig(num_rays_per_chunk=1 << 15),
             vis="viewer",

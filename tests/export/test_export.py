@@ -399,7 +399,7 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
     lost = tmp_path / "config.yml"
     text = trained("nrfgs").read_text()
     lost.write_text(text.replace("timestamp: ", "timestamp: no-"))
-    with pytest.raises(InputError, match="Run this in the folder"):
+    with pytest.raises(InputError, match="no checkpoints beside it"):
         Export("ply", lost, tmp_path / "s.ply").main()
 
 
