@@ -5,6 +5,7 @@
 composites them over the background. Nothing here needs CUDA.
 """
 
+import os
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -22,6 +23,8 @@ from nrfgs_ns.viewer.panel import asked_by_viewer
 
 NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 """Depths between which splats are drawn, in scene units: splatfacto's."""
+LOOK = "NRFGS_LOOK"
+"""Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
 
 
 class View(NamedTuple):
@@ -121,11 +124,24 @@ class Rendering:
         view = self.look(camera)
         splats = self.view_noise.moved(view.splats, self.step) if self.training else view.splats
         appearance = self.head(splats, view.visible, view.center)
-        outputs, self.info = self.paint(view, appearance)
+        outputs, self.info = self.paint(view, appearance, photograph=self._photograph_of(camera))
         if self.training:
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._correct_colors(outputs, camera)
         return outputs
+
+    def _photograph_of(self, camera: Cameras) -> int | None:
+        """Which photograph's look a rendering has: in training, the one that the camera took; None: the mean look."""
+        if self.photograph is None:
+            return None
+        if self.training:
+            return (camera.metadata or {}).get("cam_idx")
+        name = os.environ.get(LOOK)
+        if name and name not in self.photograph.names:
+            raise InputError(
+                f"{LOOK} is {name!r}, which is none of the training photographs, such as {self.photograph.names[0]!r}."
+            )
+        return self.photograph.names.index(name) if name else None
 
     def _correct_colors(self, outputs: dict[str, Tensor], camera: Cameras) -> None:
         """Apply the training camera's bilateral grid to "rgb", if there are grids."""
@@ -156,7 +172,11 @@ class Rendering:
         self.viewer_panel.background = background_color
 
     def paint(
-        self, view: View, appearance: SplatAppearance, background: Tensor | None = None
+        self,
+        view: View,
+        appearance: SplatAppearance,
+        background: Tensor | None = None,
+        photograph: int | None = None,
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Composite the visible splats over the background.
 
@@ -164,6 +184,7 @@ class Rendering:
             view: what one camera sees.
             appearance: colours and opacities of the M visible splats.
             background: a colour [3] instead of the configuration's.
+            photograph: the picture has the look of this one; None: the mean look.
 
         Returns:
             As `get_outputs`; and the rasterizer's `info`, for densification.
@@ -183,8 +204,11 @@ class Rendering:
         render, alpha = render.squeeze(0), alpha.squeeze(0)  # a view; what [0] sends back is a copy among zeros
         height, width = alpha.shape[:2]
         self.last_size = (height, width)
+        rgb = render[..., :3] if with_depth else render
+        if photograph is not None:
+            rgb = self.photograph(rgb, photograph)
         outputs = {
-            "rgb": torch.clamp(render[..., :3] if with_depth else render, 0.0, 1.0),
+            "rgb": torch.clamp(rgb, 0.0, 1.0),
             "accumulation": alpha,
             "background": background if self.training else background.expand(height, width, 3),
         }
