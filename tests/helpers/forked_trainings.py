@@ -10,10 +10,7 @@ import os
 import sys
 import traceback
 
-from quick_start import ask_for_callers_quickly
-
-ask_for_callers_quickly()
-from nrfgs_ns.training.run import train  # noqa: E402
+from nrfgs_ns.training.run import train
 
 
 def main() -> None:
