@@ -23,6 +23,7 @@ from nerfstudio.utils.colormaps import apply_float_colormap
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import AppearanceHead, Component, SplatAppearance
+from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.rasterizer import composite
 
 if TYPE_CHECKING:
@@ -66,6 +67,10 @@ class Shown:
     """factor of the residuals, >= 0; 1 is as trained."""
     frozen_center: Tensor | None = None
     """where splats are seen from [3], in world units, if that is not where the camera is"""
+    stops: float = 0.0
+    """by how much the image is exposed more"""
+    photograph: int | None = None
+    """the training photograph whose exposure and colour the image has; None: the mean look"""
 
 
 def offered_components(head: AppearanceHead, splats: dict[str, Tensor]) -> dict[str, str]:
@@ -102,8 +107,10 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
     center = view.center if shown.frozen_center is None else shown.frozen_center.to(view.center)
     gain = 0.0 if shown.mode == BASE else shown.gain
     appearance = with_gain(model.head, view.splats, view.visible, center, gain)
-    outputs, _ = model.paint(view, appearance, background)
+    outputs, _ = model.paint(view, appearance, background, shown.photograph)
     if shown.mode in (FULL, BASE):
+        if shown.stops != 0.0:
+            outputs["rgb"] = exposed(outputs["rgb"], shown.stops)
         return outputs
 
     if shown.mode == DEPTH:
