@@ -22,6 +22,7 @@ from nrfgs_ns.image.metrics import METRIC_NAMES
 from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.averaging import ParameterMean
+from nrfgs_ns.viewer.panel import ViewerPanel
 
 
 @dataclass
@@ -65,6 +66,7 @@ class NrfgsPipeline(VanillaPipeline):
             )
         self.steps_per_log = 1  # the trainer knows better
         super().__init__(config, device, test_mode, **kwargs)
+        self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             self.datamanager.load_all_images()
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
