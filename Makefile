@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO_ARGS ?=
 # uv, not pip: it can leave out the dependencies that need a compiler (requirements.override).
-INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python --constraint requirements.lock --override requirements.override
+INSTALL := $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --constraint requirements.lock --override requirements.override
 
 .PHONY: demo test test-slow test-browser lint clean
 

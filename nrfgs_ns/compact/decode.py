@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A compact file as the tables of a model."""
 
+import math
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,9 +14,16 @@ from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.encode import FORMAT, GROUPS
-from nrfgs_ns.compact.format import read_container
+from nrfgs_ns.compact.format import LARGEST_RATIO, SMALL, read_container
 from nrfgs_ns.compact.quantise import Grid, from_morton, from_smallest_three
 from nrfgs_ns.errors import InputError
+
+MOST_BANDS = 16
+"""Of a head: the sixteenth repeats every ten microradians."""
+NUMBERS = 14
+"""Of a splat beside its latents."""
+LONGEST = 200
+"""Characters of what a message quotes."""
 
 
 class Decoded(NamedTuple):
@@ -41,12 +49,13 @@ def decode(path: Path) -> Decoded:
         if header["format"] != FORMAT:
             raise ValueError(f"it holds {header['format']!r}")
         config, weights = _config(header["head"]), _weights(streams)
-        _check(header, config, weights)
-        return Decoded(config, weights, _splats(header, streams), header)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        _check(header, config, weights, sum(stream.nbytes for stream in streams.values()))
+        return Decoded(config, weights, _splats(header, streams, config.latent_dim), header)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RuntimeError) as error:
         # The checksums hold: it was written like this.
+        reason = " ".join(str(error).split())[:LONGEST]
         raise InputError(
-            f"{path} does not describe a field ({type(error).__name__}: {error}). Export it again with nrfgs export "
+            f"{path} does not describe a field ({type(error).__name__}: {reason}). Export it again with nrfgs export "
             "compact."
         ) from error
 
@@ -59,13 +68,22 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     if unknown:
         raise ValueError(f"an unknown option {sorted(unknown)[0]!r} of the head")
     config = NrfConfig(**head["config"])
+    for name in known:
+        value, default = getattr(config, name), getattr(NrfConfig(), name)
+        right = isinstance(value, (int, float) if isinstance(default, float) else type(default))
+        if not right or isinstance(value, bool) != isinstance(default, bool):
+            raise ValueError(f"the head's {name} is {ascii(value)}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"the head's {name} is {value}")
+    if config.num_bands > MOST_BANDS:
+        raise ValueError(f"the head has {config.num_bands} bands")
     config.validate()
     return config
 
 
-def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor]) -> None:
+def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor], unpacked: int) -> None:
     """Raise ValueError where the header names sizes that the file does not have, or grids that are none."""
-    if config.latent_dim >= weights["low.0.weight"].shape[1]:
+    if config.latent_dim >= weights["low.0.weight"].shape[1]:  # it sees more than the latents
         raise ValueError(
             f"head.low.0.weight of shape {list(weights['low.0.weight'].shape)} with latents of {config.latent_dim}"
         )
@@ -77,6 +95,24 @@ def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor]
             numbers = np.asarray(header["grids"][name][part])
             if numbers.shape != (count,) or numbers.dtype.kind not in "if" or not np.isfinite(numbers).all():
                 raise ValueError(f"the {part} of the grid of {name} is not {count} numbers")
+        if not (np.asarray(header["grids"][name]["step"]) > 0).all():
+            raise ValueError(f"the step of the grid of {name} is not positive")
+    if config.hidden_width > weights["low.0.weight"].shape[0]:
+        raise ValueError(
+            f"head.low.0.weight of shape {list(weights['low.0.weight'].shape)} with {config.hidden_width} hidden units"
+        )
+    with torch.random.fork_rng(devices=[]):  # whose numbers are not looked at
+        shapes = {name: list(value.shape) for name, value in config.setup().state_dict().items()}
+    for name in shapes.keys() | weights.keys():
+        found = list(weights[name].shape) if name in weights else "none"
+        if found != shapes.get(name):
+            raise ValueError(f"head.{name} of shape {found}, for a head that has {shapes.get(name, 'none')}")
+        if not torch.isfinite(weights[name]).all():
+            raise ValueError(f"head.{name} is not finite")
+    count = sum(header["splats"][group] for group in GROUPS)
+    tables = 4 * count * (config.latent_dim + NUMBERS)
+    if tables > max(LARGEST_RATIO * unpacked, SMALL):
+        raise ValueError(f"{count} splats with latents of {config.latent_dim}, unpacked from {unpacked} bytes")
 
 
 def _weights(streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
@@ -84,20 +120,22 @@ def _weights(streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
     return {name: torch.from_numpy(value.astype(np.float32)) for name, value in weights.items()}
 
 
-def _splats(header: dict[str, Any], streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
+def _splats(header: dict[str, Any], streams: dict[str, np.ndarray], rank: int) -> dict[str, Tensor]:
     grids = {name: Grid(np.array(grid["low"]), np.array(grid["step"])) for name, grid in header["grids"].items()}
-    rank = header["head"]["config"]["latent_dim"]
     parts: dict[str, list[np.ndarray]] = {
         name: [] for name in ("means", "quats", "scales", "opacities", "colors", "latents", DIFFUSE)
     }
     for group in GROUPS:
         count = header["splats"][group]
 
-        def codes(name: str, columns: int, group: str = group, count: int = count) -> np.ndarray:
-            stream = streams[f"{group}.{name}"]
-            if stream.shape != (columns, count):
-                raise ValueError(f"{group}.{name} of shape {list(stream.shape)} instead of {[columns, count]}")
-            return stream.T.astype(np.int64)
+        def stream(name: str, columns: int, group: str = group, count: int = count) -> np.ndarray:
+            found = streams[f"{group}.{name}"]
+            if found.shape != (columns, count) or found.dtype.kind != "u":
+                raise ValueError(f"{group}.{name} of shape {list(found.shape)} instead of {[columns, count]}")
+            return found
+
+        def codes(name: str, columns: int, stream=stream) -> np.ndarray:
+            return stream(name, columns).T.astype(np.int64)
 
         differences, largest = streams[f"{group}.means"], streams[f"{group}.quats_largest"]
         if differences.shape != (count,) or largest.shape != (count,) or largest.max(initial=0) > 3:
@@ -107,13 +145,19 @@ def _splats(header: dict[str, Any], streams: dict[str, np.ndarray]) -> dict[str,
         parts["quats"].append(from_smallest_three(largest.astype(np.int64), codes("quats", 3), header["quats_bits"]))
         for name, columns in (("scales", 3), ("opacities", 1), ("colors", 3)):
             parts[name].append(grids[name].values(codes(name, columns)))
-        parts["latents"].append(
-            grids["latents"].values(codes("latents", rank)) if group == "view" else np.zeros((count, rank))
-        )
+        latents = np.zeros((count, rank), dtype=np.float32)
+        if group == "view":
+            for column, (low, step) in enumerate(zip(*grids["latents"], strict=True)):
+                latents[:, column] = low + step * stream("latents", rank)[column].astype(np.float64)
+        parts["latents"].append(latents)
         parts[DIFFUSE].append(np.full(count, group == DIFFUSE))
     tables = {name: torch.from_numpy(np.concatenate(values)) for name, values in parts.items()}
     tables["features_dc"] = (tables.pop("colors") - 0.5) / SH_C0
-    return {name: value if value.dtype == torch.bool else value.float() for name, value in tables.items()}
+    tables = {name: value if value.dtype == torch.bool else value.float() for name, value in tables.items()}
+    for name, value in tables.items():
+        if not torch.isfinite(value).all():
+            raise ValueError(f"{name} beyond float32")
+    return tables
 
 
 def model_state(model, path: Path) -> dict[str, Any]:

@@ -15,7 +15,8 @@ float16 or float32), "shape", "bytes" (in the file) and "crc32" (of these bytes)
 the numbers' bytes by significance: first every number's lowest byte, then every number's next, and so on; numbers are
 in row-major order.
 
-Nothing in a file is ever run, and nothing is allocated before its size was checked against the lengths in the header.
+Nothing in a file is ever run, and nothing is allocated before its size was checked against the lengths in the header,
+and these against the size of the file: it cannot unpack to more than 32 times that, or 16 MB.
 """
 
 import json
@@ -39,8 +40,11 @@ CHECKSUM = struct.Struct("<I")
 DTYPES = ("uint8", "uint16", "uint32", "uint64", "float16", "float32")
 ENTRY = {"name": str, "dtype": str, "shape": list, "bytes": int, "crc32": int}
 """What a stream's entry in the header has."""
-LARGEST_STREAM = 2**36
-"""Bytes that a stream may unpack to: 64 GB; more is a broken file."""
+LARGEST_RATIO = 32
+"""Times its own size that a file may unpack to. Trained fields unpack to 3 to 6 times theirs."""
+SMALL = 2**24
+"""Bytes that any file may unpack to."""
+MOST_AXES = 4
 LARGEST_DICTIONARY = 2**26
 """Bytes within which xz looks for repetitions."""
 LARGEST_MEMORY = 2**28
@@ -90,9 +94,11 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             says, or a checksum does not hold.
     """
     try:
-        data = path.read_bytes()
+        data = path.read_bytes() if path.is_file() else None
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}). Export it again, or mend the path.") from error
+    if data is None:
+        raise InputError(f"{path} cannot be read (there is no such file). Export it again, or mend the path.")
     mend = "Copy it again, or export it again with nrfgs export compact."
     if data[: len(MAGIC)] != MAGIC[: len(data)] or not data:
         raise InputError(f"{path} is not a compact file of nrfgs: it begins with {data[:8]!r}. {mend}")
@@ -111,7 +117,7 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     header_end = first - CHECKSUM.size
     if version < 1 or zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
         raise InputError(f"{path} is damaged: the header's checksum does not hold. {mend}")
-    header = _header(path, data[PREAMBLE.size : header_end])
+    header = _header(path, data[PREAMBLE.size : header_end], max(LARGEST_RATIO * len(data), SMALL))
     streams = {}
     for entry in header["streams"]:
         body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
@@ -123,8 +129,9 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return header, streams
 
 
-def _header(path: Path, text: bytes) -> dict[str, Any]:
-    """The header, whose checksum holds, with a list of streams of which each has what it must."""
+def _header(path: Path, text: bytes, most: int) -> dict[str, Any]:
+    """The header, whose checksum holds, with a list of streams of which each has what it must, and which together
+    unpack to no more than `most` bytes."""
     try:
         header = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -132,13 +139,24 @@ def _header(path: Path, text: bytes) -> dict[str, Any]:
     entries = header.get("streams") if isinstance(header, dict) else None
     if not isinstance(entries, list):
         raise InputError(f"{path}: its header has no list of streams.")
+    total = 0
     for entry in entries:
         if not (isinstance(entry, dict) and all(_is(entry.get(key), kind) for key, kind in ENTRY.items())):
-            raise InputError(f"{path}: its header has a stream {entry!r}, which cannot be.")
-        if entry["dtype"] not in DTYPES or not all(_is(size, int) and size >= 0 for size in entry["shape"]):
+            raise InputError(f"{path}: its header has a stream {ascii(entry)[:200]}, which cannot be.")
+        name, sizes = ascii(entry["name"])[:80], entry["shape"]
+        shape_is_one = len(sizes) <= MOST_AXES and all(_is(size, int) and 0 <= size < 2**48 for size in sizes)
+        if entry["dtype"] not in DTYPES or not shape_is_one or entry["bytes"] < 0:
             raise InputError(
-                f"{path}: its stream {entry['name']!r} is {entry['dtype']} {entry['shape']}, which cannot be."
+                f"{path}: its stream {name} is {ascii(entry['dtype'])[:80]} {ascii(sizes)[:80]}, which cannot be."
             )
+        total += math.prod(sizes) * np.dtype(entry["dtype"]).itemsize
+        if total > most:
+            raise InputError(
+                f"{path}: its stream {name} would unpack to {ascii(sizes)} numbers, and a file of this size holds at "
+                f"most {most} bytes."
+            )
+    if len({entry["name"] for entry in entries}) < len(entries):
+        raise InputError(f"{path}: its header has two streams of one name.")
     return header
 
 
@@ -157,8 +175,6 @@ def _unpack(path: Path, entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     """The numbers of one stream whose checksum holds; a file that was made to mislead is refused all the same."""
     count = math.prod(entry["shape"])
     size = np.dtype(entry["dtype"]).itemsize
-    if count * size > LARGEST_STREAM:
-        raise InputError(f"{path}: its stream {entry['name']!r} would unpack to {count * size} bytes.")
     unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=LARGEST_MEMORY)
     try:
         raw = unpacker.decompress(body, max_length=count * size + 1) if body else b""

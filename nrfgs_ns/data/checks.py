@@ -35,6 +35,8 @@ DRAWN = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
 """Cameras that are drawn: pinholes, and those whose photographs are undistorted to a pinhole's."""
 WIDEST, NARROWEST = 1e-2, 1e3
 """Focal lengths in image sizes between which there are lenses: fields of view of 179 degrees and of 3.4 minutes."""
+ODDEST_PIXEL = 4.0
+"""Ratio of a pixel's sides; anamorphic lenses have 2."""
 FARTHEST_CENTER = 10.0
 """The principal point is not farther outside than so many image sizes."""
 SMALLEST, LARGEST = 4, 2**16
@@ -139,11 +141,8 @@ def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
     nameless = [f"frames[{i}]" for i, frame in enumerate(frames) if not _is_name(frame.get("file_path"))]
     if nameless:
         raise InputError(f"{source}: {some(nameless)} without a file_path. Name the image, or remove the frame.")
-    odd = [
-        shown(name)
-        for name in {name for frame in frames for key, name in frame.items() if key in FILES_OF_A_FRAME}
-        if _is_name(name) and not could_exist(name)
-    ]
+    names = [frame[key] for frame in frames for key in FILES_OF_A_FRAME if _is_name(frame.get(key))]
+    odd = [name for name in names if not could_exist(name)]
     if odd:
         raise InputError(f"{source}: {some(odd)} cannot be the name of a file. Correct the path.")
     for field, hint in (("mask_path", " (an all-white mask keeps the whole image)"), ("depth_file_path", "")):
@@ -266,6 +265,11 @@ def _check_lens(meta: dict[str, Any], frame: dict[str, Any], source: Path) -> No
                 f"{source}: {key} of {where} is {focal:g} for an image of {w:g} x {h:g}: no lens does that. Give it in "
                 "pixels of this image."
             )
+    if not 1 / ODDEST_PIXEL < fl_x / fl_y < ODDEST_PIXEL:
+        raise InputError(
+            f"{source}: fl_x and fl_y of {where} are {fl_x:g} and {fl_y:g}: pixels are squares, or nearly so. Give "
+            "both in pixels of this image."
+        )
     for key, center, side in (("cx", cx, w), ("cy", cy, h)):
         if not -FARTHEST_CENTER * side <= center <= (1 + FARTHEST_CENTER) * side:
             raise InputError(

@@ -160,6 +160,10 @@ class _Bytes:
             raise ValueError(f"{count} bytes are announced and {len(self.data) - self.at} are there")
         self.at += count
 
+    def end(self) -> None:
+        if self.at != len(self.data):
+            raise ValueError(f"{len(self.data) - self.at} bytes follow the last entry")
+
     def word(self) -> str:
         end = self.data.index(b"\0", self.at)
         word, self.at = self.data[self.at : end].decode("utf-8"), end + 1
@@ -173,6 +177,7 @@ def _cameras_bin(path: Path) -> dict[int, dict[str, Any]]:
         id, model, width, height = file.take("<iiQQ")
         name, parameters = MODELS.get(model, (f"number {model}", ()))
         cameras[id] = _camera(name, width, height, list(file.take(f"<{len(parameters)}d")), path)
+    file.end()
     return cameras
 
 
@@ -184,6 +189,7 @@ def _images_bin(path: Path) -> list[View]:
         name = file.word()
         file.skip(24 * file.take("<Q")[0])  # its features
         views.append(_view(id, pose[:4], pose[4:], camera, name, path))
+    file.end()
     return views
 
 
@@ -194,6 +200,7 @@ def _points_bin(path: Path) -> np.ndarray:
         _, *row, _ = file.take("<Q3d3Bd")
         file.skip(8 * file.take("<Q")[0])  # where it was seen
         rows.append(row)
+    file.end()
     return np.array(rows, dtype=np.float64).reshape(-1, 6)
 
 

@@ -37,6 +37,7 @@ from nrfgs_ns.data.checks import (
     check_options,
     check_poses,
     check_unique,
+    could_exist,
     exists,
     number,
     read_transforms,
@@ -47,7 +48,7 @@ from nrfgs_ns.data.checks import (
 from nrfgs_ns.data.colmap import read_model
 from nrfgs_ns.data.pictures import read_header, smaller_copies
 from nrfgs_ns.data.points import read_colmap, read_ply
-from nrfgs_ns.data.sight import check_sight, in_reach
+from nrfgs_ns.data.sight import MARGIN, check_sight, in_reach
 from nrfgs_ns.data.split import interior_test_images
 from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
@@ -67,6 +68,8 @@ FISHEYE_AT_LEAST = 1e-12
 """A distortion without effect: nerfstudio undistorts, and a fisheye needs it, only if some parameter is not 0."""
 LEFT_OF_IMAGE = 0.25
 """Share of an image's pixels that undistortion must leave."""
+LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
+"""By what undistortion may change the focal length: a fisheye of 170 degrees becomes a pinhole of a fifth."""
 FOLDERS = {"file_path": "images", "mask_path": "masks", "depth_file_path": "depths"}
 """Where smaller copies of a frame's files are, followed by _ and the factor."""
 COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
@@ -371,7 +374,7 @@ class NrfgsDataParser(DataParser):
         before scaling; None without."""
         if "ply_file_path" in scene.meta:
             name = scene.meta["ply_file_path"]
-            if not isinstance(name, str):
+            if not (isinstance(name, str) and could_exist(name)):
                 raise InputError(f"{scene.source}: ply_file_path is {shown(repr(name))}. Name a file, or remove it.")
             return *read_ply(self._file(name)), scene.transform
         if self._colmap.is_dir():
@@ -516,7 +519,7 @@ def _cameras(meta: dict[str, Any], poses: torch.Tensor, source: Path) -> Cameras
     frames = meta["frames"]
     fx, fy, cx, cy = (torch.tensor(_column(meta, key)) for key in ("fl_x", "fl_y", "cx", "cy"))
     width, height = (torch.tensor(_column(meta, key)).int() for key in ("w", "h"))
-    shared = any(key in meta for key in (*DISTORTION[:3], *DISTORTION[4:], "distortion_params"))
+    shared = any(key in meta for key in (*DISTORTION, "distortion_params"))
     distortion = torch.tensor([_distortion(meta if shared else frame) for frame in frames])
     kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
     if kind == CameraType.FISHEYE:
@@ -539,17 +542,33 @@ def _check_distortion(fx, fy, cx, cy, width, height, distortion, kind: CameraTyp
             flat = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
                 K, np.array([k1, k2, k3, k4]), size, np.eye(3), balance=0
             )
-            good = np.isfinite(flat).all() and 1e-2 * w < flat[0, 0] < 1e3 * w and 1e-2 * h < flat[1, 1] < 1e3 * h
+            enough = True
         elif k4 != 0:
             raise InputError(f"{where} has k4 = {k4:g}, which is for fisheyes. Set it to 0, or undistort the images.")
         else:
-            flat, (_, _, left, rows) = cv2.getOptimalNewCameraMatrix(K, np.array([k1, k2, p1, p2, k3]), size, 0)
-            good = np.isfinite(flat).all() and left * rows >= LEFT_OF_IMAGE * w * h
-        if not good:
+            parameters = np.array([k1, k2, p1, p2, k3])
+            flat, part = cv2.getOptimalNewCameraMatrix(K, parameters, size, 0)
+            enough = part[2] * part[3] >= LEFT_OF_IMAGE * w * h and not _folds(K, parameters, size, flat, part)
+        change = flat[[0, 1], [0, 1]] / (fx, fy)
+        if not (enough and ((LEAST_FOCAL < change) & (change < MOST_FOCAL)).all()):
             raise InputError(
                 f"{where} is so strong that undistorting leaves next to nothing of the image. Correct the parameters, "
                 "or undistort the photographs yourself."
             )
+
+
+def _folds(K: np.ndarray, distortion: np.ndarray, size: tuple[int, int], flat: np.ndarray, part: Sequence[int]) -> bool:
+    """Whether undistortion takes pixels of its image, `part` (x, y, width, height) of that of the pinhole `flat`, in
+    another order than they have in the photograph, or from beside it: the polynomial turns around before the edge."""
+    left, top, columns, rows = part
+    u, v = np.meshgrid(np.linspace(left, left + columns, 17), np.linspace(top, top + rows, 17))
+    rays = np.stack([(u - flat[0, 2]) / flat[0, 0], (v - flat[1, 2]) / flat[1, 1], np.ones_like(u)], axis=-1)
+    taken, _ = cv2.projectPoints(rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, distortion)
+    taken = taken.reshape(*u.shape, 2)
+    across, down = np.diff(taken, axis=1)[:-1], np.diff(taken, axis=0)[:, :-1]
+    in_order = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0] > 0
+    beside = np.abs(taken / size - 0.5).max() > 0.5 + MARGIN
+    return beside or not in_order.all()
 
 
 nrfgs_dataparser = DataParserSpecification(

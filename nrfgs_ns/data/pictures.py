@@ -13,11 +13,11 @@ from PIL import Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import whole
 
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "PPM")
 """PIL's names of what is a photograph. PIL knows others by their first bytes, whatever a file is called, and starts
 Ghostscript for one of them."""
-TEMPORARY = ".writing"
 
 
 def open_picture(path: Path) -> Image.Image:
@@ -113,12 +113,10 @@ def _resize(path: Path, size: tuple[int, int], copy: Path, kind: str) -> None:
     sampling = Image.Resampling.LANCZOS if kind == "images" else Image.Resampling.NEAREST
     lossy = kind == "images" and picture.mode == "RGB" and read_format(path) in ("JPEG", "MPO")
     exif = exif_of_copy(picture.getexif())
-    aside = copy.with_name(f"{os.getpid()}{TEMPORARY}")
+    form = "JPEG" if lossy else "PNG"
     try:
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        form = "JPEG" if lossy else "PNG"
-        picture.resize(size, sampling).save(aside, form, quality=95, compress_level=1, exif=exif)
-        os.replace(aside, copy)
+        with whole(copy) as aside:
+            picture.resize(size, sampling).save(aside, form, quality=95, compress_level=1, exif=exif)
     except OSError as error:
         raise InputError(
             f"{copy} cannot be written ({error.strerror}). Make room there, or set XDG_CACHE_HOME to another folder."

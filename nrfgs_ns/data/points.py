@@ -64,6 +64,11 @@ def read_colmap(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 def _finite(xyz: np.ndarray, rgb: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Drops what is not finite, with a warning, and rounds colours in [0, 255] to uint8."""
     good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
+    if np.count_nonzero(good) < len(good) / 2:
+        raise InputError(
+            f"{path}: {np.count_nonzero(~good)} of {len(good)} points have a NaN or infinite value. Repair or replace "
+            "the file."
+        )
     if not good.all():
         warn(f"{path}: {np.count_nonzero(~good)} of {len(good)} points have a NaN or infinite value and are left out.")
     xyz, rgb = xyz[good], rgb[good]

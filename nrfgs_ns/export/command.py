@@ -9,27 +9,37 @@ import tyro
 
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.web.options import WebOptions
 
 
 @dataclass
 class Export:
     """Write a trained model as a file that other programs read."""
 
-    format: tyro.conf.Positional[Literal["ply", "compact"]]
+    format: tyro.conf.Positional[Literal["ply", "compact", "web"]]
     """ply: the format of 3D Gaussian Splatting, with spherical harmonics fitted to the colours. compact: the field
-    itself in a small file, which ns-eval, ns-viewer and ns-render read (docs/compact-format.md)"""
+    itself in a small file, which ns-eval, ns-viewer and ns-render read (docs/compact-format.md). web: a page that runs
+    the field in a browser (docs/web.md)"""
     load_config: Path
     """config.yml of the training"""
     output: Path
-    """the file to write; an older one is replaced"""
+    """the file to write; an older one is replaced. web: a name that does not end in .html is a folder's, for a web
+    server"""
     measure: bool = True
     """render the test views from the model and from the written file, and tell what the fit loses"""
     report: Path | None = None
     """also write the numbers to this file, as JSON"""
     compact: CompactOptions = field(default_factory=CompactOptions)
-    """what a compact file may leave out"""
+    """what a compact file may leave out, and the scene in a page"""
+    web: WebOptions = field(default_factory=WebOptions)
+    """what a page says of itself"""
 
     def main(self) -> None:
+        if self.format == "web":
+            from nrfgs_ns.export.web.command import export_web
+
+            export_web(self.load_config, self.output, self.compact, self.web, self.measure, self.report)
+            return
         if self.output.is_dir():
             raise InputError(f"--output {self.output} is a folder. Name a file in it, such as splats.ply.")
         if self.format == "compact":

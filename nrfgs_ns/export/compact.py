@@ -32,13 +32,7 @@ def export_compact(
     load_config: Path, output: Path, options: CompactOptions, measure: bool, report: Path | None
 ) -> None:
     """See `nrfgs export --help`."""
-    options.precision.validate()
-    if options.views < 1:
-        raise InputError(f"--compact.views is {options.views}; it must be at least 1.")
-    for name in ("budget", "threshold"):
-        value = getattr(options, name)
-        if value is not None and not value >= 0:
-            raise InputError(f"--compact.{name} is {value}; it must be zero or positive.")
+    check_options(options)
     pipeline = load_model(load_config, "test")
     field, threshold = chosen_field(pipeline, load_config, options)
     model = pipeline.model
@@ -77,6 +71,17 @@ def export_compact(
     CONSOLE.print(f"Read it with:  ns-eval --load-config {config}", markup=False, soft_wrap=True)
     if report is not None:
         write_whole(report, json.dumps(numbers, indent=1) + "\n")
+
+
+def check_options(options: CompactOptions) -> None:
+    """Raise InputError, naming the option, if a value cannot work."""
+    options.precision.validate()
+    if options.views < 1:
+        raise InputError(f"--compact.views is {options.views}; it must be at least 1.")
+    for name in ("budget", "threshold"):
+        value = getattr(options, name)
+        if value is not None and not value >= 0:
+            raise InputError(f"--compact.{name} is {value}; it must be zero or positive.")
 
 
 def chosen_field(pipeline, load_config: Path, options: CompactOptions) -> tuple[Field, float]:

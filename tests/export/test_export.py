@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The PLY file: its layout, what the fit keeps of the head, and that nerfstudio's exporter writes the same."""
 
+import base64
 import json
 import math
 import re
@@ -16,10 +17,14 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.head import SH_C0, SplatAppearance, base_colors
 from nrfgs_ns.appearance.sh import SphericalHarmonics
 from nrfgs_ns.appearance.spherical_harmonics import sh_bases
+from nrfgs_ns.compact.decode import decode
+from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.ply import read_splats, render_splats, write_splats
+from nrfgs_ns.export.web.options import WebOptions
+from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model import harmonics_fit
 from nrfgs_ns.model.harmonics_fit import STRENGTHS, Moments, Observations, PlainSplats, fit_harmonics, observe
 from nrfgs_ns.training.run import parse, train
@@ -358,3 +363,51 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
     lost.write_text(text.replace("timestamp: ", "timestamp: no-"))
     with pytest.raises(InputError, match="Run this in the folder"):
         Export("ply", lost, tmp_path / "s.ply").main()
+
+
+# The page.
+
+
+def test_a_page_holds_the_scene_and_the_photographs(trained, tmp_path):
+    report = tmp_path / "report.json"
+    every = CompactOptions(threshold=0.0, rank=32)
+    web = WebOptions(author="me")
+    Export("web", trained("nrfgs"), tmp_path / "a/tea.html", report=report, compact=every, web=web).main()
+    numbers, text = json.loads(report.read_text()), (tmp_path / "a/tea.html").read_text(encoding="utf-8")
+    assert "<h1>tea</h1><p>me</p>" in text
+    (tmp_path / "held.nrf").write_bytes(base64.b64decode(re.search('id="packed"[^>]*>([^<]*)<', text).group(1)))
+    decoded = decode(tmp_path / "held.nrf")
+    assert len(decoded.splats["means"]) == numbers["written"] == numbers["view_dependent"] > 0
+    assert numbers["bytes"] == (tmp_path / "a/tea.html").stat().st_size > numbers["scene_bytes"]
+    assert abs(numbers["loss_db"]) < 0.5 and len(numbers["per_image"]) == 2
+
+    pipeline = load_model(trained("nrfgs"), "test")
+    cameras = pipeline.datamanager.train_dataset.cameras
+    about = json.loads(re.search('id="about"[^>]*>([^<]*)<', text).group(1))
+    names = [path.name for path in pipeline.datamanager.train_dataset.image_filenames]
+    assert [one["name"] for one in about["photographs"]] == names and numbers["start"] == names[about["start"]]
+    for camera, one in zip(cameras, about["photographs"], strict=True):
+        assert_close(torch.tensor(one["pose"]).view(3, 4), camera.camera_to_worlds, rtol=0, atol=1e-6)
+        assert_close(one["lens"], [camera.fx.item(), camera.fy.item(), camera.cx.item(), camera.cy.item()])
+        assert one["distance"] > about["nearest"] > 0
+    # It begins where the model is best, of the views that were asked: of this few, all.
+    scores = []
+    for i, batch in enumerate(pipeline.datamanager.cached_train):
+        picture = pipeline.model.get_outputs_for_camera(cameras[i : i + 1])["rgb"]
+        scores.append(psnr(picture, pipeline.model.get_gt_img(batch["image"])[..., :3]))
+    assert scores[about["start"]] == max(scores)
+
+
+def test_a_page_apart_from_its_scene(trained, tmp_path):
+    Export("web", trained("nrfgs"), tmp_path / "served", measure=False).main()
+    assert {path.name for path in (tmp_path / "served").iterdir()} == {"index.html", "scene.nrf"}
+    decode(tmp_path / "served/scene.nrf")
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(InputError, match="ends in .html"):
+        Export("web", trained("nrfgs"), tmp_path / "taken").main()
+
+
+def test_a_page_of_another_head_is_refused(trained, tmp_path):
+    with pytest.raises(InputError, match="the 'sh' head.*nrfgs export ply"):
+        Export("web", trained("nrfgs-sh"), tmp_path / "page.html").main()
+    assert not (tmp_path / "page.html").exists()

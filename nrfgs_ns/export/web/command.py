@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs export web`: what the page holds, and where it begins."""
+
+import io
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
+
+from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
+from nrfgs_ns.appearance.reduce import input_columns
+from nrfgs_ns.compact.encode import encode
+from nrfgs_ns.compact.format import write_container
+from nrfgs_ns.compact.options import CompactOptions
+from nrfgs_ns.data.views import evenly_spaced
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.compact import PLY_BYTES, check_options, chosen_field, measure_loss, write_config
+from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.export.web.options import WebOptions
+from nrfgs_ns.export.web.page import page
+from nrfgs_ns.files import whole
+from nrfgs_ns.image.metrics import psnr
+from nrfgs_ns.model.pinhole import pinhole
+
+SCENE = "scene.nrf"
+"""Name of the scene's file in a folder."""
+POSTER_SIDE = 960
+"""Longest side of the poster, pixels."""
+MOST_WEIGHTS = 1024
+"""Vectors of four that a uniform block holds on every device with WebGL 2 (16 KiB)."""
+MOST_POINTS = 20_000
+"""Splats that are asked how far away a photograph's subject is."""
+
+
+def export_web(
+    load_config: Path,
+    output: Path,
+    options: CompactOptions,
+    web: WebOptions,
+    measure: bool,
+    report: Path | None,
+) -> None:
+    """Write a page; see `nrfgs export --help`.
+
+    Args:
+        output: an .html file; any other name is that of a folder, in which the page and its scene lie apart.
+    """
+    check_options(options)
+    alone = output.suffix.lower() in (".html", ".htm")
+    if not alone and output.is_file():
+        raise InputError(f"--output {output} is a file. Name one that ends in .html, or a folder.")
+    pipeline = load_model(load_config, "test")
+    model = pipeline.model
+    if not isinstance(model.head, NeuralResidualField):
+        raise InputError(
+            f"--load-config {load_config}: a page runs a neural residual field, and this model has the "
+            f"{model.head.name!r} head. Use nrfgs export ply, and a viewer of such files."
+        )
+    if (vectors := weight_vectors(model.head.config)) > MOST_WEIGHTS:
+        raise InputError(
+            f"--load-config {load_config}: the field's weights fill {vectors} vectors of a shader, and some phones "
+            f"have room for {MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
+        )
+    field, threshold = chosen_field(pipeline, load_config, options)
+    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
+    header, streams = encode(field, options.precision, render)
+    about, poster = surroundings(pipeline)
+    with TemporaryDirectory() as temporary:
+        file = Path(temporary) / SCENE
+        scene_bytes = write_container(file, header, streams)
+        scene = file.read_bytes()
+        losses = measure_loss(pipeline, write_config(load_config, file)) if measure else {}
+    title = output.stem if web.title is None else web.title
+    text = page(about, poster, scene if alone else SCENE, title, web.author)
+    written = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
+    for path, content in written.items():
+        write(path, content)
+
+    count, size = sum(header["splats"].values()), sum(map(len, written.values()))
+    name = about["photographs"][about["start"]]["name"]
+    CONSOLE.print(
+        f"{output}: {count:,} splats, {header['splats']['view']:,} of them view-dependent, {size / 1e6:.2f} MB; 3DGS's "
+        f"PLY of as many splats has {PLY_BYTES * count / 1e6:.2f} MB. It begins where {name} was taken.",
+        markup=False,
+        soft_wrap=True,
+    )
+    if measure:
+        CONSOLE.print(
+            f"PSNR on {len(losses['per_image'])} test views: model {losses['psnr_model']:.2f} dB, the page's scene "
+            f"{losses['psnr_file']:.2f} dB."
+        )
+    where = "Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md."
+    CONSOLE.print(where)
+    if report is not None:
+        numbers = {
+            "splats": model.num_points,
+            "written": count,
+            "view_dependent": header["splats"]["view"],
+            "rank": field.head.config.latent_dim,
+            "threshold": threshold if threshold != float("inf") else None,
+            "bytes": size,
+            "scene_bytes": scene_bytes,
+            "ply_bytes": PLY_BYTES * count,
+            "start": name,
+        }
+        write(report, (json.dumps(numbers | losses, indent=1) + "\n").encode())
+
+
+def weight_vectors(config: NrfConfig) -> int:
+    """Vectors of four that the page's shader reads for a view (`viewWeights` in field.js)."""
+    branches = {"low": config.hidden_width if config.split_bands else 2 * config.hidden_width}
+    if config.split_bands and config.num_bands > 1:
+        branches["high"] = config.hidden_width
+    total = 0
+    for branch, units in branches.items():
+        columns = input_columns(config, branch)
+        view = sum(len(found) for name, found in columns.items() if name not in ("latents", "color", "opacity"))
+        total += -(-units // 4) * (view + 4) + 1
+    return total
+
+
+@torch.no_grad()
+def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
+    """What the page's scripts must know besides the scene, and its poster.
+
+    It begins at the training view that the model draws best (PSNR) of at most eight, evenly spaced; the poster is the
+    model's picture of it.
+
+    Returns:
+        "photographs": name, pose [12] (camera to world, x right, y up, z backwards, row by row), lens (focal lengths,
+        principal point) and size in pixels, and "distance", to the subject; "start", one of them; "up", a direction;
+        "nearest", the shortest distance to what is turned around; "speed", units a second. And a JPEG.
+    """
+    model, data = pipeline.model, pipeline.datamanager
+    images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
+    cameras = data.train_dataset.cameras
+    best, start, poster = float("-inf"), 0, None
+    for i in evenly_spaced(len(cameras), 8):
+        camera = cameras[i : i + 1].to(model.device)
+        outputs = model.get_outputs_for_camera(camera)
+        truth = model.composite_with_background(model.get_gt_img(images[i]["image"]), outputs["background"])
+        score = psnr(outputs["rgb"], truth, model._mask(images[i]))
+        if poster is None or (score is not None and score > best):
+            best, start, poster = score if score is not None else best, i, outputs["rgb"]
+
+    poses = cameras.camera_to_worlds.cpu()
+    up = poses[:, :3, 1].mean(dim=0)
+    up = up / up.norm() if up.norm() > 1e-3 else up.new_tensor([0.0, 0.0, 1.0])
+    means = subject(model)
+    photographs = [
+        {
+            "name": Path(name).name,
+            "pose": _rounded(poses[i].flatten()),
+            "lens": _rounded(torch.stack([getattr(cameras, part)[i, 0] for part in ("fx", "fy", "cx", "cy")])),
+            "size": [int(cameras.width[i]), int(cameras.height[i])],
+            "distance": distance(cameras[i : i + 1], means),
+        }
+        for i, name in enumerate(data.train_dataset.image_filenames)
+    ]
+    known = sorted(one["distance"] for one in photographs if one["distance"] is not None)
+    typical = known[len(known) // 2] if known else model.scene_unit
+    for one in photographs:
+        one["distance"] = round(typical if one["distance"] is None else one["distance"], 6)
+    about = {
+        "photographs": photographs,
+        "start": start,
+        "up": _rounded(up),
+        "nearest": typical / 50,
+        "speed": typical / 2,
+    }
+    return about, _jpeg(poster)
+
+
+def subject(model) -> torch.Tensor:
+    """Means of splats that are rather opaque than not, at most MOST_POINTS of them. [P, 3]"""
+    opaque = model.gauss_params["means"][model.gauss_params["opacities"][:, 0] > 0]
+    return opaque[:: max(1, -(-len(opaque) // MOST_POINTS))].cpu()
+
+
+def distance(camera: Cameras, means: torch.Tensor) -> float | None:
+    """Median depth of the means in the middle of a camera's picture, half as wide and high; None if there are none."""
+    seen = pinhole(camera, camera.camera_to_worlds.cpu().reshape(1, 3, 4), 1)
+    points = means @ seen.viewmat[0, :3, :3].T + seen.viewmat[0, :3, 3]
+    pixels = points @ seen.K[0].T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    size = pixels.new_tensor([seen.width, seen.height])
+    middle = ((pixels / size - 0.5).abs() < 0.25).all(dim=1) & (points[:, 2] > 0)
+    return float(points[middle, 2].median()) if middle.any() else None
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file, whole or not at all; folders are made."""
+    with whole(path) as aside:
+        aside.write_bytes(content)
+
+
+def _rounded(values: torch.Tensor) -> list[float]:
+    return [round(value, 6) for value in values.tolist()]
+
+
+def _jpeg(picture: torch.Tensor) -> bytes:
+    """A picture [H, W, 3] in [0, 1], made smaller if it is large."""
+    image = Image.fromarray((picture * 255).round().byte().cpu().numpy())
+    image.thumbnail((POSTER_SIDE, POSTER_SIDE))
+    stream = io.BytesIO()
+    image.save(stream, "jpeg", quality=80)
+    return stream.getvalue()

@@ -1,0 +1,383 @@
+// SPDX-License-Identifier: Apache-2.0
+// Reads a compact file (docs/compact-format.md): container, xz streams, tables. Runs in the worker.
+
+const MAGIC = [0x89, 0x4e, 0x52, 0x46, 0x0d, 0x0a, 0x1a, 0x0a];
+const VERSION = 1;
+const BYTES = { uint8: 1, uint16: 2, uint32: 4, uint64: 8, float16: 2, float32: 4 };
+const LARGEST_STREAM = 2 ** 31;
+
+// A fault of the file, to be shown to a reader.
+class BadFile extends Error {}
+
+// The scene in a file's bytes. `progress` is told the share that is done.
+//   table    Float32Array [N, 16]: mean, logit of opacity; rotation (w, x, y, z); standard deviations, 0; base colour, 0
+//   latents  Float32Array [V, rank filled up to a multiple of 4]; the first V of the N splats are view-dependent
+//   weights  name -> {shape, values}
+function readScene(bytes, progress) {
+  const { header, streams } = readContainer(bytes, progress);
+  if (header.format !== "nrfgs-compact" || header.head.name !== "nrf") {
+    throw new BadFile("The scene is not a neural residual field.");
+  }
+  const count = { view: header.splats.view, diffuse: header.splats.diffuse };
+  const rank = header.head.config.latent_dim;
+  const scene = {
+    header,
+    count: count.view + count.diffuse,
+    viewDependent: count.view,
+    table: new Float32Array(16 * (count.view + count.diffuse)),
+    latents: new Float32Array(4 * Math.ceil(rank / 4) * count.view),
+    weights: {},
+  };
+  for (const [name, stream] of Object.entries(streams)) {
+    if (name.startsWith("head.")) {
+      const values = stream.dtype === "float32" ? new Float32Array(numbers(stream).buffer) : halves(numbers(stream));
+      scene.weights[name.slice("head.".length)] = { shape: stream.shape, values };
+    }
+  }
+  let first = 0;
+  for (const group of ["view", "diffuse"]) {
+    const n = count[group];
+    const codes = (name, columns) => {
+      const stream = streams[`${group}.${name}`];
+      if (!stream || stream.shape.length !== (columns ? 2 : 1) || stream.shape.at(-1) !== n) {
+        throw new BadFile(`The scene's ${group}.${name} does not fit its number of splats.`);
+      }
+      if (columns && stream.shape[0] !== columns) throw new BadFile(`The scene's ${group}.${name} has other columns.`);
+      return stream;
+    };
+    readMeans(codes("means", 0), header.grids.means, scene.table, first, n);
+    readRotations(codes("quats_largest", 0), codes("quats", 3), header.quats_bits, scene.table, first, n);
+    const put = (name, columns, offset, value) => {
+      const code = numbers(codes(name, columns));
+      const { low, step } = header.grids[name];
+      for (let c = 0; c < columns; c++) {
+        for (let i = 0; i < n; i++) scene.table[16 * (first + i) + offset + c] = value(low[c] + step[c] * code[c * n + i]);
+      }
+    };
+    put("opacities", 1, 3, (x) => x);
+    put("scales", 3, 8, Math.exp);
+    put("colors", 3, 12, (x) => x);
+    first += n;
+  }
+  if (count.view > 0) {
+    const stream = streams["view.latents"];
+    if (!stream || stream.shape[0] !== rank || stream.shape[1] !== count.view) {
+      throw new BadFile("The scene's view.latents do not fit its number of splats.");
+    }
+    const code = numbers(stream), width = 4 * Math.ceil(rank / 4);
+    const { low, step } = header.grids.latents;
+    for (let r = 0; r < rank; r++) {
+      for (let i = 0; i < count.view; i++) {
+        scene.latents[width * i + r] = low[r] + step[r] * code[r * count.view + i];
+      }
+    }
+  }
+  return scene;
+}
+
+function readContainer(bytes, progress) {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  if (bytes.length < 28 || MAGIC.some((byte, i) => bytes[i] !== byte)) {
+    throw new BadFile("The page does not hold a scene of nrfgs, or only a part of one.");
+  }
+  if (view.getUint32(8, true) !== VERSION) throw new BadFile("The scene is of another version than this page reads.");
+  const length = view.getUint32(12, true), total = Number(view.getBigUint64(16, true));
+  if (total !== bytes.length || 28 + length > total) {
+    throw new BadFile(`The scene has ${bytes.length} bytes instead of ${total}: the page is cut short.`);
+  }
+  if (crc32(bytes.subarray(0, 24 + length)) !== view.getUint32(24 + length, true)) {
+    throw new BadFile("The scene is damaged: the checksum of its header does not hold.");
+  }
+  const header = JSON.parse(new TextDecoder().decode(bytes.subarray(24, 24 + length)));
+  const streams = {};
+  let at = 28 + length;
+  for (const { name, dtype, shape, bytes: size, crc32: sum } of header.streams) {
+    const body = bytes.subarray(at, at + size);
+    at += size;
+    if (body.length !== size || crc32(body) !== sum) {
+      throw new BadFile(`The scene is damaged: the checksum of its stream ${name} does not hold.`);
+    }
+    const unpacked = BYTES[dtype] * shape.reduce((a, b) => a * b, 1);
+    if (!(unpacked <= LARGEST_STREAM)) throw new BadFile(`The scene's stream ${name} is too large.`);
+    streams[name] = { dtype, shape, planes: unxz(body, unpacked) };
+    progress(at / total);
+  }
+  return { header, streams };
+}
+
+let crcTable = null;
+
+function crc32(bytes) {
+  if (!crcTable) {
+    crcTable = new Uint32Array(256);
+    for (let n = 0; n < 256; n++) {
+      let c = n;
+      for (let k = 0; k < 8; k++) c = c & 1 ? 0xedb88320 ^ (c >>> 1) : c >>> 1;
+      crcTable[n] = c;
+    }
+  }
+  let crc = -1;
+  for (let i = 0; i < bytes.length; i++) crc = crcTable[(crc ^ bytes[i]) & 255] ^ (crc >>> 8);
+  return (crc ^ -1) >>> 0;
+}
+
+// A stream's numbers: of one byte or two as they are, of four as Uint32Array.
+function numbers({ dtype, planes }) {
+  const size = BYTES[dtype], n = planes.length / size;
+  if (size === 1) return planes;
+  const out = size === 2 ? new Uint16Array(n) : new Uint32Array(n);
+  for (let k = 0; k < size; k++) for (let i = 0; i < n; i++) out[i] |= planes[k * n + i] << (8 * k);
+  return out;
+}
+
+function halves(codes) {
+  return Float32Array.from(codes, (code) => {
+    const sign = code & 0x8000 ? -1 : 1, exponent = (code >> 10) & 31, fraction = code & 1023;
+    if (exponent === 0) return sign * fraction * 2 ** -24;
+    return exponent === 31 ? NaN : sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
+  });
+}
+
+// Every third bit of 30, pressed together.
+function thirds(x) {
+  x &= 0x09249249;
+  x = (x ^ (x >>> 2)) & 0x030c30c3;
+  x = (x ^ (x >>> 4)) & 0x0300f00f;
+  x = (x ^ (x >>> 8)) & 0x030000ff;
+  return (x ^ (x >>> 16)) & 0x3ff;
+}
+
+// Running sums of 64-bit differences, and the coordinates whose bits alternate in them.
+function readMeans({ planes }, { low, step }, table, first, n) {
+  let lower = 0, upper = 0;
+  const byte = (k, i) => planes[k * n + i];
+  for (let i = 0; i < n; i++) {
+    const sum = lower + ((byte(0, i) | (byte(1, i) << 8) | (byte(2, i) << 16) | (byte(3, i) << 24)) >>> 0);
+    const carry = sum >= 2 ** 32 ? 1 : 0;
+    lower = sum >>> 0;
+    upper = (upper + carry + (byte(4, i) | (byte(5, i) << 8) | (byte(6, i) << 16) | (byte(7, i) << 24))) >>> 0;
+    const middle = (lower >>> 30) | ((upper & 0x0fffffff) << 2);
+    for (let a = 0; a < 3; a++) {
+      const code = thirds(lower >>> a & 0x3fffffff >>> a) | (thirds(middle >>> a) << 10) | (((upper >>> (28 + a)) & 1) << 20);
+      table[16 * (first + i) + a] = low[a] + step[a] * code;
+    }
+  }
+}
+
+// The smallest three components of unit quaternions, and the largest from their length.
+function readRotations(largest, codes, bits, table, first, n) {
+  const which = numbers(largest), code = numbers(codes), top = 2 ** bits - 1;
+  for (let i = 0; i < n; i++) {
+    const at = 16 * (first + i) + 4;
+    let squares = 0;
+    for (let k = 0, c = 0; k < 4; k++) {
+      if (k === which[i]) continue;
+      const value = (code[n * c++ + i] / top - 0.5) * Math.SQRT2;
+      table[at + k] = value;
+      squares += value * value;
+    }
+    const rest = Math.sqrt(Math.max(1 - squares, 0)), norm = Math.sqrt(squares + rest * rest);
+    table[at + which[i]] = rest;
+    for (let k = 0; k < 4; k++) table[at + k] /= norm;
+  }
+}
+
+// ---- xz (https://tukaani.org/xz/xz-file-format.txt): blocks with the LZMA2 filter and no check, as the format has them.
+
+function unxz(input, size) {
+  if (size === 0 && input.length === 0) return new Uint8Array(0);
+  const broken = () => new BadFile("The scene is damaged: one of its streams cannot be unpacked.");
+  if (input.length < 32 || input[0] !== 0xfd || input[1] !== 0x37 || input[7] !== 0) throw broken();
+  const output = new Uint8Array(size);
+  let at = 12, filled = 0;
+  while (input[at] !== 0) {  // 0 begins the index, which nothing here needs
+    const flags = input[at + 1], end = at + 4 * (input[at] + 1);
+    let p = at + 2;
+    for (const bit of [0x40, 0x80]) if (flags & bit) while (input[p++] & 0x80);
+    if (flags & 0x3f || input[p] !== 0x21 || input[p + 1] !== 1) throw broken();
+    [at, filled] = lzma2(input, end, output, filled, broken);
+    at += -at & 3;
+  }
+  if (filled !== size) throw broken();
+  return output;
+}
+
+// Where LZMA's probabilities lie in one array.
+const IS_MATCH = 0, IS_REP = 192, IS_REP0 = 204, IS_REP1 = 216, IS_REP2 = 228, IS_REP0_LONG = 240;
+const SLOT = 432, SPECIAL = 688, ALIGN = 816, LENGTH = 832, REP_LENGTH = 1346, LITERAL = 1860;
+
+// Unpacks LZMA2 chunks from input[at]; returns where they end, and how many bytes of `output` are filled.
+function lzma2(input, at, output, filled, broken) {
+  const coder = new Uint32Array(2);  // range, code: a typed array keeps them whole numbers
+  let probs = new Uint16Array(0), lc = 0, lp = 0, pb = 0, state = 0, rep0 = 0, rep1 = 0, rep2 = 0, rep3 = 0, origin = 0;
+
+  function bit(index) {
+    const p = probs[index], bound = (coder[0] >>> 11) * p;
+    let value;
+    if (coder[1] < bound) {
+      coder[0] = bound;
+      probs[index] = p + ((2048 - p) >>> 5);
+      value = 0;
+    } else {
+      coder[0] -= bound;
+      coder[1] -= bound;
+      probs[index] = p - (p >>> 5);
+      value = 1;
+    }
+    if (coder[0] < 0x1000000) normalize();
+    return value;
+  }
+  function normalize() {
+    coder[0] <<= 8;
+    coder[1] = (coder[1] << 8) | input[at++];
+  }
+  function tree(base, bits) {
+    let m = 1;
+    for (let k = 0; k < bits; k++) m = (m << 1) | bit(base + m);
+    return m - (1 << bits);
+  }
+  function reversed(base, bits) {
+    let m = 1, value = 0;
+    for (let k = 0; k < bits; k++) {
+      const b = bit(base + m);
+      m = (m << 1) | b;
+      value |= b << k;
+    }
+    return value;
+  }
+  function length(base, place) {
+    if (bit(base) === 0) return 2 + tree(base + 2 + 8 * place, 3);
+    if (bit(base + 1) === 0) return 10 + tree(base + 130 + 8 * place, 3);
+    return 18 + tree(base + 258, 8);
+  }
+  function distance(slot) {
+    if (slot < 4) return slot;
+    const bits = (slot >> 1) - 1;
+    const high = ((2 | (slot & 1)) << bits) >>> 0;
+    if (slot < 14) return high + reversed(SPECIAL + high - slot, bits);
+    let direct = 0;
+    for (let k = 4; k < bits; k++) {
+      coder[0] >>>= 1;
+      const one = coder[1] >= coder[0] ? 1 : 0;
+      if (one) coder[1] -= coder[0];
+      direct = direct * 2 + one;
+      if (coder[0] < 0x1000000) normalize();
+    }
+    return high + direct * 16 + reversed(ALIGN, 4);
+  }
+  function literal() {
+    const place = filled - origin;
+    const before = place > 0 ? output[filled - 1] : 0;
+    const base = LITERAL + 0x300 * (((place & ((1 << lp) - 1)) << lc) + (before >> (8 - lc)));
+    let symbol = 1;
+    if (state >= 7) {
+      let match = output[filled - rep0 - 1], offset = 0x100;
+      while (symbol < 0x100) {
+        match <<= 1;
+        const expected = match & offset, b = bit(base + offset + expected + symbol);
+        symbol = (symbol << 1) | b;
+        offset &= b ? expected : ~expected;
+      }
+    } else {
+      // `bit` eight times, written out: most of a scene is literals, and this is where its time goes.
+      let range = coder[0], code = coder[1];
+      while (symbol < 0x100) {
+        const p = probs[base + symbol], bound = (range >>> 11) * p;
+        if (code < bound) {
+          range = bound;
+          probs[base + symbol] = p + ((2048 - p) >>> 5);
+          symbol <<= 1;
+        } else {
+          range -= bound;
+          code -= bound;
+          probs[base + symbol] = p - (p >>> 5);
+          symbol = (symbol << 1) | 1;
+        }
+        if (range < 0x1000000) {
+          range = (range << 8) >>> 0;
+          code = ((code << 8) | input[at++]) >>> 0;
+        }
+      }
+      coder[0] = range;
+      coder[1] = code;
+    }
+    output[filled++] = symbol;
+    state = state < 4 ? 0 : state < 10 ? state - 3 : state - 6;
+  }
+  function copy(count, end) {
+    if (rep0 >= filled - origin || filled + count > end) throw broken();
+    for (let from = filled - rep0 - 1; count > 0; count--) output[filled++] = output[from++];
+  }
+
+  for (;;) {
+    if (at >= input.length) throw broken();
+    const control = input[at++];
+    if (control === 0) return [at, filled];
+    let count = ((input[at] << 8) | input[at + 1]) + 1;
+    at += 2;
+    if (control < 0x80) {
+      if (control > 2 || filled + count > output.length) throw broken();
+      if (control === 1) origin = filled;
+      output.set(input.subarray(at, at + count), filled);
+      at += count;
+      filled += count;
+      continue;
+    }
+    count += (control & 0x1f) << 16;
+    const chunk = ((input[at] << 8) | input[at + 1]) + 1, reset = (control >> 5) & 3;
+    at += 2;
+    if (reset === 3) origin = filled;
+    if (reset >= 2) {
+      const properties = input[at++];
+      pb = Math.floor(properties / 45);
+      lp = Math.floor((properties % 45) / 9);
+      lc = properties % 9;
+      if (pb > 4 || lc + lp > 4) throw broken();
+      probs = new Uint16Array(LITERAL + (0x300 << (lc + lp)));
+    }
+    if (reset >= 1) {
+      probs.fill(1024);
+      state = rep0 = rep1 = rep2 = rep3 = 0;
+    }
+    const chunkEnd = at + chunk, end = filled + count;
+    if (probs.length === 0 || chunkEnd > input.length || end > output.length) throw broken();
+    coder[0] = 0xffffffff;
+    coder[1] = (input[at + 1] << 24) | (input[at + 2] << 16) | (input[at + 3] << 8) | input[at + 4];
+    at += 5;
+    while (filled < end) {
+      const place = (filled - origin) & ((1 << pb) - 1);
+      if (bit(IS_MATCH + (state << 4) + place) === 0) {
+        literal();
+      } else if (bit(IS_REP + state) === 0) {
+        rep3 = rep2;
+        rep2 = rep1;
+        rep1 = rep0;
+        const count = length(LENGTH, place);
+        state = state < 7 ? 7 : 10;
+        rep0 = distance(tree(SLOT + 64 * Math.min(count - 2, 3), 6));
+        copy(count, end);
+      } else {
+        let again = true;
+        if (bit(IS_REP0 + state) === 0) {
+          again = bit(IS_REP0_LONG + (state << 4) + place) === 1;
+        } else {
+          let next = rep1;
+          if (bit(IS_REP1 + state) === 1) {
+            next = rep2;
+            if (bit(IS_REP2 + state) === 1) {
+              next = rep3;
+              rep3 = rep2;
+            }
+            rep2 = rep1;
+          }
+          rep1 = rep0;
+          rep0 = next;
+        }
+        const count = again ? length(REP_LENGTH, place) : 1;
+        state = state < 7 ? (again ? 8 : 9) : 11;
+        copy(count, end);
+      }
+    }
+    at = chunkEnd;
+  }
+}

@@ -1,0 +1,330 @@
+// SPDX-License-Identifier: Apache-2.0
+// Splats into a picture, with gsplat's rules: a blur of 0.3 square pixels, opacity at most 0.999 and nothing below
+// 1/255, each splat in the 16-pixel tiles that the square of three standard deviations meets. Projection as in
+// nrfgs_ns/rasterizer/torch_cpu/projection.py.
+
+const SPLAT_VERTEX = `${HEAD}
+uniform sampler2D table;
+uniform usampler2D looks;
+uniform mat4 view;       // world to camera: x right, y down, z forwards
+uniform vec4 lens;       // focal lengths and principal point, pixels
+uniform vec2 size;       // of the picture, pixels
+uniform float near;
+uniform bool antialiased;
+in uint splat;
+flat out vec4 look;      // colour, opacity
+flat out vec3 conic;
+flat out vec2 mean;      // pixels, from the top left
+flat out vec4 tiles;     // left, top, right, bottom of the tiles that may be touched
+
+void main() {
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside, until there is something to draw
+  int i = int(splat);
+  ivec2 at = ${texel(TABLE_TEXELS)};
+  look = uintBitsToFloat(texelFetch(looks, ivec2(i % ${PER_ROW(TABLE_TEXELS)}, i / ${PER_ROW(TABLE_TEXELS)}), 0));
+  vec4 q = texelFetch(table, at + ivec2(1, 0), 0);
+  vec3 scale = texelFetch(table, at + ivec2(2, 0), 0).xyz;
+  vec3 p = (view * vec4(texelFetch(table, at, 0).xyz, 1.0)).xyz;
+  if (!(p.z >= near)) return;
+
+  vec2 slope = p.xy / p.z;
+  mean = lens.xy * slope + lens.zw;
+  vec2 margin = 0.15 * size / lens.xy;
+  vec2 held = clamp(slope, -lens.zw / lens.xy - margin, (size - lens.zw) / lens.xy + margin);
+  float w = q.x, x = q.y, y = q.z, z = q.w;
+  mat3 axes = mat3(view) * mat3(
+    scale.x * vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
+    scale.y * vec3(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
+    scale.z * vec3(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)));
+  vec3 right = vec3(axes[0].x, axes[1].x, axes[2].x), down = vec3(axes[0].y, axes[1].y, axes[2].y);
+  vec3 ahead = vec3(axes[0].z, axes[1].z, axes[2].z);
+  vec3 a0 = (lens.x / p.z) * (right - held.x * ahead), a1 = (lens.y / p.z) * (down - held.y * ahead);
+  float xx = dot(a0, a0), xy = dot(a0, a1), yy = dot(a1, a1);
+  vec3 normal = cross(a0, a1);
+  float det = dot(normal, normal), blurred = det + 0.3 * (xx + yy) + 0.09;
+  xx += 0.3;
+  yy += 0.3;
+  float spread = length(vec2(0.5 * (xx - yy), xy)), middle = 0.5 * (xx + yy);
+  float radius = ceil(3.0 * sqrt(middle + max(spread, ${Math.sqrt(0.1)})));
+  if (any(lessThanEqual(mean + radius, vec2(0.0))) || any(greaterThanEqual(mean - radius, size))) return;
+  if (antialiased) look.a *= sqrt(det / blurred);
+  if (!(look.a >= 1.0 / 255.0)) return;
+  conic = vec3(yy, -xy, xx) / blurred;
+  tiles = vec4(floor(mean / 16.0 - radius / 16.0), ceil(mean / 16.0 + radius / 16.0)) * 16.0;
+
+  // The ellipse of 1/255: half axes, a hundredth of a pixel wider than needed.
+  float longest = middle + spread;
+  vec2 axis = xx >= yy ? vec2(longest - yy, xy) : vec2(xy, longest - xx);
+  axis = spread > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
+  vec2 half_axes = sqrt(2.0 * log(255.0 * look.a) * vec2(longest, blurred / longest)) + 0.01;
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  vec2 pixel = mean + corner.x * half_axes.x * axis + corner.y * half_axes.y * vec2(-axis.y, axis.x);
+  gl_Position = vec4(2.0 * pixel / size - 1.0, 0.0, 1.0) * vec4(1.0, -1.0, 1.0, 1.0);
+}
+`;
+
+const SPLAT_FRAGMENT = `${HEAD}
+uniform vec2 size;
+flat in vec4 look;
+flat in vec3 conic;
+flat in vec2 mean;
+flat in vec4 tiles;
+out vec4 blended;
+void main() {
+  vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
+  if (any(lessThan(pixel, tiles.xy)) || any(greaterThan(pixel, tiles.zw))) discard;
+  vec2 d = mean - pixel;
+  float sigma = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
+  float alpha = min(0.999, look.a * exp(-sigma));
+  if (sigma < 0.0 || alpha < 1.0 / 255.0) discard;
+  blended = vec4(look.rgb * alpha, alpha);
+}
+`;
+
+const WHOLE_VERTEX = `${HEAD}
+void main() {
+  gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
+}
+`;
+
+const SHOW_FRAGMENT = `${HEAD}
+uniform sampler2D picture;
+uniform vec2 size;
+out vec4 color;
+void main() {
+  color = vec4(clamp(texture(picture, gl_FragCoord.xy / size).rgb, 0.0, 1.0), 1.0);
+}
+`;
+
+const LARGEST_KEPT = 2 ** 28;  // bytes for what is kept of the first layers: beyond, it is computed for each view
+const GREY = [0.5, 0.5, 0.5];
+
+class Painter {
+  // canvas: to draw on. scene: of `readScene`.
+  constructor(canvas, scene) {
+    const gl = (this.gl = canvas.getContext("webgl2", {
+      alpha: false, antialias: false, depth: false, stencil: false, powerPreference: "high-performance",
+    }));
+    if (!gl) throw new BadFile("This browser has no WebGL 2, which the scene is drawn with.");
+    this.canvas = canvas;
+    const floats = gl.getExtension("EXT_color_buffer_float"), halfs = gl.getExtension("EXT_color_buffer_half_float");
+    this.exact = Boolean(floats || halfs);  // else pictures are blended in 8 bits
+    this.header = scene.header;
+    this.count = scene.count;
+    this.viewDependent = scene.viewDependent;
+    this.background = scene.header.render.background;
+    this.near = 0.01 * scene.header.head.scene_unit;
+    this.largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    this.plan = plan(scene.header.head.config, scene.weights);
+    if (this.largest < WIDTH || this._height(scene.count, TABLE_TEXELS) > this.largest) {
+      throw new BadFile(`This device's textures are too small for ${scene.count.toLocaleString()} splats.`);
+    }
+
+    gl.bindVertexArray((this.none = gl.createVertexArray()));
+    this.table = this._floats(scene.table, TABLE_TEXELS, scene.count);
+    this.rows = this._height(scene.count, TABLE_TEXELS);
+    this.looks = this._texture(gl.RGBA32UI, PER_ROW(TABLE_TEXELS), this.rows);
+    this.looksTarget = this._target(this.looks);
+    this._buildField(scene);
+    this._buildSplats();
+    this.show = this._program(WHOLE_VERTEX, SHOW_FRAGMENT);
+    this.drawn = 0;  // instances whose order is known
+    this.target = null;
+  }
+
+  _height(count, each) {
+    return Math.max(1, Math.ceil(count / PER_ROW(each)));
+  }
+
+  _buildField(scene) {
+    const { gl, plan } = this;
+    const own = ownWeights(plan, scene.weights), view = viewWeights(plan, scene.weights);
+    const room = gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
+    if (view.byteLength > room) throw new BadFile(`This device's shaders have no room for ${view.length} weights.`);
+    const ownTexture = this._texture(gl.RGBA32F, own.width, plan.groups, own.values);
+    const latents = this._floats(scene.latents, plan.latentTexels, scene.viewDependent);
+    const height = this._height(scene.viewDependent, plan.groups);
+    const fits = this.exact && height <= this.largest && 8 * WIDTH * height <= LARGEST_KEPT;
+    this.kept = null;
+    if (fits) {
+      this.kept = this._texture(gl.RGBA16F, WIDTH, height);
+      const target = this._target(this.kept);
+      const keep = this._program(WHOLE_VERTEX, keepShader(plan, scene.viewDependent));
+      gl.useProgram(keep.program);
+      gl.disable(gl.BLEND);
+      this._bind(keep, { table: this.table, latents, ownWeights: ownTexture });
+      gl.viewport(0, 0, WIDTH, height);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+      gl.deleteFramebuffer(target);
+      gl.deleteProgram(keep.program);
+      gl.deleteTexture(latents);
+      gl.deleteTexture(ownTexture);
+    } else {
+      this.latents = latents;
+      this.ownTexture = ownTexture;
+    }
+    this.look = this._program(WHOLE_VERTEX, lookShader(plan, scene.header, this, fits));
+    const block = gl.createBuffer();
+    gl.bindBuffer(gl.UNIFORM_BUFFER, block);
+    gl.bufferData(gl.UNIFORM_BUFFER, view, gl.STATIC_DRAW);
+    gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, block);
+    gl.uniformBlockBinding(this.look.program, gl.getUniformBlockIndex(this.look.program, "Weights"), 0);
+  }
+
+  _buildSplats() {
+    const { gl } = this;
+    this.splats = this._program(SPLAT_VERTEX, SPLAT_FRAGMENT);
+    this.instances = gl.createVertexArray();
+    gl.bindVertexArray(this.instances);
+    this.order = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * Math.max(this.count, 1), gl.DYNAMIC_DRAW);
+    const place = gl.getAttribLocation(this.splats.program, "splat");
+    gl.enableVertexAttribArray(place);
+    gl.vertexAttribIPointer(place, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(place, 1);
+    gl.bindVertexArray(this.none);
+  }
+
+  // The rows to draw, far to near.
+  setOrder(rows) {
+    const { gl } = this;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, rows);
+    this.drawn = rows.length;
+  }
+
+  // Evaluate the field for rows [first, first + rows) of the texture.
+  //   center  from where splats are seen; camera: what is seen of them, or null for all
+  //   mode    "full", "residual", "opacity residual"; gain: factor of the residuals
+  evaluate({ center, camera, mode, gain }, first, rows) {
+    const { gl, look } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.looksTarget);
+    gl.useProgram(look.program);
+    gl.disable(gl.BLEND);
+    gl.viewport(0, 0, PER_ROW(TABLE_TEXELS), this.rows);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(0, first, PER_ROW(TABLE_TEXELS), rows);
+    const extra = this.kept ? { kept: this.kept } : { latents: this.latents, ownWeights: this.ownTexture };
+    this._bind(look, { table: this.table, ...extra });
+    gl.uniform3fv(look.at("center"), center);
+    gl.uniform1f(look.at("gain"), gain);
+    gl.uniform1i(look.at("mode"), ["full", "residual", "opacity residual"].indexOf(mode));
+    gl.uniform1i(look.at("only_seen"), camera ? 1 : 0);
+    if (camera) gl.uniform4fv(look.at("planes"), planesOf(camera, this.near));
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.disable(gl.SCISSOR_TEST);
+  }
+
+  // Draw onto the canvas. camera: {view, lens, size}, size that of the picture, which is stretched over the canvas.
+  draw({ view, lens, size }, mode) {
+    const { gl, splats, show } = this;
+    const [width, height] = size;
+    this._resize(width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.buffer);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(...(mode === "full" ? this.background : GREY), 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.useProgram(splats.program);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    this._bind(splats, { table: this.table, looks: this.looks });
+    gl.uniformMatrix4fv(splats.at("view"), true, [...view, 0, 0, 0, 1]);
+    gl.uniform4fv(splats.at("lens"), lens);
+    gl.uniform2f(splats.at("size"), width, height);
+    gl.uniform1f(splats.at("near"), this.near);
+    gl.uniform1i(splats.at("antialiased"), this.header.render.rasterize_mode === "antialiased" ? 1 : 0);
+    gl.bindVertexArray(this.instances);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.drawn);
+    gl.bindVertexArray(this.none);
+    gl.disable(gl.BLEND);
+
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.useProgram(show.program);
+    this._bind(show, { picture: this.target.texture });
+    gl.uniform2f(show.at("size"), this.canvas.width, this.canvas.height);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Wait until the GPU has done what it was told.
+  finish() {
+    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+
+  _resize(width, height) {
+    const { gl } = this;
+    if (this.target && this.target.width === width && this.target.height === height) return;
+    if (this.target) {
+      gl.deleteFramebuffer(this.target.buffer);
+      gl.deleteTexture(this.target.texture);
+    }
+    const texture = this._texture(this.exact ? gl.RGBA16F : gl.RGBA8, width, height);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
+    this.target = { width, height, texture, buffer: this._target(texture) };
+  }
+
+  // A texture of numbers, `each` texels for a splat, filled up to whole rows.
+  _floats(values, each, count) {
+    const perRow = PER_ROW(each), height = this._height(count, each), rowLength = 4 * WIDTH;
+    const texture = this._texture(this.gl.RGBA32F, WIDTH, height);
+    const strip = new Float32Array(rowLength);
+    for (let row = 0; row < height; row++) {
+      const part = values.subarray(4 * each * perRow * row, 4 * each * Math.min(perRow * (row + 1), count));
+      strip.set(part);
+      this.gl.texSubImage2D(this.gl.TEXTURE_2D, 0, 0, row, WIDTH, 1, this.gl.RGBA, this.gl.FLOAT, strip);
+    }
+    return texture;
+  }
+
+  _texture(format, width, height, values = null) {
+    const { gl } = this;
+    const texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+    if (values) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, gl.RGBA, gl.FLOAT, values);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+    return texture;
+  }
+
+  _target(texture) {
+    const { gl } = this;
+    const buffer = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) {
+      throw new BadFile("This device cannot draw into the textures that the scene needs.");
+    }
+    return buffer;
+  }
+
+  _program(vertex, fragment) {
+    const { gl } = this;
+    const program = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+      const said = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader)).join("\n");
+      throw new Error(`a shader does not compile: ${said} ${gl.getProgramInfoLog(program)}`);
+    }
+    const places = {};
+    return { program, at: (name) => (places[name] ??= gl.getUniformLocation(program, name)) };
+  }
+
+  _bind(program, textures) {
+    const { gl } = this;
+    gl.useProgram(program.program);
+    Object.entries(textures).forEach(([name, texture], unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.uniform1i(program.at(name), unit);
+    });
+    gl.activeTexture(gl.TEXTURE0);
+  }
+}

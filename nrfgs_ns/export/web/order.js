@@ -1,0 +1,125 @@
+// SPDX-License-Identifier: Apache-2.0
+// Which splats a camera may see, far ones first. Runs in the worker.
+
+const MARGIN = 0.15;  // of the picture, around it: the camera goes on moving while the splats are sorted
+const SIGMAS = 3.4;   // beyond sqrt(2 ln 255) = 3.33 standard deviations even an opaque splat is not drawn
+
+// The planes that bound what a camera sees, with a margin, in world coordinates with unit normals that point inwards:
+// near, left, right, top, bottom, four numbers each. A splat whose mean is more than its reach behind one is not drawn:
+// the projection, too, takes a splat's shape no further out than the margin.
+//   view  rows of the world-to-camera matrix [3, 4] (x right, y down, z forwards)
+//   lens  focal lengths and principal point, pixels; size: of the picture, pixels
+function planesOf({ view, lens: [fx, fy, cx, cy], size: [width, height] }, near) {
+  const [x, y, z] = [0, 4, 8].map((start) => Array.from(view.slice(start, start + 4)));
+  const side = (across, sign, pixels, length, focal) => {
+    const slope = (pixels + MARGIN * length) / focal, norm = Math.hypot(1, slope);
+    return across.map((value, k) => (sign * value + slope * z[k]) / norm);
+  };
+  return Float32Array.from([
+    ...[z[0], z[1], z[2], z[3] - near],
+    ...side(x, 1, cx, width, fx), ...side(x, -1, width - cx, width, fx),
+    ...side(y, 1, cy, height, fy), ...side(y, -1, height - cy, height, fy),
+  ]);
+}
+
+class Order {
+  // Takes the table [N, 16] of `readScene`.
+  constructor(table) {
+    const n = (this.count = table.length / 16);
+    this.means = new Float32Array(3 * n);
+    this.reach = new Float32Array(n);  // radius of a ball outside which a splat is not drawn
+    for (let i = 0; i < n; i++) {
+      for (let a = 0; a < 3; a++) this.means[3 * i + a] = table[16 * i + a];
+      this.reach[i] = SIGMAS * Math.max(table[16 * i + 8], table[16 * i + 9], table[16 * i + 10]);
+    }
+    this.opaque = new Uint8Array(n);
+    for (let i = 0; i < n; i++) this.opaque[i] = table[16 * i + 3] > -1 ? 1 : 0;  // a logit: opacity above 0.27
+    this.keys = [new Uint32Array(n), new Uint32Array(n)];
+    this.rows = [new Uint32Array(n), new Uint32Array(n)];
+    this.depths = new Float32Array(this.keys[0].buffer);
+  }
+
+  // Rows of the table, far to near; of equally deep splats the later first: gsplat draws the earlier in front.
+  sorted({ view, lens, size, near }) {
+    const { means, reach, depths } = this;
+    const planes = planesOf({ view, lens, size }, near);
+    let m = 0;
+    const rows = this.rows[0];
+    for (let i = 0; i < this.count; i++) {
+      const x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2], r = reach[i];
+      const depth = Math.fround(view[8] * x + view[9] * y + view[10] * z + view[11]);
+      if (!(depth >= near)) continue;
+      let seen = true;
+      for (let k = 4; k < 20 && seen; k += 4) {
+        seen = planes[k] * x + planes[k + 1] * y + planes[k + 2] * z + planes[k + 3] > -r;
+      }
+      if (!seen) continue;
+      depths[m] = depth;  // the bits of a positive float sort like the float
+      rows[m++] = i;
+    }
+    this._radix(m);
+    return this.rows[0].slice(0, m).reverse();
+  }
+
+  // How far along a ray the first splat lies that somebody would see there; null for none.
+  picked({ eye, direction, spread }) {
+    const { means, reach, opaque } = this;
+    let nearest = Infinity;
+    for (let i = 0; i < this.count; i++) {
+      if (!opaque[i]) continue;
+      const x = means[3 * i] - eye[0], y = means[3 * i + 1] - eye[1], z = means[3 * i + 2] - eye[2];
+      const along = x * direction[0] + y * direction[1] + z * direction[2];
+      if (along <= 0 || along >= nearest) continue;
+      const beside = Math.sqrt(Math.max(0, x * x + y * y + z * z - along * along));
+      if (beside < Math.min(reach[i] / SIGMAS, 0.1 * along) + spread * along) nearest = along;
+    }
+    return nearest < Infinity ? nearest : null;
+  }
+
+  // Stable sort of the first m keys with their rows, by four bytes; the result is back in the first of each pair.
+  _radix(m) {
+    const { keys, rows } = this;
+    const counts = new Uint32Array(4 * 256);
+    for (let i = 0; i < m; i++) {
+      const key = keys[0][i];
+      for (let b = 0; b < 4; b++) counts[256 * b + ((key >>> (8 * b)) & 255)]++;
+    }
+    for (let b = 0; b < 4; b++) {
+      const from = b & 1, to = 1 - from, shift = 8 * b;
+      const starts = new Uint32Array(256);
+      for (let v = 1; v < 256; v++) starts[v] = starts[v - 1] + counts[256 * b + v - 1];
+      const [k0, r0, k1, r1] = [keys[from], rows[from], keys[to], rows[to]];
+      for (let i = 0; i < m; i++) {
+        const place = starts[(k0[i] >>> shift) & 255]++;
+        k1[place] = k0[i];
+        r1[place] = r0[i];
+      }
+    }
+  }
+}
+
+// What the worker answers: {read} with a file's bytes, then any number of {camera} and {pick}.
+function answer(post) {
+  let order = null;
+  return ({ read, camera, pick }) => {
+    try {
+      if (read) {
+        const scene = readScene(new Uint8Array(read), (progress) => post({ progress }));
+        order = new Order(scene.table);
+        post({ scene }, [scene.table.buffer, scene.latents.buffer]);
+      } else if (pick) {
+        post({ picked: order.picked(pick) });
+      } else {
+        const rows = order.sorted(camera);
+        post({ rows }, [rows.buffer]);
+      }
+    } catch (error) {
+      post({ failed: error instanceof BadFile ? error.message : `The scene cannot be read (${error.message}).` });
+    }
+  };
+}
+
+if (typeof WorkerGlobalScope !== "undefined") {
+  const handle = answer((message, transfer) => self.postMessage(message, transfer));
+  self.onmessage = (event) => handle(event.data);
+}

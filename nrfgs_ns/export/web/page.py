@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page's text: a template, its style and scripts, a scene in the compact format, and what the scripts must know."""
+
+import base64
+import html
+import json
+from importlib.resources import files
+from typing import Any
+
+READER = ("compact.js", "order.js")
+"""Scripts that also run in a worker."""
+VIEWER = ("field.js", "draw.js", "app.js")
+
+
+def page(about: dict[str, Any], poster: bytes, scene: bytes | str, title: str, author: str = "") -> str:
+    """The HTML of a page that shows a scene.
+
+    Args:
+        about: what the scripts read besides the scene: "photographs", "start", "focus", "up", "nearest", "speed".
+        poster: a JPEG to look at while the scene is loaded.
+        scene: a compact file's bytes; or the name of one that lies beside the page.
+        title, author: plain text.
+    """
+    beside = isinstance(scene, str)
+    byline = f"<p>{html.escape(author)}</p>" if author else ""
+    parts = {
+        "connect": "'self'" if beside else "'none'",
+        "title": html.escape(title),
+        "byline": byline,
+        "poster": "data:image/jpeg;base64," + base64.b64encode(poster).decode(),
+        "style": _asset("page.css"),
+        "reader": "".join(map(_asset, READER)),
+        "viewer": "".join(map(_asset, VIEWER)),
+        # In a script element only "</" could end it.
+        "about": json.dumps(about, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        "packed": html.escape(scene) if beside else base64.b64encode(scene).decode(),
+    }
+    text = _asset("page.html")
+    pieces = text.split("{{")
+    return pieces[0] + "".join(parts[name] + rest for name, rest in (piece.split("}}", 1) for piece in pieces[1:]))
+
+
+def _asset(name: str) -> str:
+    return (files(__package__) / name).read_text(encoding="utf-8")

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""COLMAP models, binary and text, as `ns-train nrfgs --data ... colmap` reads them."""
+
+import struct
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from attempt import Case
+from hypothesis import strategies as st
+from PIL import Image
+from small_capture import Capture
+from values import damage, damages
+
+AREA = "COLMAP model"
+MODEL = Path("colmap/sparse/0")
+FILES = ("cameras", "images", "points3D")
+
+
+def load(data: Path, manager: dict | None = None, **options) -> None:
+    """What a training does before its first step."""
+    from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+
+    from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+
+    parser = ColmapDataParserConfig(data=data, **options)
+    NrfgsDatamanagerConfig(dataparser=parser, **(manager or {})).setup(device="cpu").load_all_images()
+
+
+class Model:
+    """Ten cameras on a ring and forty points, to be changed before they are written."""
+
+    def __init__(self) -> None:
+        self.cameras = [(1, 1, 12, 9, (10.0, 11.0, 6.0, 4.5))]
+        self.images = []
+        for i in range(10):
+            world_to_camera = np.linalg.inv(Capture.pose(2 * np.pi * i / 10) * [1, -1, -1, 1])
+            self.images.append(
+                (i + 1, quaternion(world_to_camera[:3, :3]), tuple(world_to_camera[:3, 3]), 1, f"{i:03d}.png")
+            )
+        rng = np.random.default_rng(1)
+        self.points = [(i, tuple(xyz), (9, 99, 199)) for i, xyz in enumerate(rng.normal((5, 6, 7), 0.5, (40, 3)))]
+        self.tracks = 2
+        self.counts = {}
+
+    def binary(self) -> dict[str, bytes]:
+        cameras = [struct.pack(f"<iiQQ{len(p)}d", i, m, w, h, *p) for i, m, w, h, p in self.cameras]
+        images = [
+            struct.pack("<i7di", i, *q, *t, c)
+            + name.encode("utf-8", "surrogatepass")
+            + b"\0"
+            + struct.pack("<Qddq", 1, 3.0, 4.0, -1)
+            for i, q, t, c, name in self.images
+        ]
+        points = [
+            struct.pack("<Q3d3BdQ", i, *xyz, *rgb, 0.5, self.tracks) + struct.pack("<iiii", 1, 0, 2, 0)
+            for i, xyz, rgb in self.points
+        ]
+        return {
+            file: struct.pack("<Q", self.counts.get(file, len(rows))) + b"".join(rows)
+            for file, rows in zip(FILES, (cameras, images, points), strict=True)
+        }
+
+    def text(self) -> dict[str, bytes]:
+        names = {1: "PINHOLE", 6: "FULL_OPENCV"}
+
+        def line(*words) -> str:
+            return " ".join(map(str, words)) + "\n"
+
+        cameras = "".join(line(i, names.get(m, m), w, h, *p) for i, m, w, h, p in self.cameras)
+        images = "".join(line(i, *q, *t, c, name) + line(3.0, 4.0, -1) for i, q, t, c, name in self.images)
+        points = "".join(line(i, *xyz, *rgb, 0.5, 1, 0, 2, 0) for i, xyz, rgb in self.points)
+        return {file: f"# {file}\n{rows}".encode() for file, rows in zip(FILES, (cameras, images, points), strict=True)}
+
+    def write(self, folder: Path, text: bool = False) -> Path:
+        (folder / MODEL).mkdir(parents=True)
+        (folder / "images").mkdir()
+        for file, content in (self.text() if text else self.binary()).items():
+            (folder / MODEL / f"{file}.{'txt' if text else 'bin'}").write_bytes(content)
+        rng = np.random.default_rng(0)
+        for i in range(10):
+            pixels = rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)
+            Image.fromarray(pixels).save(folder / "images" / f"{i:03d}.png")
+        return folder
+
+
+def quaternion(rotation: np.ndarray) -> tuple[float, ...]:
+    """(w, x, y, z) of a rotation: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    K = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, d + b, g + c],
+            [c - g, d + b, e - a - i, h + f],
+            [d - b, g + c, h + f, i - a - e],
+        ]
+    )
+    return tuple(np.linalg.eigh(K)[1][:, -1])
+
+
+def model(name: str, change, text: bool = False, **options) -> Case:
+    def build(folder: Path):
+        one = Model()
+        change(one)
+        return partial(load, one.write(folder / "scene", text), **options)
+
+    return Case(f"{'text: ' if text else ''}{name}", build)
+
+
+def camera(title: str, text: bool = False, **fields) -> Case:
+    def change(one: Model) -> None:
+        found = dict(zip(("id", "model", "w", "h", "p"), one.cameras[0], strict=True)) | fields
+        one.cameras[0] = tuple(found.values())
+
+    return model(f"camera: {title}", change, text)
+
+
+def image(title: str, text: bool = False, **fields) -> Case:
+    def change(one: Model) -> None:
+        found = dict(zip(("id", "q", "t", "camera", "name"), one.images[3], strict=True)) | fields
+        one.images[3] = tuple(found.values())
+
+    return model(f"image: {title}", change, text)
+
+
+def file(name: str, which: str, change, **options) -> Case:
+    def build(folder: Path):
+        scene = Model().write(folder / "scene")
+        change(scene / which)
+        return partial(load, scene, **options)
+
+    return Case(name, build)
+
+
+def cut(share: float):
+    return lambda path: path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+
+
+def announce(one: Model, which: str, count: int) -> None:
+    one.counts[which] = count
+
+
+def at(one: Model, *place: float) -> None:
+    """Put all points at one place."""
+    one.points = [(i, place, color) for i, _, color in one.points]
+
+
+def move(one: Model, factor: float) -> None:
+    i, q, t, c, name = one.images[4]
+    one.images[4] = (i, q, tuple(factor * value for value in t), c, name)
+
+
+NAN, INF = float("nan"), float("inf")
+CASES = [
+    *(
+        camera(f"parameters {p}", text, p=p)
+        for text in (False, True)
+        for p in (
+            (0.0, 11.0, 6.0, 4.5),
+            (NAN, 11.0, 6.0, 4.5),
+            (10.0, -1.0, 6.0, 4.5),
+            (INF, 11.0, 6.0, 4.5),
+            (1e38, 1e38, 6.0, 4.5),
+            (10.0, 11.0, 1e30, 4.5),
+        )
+    ),
+    *(camera(f"{w} x {h} pixels", w=w, h=h) for w, h in ((0, 9), (2**60, 9), (24, 18), (1, 1))),
+    camera("three parameters", True, p=(10.0, 6.0, 4.5)),
+    camera("words", True, p=("a", "b", "c", "d")),
+    camera("of an unknown model", model=77),
+    camera("of an unknown model", True, model="PINE"),
+    camera("FULL_OPENCV", model=6, p=(10.0, 11.0, 6.0, 4.5) + (0.1,) * 8),
+    camera("of number 2", id=2),
+    camera("strong distortion", model=4, p=(10.0, 11.0, 6.0, 4.5, 1e10, 0.0, 0.0, 0.0)),
+    *(
+        image(f"rotation {q}", text, q=q)
+        for text in (False, True)
+        for q in ((0.0, 0.0, 0.0, 0.0), (NAN, 0.0, 0.0, 0.0), (9.0, 0.0, 0.0, 0.0))
+    ),
+    image("position NaN", t=(NAN, 0.0, 0.0)),
+    image("position infinite", t=(INF, 0.0, 0.0)),
+    image("without a name", name=""),
+    image("of a name that is twice", name="000.png"),
+    image("of a file that is not there", name="no.png"),
+    *(image(f"named {name[:20]!r}", name=name) for name in ("x" * 300, "/dev/zero", "..", "a\nb")),
+    image("with words", True, t=("a", "b", "c")),
+    image("with too little", True, t=()),
+    *(
+        model(f"{count} {which} announced", lambda one, c=count, w=which: announce(one, w, c))
+        for which in FILES
+        for count in (11, 2**40, 2**63)
+    ),
+    *(
+        model(f"tracks of {count}", lambda one, c=count: setattr(one, "tracks", c))
+        for count in (7, 2**32, 2**40, 2**61, 2**63)
+    ),
+    model("no images", lambda one: one.images.clear()),
+    model("no cameras", lambda one: one.cameras.clear()),
+    model("one camera a thousand times as far", lambda one: move(one, 1e3)),
+    model("points at 1e30", lambda one: at(one, 1e30, 1e30, 1e30)),
+    model("points of another world", lambda one: at(one, 900.0, 900.0, 900.0)),
+    model("points NaN", lambda one: at(one, NAN, NAN, NAN)),
+    *(file(f"{which} missing", str(MODEL / f"{which}.bin"), Path.unlink) for which in FILES),
+    *(file(f"{which} empty", str(MODEL / f"{which}.bin"), cut(0)) for which in FILES),
+    *(
+        file(f"{which} cut at {share}", str(MODEL / f"{which}.bin"), cut(share))
+        for which in FILES
+        for share in (0.2, 0.5, 0.98)
+    ),
+    file("image missing", "images/003.png", Path.unlink),
+    file("image unreadable", "images/003.png", cut(0.1)),
+    file("image of another size", "images/003.png", lambda path: Image.new("RGB", (9, 9)).save(path)),
+    file("the model elsewhere", "images/003.png", lambda path: None, colmap_path=Path("nowhere")),
+    file("masks missing", "images/003.png", lambda path: None, masks_path=Path("masks")),
+    file("images elsewhere", "images/003.png", lambda path: None, images_path=Path("nowhere")),
+    *(
+        file(f"{name} {value}", "images/003.png", lambda path: None, **{name: value})
+        for name, value in (
+            ("scale_factor", 0.0),
+            ("downscale_factor", 0),
+            ("downscale_factor", 4),
+            ("eval_interval", 0),
+        )
+    ),
+    file("a list of strangers", "train_list.txt", lambda path: path.write_text("nobody.png\n")),
+    file("a list that is no text", "train_list.txt", lambda path: path.write_bytes(b"\xff\xfe\x00")),
+    Case("--data not there", lambda folder: partial(load, folder / "nowhere")),
+    Case("--data empty", lambda folder: partial(load, folder)),
+]
+
+
+def inputs() -> st.SearchStrategy[Case]:
+    """One file of a model, damaged."""
+
+    def case(which: str, text: bool, chosen) -> Case:
+        def build(folder: Path):
+            scene = Model().write(folder / "scene", text)
+            path = scene / MODEL / f"{which}.{'txt' if text else 'bin'}"
+            path.write_bytes(damage(path.read_bytes(), chosen))
+            return partial(load, scene)
+
+        return Case(f"{which} {'text' if text else 'binary'} {chosen}"[:200], build, hostile=False)
+
+    return st.builds(case, st.sampled_from(FILES), st.booleans(), damages())

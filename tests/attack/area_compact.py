@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compact files: damaged, and made to mislead with checksums that hold."""
+
+import json
+import lzma
+import zlib
+from functools import lru_cache, partial
+from pathlib import Path
+from types import SimpleNamespace
+
+from attempt import Case
+from hypothesis import strategies as st
+from values import damage, damages, replace_in, replacements
+
+AREA = "compact file"
+
+
+@lru_cache
+def written() -> bytes:
+    """A field of sixty splats."""
+    import tempfile
+
+    import torch
+
+    from nrfgs_ns.appearance.nrf import NrfConfig
+    from nrfgs_ns.compact.encode import encode
+    from nrfgs_ns.compact.format import write_container
+    from nrfgs_ns.compact.precision import Precision
+
+    torch.manual_seed(3)
+    head = NrfConfig(latent_dim=8, hidden_width=16, output_init="default").setup().requires_grad_(False)
+    columns = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "features_dc": 3, "latents": 8}
+    splats = {name: torch.randn(60, count) for name, count in columns.items()}
+    header, streams = encode(SimpleNamespace(head=head, splats=splats), Precision(), {})
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "field.nrf"
+        write_container(path, header, streams)
+        return path.read_bytes()
+
+
+def read(path: Path) -> None:
+    from nrfgs_ns.compact.decode import decode
+
+    decode(path)
+
+
+def holding(name: str, content: bytes, hostile: bool = True) -> Case:
+    def build(folder: Path):
+        (folder / "field.nrf").write_bytes(content)
+        return partial(read, folder / "field.nrf")
+
+    return Case(name, build, hostile)
+
+
+def parts(data: bytes) -> tuple[dict, list[bytes]]:
+    """The header, and the streams as they are in the file."""
+    from nrfgs_ns.compact.format import CHECKSUM, PREAMBLE
+
+    _, _, length, _ = PREAMBLE.unpack_from(data)
+    header = json.loads(data[PREAMBLE.size : PREAMBLE.size + length])
+    first, bodies = PREAMBLE.size + length + CHECKSUM.size, []
+    for entry in header["streams"]:
+        bodies.append(data[first : first + entry["bytes"]])
+        first += entry["bytes"]
+    return header, bodies
+
+
+def joined(text: bytes, bodies: list[bytes], version: int = 1) -> bytes:
+    """A file whose checksums and lengths hold."""
+    from nrfgs_ns.compact.format import CHECKSUM, MAGIC, PREAMBLE
+
+    total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
+    start = PREAMBLE.pack(MAGIC, version, len(text), total) + text
+    return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
+
+
+def claiming(name: str, change) -> Case:
+    """A header that says something else."""
+
+    def build(folder: Path):
+        header, bodies = parts(written())
+        change(header)
+        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies))
+        return partial(read, folder / "field.nrf")
+
+    return Case(name, build)
+
+
+def bomb(count: int, dtype: str, stream: str, **config) -> Case:
+    """A stream of so many zeros, which packs to next to nothing."""
+
+    def build(folder: Path):
+        header, bodies = parts(written())
+        header["head"]["config"].update(config)
+        group, _, _ = stream.partition(".")
+        size = int(dtype.removeprefix("uint")) // 8
+        packer = lzma.LZMACompressor(format=lzma.FORMAT_XZ, check=lzma.CHECK_NONE)
+        zeros, packed = bytes(2**20), []
+        for _ in range(count * size // 2**20):
+            packed.append(packer.compress(zeros))
+        body = b"".join(packed) + packer.flush()
+        for index, entry in enumerate(header["streams"]):
+            if entry["name"] == stream:
+                shape = [count] if len(entry["shape"]) == 1 else [entry["shape"][0], count // entry["shape"][0]]
+                entry.update(dtype=dtype, shape=shape, bytes=len(body), crc32=zlib.crc32(body))
+                bodies[index] = body
+        header["splats"][group] = count
+        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies))
+        return partial(read, folder / "field.nrf")
+
+    return Case(f"{stream} of {count * int(dtype[4:]) // 8:,} bytes when unpacked", build)
+
+
+def text(name: str, content: bytes) -> Case:
+    def build(folder: Path):
+        (folder / "field.nrf").write_bytes(joined(content, parts(written())[1]))
+        return partial(read, folder / "field.nrf")
+
+    return Case(f"header {name}", build)
+
+
+def config(name: str, value) -> Case:
+    return claiming(f"{name} {str(value)[:20]}", lambda header: header["head"]["config"].update({name: value}))
+
+
+def grid(table: str, part: str, value) -> Case:
+    def change(header) -> None:
+        count = len(header["grids"][table][part])
+        header["grids"][table][part] = [value] * count
+
+    return claiming(f"{part} of {table} {value}", change)
+
+
+CASES = [
+    bomb(2**28, "uint8", "view.means"),
+    bomb(2**29, "uint8", "view.means"),
+    bomb(2**26, "uint64", "view.latents"),
+    bomb(2**26, "uint64", "diffuse.means", latent_dim=22),
+    *(
+        claiming(f"{count} splats", lambda header, c=count: header["splats"].update(view=c))
+        for count in (-1, 0, 61, 2**40, 2**63, 1.5, "60", None, [])
+    ),
+    *(
+        claiming(f"shape {str(shape)[:20]}", lambda header, s=shape: header["streams"][0].update(shape=s))
+        for shape in ([2**40], [2**62, 4], [0, 2**62], [1] * 100 + [60], [-60], [60.0], None, [[60]])
+    ),
+    *(
+        claiming(f"{size} bytes", lambda header, s=size: header["streams"][0].update(bytes=s))
+        for size in (-1, 0, 2**63, 1.5)
+    ),
+    claiming("two streams of one name", lambda header: header["streams"][1].update(name=header["streams"][0]["name"])),
+    claiming("no streams", lambda header: header.update(streams=[])),
+    claiming("format of another", lambda header: header.update(format="x")),
+    claiming("no format", lambda header: header.pop("format")),
+    claiming("no head", lambda header: header.pop("head")),
+    claiming("another head", lambda header: header["head"].update(name="sh")),
+    claiming("no grids", lambda header: header.update(grids=None)),
+    *(
+        claiming(f"quats_bits {bits}", lambda header, b=bits: header.update(quats_bits=b))
+        for bits in (0, 1, 17, 10**9, True, "8", None)
+    ),
+    *(config("latent_dim", value) for value in (0, -1, 9, 10**9, 2**63, 8.0, "8", None, [8], True)),
+    *(config("hidden_width", value) for value in (0, 17, 10**9, 10**30, "16", None)),
+    *(config("num_bands", value) for value in (0, 4, 10**9, "3", None)),
+    *(config("color_scale", value) for value in (-1, float("nan"), float("inf"), "x", None)),
+    *(config("split_bands", value) for value in (False, "yes", None, 3)),
+    config("_target", "os.system"),
+    config("anything", 1),
+    *(
+        grid(table, "step", value)
+        for table in ("means", "latents")
+        for value in (0.0, -1.0, float("nan"), float("inf"), 1e300, "x", None)
+    ),
+    *(grid("scales", "low", value) for value in (float("nan"), 1e300, -1e39, [], None)),
+    text("deep", b"[" * 200_000),
+    text("no JSON", b"{"),
+    text("a list", b"[]"),
+    text("null", b"null"),
+    text("5,000 digits", b'{"streams": ' + b"9" * 5000 + b"}"),
+    holding("empty", b""),
+    holding("zeros", bytes(1000)),
+    holding("a PNG", b"\x89PNG\r\n\x1a\n" + bytes(100)),
+    Case("not there", lambda folder: partial(read, folder / "field.nrf")),
+    Case("a folder", lambda folder: partial(read, folder)),
+    Case("a device", lambda folder: partial(read, Path("/dev/zero"))),
+    Case("a name too long", lambda folder: partial(read, folder / ("x" * 300))),
+    *(
+        Case(f"cut at {share}", lambda folder, s=share: holding("", written()[: int(s * len(written()))]).build(folder))
+        for share in (0.001, 0.01, 0.3, 0.9, 0.999)
+    ),
+]
+
+
+def inputs() -> st.SearchStrategy[Case]:
+    """A file that is damaged, or whose header says something else and has the checksum for it."""
+
+    def damaged(chosen) -> Case:
+        return holding(f"bytes {chosen}"[:200], damage(written(), chosen), hostile=False)
+
+    def misleading(chosen) -> Case:
+        case = claiming(f"header {chosen}"[:200], lambda header: replace_in(header, chosen))
+        return case._replace(hostile=False)
+
+    return st.one_of(damages().map(damaged), replacements().map(misleading))

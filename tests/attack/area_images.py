@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images and masks: damaged, of other formats, and of sizes that nobody has."""
+
+import io
+import os
+import struct
+import zlib
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from area_transforms import broken, capture_in, load
+from attempt import Case
+from broken_captures import FILES
+from hypothesis import strategies as st
+from PIL import Image
+from small_capture import Capture
+from values import damage, damages
+
+AREA = "images and masks"
+EPS = (
+    b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 9\n%%EndComments\n"
+    b"%%Page: 1 1\n(ran) (w) file closefile showpage\n%%EOF\n"
+)
+
+
+def encoded(form: str, size: tuple[int, int] = (12, 9), mode: str = "RGB") -> bytes:
+    rng = np.random.default_rng(2)
+    image = Image.fromarray(rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)).convert(mode)
+    file = io.BytesIO()
+    image.save(file, form)
+    return file.getvalue()
+
+
+def png_claiming(width: int, height: int) -> bytes:
+    """A PNG that says it is of this size, and holds a few bytes."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
+
+
+def holding(name: str, content: bytes, file: str = "images/003.png", **meta) -> Case:
+    def change(capture: Capture) -> None:
+        (capture.folder / file).write_bytes(content)
+        capture.meta |= meta
+
+    return broken(name, change)
+
+
+def sized(width: int, height: int) -> Case:
+    def change(capture: Capture) -> None:
+        capture.meta |= {"w": width, "h": height, "cx": width / 2, "cy": height / 2, "fl_x": 10.0, "fl_y": 10.0}
+        for one in capture.meta["frames"]:
+            Image.new("RGB", (width, height)).save(capture.folder / one["file_path"])
+            Image.new("L", (width, height), 255).save(capture.folder / one["mask_path"])
+
+    return broken(f"all images {width} x {height}", change)
+
+
+def odd_file(name: str, make) -> Case:
+    def change(capture: Capture) -> None:
+        path = capture.folder / "images/003.png"
+        path.unlink()
+        make(path)
+
+    return broken(name, change)
+
+
+CASES = [
+    *(broken(name, lambda c, change=change: change(c)) for name, (change, _) in FILES.items() if "mask" not in name),
+    *(
+        holding(f"{kind} that is EPS", EPS, file)
+        for kind, file in (("image", "images/003.png"), ("mask", "masks/003.png"))
+    ),
+    holding("PDF", b"%PDF-1.4\n%%EOF\n"),
+    holding("GIF", encoded("GIF")),
+    holding("SVG", b'<svg xmlns="http://www.w3.org/2000/svg" width="12" height="9"/>'),
+    holding("ICO", encoded("ICO", (16, 16))),
+    *(holding(f"{mode} of more than 8 bits", encoded("TIFF", mode=mode)) for mode in ("I", "F")),
+    *(
+        holding(f"{form} cut in the middle", encoded(form)[: len(encoded(form)) // 2])
+        for form in ("PNG", "TIFF", "BMP", "WEBP", "PPM")
+    ),
+    holding("bomb of 4 gigapixels", png_claiming(65000, 65000), w=65000, h=65000, fl_x=5e4, fl_y=5e4, cx=3e4, cy=3e4),
+    holding("bomb of 170 megapixels", png_claiming(13000, 13000), w=13000, h=13000, fl_x=1e4, fl_y=1e4, cx=6e3, cy=6e3),
+    holding("PNG of 0 x 0", png_claiming(0, 0)),
+    holding("text of 100 MB when unpacked", b"\x89PNG\r\n\x1a\n" + bytes(50)),
+    sized(1, 1),
+    sized(1, 9),
+    sized(12, 1),
+    sized(2, 2),
+    odd_file("a folder", Path.mkdir),
+    odd_file("a pipe", os.mkfifo),
+    odd_file("a link to itself", lambda path: path.symlink_to(path)),
+    odd_file("a link to /dev/zero", lambda path: path.symlink_to("/dev/zero")),
+    odd_file("a link to nowhere", lambda path: path.symlink_to("/nowhere")),
+    holding("mask cut in the middle", encoded("PNG", mode="L")[:60], "masks/003.png"),
+    holding("mask empty", b"", "masks/003.png"),
+    holding("mask in colours", encoded("PNG"), "masks/003.png"),
+    holding("mask of another size", encoded("PNG", (6, 6), "L"), "masks/003.png"),
+]
+
+
+def inputs() -> st.SearchStrategy[Case]:
+    """An image or a mask of some format, damaged."""
+
+    def case(form: str, kind: str, chosen) -> Case:
+        def build(folder: Path):
+            capture = capture_in(folder)
+            content = encoded(form, mode="L" if kind == "masks" else "RGB")
+            (capture.folder / kind / "003.png").write_bytes(damage(content, chosen))
+            capture.save()
+            return partial(load, capture.folder)
+
+        return Case(f"{form} {kind} {chosen}"[:200], build, hostile=False)
+
+    forms = st.sampled_from(["PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM"])
+    return st.builds(case, forms, st.sampled_from(["images", "masks"]), damages())

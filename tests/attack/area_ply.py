@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The .ply of points that a training starts from."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from area_transforms import broken, capture_in, load
+from attempt import Case
+from hypothesis import strategies as st
+from values import damage, damages
+
+AREA = ".ply of points"
+
+HEAD = b"ply\nformat %s 1.0\nelement vertex %d\nproperty %s x\nproperty float y\nproperty float z\nend_header\n"
+
+
+def holding(name: str, content: bytes) -> Case:
+    return broken(name, lambda capture: (capture.folder / "points.ply").write_bytes(content))
+
+
+def stored(name: str, xyz, rgb=None) -> Case:
+    return broken(name, lambda capture: capture.add_ply(np.asarray(xyz), rgb))
+
+
+TWO = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float %s\nproperty float %s\nend_header\n1 1\n"
+BINARY = b"binary_little_endian"
+ROWS = b"5 6 7\n" * 9
+FINE = np.full((40, 3), 6.0)
+CASES = [
+    holding("empty", b""),
+    holding("no ply", b"solid\n"),
+    holding("header without end", b"ply\nformat ascii 1.0\nelement vertex 9\n"),
+    holding("endless header", b"ply\nformat ascii 1.0\n" + b"comment x\n" * 100_000),
+    holding("no vertices", b"ply\nformat ascii 1.0\nelement face 1\nproperty float x\nend_header\n1\n"),
+    *(
+        holding(f"{form.decode()} of {n} vertices", HEAD % (form, n, b"float") + ROWS)
+        for form in (b"ascii", BINARY)
+        for n in (10**3, 10**7, 10**10, 10**18, 10**30)
+    ),
+    holding("negative count", HEAD % (BINARY, -3, b"float") + ROWS),
+    holding("unknown type", HEAD % (BINARY, 9, b"quad") + bytes(1000)),
+    holding("x is a list", HEAD % (b"ascii", 9, b"list uchar float") + b"1 5 6 7\n" * 9),
+    holding("list of 4 billion", HEAD % (BINARY, 9, b"list uint float") + b"\xff" * 1000),
+    holding("x twice", TWO % (b"x", b"x")),
+    holding("no z", TWO % (b"x", b"y")),
+    holding("words", HEAD % (b"ascii", 9, b"float") + b"a b c\n" * 9),
+    holding("unknown format", HEAD % (b"base64", 9, b"float") + ROWS),
+    holding("bytes", bytes(range(256)) * 9),
+    stored("all NaN", np.full((40, 3), np.nan)),
+    stored("all infinite", np.full((40, 3), np.inf)),
+    stored("at 1e300", np.full((40, 3), 1e300)),
+    stored("at -1e30", np.full((40, 3), -1e30)),
+    stored("colours of 300", FINE, np.full((40, 3), 300, dtype=np.int32)),
+    stored("colours of -1", FINE, np.full((40, 3), -1, dtype=np.int32)),
+    stored("colours of 1e300", FINE, np.full((40, 3), 1e300)),
+    stored("colours all NaN", FINE, np.full((40, 3), np.nan)),
+]
+
+
+def inputs() -> st.SearchStrategy[Case]:
+    """A point cloud, damaged."""
+
+    def case(text: bool, chosen) -> Case:
+        def build(folder: Path):
+            capture = capture_in(folder)
+            rng = np.random.default_rng(1)
+            path = capture.add_ply(
+                rng.normal((5, 6, 7), 0.5, (40, 3)), rng.integers(0, 256, (40, 3), dtype=np.uint8), text
+            )
+            path.write_bytes(damage(path.read_bytes(), chosen))
+            capture.save()
+            return partial(load, capture.folder)
+
+        return Case(f"{'text' if text else 'binary'} {chosen}"[:200], build, hostile=False)
+
+    return st.builds(case, st.booleans(), damages())

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python tests/attack/table.py [--examples N] [--record FILE]`: attack, and print what came of it, as a table.
+
+Every module area_*.py beside this one is an area: AREA (its name), CASES (a list of Case), and inputs(), a hypothesis
+strategy of further ones. The installed `nrfgs_ns` is attacked, or another in PYTHONPATH.
+"""
+
+import argparse
+import importlib
+import json
+import sys
+from collections import Counter
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+for folder in (HERE, HERE.parent / "helpers"):
+    if str(folder) not in sys.path:
+        sys.path.insert(0, str(folder))
+
+from attempt import Case, Outcome, attempt  # noqa: E402
+from hypothesis import HealthCheck, Phase, given, settings  # noqa: E402
+
+COLUMNS = {
+    "tried": (),
+    "one clear sentence": ("refused",),
+    "used": ("read",),
+    "traceback": ("traceback", "unclear"),
+    "silent wrong": ("silent",),
+    "hang, or too much": ("hang", "slow", "large", "wrote", "broken case"),
+}
+"""Of the table, and the outcomes that each counts."""
+
+
+def areas() -> list:
+    """The modules of all areas."""
+    return [importlib.import_module(path.stem) for path in sorted(HERE.glob("area_*.py"))]
+
+
+def drawn(area, count: int) -> list[Case]:
+    """Further inputs of an area, the same ones each time."""
+    cases: list[Case] = []
+
+    @settings(
+        max_examples=count, derandomize=True, database=None, deadline=None, phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(area.inputs())
+    def collect(case: Case) -> None:
+        cases.append(case)
+
+    if count:
+        collect()
+    return cases
+
+
+def table(found: dict[str, list[tuple[str, Outcome]]]) -> str:
+    """Markdown: a row for each area, and their sum."""
+    rows = [["area", *COLUMNS]]
+    total: Counter = Counter()
+    for area, outcomes in found.items():
+        kinds = Counter(outcome.kind for _, outcome in outcomes)
+        numbers = Counter({column: sum(kinds[kind] for kind in counted) for column, counted in COLUMNS.items()})
+        numbers["tried"] = len(outcomes)
+        total += numbers
+        rows.append([area, *(str(numbers[column]) for column in COLUMNS)])
+    rows.append(["all", *(str(total[column]) for column in COLUMNS)])
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([lines[0], "|---" + "|---:" * len(COLUMNS) + "|", *lines[1:]]) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--examples", type=int, default=100, help="random inputs in each area, beside the list")
+    parser.add_argument("--record", type=Path, help="also write the counts and the inputs that did not hold, as JSON")
+    parser.add_argument("--area", help="this area alone")
+    options = parser.parse_args()
+    found: dict[str, list[tuple[str, Outcome]]] = {}
+    for area in areas():
+        if options.area not in (None, area.AREA):
+            continue
+        cases = [*area.CASES, *drawn(area, options.examples)]
+        found[area.AREA] = [(case.name, attempt(case)) for case in cases]
+        for name, outcome in found[area.AREA]:
+            if outcome.kind not in ("refused", "read"):
+                print(f"{area.AREA}: {ascii(name)}: {outcome.kind}: {ascii(outcome.said[:300])}", file=sys.stderr)
+    print(table(found))
+    if options.record:
+        record = {
+            area: {
+                "outcomes": Counter(outcome.kind for _, outcome in outcomes),
+                "did not hold": [[n, o.kind, o.said[:200]] for n, o in outcomes if o.kind not in ("refused", "read")],
+            }
+            for area, outcomes in found.items()
+        }
+        options.record.parent.mkdir(parents=True, exist_ok=True)
+        options.record.write_text(json.dumps({"examples": options.examples, "areas": record}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    import nrfgs_ns.compact.decode
+    import nrfgs_ns.data.datamanager  # noqa: F401  (once, not in every child)
+
+    main()

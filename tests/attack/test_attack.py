@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hostile inputs are refused with one clear sentence (see `attempt`), whatever is wrong with them.
+
+`python tests/attack/table.py` runs more of them and prints the table of docs/stability.md.
+"""
+
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from attempt import GOOD, Case, attempt  # noqa: E402
+from table import areas  # noqa: E402
+
+AREAS = {area.AREA: area for area in areas()}
+
+
+@pytest.mark.parametrize("area", AREAS)
+def test_every_input_of_the_list(area):
+    outcomes = {case.name: attempt(case) for case in AREAS[area].CASES}
+    bad = {name: outcome for name, outcome in outcomes.items() if outcome.kind not in GOOD}
+    assert not bad
+
+
+@pytest.mark.parametrize("area", AREAS)
+@settings(max_examples=15, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_inputs_that_nobody_thought_of(area, data):
+    case = data.draw(AREAS[area].inputs())
+    outcome = attempt(case)
+    assert outcome.kind in GOOD, (case.name, outcome)
+
+
+def test_the_attack_tells_outcomes_apart(tmp_path):
+    def case(act, hostile=True):
+        return Case("", lambda folder: lambda: act(folder), hostile)
+
+    def refuse(message):
+        from nrfgs_ns.errors import InputError
+
+        raise InputError(message)
+
+    assert attempt(case(lambda folder: refuse("x: is wrong. Mend it."))).kind == "refused"
+    assert attempt(case(lambda folder: refuse("x:\nis wrong"))).kind == "unclear"
+    assert attempt(case(lambda folder: 1 / 0)).kind == "traceback"
+    assert attempt(case(lambda folder: sys.exit(1))).kind == "traceback"
+    assert attempt(case(lambda folder: None)).kind == "silent"
+    assert attempt(case(lambda folder: None, hostile=False)).kind == "read"
+    assert attempt(case(lambda folder: (folder / "x").touch(), hostile=False)).kind == "wrote"
+    assert attempt(case(lambda folder: bytearray(2**30 + 2**28).count(1), hostile=False)).kind in ("large", "slow")
+    assert attempt(Case("", lambda folder: 1 / 0)).kind == "broken case"
