@@ -53,7 +53,7 @@ class StepCpu:
     """threads of torch"""
     quick: bool = False
     """the demo's quick scene"""
-    out: Path = Path("docs/results/step_cpu.json")
+    out: Path = Path("step_cpu.json")
     """JSON file of the results"""
 
     def main(self) -> None:

@@ -4,6 +4,7 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 import yaml
@@ -61,8 +62,7 @@ def export_compact(
         soft_wrap=True,
     )
     if measure:
-        small = load_model(config, "test").model  # read as ns-eval reads it
-        numbers |= measure_loss(pipeline, lambda camera: {"file": small.get_outputs_for_camera(camera)["rgb"]})
+        numbers |= measure_file(pipeline, config)
         lost = round(numbers["loss_db"], 3) + 0.0  # without the sign of a -0.0
         CONSOLE.print(
             f"PSNR on {len(numbers['per_image'])} test views: model {numbers['psnr_model']:.2f} dB, file "
@@ -153,3 +153,9 @@ def write_config(load_config: Path, output: Path) -> Path:
     path = config.get_base_dir() / "config.yml"
     path.write_text(yaml.dump(config), encoding="utf-8")
     return path
+
+
+def measure_file(pipeline, config: Path) -> dict[str, Any]:
+    """`measure_loss` of a file, read as ns-eval reads it, by the config.yml beside it."""
+    small = load_model(config, "test").model
+    return measure_loss(pipeline, lambda camera: {"file": small.get_outputs_for_camera(camera)["rgb"]})
