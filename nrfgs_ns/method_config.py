@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -25,6 +25,7 @@ from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
 from nrfgs_ns.training.trainer import NrfgsTrainerConfig
+from nrfgs_ns.viewer.server import LocalViewerConfig
 
 STEPS = 30_000
 AVERAGED = 200
@@ -67,7 +68,7 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
                 "camera_opt": adam(1e-4, lr_final=5e-7, warmup_steps=1000, lr_pre_warmup=0),
                 "bilateral_grid": adam(2e-3, lr_final=1e-4, warmup_steps=1000, lr_pre_warmup=0),
             },
-            viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+            viewer=LocalViewerConfig(num_rays_per_chunk=1 << 15),
             vis="viewer",
         ),
         description=description,

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
+from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
 from nrfgs_ns.data.checks import shown
 from nrfgs_ns.errors import InputError
@@ -122,7 +123,7 @@ def _camera(model: str, width: int, height: int, parameters: list[float], path: 
 
 
 def _view(id: int, rotation: list[float], translation: list[float], camera: int, name: str, path: Path) -> View:
-    w, x, y, z = quaternion = np.array(rotation)
+    quaternion = np.array(rotation)
     pose = np.eye(4)
     pose[:3, 3] = translation
 
@@ -133,11 +134,7 @@ def _view(id: int, rotation: list[float], translation: list[float], camera: int,
         reject("holds NaN or Inf")
     if abs(np.linalg.norm(quaternion) - 1) > QUATERNION_TOLERANCE:
         reject(f"has a quaternion of length {np.linalg.norm(quaternion):.3g} instead of 1")
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    pose[:3, :3] = qvec2rotmat(quaternion)
     return View(id, name, camera, pose)
 
 

@@ -443,6 +443,9 @@ class NrfgsColmapDataParser(NrfgsDataParser):
     def _order(self, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return frames  # by COLMAP's numbers
 
+    def _to_frames(self, meta: dict[str, Any]) -> torch.Tensor | None:
+        return torch.tensor(meta["applied_transform"]) if "applied_transform" in meta else None
+
     @property
     def _colmap(self) -> Path:
         return self._folder / self.config.colmap_path

@@ -24,6 +24,7 @@ from nrfgs_ns.export.loss import measure_loss
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.simplify.field_views import FieldViews, slim
 from nrfgs_ns.simplify.residuals import look_over
+from nrfgs_ns.training.config_file import read_config
 
 PLY_BYTES = 62 * 4
 """Of one splat in 3DGS's PLY file, with harmonics of degree 3."""
@@ -129,14 +130,15 @@ def stream_bytes(path: Path) -> dict[str, int]:
 def write_config(load_config: Path, output: Path) -> Path:
     """Write what nerfstudio's commands need to find a compact file: a config.yml, and a checkpoint that says nothing.
 
-    For FILE.nrf they are in FILE/METHOD/compact. Paths are as they were given, so relative ones count from the folder
-    in which the commands are run, as in every config.yml of nerfstudio.
+    For FILE.nrf they are in FILE.nrf.nerfstudio/METHOD/compact: a folder named FILE may be somebody's data. Paths are
+    as they were given, so relative ones count from the folder in which the commands are run, as in every config.yml of
+    nerfstudio.
 
     Returns:
         the config.yml.
     """
-    config = yaml.load(load_config.read_text(), Loader=yaml.Loader)
-    config.output_dir, config.experiment_name, config.timestamp = output.parent, output.stem, "compact"
+    config = read_config(load_config)
+    config.output_dir, config.experiment_name, config.timestamp = output.parent, f"{output.name}.nerfstudio", "compact"
     config.relative_model_dir = Path("nerfstudio_models")
     config.load_dir = config.load_checkpoint = config.load_step = None
     config.pipeline.compact = output

@@ -29,6 +29,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory
+from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.run import parse
 from nrfgs_ns.training.trainer import NrfgsTrainer, NrfgsTrainerConfig
 
@@ -295,7 +296,7 @@ def _read_config(checkpoint: Path) -> NrfgsTrainerConfig:
     """The configuration of a checkpoint, for this machine's device."""
     if not (checkpoint / "config.yml").is_file() or not (checkpoint / "world.json").is_file():
         raise InputError(f"{checkpoint} is not a checkpoint of nrfgs: it has no config.yml with a world.json.")
-    config = yaml.load((checkpoint / "config.yml").read_text(encoding="utf-8"), Loader=yaml.Loader)
+    config = read_config(checkpoint / "config.yml")
     config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
     return config
 

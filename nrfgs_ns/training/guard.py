@@ -29,6 +29,7 @@ from torch import Tensor
 
 from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.training.guard_report import Finding, report
+from nrfgs_ns.training.in_sight import PATIENCE, InSight
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 
 MAX_GRADIENT = 2.0**63
@@ -76,6 +77,7 @@ class Guard:
     def __init__(self, pipeline):
         self.pipeline = pipeline
         self.step = 0
+        self.in_sight = InSight()
         self._verdict: _Verdict | None = None
         # Pinned memory and events are dear to make; one of each will do, for a verdict is read before the next is made.
         self._in_host_memory: Tensor | None = None
@@ -89,10 +91,17 @@ class Guard:
         """Head of a training step: learn about the step before, and now and then look at the parameters.
 
         Raises:
-            TrainingStopped: the step before was condemned, or a parameter is not finite.
+            TrainingStopped: the step before was condemned, a parameter is not finite, or nothing is visible any more.
         """
         self.settle()
         self.step = step
+        if self._out_of_sight():
+            raise TrainingStopped(
+                f"No splat has been visible in the last {PATIENCE} steps, so nothing is learnt. Poses and points are "
+                "not of one world, or a learning rate has thrown the splats out of sight. The viewer shows where the "
+                "cameras are.",
+                step,
+            )
         if step % PARAMETERS_EVERY == 0:
             self.check_parameters(optimizers)
 
@@ -124,6 +133,10 @@ class Guard:
                 self._send_home(self._verdict)
         else:
             self.settle()
+
+    def _out_of_sight(self) -> bool:
+        """Whether nothing has been visible for long."""
+        return not self.in_sight.see(getattr(self.model, "info", {}))
 
     def _share(self, names: list[str], tensors: list[Tensor], sizes: Tensor) -> tuple[list[str], list[Tensor], Tensor]:
         """Here joins in what other devices have found, where there are any (`distributed`)."""

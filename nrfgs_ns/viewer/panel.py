@@ -18,6 +18,7 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from nrfgs_ns.viewer.pictures import FULL, LEGENDS, Shown, modes, offered_components, picture
+from nrfgs_ns.viewer.server import protect
 
 if TYPE_CHECKING:
     from nrfgs_ns.model.model import NrfgsModel
@@ -39,6 +40,7 @@ class ViewerPanel(ViewerControl):
     """
 
     def __init__(self, model: "NrfgsModel"):
+        protect()
         self.model = model
         self.background: Tensor | None = None
         """the viewer's background colour, [3]"""

@@ -237,7 +237,7 @@ def exported(tiny_scene, tmp_path_factory):
 def test_nerfstudios_commands_read_the_file(exported, tmp_path):
     _, file, report = exported
     numbers = json.loads(report.read_text())
-    config = file.parent / "small" / "nrfgs" / "compact" / "config.yml"
+    config = file.parent / "small.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
     results = evaluate(config, tmp_path / "eval.json")
     assert results["splats"] == numbers["written"]
     # The same pictures, measured by two pieces of code in float32.
@@ -252,7 +252,7 @@ def test_nerfstudios_commands_read_the_file(exported, tmp_path):
 
 def test_the_file_says_which_splats_are_diffuse(exported):
     _, file, report = exported
-    _, pipeline, _, step = eval_setup(file.parent / "small" / "nrfgs" / "compact" / "config.yml")
+    _, pipeline, _, step = eval_setup(file.parent / "small.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml")
     model, numbers = pipeline.model, json.loads(report.read_text())
     assert step == 7
     diffuse = model.densification.state.get(DIFFUSE)
@@ -274,10 +274,10 @@ def test_a_broken_file_stops_ns_eval_with_a_sentence(exported, tmp_path):
     try:
         file.write_bytes(whole[:-5])
         with pytest.raises(InputError, match="its header says"):
-            evaluate(file.parent / "small" / "nrfgs" / "compact" / "config.yml", tmp_path / "eval.json")
+            evaluate(file.parent / "small.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml", tmp_path / "eval.json")
         file.unlink()
         with pytest.raises(InputError, match="cannot be read"):
-            evaluate(file.parent / "small" / "nrfgs" / "compact" / "config.yml", tmp_path / "eval.json")
+            evaluate(file.parent / "small.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml", tmp_path / "eval.json")
     finally:
         file.write_bytes(whole)
 

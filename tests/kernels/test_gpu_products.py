@@ -112,7 +112,7 @@ def exported_files(device: str, scene: Path, out: Path) -> dict[str, dict]:
         # The report's mean over the images is ns-eval's, which sums in another order.
         assert reports[kind]["psnr_model"] == pytest.approx(scores["psnr"], abs=1e-3)
     assert len(read_splats(out / "splats.ply").means) == reports["ply"]["written"] > 100
-    small = evaluate(out / "field" / "nrfgs" / "compact" / "config.yml", out / "small.json")
+    small = evaluate(out / "field.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml", out / "small.json")
     assert small["psnr"] == pytest.approx(reports["compact"]["psnr_file"], abs=1e-3)
     return reports
 

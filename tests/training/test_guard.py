@@ -9,6 +9,7 @@ from short_trainings import command_line
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.guard import MAX_GRADIENT, PARAMETERS_EVERY, TrainingStopped
+from nrfgs_ns.training.in_sight import PATIENCE, InSight
 from nrfgs_ns.training.run import _set_random_seed, parse
 
 
@@ -288,3 +289,18 @@ def state_of(trainer) -> dict:
     """What a checkpoint would hold now."""
     optimizers = {name: optimizer.state_dict() for name, optimizer in trainer.optimizers.optimizers.items()}
     return {"pipeline": trainer.pipeline.state_dict(), "optimizers": optimizers}
+
+
+def test_a_training_in_which_nothing_is_visible_stops(start):
+    trainer = start(steps=PATIENCE + 50)
+    with torch.no_grad():
+        trainer.pipeline.model.gauss_params["means"] += 1e6
+    with pytest.raises(TrainingStopped, match=f"No splat has been visible in the last {PATIENCE} steps") as stopped:
+        trainer.train()
+    assert stopped.value.step == PATIENCE and list(checkpoints(trainer)) == [PATIENCE]
+
+
+def test_now_and_then_a_view_may_see_nothing():
+    sight, nothing, something = InSight(), {"gaussian_ids": torch.empty(0)}, {"gaussian_ids": torch.arange(3)}
+    assert all(sight.see(nothing) for _ in range(PATIENCE - 1)) and sight.see(something) and sight.see({})
+    assert all(sight.see(nothing) for _ in range(PATIENCE - 1)) and not sight.see(nothing)

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs eval`: what `ns-eval` does and writes, for a training that another person has handed on, too."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from nrfgs_ns.files import write_whole
+
+
+@dataclass
+class Eval:
+    """Evaluate a trained model on its test views. Its config.yml is read as options alone and runs no code."""
+
+    config: tyro.conf.Positional[Path]
+    """config.yml of the training"""
+    output_path: Path = Path("output.json")
+    """the file for the numbers, as ns-eval writes it"""
+    render_output_path: Path | None = None
+    """folder for the pictures, truth and rendering side by side"""
+
+    def main(self) -> None:
+        from nerfstudio.utils.rich_utils import CONSOLE
+
+        from nrfgs_ns.export.loading import load_training
+
+        trained = load_training(self.config, "test")
+        results = trained.pipeline.get_average_eval_image_metrics(output_path=self.render_output_path, get_std=True)
+        numbers = {
+            "experiment_name": trained.config.experiment_name,
+            "method_name": trained.config.method_name,
+            "checkpoint": str(trained.checkpoint),
+            "results": results,
+        }
+        write_whole(self.output_path, json.dumps(numbers, indent=2) + "\n")
+        CONSOLE.print(f"Saved results to: {self.output_path}", markup=False, soft_wrap=True)

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs view`: nerfstudio's viewer, as `ns-viewer` opens it, for what another person has handed on, too."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from time import sleep
+from types import SimpleNamespace
+
+import tyro
+
+from nrfgs_ns.compact.format import MAGIC
+from nrfgs_ns.errors import InputError
+
+
+@dataclass
+class View:
+    """Look at a trained model in a browser. Its config.yml is read as options alone and runs no code."""
+
+    model: tyro.conf.Positional[Path]
+    """config.yml of the training, or a file of `nrfgs export compact`, which needs nothing else"""
+    host: str = "127.0.0.1"
+    """the address to listen on. 127.0.0.1: this machine alone; to look from another one, forward the port (ssh -L
+    7007:localhost:7007 HOST). 0.0.0.0: whoever reaches this machine can look"""
+    port: int | None = None
+    """where it listens; None: 7007, or the next that is free"""
+
+    def main(self) -> None:
+        if not self.model.is_file():
+            raise InputError(f"{self.model}: no such file. Name a config.yml, or a file of nrfgs export compact.")
+        with self.model.open("rb") as file:
+            compact = file.read(len(MAGIC)) == MAGIC
+
+        from nrfgs_ns.viewer.server import LocalViewerConfig
+
+        config = LocalViewerConfig(websocket_host=self.host, websocket_port=self.port)
+        if compact:
+            view_file(self.model, config)
+            while True:
+                sleep(1)
+        from nerfstudio.scripts.viewer.run_viewer import _start_viewer
+
+        from nrfgs_ns.export.loading import load_training
+
+        trained = load_training(self.model, "test")
+        trained.config.vis, trained.config.viewer = "viewer", config
+        _start_viewer(trained.config, trained.pipeline, trained.step)
+
+
+def view_file(path: Path, config):
+    """Nerfstudio's viewer for a compact file alone: no photographs, no training.
+
+    Args:
+        path: the file.
+        config: a LocalViewerConfig.
+
+    Returns:
+        the viewer.
+    """
+    from nerfstudio.utils.rich_utils import CONSOLE
+    from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+
+    from nrfgs_ns.export.loading import load_file
+
+    model = load_file(path)
+    pipeline = SimpleNamespace(model=model, datamanager=SimpleNamespace(includes_time=False))
+    viewer = Viewer(config, path.parent / "viewer.log", datapath=path.parent, pipeline=pipeline)
+    viewer.camera_handles, viewer.original_c2w = {}, {}
+    for button in (viewer.pause_train, viewer.resume_train, viewer.hide_images):
+        button.visible = False
+
+    means = model.means.detach()
+    middle = means.median(dim=0).values
+    spread = (means - middle).norm(dim=-1).median()
+    stand = middle + spread * means.new_tensor((2.0, -2.0, 1.0))  # z is up
+
+    def welcome(client) -> None:
+        with client.atomic():
+            client.camera.position = (stand * VISER_NERFSTUDIO_SCALE_RATIO).cpu().numpy()
+            client.camera.look_at = (middle * VISER_NERFSTUDIO_SCALE_RATIO).cpu().numpy()
+
+    viewer.viser_server.on_client_connect(welcome)
+    for line in viewer.viewer_info:
+        CONSOLE.print(line, markup=False, soft_wrap=True)
+    return viewer

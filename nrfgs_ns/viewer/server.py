@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the viewer is served: to this machine alone, its own files alone, to its own page alone.
+
+Nerfstudio 1.1.5 serves its viewer through viser 0.2.7, which listens on all interfaces, hands out any file that a raw
+path leads to (`GET /../../etc/passwd`), lets every web page that is open in the user's browser steer it, and takes any
+number for the size of a picture. `protect` changes that for the viewers that are opened from then on in this process:
+
+    host      127.0.0.1 unless another one is chosen. `ns-viewer` cannot tell nerfstudio's default of 0.0.0.0 from a
+              choice, so that there it counts as none; `ns-train` and `nrfgs view` take it at its word.
+    requests  refused where the Host header is neither an address nor a name of this machine (another name may have been
+              made to point here), or where the page that asks is of another origin.
+    files     refused outside the folder of viser's page.
+    messages  dropped where a browser's page would not send them; numbers are held within the bounds of their control.
+
+Read in: nerfstudio 1.1.5, viser 0.2.7 (`viser/infra/_infra.py`, `viser/_messages.py`), which nerfstudio pins.
+"""
+
+import functools
+import importlib.metadata
+import ipaddress
+import math
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import urlsplit
+
+import websockets.server
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.viewer.viewer import Viewer
+from nerfstudio.viewer_legacy.server.viewer_state import ViewerLegacyState
+from viser import _messages, infra
+from viser.infra import _infra
+
+from nrfgs_ns.errors import InputError
+
+VISER_READ = "0.2.7"
+LOCAL, ALL_INTERFACES = "127.0.0.1", "0.0.0.0"
+
+WIDEST = 8.0
+"""Largest ratio of a picture's sides."""
+FARTHEST = 1e6
+"""Largest number in a message: beyond it float32 has no room for a scene."""
+LARGEST = 1e4
+"""Largest value of a control that has bounds of its own, if those are wider: pixels, seconds."""
+LONGEST_TEXT = 200
+
+SENT_BY_PAGES = (
+    _messages.ViewerCameraMessage,
+    _messages.GuiUpdateMessage,
+    _messages.SceneNodeClickMessage,
+    _messages.ScenePointerMessage,
+    _messages.TransformControlsUpdateMessage,
+)
+"""What the viewer's page sends of its own accord. Not among them: uploads, which nothing here takes, and the wish for a
+public link, which is the user's to make (`--viewer.make-share-url`)."""
+
+
+@dataclass
+class LocalViewerConfig(ViewerConfig):
+    """Nerfstudio's viewer, served to this machine alone."""
+
+    websocket_host: str = LOCAL
+    """The address to listen on. 127.0.0.1: this machine alone; to look from another one, forward the port (ssh -L
+    7007:localhost:7007 HOST). 0.0.0.0: whoever reaches this machine can look and steer."""
+
+
+def protect() -> None:
+    """Serve all viewers of this process from now on as this module says.
+
+    Raises:
+        InputError: viser is another version than the one whose server is known here.
+    """
+    if infra.WebsockServer is GuardedServer:
+        return
+    version = importlib.metadata.version("viser")
+    if version != VISER_READ:
+        raise InputError(
+            f"viser {version} is installed, and the viewer is guarded in {VISER_READ} alone, which nerfstudio 1.1.5 "
+            f"pins. Run: pip install viser=={VISER_READ}."
+        )
+    infra.WebsockServer = GuardedServer
+    _infra.websockets = _Websockets()
+    Viewer.__init__ = _guarded(Viewer.__init__)
+    ViewerLegacyState.__init__ = _refused
+
+
+def _guarded(open_viewer):
+    """Nerfstudio's `Viewer.__init__` with the host that was chosen, and a line on how to look from elsewhere."""
+
+    @functools.wraps(open_viewer)
+    def open_guarded(self, config, *args, **options) -> None:
+        if type(config) is ViewerConfig and config.websocket_host == ALL_INTERFACES:
+            config = replace(config, websocket_host=LOCAL)
+        open_viewer(self, config, *args, **options)
+        server, tunnel = self.viser_server, self.viser_server._share_tunnel
+        if tunnel is not None and tunnel.get_url():
+            server._websock_server.names.add(urlsplit(tunnel.get_url()).hostname)
+        port, machine = server.get_port(), socket.gethostname()
+        if config.websocket_host in (LOCAL, "localhost"):
+            self.viewer_info.append(f"From another machine: ssh -L {port}:localhost:{port} {machine}")
+        else:
+            self.viewer_info.append(f"Whoever reaches {config.websocket_host} can look, and steer the training.")
+
+    return open_guarded
+
+
+def _refused(*_, **__) -> None:
+    raise InputError("The legacy viewer is steered by a page of another site. Use --vis viewer.")
+
+
+class GuardedServer(infra.WebsockServer):
+    """Viser's server, which looks at what comes in."""
+
+    def __init__(self, host: str, *args, message_class=infra.Message, **options):
+        super().__init__(host, *args, message_class=_Admission(message_class, self), **options)
+        self.names = {"localhost"}
+        """names by which this server may be asked for, lower case"""
+        if host not in (LOCAL, "localhost"):
+            machine = socket.gethostname().lower()
+            self.names |= {host.lower(), machine, f"{machine}.local"}
+        self.bounds: dict[str, tuple[Any, Any]] = {}
+        """smallest and largest value of the controls that have such, by id"""
+        self.file_names: set[str] = set()
+        """the ids of text fields that become the name of a file"""
+
+    def queue_message(self, message) -> None:
+        """Remember the bounds of the controls that are put up."""
+        if getattr(message, "min", None) is not None or getattr(message, "max", None) is not None:
+            self.bounds[message.id] = (message.min, message.max)
+        elif isinstance(message, _messages.GuiAddTextMessage) and message.label == "Render name":
+            self.file_names.add(message.id)
+        elif isinstance(message, _messages.ThemeConfigurationMessage):
+            message.show_share_button = False
+        super().queue_message(message)
+
+    def _background_worker(self, ready_sem) -> None:
+        _serving.server = self  # for `_serve`, which is called in this thread
+        super()._background_worker(ready_sem)
+
+    def refusal(self, path: str, headers) -> tuple[HTTPStatus, dict, bytes] | None:
+        """The answer to a request that is not served, None for the others.
+
+        Args:
+            path: as it stands in the request's first line.
+            headers: the request's.
+        """
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        if len(hosts) != 1 or not self._known(hosts[0]):
+            sentence = "Not served under this name. Open the viewer as http://localhost:PORT or by the address."
+            return HTTPStatus.FORBIDDEN, {}, sentence.encode()
+        if any(origin.partition("://")[2] != hosts[0] for origin in origins):
+            return HTTPStatus.FORBIDDEN, {}, b"Not served to pages of other sites."
+        if headers.get_all("Upgrade") == ["websocket"]:
+            return None
+        root = self._http_server_root.resolve()
+        try:
+            path = path.partition("?")[0]
+            asked = (root / path.removeprefix("/")).resolve()
+            found = path == "/" or (asked.is_relative_to(root) and asked.is_file())
+        except (OSError, ValueError):  # too long, or not a path
+            found = False
+        return None if found else (HTTPStatus.NOT_FOUND, {}, b"404")
+
+    def _known(self, host: str) -> bool:
+        """Whether a Host header names this server. An address does: what points it elsewhere is not a name server."""
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return name in self.names
+        return True
+
+
+class _Admission:
+    """What stands in for viser's message class: its `deserialize` lets pass what a page would send.
+
+    What it does not becomes a message that nobody listens to. An exception would leave the client's render thread
+    running for ever.
+    """
+
+    def __init__(self, message_class: type, server: GuardedServer):
+        self.message_class = message_class
+        self.server = server
+
+    def deserialize(self, raw: bytes):
+        try:
+            message = self.message_class.deserialize(raw)
+            self._check(message)
+        except Exception:  # whatever bytes may do to viser
+            return _messages.ResetGuiMessage()
+        return message
+
+    def _check(self, message) -> None:
+        """Hold a message within bounds.
+
+        Raises:
+            ValueError: it is not one that a page would send.
+        """
+        if not isinstance(message, SENT_BY_PAGES):
+            raise ValueError(type(message).__name__)
+        for number in _numbers([getattr(message, field.name) for field in fields(message)]):
+            if not abs(number) <= FARTHEST:
+                raise ValueError(number)
+        if isinstance(message, _messages.ViewerCameraMessage):
+            lengths = [len(getattr(message, name)) for name in ("wxyz", "position", "look_at", "up_direction")]
+            if lengths != [4, 3, 3, 3] or math.hypot(*message.wxyz) < 1e-3 or message.aspect <= 0:
+                raise ValueError("no camera")
+            message.aspect = _held(message.aspect, 1 / WIDEST, WIDEST)
+            message.fov = _held(message.fov, 0.01, 3.1)
+        elif isinstance(message, _messages.GuiUpdateMessage):
+            if set(message.updates) != {"value"}:
+                raise ValueError("a page sets values")
+            value = message.updates["value"]
+            if isinstance(value, str):
+                value = value[:LONGEST_TEXT]
+                if message.id in self.server.file_names:
+                    value = value.replace("/", "_").replace("\\", "_")
+            elif message.id in self.server.bounds:
+                value = _held(value, *self.server.bounds[message.id])
+            message.updates["value"] = value
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """All numbers in nested tuples, lists and dictionaries."""
+    if isinstance(value, dict):
+        value = value.values()
+    elif isinstance(value, (int, float)):
+        yield value
+        return
+    elif not isinstance(value, (list, tuple)):
+        return
+    for part in value:
+        yield from _numbers(part)
+
+
+def _held(value: Any, low: Any, high: Any) -> Any:
+    """A number, or each of a tuple of numbers, between its bounds; None is no bound."""
+    if isinstance(value, tuple):
+        lows, highs = (bound if isinstance(bound, tuple) else (bound,) * len(value) for bound in (low, high))
+        return tuple(_held(*each) for each in zip(value, lows, highs, strict=True))
+    if high is not None:
+        value = min(value, high, LARGEST)
+    return value if low is None else max(value, low)
+
+
+_serving = threading.local()
+
+
+class _Websockets:
+    """The module `websockets` as viser's server sees it: with a `serve` that asks the guard."""
+
+    def __getattr__(self, name: str):
+        return getattr(websockets, name)
+
+    @property
+    def server(self):
+        return self
+
+    @staticmethod
+    def serve(handler, host: str, port: int, process_request, **options):
+        guard = _serving.server
+
+        async def answer(path: str, headers):
+            refusal = guard.refusal(path, headers)
+            return await process_request(path, headers) if refusal is None else refusal
+
+        async def handle(websocket) -> None:
+            await handler(_BytesAlone(websocket))
+
+        return websockets.server.serve(handle, host, port, process_request=answer, **options)
+
+
+class _BytesAlone:
+    """A connection that skips messages of text: viser would fall over them."""
+
+    def __init__(self, websocket):
+        self.websocket = websocket
+        self.send = websocket.send
+
+    async def recv(self) -> bytes:
+        while not isinstance(message := await self.websocket.recv(), bytes):
+            pass
+        return message

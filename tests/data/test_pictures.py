@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Smaller copies of images, made where a data set has none."""
+
+import os
+
+import numpy as np
+import pytest
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from PIL import Image
+from small_capture import Capture
+from small_colmap import Model
+
+from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.pictures import smaller_copies
+from nrfgs_ns.errors import InputError
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def files(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("layout", ["transforms.json", "COLMAP"])
+def test_images_are_resized_where_there_is_no_folder_of_them(tmp_path, cache, layout):
+    if layout == "COLMAP":
+        config = ColmapDataParserConfig(data=Model().write(tmp_path / "scene"), downscale_factor=2)
+    else:
+        capture = Capture(tmp_path / "scene", images=10)
+        capture.add_masks()
+        capture.save()
+        config = NrfgsDataParserConfig(data=capture.folder, downscale_factor=2, eval_mode="interval")
+    before = files(tmp_path / "scene")
+    manager = NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
+    assert manager.load_all_images() == (8, 2)
+    assert files(tmp_path / "scene") == before
+    image, cameras = manager.cached_train[0], manager.train_dataset.cameras
+    assert image["image"].shape == (4, 6, 3)  # 9 / 2 rounded down
+    assert (cameras.width == 6).all() and (cameras.height == 4).all() and (cameras.fx == 5.0).all()
+    assert [path.name for path in manager.train_dataset.image_filenames][:2] == ["001.png", "002.png"]
+    truth = Image.open(tmp_path / "scene/images/001.png").resize((6, 4), Image.Resampling.LANCZOS)
+    np.testing.assert_array_equal(image["image"], truth)
+    if layout != "COLMAP":
+        mask = Image.open(tmp_path / "scene/masks/001.png").resize((6, 4), Image.Resampling.NEAREST)
+        np.testing.assert_array_equal(image["mask"][..., 0], np.array(mask) > 0)
+    made = files(cache)
+    assert len(made) == (10 if layout == "COLMAP" else 20)
+    NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu").load_all_images()
+    assert files(cache) == made, "the second time they are there"
+
+
+def test_folders_of_the_data_set_come_first(tmp_path, cache):
+    capture = Capture(tmp_path / "scene", images=10)
+    (capture.folder / "images_2").mkdir()
+    for path in (capture.folder / "images").iterdir():
+        Image.new("RGB", (6, 4), (9, 99, 199)).save(capture.folder / "images_2" / path.name)
+    capture.parse(downscale_factor=2)
+    assert not cache.exists()
+    (capture.folder / "images_2" / "003.png").unlink()
+    with pytest.raises(InputError, match=r"1 of 9 images are missing: .*images_2/003.png"):
+        capture.parse(downscale_factor=2)
+
+
+def test_a_changed_photograph_has_another_copy(tmp_path):
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (40, 30), (200, 0, 0)).save(path)
+    (first,) = smaller_copies([path], [(20, 15)], "images")
+    Image.new("RGB", (40, 30), (0, 200, 0)).save(path)
+    os.utime(path, ns=(1, 1))
+    (second,) = smaller_copies([path], [(20, 15)], "images")
+    with Image.open(first) as one, Image.open(second) as other:
+        assert first.name == second.name == "a.jpg" and one.format == other.format == "JPEG" and other.size == (20, 15)
+        assert one.getpixel((3, 3))[0] > 190 and other.getpixel((3, 3))[1] > 190
+
+
+def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match="cannot be written.*XDG_CACHE_HOME"):
+        smaller_copies([tmp_path / "a.png"], [(20, 15)], "images")
+
+
+def test_large_photographs_of_colmap_need_no_answer(tmp_path, monkeypatch):
+    monkeypatch.setattr("rich.prompt.Confirm.ask", lambda *_, **__: pytest.fail("asked a question"))
+    one = Model()
+    one.cameras = [(1, 1, 1700, 8, (1500.0, 1500.0, 850.0, 4.0))]
+    scene = one.write(tmp_path / "scene")
+    for path in (scene / "images").iterdir():
+        Image.new("RGB", (1700, 8)).save(path)
+    config = ColmapDataParserConfig(data=scene)
+    manager = NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
+    assert manager.train_dataset[0]["image"].shape == (4, 850, 3)

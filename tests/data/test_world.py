@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures in coordinates of the earth, and whether cameras see what training starts from."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from small_capture import Capture
+
+from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.world import CaptureFrame
+from nrfgs_ns.errors import InputError
+
+UTM = np.array([448_262.3, 5_412_345.6, 311.2])
+
+
+def with_points(folder, offset=0.0, images=10) -> tuple[Capture, np.ndarray]:
+    capture = Capture(folder, images)
+    xyz = np.random.default_rng(1).normal((5, 6, 7), 0.5, (40, 3)) + offset
+    for frame in capture.meta["frames"]:
+        matrix = np.array(frame["transform_matrix"])
+        matrix[:3, 3] += offset
+        frame["transform_matrix"] = matrix.tolist()
+    capture.add_ply(xyz)
+    return capture, xyz
+
+
+@pytest.mark.parametrize("orientation", ["up", "pca", "vertical", "none"])
+@pytest.mark.parametrize("center", ["poses", "focus"])
+def test_coordinates_of_the_earth_lose_nothing(tmp_path, orientation, center):
+    options = {"orientation_method": orientation, "center_method": center}
+    near, _ = with_points(tmp_path / "near")
+    far, xyz = with_points(tmp_path / "far", UTM)
+    near, far = near.parse(**options), far.parse(**options)
+    # Both are float32 numbers below 2 after some sums of numbers below 10.
+    torch.testing.assert_close(far.cameras.camera_to_worlds, near.cameras.camera_to_worlds, atol=1e-5, rtol=0)
+    torch.testing.assert_close(far.metadata["points3D_xyz"], near.metadata["points3D_xyz"], atol=1e-5, rtol=0)
+    assert far.dataparser_scale == pytest.approx(near.dataparser_scale, rel=1e-6)
+    # The way back: float32 numbers below 2 in units of three metres, and float64 at 5,000,000.
+    frame = CaptureFrame.of(far)
+    points = far.metadata["points3D_xyz"].numpy()
+    np.testing.assert_allclose(frame.to_capture(points), xyz, atol=1e-5, rtol=0)
+    np.testing.assert_allclose(frame.to_training(xyz), points, atol=1e-6, rtol=0)
+    assert np.abs(frame.origin - UTM - (5, 6, 7)).max() < 4 and (frame.origin == np.round(frame.origin)).all()
+    assert (CaptureFrame.of(near).origin == 0).all()
+
+
+def test_what_nerfstudio_writes_beside_the_checkpoints_leads_back(tmp_path):
+    far, xyz = with_points(tmp_path / "far", UTM)
+    outputs = far.parse()
+    outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
+    saved = json.loads((tmp_path / "dataparser_transforms.json").read_text())
+    transform, scale = np.array(saved["transform"]), saved["scale"]
+    back = (outputs.metadata["points3D_xyz"].numpy() / scale - transform[:, 3]) @ transform[:, :3]
+    np.testing.assert_allclose(back, xyz, atol=1e-5, rtol=0)
+    poses = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds, "opengl")
+    truth = {frame["file_path"][-7:]: np.array(frame["transform_matrix"]) for frame in far.meta["frames"]}
+    for path, pose in zip(outputs.image_filenames, poses.numpy(), strict=True):
+        np.testing.assert_allclose(pose, truth[path.name][:3], atol=1e-5, rtol=0)
+
+
+def test_without_centring_coordinates_stay(tmp_path):
+    far, _ = with_points(tmp_path / "far", UTM)
+    outputs = far.parse(center_method="none", orientation_method="none", auto_scale_poses=False)
+    assert outputs.dataparser_transform.dtype == torch.float32
+    assert outputs.cameras.camera_to_worlds[:, 1, 3].min() > 5_000_000
+
+
+def test_an_applied_transform_is_part_of_the_way_back(tmp_path):
+    """The capture's own world is that from before it."""
+    far, xyz = with_points(tmp_path / "far", UTM)
+    far.meta["applied_transform"] = [[0, 0, 1, 3], [1, 0, 0, 4], [0, 1, 0, 5]]
+    outputs = far.parse()
+    back = CaptureFrame.of(outputs).to_capture(outputs.metadata["points3D_xyz"].numpy())
+    np.testing.assert_allclose(back, (xyz - (3, 4, 5)) @ np.array(far.meta["applied_transform"])[:, :3], atol=1e-5)
+
+
+# What the cameras see.
+
+
+def turn_away(frame) -> None:
+    matrix = np.array(frame["transform_matrix"])
+    matrix[:3, [0, 2]] *= -1
+    frame["transform_matrix"] = matrix.tolist()
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_views_without_a_point_are_named(tmp_path, printed, count):
+    capture, _ = with_points(tmp_path / "scene")
+    for frame in capture.meta["frames"][:count]:
+        turn_away(frame)
+    capture.parse(eval_mode="all")
+    assert f"{count} of 10 training views see none of the 40 points" in (text := printed()) and "009.png" in text
+
+
+def test_most_views_must_see_something(tmp_path):
+    capture, _ = with_points(tmp_path / "scene")
+    for frame in capture.meta["frames"][:7]:
+        turn_away(frame)
+    with pytest.raises(InputError, match="7 of 10 training views see none of the 40 points"):
+        capture.parse(eval_mode="all")
+
+
+def test_some_points_far_away_are_left_out(tmp_path, printed):
+    capture, xyz = with_points(tmp_path / "scene")
+    xyz[:3] *= 1e8
+    capture.add_ply(xyz)
+    assert capture.parse().metadata["points3D_xyz"].shape == (37, 3)
+    assert "3 of 40 points are 100,000 times as far away" in printed()
+
+
+@pytest.mark.parametrize("factor", [30.0, 1000.0])
+def test_a_camera_far_outside_is_named(tmp_path, printed, factor):
+    capture, _ = with_points(tmp_path / "scene", images=24)
+    matrix = np.array(capture.meta["frames"][5]["transform_matrix"])
+    matrix[:3, 3] = (5, 6, 7) + factor * (matrix[:3, 3] - (5, 6, 7))
+    capture.meta["frames"][5]["transform_matrix"] = matrix.tolist()
+    if factor == 1000.0:
+        with pytest.raises(InputError, match=r"images/018.png \(1e\+03 times\).*remove the frames"):
+            capture.parse()
+    else:
+        capture.parse()
+        assert "images/018.png (30 times)" in printed()
+
+
+def test_empty_masks_are_named(tmp_path, printed):
+    from PIL import Image
+
+    capture = Capture(tmp_path / "scene", images=10)
+    capture.add_masks()
+    capture.save()
+
+    def load():
+        config = NrfgsDataParserConfig(data=capture.folder, load_3D_points=False)
+        NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu").load_all_images()
+
+    Image.new("L", (12, 9)).save(capture.folder / "masks/003.png")
+    load()
+    assert "the masks of 003.png leave nothing of the image" in printed()
+    for path in (capture.folder / "masks").iterdir():
+        Image.new("L", (12, 9)).save(path)
+    with pytest.raises(InputError, match="masks of 000.png, 001.png, 002.png and 6 more leave nothing"):
+        load()
+
+
+# Fisheyes.
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.05])
+def test_a_fisheye_is_undistorted(tmp_path, k1):
+    """What is in memory is what a pinhole sees of a world whose colour depends on direction."""
+    from PIL import Image
+
+    side, focal = 96, 60.0
+
+    def seen(x, y):  # smooth in the direction (x, y, 1)
+        return np.stack([128 + 100 * np.sin(3 * x), 128 + 100 * np.cos(2 * y + x), 0 * x + 50], axis=-1)
+
+    capture = Capture(tmp_path / "scene", images=3)
+    capture.meta |= {"w": side, "h": side, "cx": side / 2, "cy": side / 2, "fl_x": focal, "fl_y": focal}
+    capture.meta |= {"camera_model": "OPENCV_FISHEYE", "k1": k1}
+    u, v = np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5)
+    x, y = (u - side / 2) / focal, (v - side / 2) / focal
+    distance = np.hypot(x, y)
+    angle = distance.copy()
+    for _ in range(20):  # distance = angle (1 + k1 angle^2)
+        angle = distance / (1 + k1 * angle**2)
+    stretch = np.tan(angle) / distance
+    for frame in capture.meta["frames"]:
+        Image.fromarray(seen(x * stretch, y * stretch).round().astype(np.uint8)).save(
+            capture.folder / frame["file_path"]
+        )
+    capture.save()
+    config = NrfgsDataParserConfig(data=capture.folder, load_3D_points=False)
+    manager = NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
+    image = manager.cached_train[0]["image"].numpy().astype(float)
+    camera = manager.train_dataset.cameras[0]
+    u, v = np.meshgrid(np.arange(image.shape[1]) + 0.5, np.arange(image.shape[0]) + 0.5)
+    x, y = (u - camera.cx.item()) / camera.fx.item(), (v - camera.cy.item()) / camera.fy.item()
+    error = np.abs(image - seen(x, y))[2:-2, 2:-2]
+    # Interpolating between pixels 1/60 apart, second derivative 900: below 0.1. Rounding twice: 1.
+    assert error.max() < 2.5
+    as_pinhole = np.abs(image - seen(*((np.stack([u, v]) - side / 2) / focal)))[2:-2, 2:-2]
+    assert as_pinhole.max() > 10
+    assert camera.camera_type.item() == 1
+
+
+def test_raw_photographs_are_for_prepare(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "IMG_1.JPG").touch()
+    with pytest.raises(InputError, match=r"photographs without poses: `nrfgs prepare .*photos SCENE`"):
+        NrfgsDataParserConfig(data=tmp_path / "photos").setup().get_dataparser_outputs()

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A COLMAP model of ten cameras on a ring, for tests that break it."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from small_capture import Capture
+
+MODEL = Path("colmap/sparse/0")
+FILES = ("cameras", "images", "points3D")
+
+
+class Model:
+    """Ten cameras on a ring and forty points, to be changed before they are written."""
+
+    def __init__(self) -> None:
+        self.cameras = [(1, 1, 12, 9, (10.0, 11.0, 6.0, 4.5))]
+        self.images = []
+        for i in range(10):
+            world_to_camera = np.linalg.inv(Capture.pose(2 * np.pi * i / 10) * [1, -1, -1, 1])
+            self.images.append(
+                (i + 1, quaternion(world_to_camera[:3, :3]), tuple(world_to_camera[:3, 3]), 1, f"{i:03d}.png")
+            )
+        rng = np.random.default_rng(1)
+        self.points = [(i, tuple(xyz), (9, 99, 199)) for i, xyz in enumerate(rng.normal((5, 6, 7), 0.5, (40, 3)))]
+        self.tracks = 2
+        self.counts = {}
+
+    def binary(self) -> dict[str, bytes]:
+        cameras = [struct.pack(f"<iiQQ{len(p)}d", i, m, w, h, *p) for i, m, w, h, p in self.cameras]
+        images = [
+            struct.pack("<i7di", i, *q, *t, c)
+            + name.encode("utf-8", "surrogatepass")
+            + b"\0"
+            + struct.pack("<Qddq", 1, 3.0, 4.0, -1)
+            for i, q, t, c, name in self.images
+        ]
+        points = [
+            struct.pack("<Q3d3BdQ", i, *xyz, *rgb, 0.5, self.tracks) + struct.pack("<iiii", 1, 0, 2, 0)
+            for i, xyz, rgb in self.points
+        ]
+        return {
+            file: struct.pack("<Q", self.counts.get(file, len(rows))) + b"".join(rows)
+            for file, rows in zip(FILES, (cameras, images, points), strict=True)
+        }
+
+    def text(self) -> dict[str, bytes]:
+        names = {1: "PINHOLE", 6: "FULL_OPENCV"}
+
+        def line(*words) -> str:
+            return " ".join(map(str, words)) + "\n"
+
+        cameras = "".join(line(i, names.get(m, m), w, h, *p) for i, m, w, h, p in self.cameras)
+        images = "".join(line(i, *q, *t, c, name) + line(3.0, 4.0, -1) for i, q, t, c, name in self.images)
+        points = "".join(line(i, *xyz, *rgb, 0.5, 1, 0, 2, 0) for i, xyz, rgb in self.points)
+        return {file: f"# {file}\n{rows}".encode() for file, rows in zip(FILES, (cameras, images, points), strict=True)}
+
+    def write(self, folder: Path, text: bool = False) -> Path:
+        (folder / MODEL).mkdir(parents=True)
+        (folder / "images").mkdir()
+        for file, content in (self.text() if text else self.binary()).items():
+            (folder / MODEL / f"{file}.{'txt' if text else 'bin'}").write_bytes(content)
+        rng = np.random.default_rng(0)
+        for i in range(10):
+            pixels = rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)
+            Image.fromarray(pixels).save(folder / "images" / f"{i:03d}.png")
+        return folder
+
+
+def quaternion(rotation: np.ndarray) -> tuple[float, ...]:
+    """(w, x, y, z) of a rotation: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    K = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, d + b, g + c],
+            [c - g, d + b, e - a - i, h + f],
+            [d - b, g + c, h + f, i - a - e],
+        ]
+    )
+    return tuple(np.linalg.eigh(K)[1][:, -1])

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""config.yml: what a training saved is read back whole, and a file that asks for more is not obeyed."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+
+from nrfgs_ns import method_config
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.config_file import read_config
+
+METHODS = ["nrfgs", "nrfgs_fast", "nrfgs_best", "nrfgs_sh", "nrfgs_vdgs", "nrfgs_gsnb", "nrfgs_sg"]
+SAVED = Path(__file__).resolve().parents[1] / "fixtures" / "saved_0_1_0"
+
+
+@pytest.fixture
+def saved(tmp_path):
+    def save(text: str) -> Path:
+        path = tmp_path / "config.yml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return save
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_what_is_saved_is_read_back(saved, name):
+    config = replace(getattr(method_config, name).config, data=Path("/some where/scène"))
+    assert read_config(saved(yaml.dump(config))) == config
+
+
+def test_nerfstudios_colmap_parser_is_read_back(saved):
+    config = method_config.nrfgs.config
+    datamanager = replace(config.pipeline.datamanager, dataparser=ColmapDataParserConfig(colmap_path=Path("sparse/0")))
+    config = replace(config, pipeline=replace(config.pipeline, datamanager=datamanager))
+    read = read_config(saved(yaml.dump(config)))
+    assert read == config and read.pipeline.datamanager.dataparser.setup is not None
+    assert read.optimizers["field"]["optimizer"]._target is torch.optim.Adam
+
+
+@pytest.mark.parametrize("name", ["whole", "reduced"])
+def test_a_configuration_of_an_older_version_is_read(name):
+    path = SAVED / name / "config.yml"
+    read, plain = read_config(path), yaml.load(path.read_text(), Loader=yaml.Loader)
+    assert type(read) is type(plain) and read.pipeline.model.appearance == plain.pipeline.model.appearance
+    assert vars(read).keys() == vars(plain).keys()
+
+
+WHOLE = yaml.dump(method_config.nrfgs.config)
+HOSTILE = {
+    "a call": "!!python/object/apply:os.system ['touch {mark}']",
+    "a call with keywords": "!!python/object/apply:os.system\nargs: ['touch {mark}']",
+    "a new object": "!!python/object/new:os.system ['touch {mark}']",
+    "a call inside": WHOLE.replace(
+        "project_name: nerfstudio-project", "project_name: !!python/object/apply:os.system ['touch {mark}']"
+    ),
+    "a call in a path": WHOLE.replace(
+        "project_name: nerfstudio-project",
+        "project_name: !!python/object/apply:pathlib.Path [!!python/object/apply:os.system ['touch {mark}']]",
+    ),
+    "a call through a package": "!!python/object/apply:nerfstudio.utils.scripts.run_command ['touch {mark}']",
+    "a module of a package": "!!python/object/apply:nerfstudio.scripts.train.os.system ['touch {mark}']",
+    "a module": "!!python/module:os",
+    "a function as target": WHOLE.replace(
+        "!!python/name:nrfgs_ns.training.trainer.NrfgsTrainer ''", "!!python/name:os.system ''"
+    ),
+    "another class as target": WHOLE.replace(
+        "!!python/name:torch.optim.adam.Adam ''", "!!python/name:nerfstudio.utils.writer.TensorboardWriter ''", 1
+    ),
+    "a method of a configuration": WHOLE.replace(
+        "project_name: nerfstudio-project", "setup: !!python/name:torch.optim.adam.Adam ''"
+    ),
+    "an object that is no configuration": "!!python/object:nerfstudio.engine.trainer.Trainer {{}}",
+    "an object of another package": "!!python/object:subprocess.Popen {{}}",
+    "a list": "[1, 2]",
+    "nothing": "",
+    "no YAML": "{{]",
+    "deep": "[" * 2_000,
+    "bytes": "!!binary aGk=",
+    "a value that the enum lacks": "!!python/object/apply:nerfstudio.utils.writer.EventName ['no such']",
+}
+
+
+@pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE.keys())
+def test_a_file_that_asks_for_more_is_refused(saved, tmp_path, text):
+    mark = tmp_path / "mark"
+    text = text.replace("{mark}", str(mark)).replace("{{", "{").replace("}}", "}")
+    assert text != WHOLE
+    with pytest.raises(InputError, match="config.yml is not") as refused:
+        read_config(saved(text))
+    assert "\n" not in str(refused.value) and not mark.exists()
+    if "touch" in text:  # the file is one that would have been obeyed, or would have failed for another reason
+        assert "it asks for" in str(refused.value) or "could not determine a constructor" in str(refused.value)
+
+
+def test_a_file_that_is_not_there_or_no_configuration(tmp_path):
+    with pytest.raises(InputError, match="no such file. Name the config.yml"):
+        read_config(tmp_path / "config.yml")
+    (tmp_path / "large").write_bytes(b"a" * (1 << 21))
+    with pytest.raises(InputError, match="larger than"):
+        read_config(tmp_path / "large")
+    (tmp_path / "binary").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match="not a configuration"):
+        read_config(tmp_path / "binary")

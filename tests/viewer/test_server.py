@@ -1,0 +1,354 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the viewer's server lets in, asked with raw sockets as somebody would who means harm."""
+
+import asyncio
+import base64
+import os
+import socket
+import threading
+import time
+from types import SimpleNamespace
+
+import msgspec
+import pytest
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.scripts.viewer import run_viewer
+from nerfstudio.viewer.viewer import Viewer
+from short_trainings import command_line, trained
+from websockets.asyncio.client import connect
+
+from nrfgs_ns.compact.format import MAGIC
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.training.run import parse
+from nrfgs_ns.viewer.command import View, view_file
+from nrfgs_ns.viewer.server import LocalViewerConfig
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+
+@pytest.fixture(scope="module")
+def interface() -> str:
+    """An address of this machine that others reach; no packet is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            pytest.skip("this machine has no network interface")
+        address = probe.getsockname()[0]
+    if address.startswith("127."):
+        pytest.skip("this machine has no network interface")
+    return address
+
+
+@pytest.fixture(scope="module")
+def pipeline(tiny_scene, tmp_path_factory):
+    words = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path_factory.mktemp("out"))]
+    pipeline = parse(words).pipeline.setup(device="cpu", test_mode="val")
+    pipeline.eval()
+    return pipeline
+
+
+@pytest.fixture(scope="module")
+def open_viewer(pipeline, tiny_scene, tmp_path_factory):
+    opened = []
+
+    def start(config) -> Viewer:
+        log = tmp_path_factory.mktemp("viewer") / "log.txt"
+        viewer = Viewer(config, log, datapath=tiny_scene, pipeline=pipeline, train_lock=threading.Lock())
+        viewer.init_scene(pipeline.datamanager.train_dataset, "completed", pipeline.datamanager.eval_dataset)
+        opened.append(viewer)
+        return viewer
+
+    yield start
+    for viewer in opened:
+        viewer.viser_server.stop()
+
+
+@pytest.fixture(scope="module")
+def to_all(open_viewer) -> Viewer:
+    """A viewer that listens on all interfaces, as was asked for."""
+    return open_viewer(LocalViewerConfig(websocket_host="0.0.0.0"))
+
+
+def reachable(address: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(5)
+        return probe.connect_ex((address, port)) == 0
+
+
+def answer(address: str, port: int, path: str, *headers: str, host: str | None = None) -> tuple[int, bytes]:
+    """Status and body of the answer to a GET whose path is sent as it is."""
+    lines = [f"GET {path} HTTP/1.1", f"Host: {host or f'{address}:{port}'}", *headers, "", ""]
+    with socket.create_connection((address, port), timeout=20) as connection:
+        connection.sendall("\r\n".join(lines).encode())
+        received = b""
+        while b"\r\n\r\n" not in received or received.startswith(b"HTTP/1.1 404"):
+            part = connection.recv(1 << 16)
+            received += part
+            if not part:
+                break
+    head, _, body = received.partition(b"\r\n\r\n")
+    return int(head.split()[1]), body
+
+
+def upgrade(address: str, port: int, *headers: str, host: str | None = None) -> int:
+    """Status of the answer to a wish for a WebSocket; 101 is yes."""
+    key = base64.b64encode(os.urandom(16)).decode()
+    wish = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", f"Sec-WebSocket-Key: {key}"]
+    return answer(address, port, "/", *wish, *headers, host=host)[0]
+
+
+@pytest.mark.parametrize("config", [LocalViewerConfig(), ViewerConfig()], ids=["ours", "nerfstudio's default"])
+def test_the_network_is_refused_unless_it_is_asked_for(open_viewer, interface, config):
+    viewer = open_viewer(config)
+    port = viewer.viser_server.get_port()
+    assert reachable("127.0.0.1", port)
+    assert not reachable(interface, port)
+    assert "127.0.0.1" in viewer.viewer_info[0] and f"ssh -L {port}:localhost:{port}" in viewer.viewer_info[1]
+
+
+def test_the_network_is_served_if_it_is_asked_for(to_all, interface):
+    port = to_all.viser_server.get_port()
+    status, body = answer(interface, port, "/")
+    assert status == 200 and b"<html" in body.lower()
+    assert "Whoever reaches 0.0.0.0" in to_all.viewer_info[1]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../../../../../../../../../etc/passwd",
+        "/assets/../../../../../../../../../../../etc/passwd",
+        "//etc/passwd",
+        "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
+        "/../__init__.py",
+        "/../../_viser.py?x=1",
+        "/assets",
+        "/assets/..",
+        "/a\0b",
+        "/" + "a" * 5000,
+        "http://elsewhere/index.html",
+        "*",
+    ],
+)
+def test_no_file_outside_the_page_is_served(to_all, interface, path):
+    status, body = answer(interface, to_all.viser_server.get_port(), path)
+    assert status == 404 and body == b"404"
+
+
+def test_the_page_is_served_under_this_machines_names_alone(to_all, interface):
+    port = to_all.viser_server.get_port()
+    for name in ("localhost:1234", "127.0.0.1", "[::1]:7007", interface, f"{socket.gethostname()}:{port}"):
+        assert answer(interface, port, "/", host=name)[0] == 200, name
+        assert upgrade(interface, port, host=name) == 101, name
+    # A name that somebody's own name server makes point to this machine while the page is open.
+    for name in ("evil.example", "evil.example:7007", "localhost.evil.example", "user@evil.example", "[", ""):
+        assert answer(interface, port, "/", host=name or " ")[0] == 403, name
+        assert upgrade(interface, port, host=name or " ") == 403, name
+    assert answer(interface, port, "/", f"Host: {interface}")[0] == 403, "two of them"
+
+
+def test_pages_of_other_origins_are_refused(to_all, interface):
+    port = to_all.viser_server.get_port()
+    assert upgrade(interface, port) == 101, "no browser's page"
+    assert upgrade(interface, port, f"Origin: http://{interface}:{port}") == 101
+    assert upgrade(interface, port, f"Origin: https://{interface}:{port}") == 101, "behind a proxy"
+    for origin in (
+        "http://evil.example",
+        "https://viewer.nerf.studio",
+        "null",
+        f"http://{interface}",
+        f"http://{interface}:{port + 1}",
+        f"http://evil.example://{interface}:{port}",
+    ):
+        assert upgrade(interface, port, f"Origin: {origin}") == 403, origin
+        assert answer(interface, port, "/", f"Origin: {origin}")[0] == 403, origin
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [0.0, 0.0, -3.0],
+    "fov": 0.9,
+    "aspect": 4 / 3,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, -1.0, 0.0],
+}
+
+
+def send(port: int, messages: list, until=lambda: True) -> None:
+    """Be a browser that sends these, dictionaries packed and the rest as it is, and stays until something has come."""
+
+    async def talk():
+        async with connect(f"ws://127.0.0.1:{port}", max_size=None) as client:
+
+            async def read():
+                async for _ in client:
+                    pass
+
+            reading = asyncio.create_task(read())
+            for message in messages:
+                await client.send(msgspec.msgpack.encode(message) if isinstance(message, dict) else message)
+            deadline = time.time() + 60
+            while not until():
+                assert time.time() < deadline, "what was waited for has not come"
+                await asyncio.sleep(0.05)
+            reading.cancel()
+
+    asyncio.run(talk())
+
+
+def update(handle, value) -> dict:
+    return {"type": "GuiUpdateMessage", "id": handle._impl.id, "updates": {"value": value}}
+
+
+def test_sizes_of_pictures_are_held_within_bounds(to_all, pipeline, monkeypatch):
+    """A resolution of 20,000 and a window a thousand times as wide as it is high."""
+    drawn = []
+    render = pipeline.model.viewer_panel.render
+
+    def watched(camera, obb_box=None):
+        drawn.append((int(camera.width), int(camera.height)))
+        return render(camera, obb_box)
+
+    monkeypatch.setattr(pipeline.model.viewer_panel, "render", watched)
+    slider = to_all.control_panel._max_res.gui_handle
+    largest = 2048
+    for wish, aspect in ((20_000, 1.0), (20_000, 1e5), (20_000, 1e-5), (-5, 1.0), (0, 1e5)):
+        drawn.clear()
+        count = len(drawn) + 1
+        send(
+            to_all.viser_server.get_port(),
+            [{**CAMERA, "aspect": aspect}, update(slider, wish)],
+            lambda count=count: len(drawn) >= count and slider.value in (64, largest),
+        )
+        assert slider.value == (largest if wish > 0 else 64)
+        assert all(4 <= side <= largest for size in drawn for side in size), drawn
+
+
+def test_messages_that_no_page_sends_do_nothing(to_all):
+    viewer = to_all
+    port, slider = viewer.viser_server.get_port(), viewer.control_panel._max_res.gui_handle
+    slider.value = 512
+    nan = float("nan")
+    garbage = [
+        b"",
+        b"\xc1 not msgpack",
+        "text",
+        msgspec.msgpack.encode([1, 2, 3]),
+        {"type": "NoSuchMessage"},
+        {"type": "ViewerCameraMessage"},
+        {**CAMERA, "wxyz": [0.0, 0.0, 0.0, 0.0]},
+        {**CAMERA, "position": [nan, 0.0, 0.0]},
+        {**CAMERA, "position": [1e300, 0.0, 0.0]},
+        {**CAMERA, "position": [0.0, 0.0]},
+        {**CAMERA, "aspect": 0.0},
+        {**CAMERA, "aspect": nan},
+        {**CAMERA, "fov": float("inf")},
+        {"type": "ShareUrlRequest"},
+        {"type": "FileTransferStart", "source_component_id": slider._impl.id, "transfer_uuid": "a", "filename": "b",
+         "mime_type": "c", "part_count": 10**9, "size_bytes": 10**15},
+        {"type": "GuiUpdateMessage", "id": slider._impl.id, "updates": {"value": nan}},
+        {"type": "GuiUpdateMessage", "id": slider._impl.id, "updates": {"is_button": True}},
+        {"type": "GuiUpdateMessage", "id": slider._impl.id, "updates": [1]},
+    ]  # fmt: skip
+    # The last one is in order: when it has had its effect, all others have been read.
+    send(port, [*garbage, CAMERA, update(slider, 128)], lambda: slider.value == 128)
+    assert viewer.viser_server._share_tunnel is None
+    assert not viewer.viser_server.gui._current_file_upload_states
+    deadline = time.time() + 30
+    while viewer.render_statemachines and time.time() < deadline:
+        time.sleep(0.1)
+    assert not viewer.render_statemachines, "the client that has gone is still drawn for"
+
+
+def test_a_camera_path_is_saved_in_its_folder(to_all):
+    """Its name is what the browser says, and becomes a file's."""
+    (name,) = to_all.viser_server._websock_server.file_names
+    handle = to_all.viser_server.gui._gui_input_handle_from_id[name]
+    send(to_all.viser_server.get_port(), [update(handle, "../../../a\\b" + "c" * 1000)], lambda: "a_b" in handle.value)
+    assert handle.value == (".._.._.._a_b" + "c" * 1000)[:200]
+
+
+def test_ns_viewer_listens_to_this_machine_alone(tiny_scene, tmp_path, monkeypatch, interface):
+    """Its own main function, with its own default of 0.0.0.0."""
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path, 2))
+    opened = []
+
+    def viewer(*args, **more):
+        opened.append(Viewer(*args, **more))
+        return opened[-1]
+
+    def look(_):
+        port = opened[0].viser_server.get_port()
+        assert reachable("127.0.0.1", port) and not reachable(interface, port)
+        assert answer("127.0.0.1", port, "/")[0] == 200
+        assert answer("127.0.0.1", port, "/../../../../../../../../../../../etc/passwd")[0] == 404
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_viewer, "ViewerState", viewer)
+    monkeypatch.setattr(run_viewer, "time", SimpleNamespace(sleep=look))
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_viewer.RunViewer(config).main()
+    finally:
+        for one in opened:
+            one.viser_server.stop()
+
+
+def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):
+    with pytest.raises(InputError, match="legacy viewer .* Use --vis viewer"):
+        config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "viewer_legacy"])
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+
+
+def test_nrfgs_view_opens_a_compact_file_alone(tiny_scene, tmp_path, monkeypatch):
+    """No config.yml, no data set; and what it draws is what the file's config.yml leads to."""
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "out", 2))
+    Export("compact", config, tmp_path / "with" / "it.nrf", measure=False).main()
+    original = load_model(next((tmp_path / "with").rglob("config.yml")), "test")
+    (tmp_path / "alone").mkdir()
+    (tmp_path / "with" / "it.nrf").rename(tmp_path / "alone" / "it.nrf")
+
+    drawn = []
+    viewer = view_file(tmp_path / "alone" / "it.nrf", LocalViewerConfig())
+    try:
+        model = viewer.pipeline.model
+        camera = original.datamanager.eval_dataset.cameras[:1]
+        ours, theirs = (one.get_outputs_for_camera(camera)["rgb"] for one in (model, original.model))
+        assert (ours - theirs).abs().max() < 1e-6 and ours.std() > 0.01
+        render = model.viewer_panel.render
+
+        def watched(camera, obb_box=None):
+            drawn.append(render(camera, obb_box))
+            return drawn[-1]
+
+        monkeypatch.setattr(model.viewer_panel, "render", watched)
+        # A browser's first view looks away; it is moved to where there is something to see.
+        away = {**CAMERA, "position": [0.0, 0.0, 900.0], "look_at": [0.0, 0.0, 1000.0]}
+        moved = []
+
+        async def be_moved():
+            port = viewer.viser_server.get_port()
+            async with connect(f"ws://127.0.0.1:{port}", max_size=None) as client:
+                await client.send(msgspec.msgpack.encode(away))
+                while not {"SetCameraPositionMessage", "SetCameraLookAtMessage"} <= {one["type"] for one in moved}:
+                    moved.extend(msgspec.msgpack.decode(await asyncio.wait_for(client.recv(), 60)))
+                while not drawn:
+                    await asyncio.sleep(0.1)
+
+        asyncio.run(asyncio.wait_for(be_moved(), 100))
+    finally:
+        viewer.viser_server.stop()
+    assert os.listdir(tmp_path / "alone") == ["it.nrf"], "nothing is written beside it"
+
+
+def test_nrfgs_view_refuses_what_it_cannot_open(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        View(tmp_path / "none.nrf").main()
+    (tmp_path / "broken.nrf").write_bytes(MAGIC + b"1234")
+    with pytest.raises(InputError, match="broken.nrf"):
+        View(tmp_path / "broken.nrf").main()
