@@ -5,8 +5,8 @@
     python -m nrfgs_lab.results unpack results/NAME.json OUT     # the folder again: `nrfgs bench` reports from it
 
 {"study": NAME, "records": {path without .json: record}, "texts": {path: lines}}, a line for each record. Numbers are
-kept to seven significant digits, as many as float32 has. Figures and the tables of other formats are not kept: the commands
-draw them anew from the records. Nor is what ns-eval says of each image, where `bench/measure.py` says it too.
+kept to seven significant digits, as many as float32 has. Figures and the tables of other formats are not kept: the
+commands draw them anew from the records. Nor is what ns-eval says of each image, where `bench/measure.py` says it too.
 """
 
 import json
