@@ -2,8 +2,8 @@
 """The registered methods: configuration only.
 
 Everything but the appearance head is splatfacto's, to the number: learning rates, schedules, densification, steps.
-The two presets of `nrfgs` differ in one thing each, and are means over their last steps; where they lie on the front is
-in docs/trade-off.md.
+`nrfgs` alone chooses its steps by the number of training views, and keeps its field from learning few of them by heart
+(docs/captures.md). Its two presets are ends of the trade in docs/trade-off.md.
 """
 
 from copy import deepcopy
@@ -23,13 +23,13 @@ from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS
 from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
-from nrfgs_ns.training.trainer import NrfgsTrainerConfig
+from nrfgs_ns.training.trainer import AVERAGED, NrfgsTrainerConfig
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
-STEPS = 30_000
-AVERAGED = 200
-"""Last steps of the presets, whose mean is the trained model."""
+HALF_A_SPACING = 0.5
+"""Noise on where the field is asked from, in distances between neighbouring training cameras (docs/captures.md)."""
 
 
 def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str, Any]:
@@ -92,21 +92,20 @@ def preset(name: str, of: MethodSpecification, description: str, model: dict[str
     )
 
 
-nrfgs = method(
+nrfgs = preset(
     "nrfgs",
-    NrfConfig(),
+    method("nrfgs", NrfConfig(), "", latents=adam(0.0025), field=adam(5e-3, lr_final=5e-4)),
     "Gaussian splatting with a neural residual field for view-dependent colour and opacity.",
-    latents=adam(0.0025),
-    field=adam(5e-3, lr_final=5e-4),
+    model={"view_noise": HALF_A_SPACING},
+    max_num_iterations=0,
 )
 
 nrfgs_fast = preset(
     "nrfgs-fast",
     nrfgs,
-    "nrfgs in a third of the steps, its schedules shortened to them: a third of the time. 1 dB less on a capture of "
-    "255 views, 0.8 to 1.2 dB more on three of 21 to 74.",
+    "nrfgs in 10,000 steps, however many views there are: where they are many, a third of the time for 1 dB.",
     model={},
-    max_num_iterations=10_000,
+    max_num_iterations=FEWEST_STEPS,
     schedule_steps=STEPS,
     average_steps=AVERAGED,
 )
@@ -114,8 +113,10 @@ nrfgs_fast = preset(
 nrfgs_best = preset(
     "nrfgs-best",
     nrfgs,
-    "nrfgs with the densification of 3DGS: 1.7 times as many splats, 0.7 and 1.5 dB more on two captures.",
+    "nrfgs in 30,000 steps with the densification of 3DGS: 1.7 times as many splats, 0.7 and 1.5 dB more on two "
+    "captures.",
     model={"densification": "original"},
+    max_num_iterations=STEPS,
     average_steps=AVERAGED,
 )
 

@@ -81,7 +81,10 @@ def test_everything_else_is_splatfactos(name):
             for part in ("optimizer", "scheduler"):
                 assert parts[part] == host.optimizers[group][part], (group, part)
     assert set(host.optimizers) - set(ours.optimizers) <= {"features_rest"}
-    for field in ("max_num_iterations", "mixed_precision", "use_grad_scaler", "gradient_accumulation_steps", "vis"):
+    # nrfgs chooses by the number of views, up to splatfacto's number.
+    assert ours.max_num_iterations == (0 if name == "nrfgs" else host.max_num_iterations)
+    assert ours.for_views(10_000).max_num_iterations == host.max_num_iterations
+    for field in ("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps", "vis"):
         assert getattr(ours, field) == getattr(host, field), field
     datamanager, host_datamanager = ours.pipeline.datamanager, host.pipeline.datamanager
     for field in ("cache_images", "cache_images_type", "camera_res_scale_factor", "train_cameras_sampling_strategy"):
@@ -92,7 +95,10 @@ def test_everything_else_is_splatfactos(name):
     "name, differs",
     [
         ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200}),
-        ("nrfgs-best", {"average_steps": 200, "pipeline.model.densification": "original"}),
+        (
+            "nrfgs-best",
+            {"max_num_iterations": 30_000, "average_steps": 200, "pipeline.model.densification": "original"},
+        ),
     ],
 )
 def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):

@@ -34,7 +34,7 @@ package adds to nerfstudio's options, or explains or presets in its own way; all
 there too, in `ns-train nrfgs --help`. Underscores and hyphens are the same. A scene unit is what the cameras fill:
 they lie within [-1, 1].
 """
-HOST = "`--max-num-iterations` (30000), `--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
+HOST = "`--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
 
 
 class Option(NamedTuple):

@@ -46,6 +46,7 @@ class ShardedModel(NrfgsModel):
 
     def populate_modules(self):
         super().populate_modules()
+        self.view_noise.seed += comm.rank()  # each device has other splats
         self.sizes: list[tuple[int, int]] = []
         if isinstance(self.densification, Mcmc):
             budget, rank = self.densification.budget, comm.rank()
@@ -86,7 +87,7 @@ class ShardedModel(NrfgsModel):
         field = self.field
         projection = self._project_everywhere(field.splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
-        appearance = field.seen_from(View(projection, centers))
+        appearance = self._as_learnt(field).seen_from(View(projection, centers))
 
         absgrad = self.training and self.densification.needs_absgrad(self.step)
         own, colored = send_to_cameras(projection, appearance, *self.sizes[comm.rank()], absgrad)

@@ -31,9 +31,9 @@ MODEL_STEPS = (
 """Options of the model that are step numbers. Resets are counted in refinements."""
 
 
-def fewer(steps: int, devices: int) -> int:
-    """A step number, divided; never 0 unless it was."""
-    return max(1, round(steps / devices)) if steps > 0 else steps
+def fewer(steps: int | None, devices: int) -> int | None:
+    """A step number, divided; never 0 unless it was. None stays None."""
+    return max(1, round(steps / devices)) if steps is not None and steps > 0 else steps
 
 
 def with_fewer_steps(config: Any, devices: int) -> Any:

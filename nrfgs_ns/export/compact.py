@@ -150,7 +150,7 @@ def write_config(load_config: Path, output: Path) -> Path:
     models.mkdir(parents=True, exist_ok=True)
     for older in models.glob("step-*.ckpt"):
         older.unlink()
-    step = config.max_num_iterations - 1
+    step = max(config.max_num_iterations, 1) - 1
     torch.save({"step": step, "pipeline": {}}, models / f"step-{step:09d}.ckpt")
     path = config.get_base_dir() / "config.yml"
     path.write_text(yaml.dump(config), encoding="utf-8")

@@ -7,6 +7,7 @@ nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the pa
 hold, so that an interrupted training can go on.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -40,6 +41,7 @@ from nrfgs_ns.model.checkpoint import check_compatible, reduced_config
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.pinhole import Pinhole, pinhole
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
+from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.training.pace import Pace
 
@@ -55,6 +57,9 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """target class to instantiate"""
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
+    view_noise: float = 0.0
+    """in training the head sees each splat from a camera centre of its own, moved by noise this many times as long as
+    neighbouring training cameras are apart (docs/captures.md). 0: from the camera's"""
     warmup_steps: int | None = None
     """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
     A head that adds nothing from the start skips them."""
@@ -92,6 +97,8 @@ class NrfgsModel(SplatfactoModel):
     """who says what a browser sees (`show_by`); None: there is no viewer"""
     _fit_cameras: Cameras | None = None
     _fit: Fit | None = None
+    camera_spacing: float = 0.0
+    """world units between neighbouring training cameras; 0 until a training begins"""
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
 
@@ -121,6 +128,9 @@ class NrfgsModel(SplatfactoModel):
             else get_color(self.config.background_color)
         )
         self.densification = build_densification(self.config, self.num_train_data, self.scene_unit)
+        if not self.config.view_noise >= 0.0:
+            raise InputError(f"pipeline.model.view_noise is {self.config.view_noise}; it must be zero or positive.")
+        self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
 
     def _initial_splats(self) -> dict[str, Parameter]:
         """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
@@ -238,13 +248,19 @@ class NrfgsModel(SplatfactoModel):
         """
         field = self.field
         view = self.project(camera, field.splats)
-        appearance = field.seen_from(view)
+        appearance = self._as_learnt(field).seen_from(view)
         background = self._get_background_color()
         outputs, self.info = self.composite(view, appearance, background)
         if self.training:
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._finish_for_training(outputs, camera, background)
         return outputs
+
+    def _as_learnt(self, field: Field) -> Field:
+        """The field as its head is asked about it in this step (`view_noise.py`); outside of training, the field."""
+        if not self.training:
+            return field
+        return field._replace(splats=self.view_noise.moved(field.splats, self.step))
 
     def _finish_for_training(self, outputs: dict[str, Tensor], camera: Cameras, background: Tensor) -> None:
         """Leave the background a colour [3], and apply the camera's bilateral grid, if there are grids."""
@@ -350,7 +366,10 @@ class NrfgsModel(SplatfactoModel):
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
-        self.densification.see_cameras(cameras.camera_to_worlds[:, :3, 3])
+        centers = cameras.camera_to_worlds[:, :3, 3]
+        self.densification.see_cameras(centers)
+        self.camera_spacing = camera_spacing(centers)
+        self.view_noise.sigma = self.config.view_noise * self.camera_spacing / math.sqrt(3.0)
 
         def before_first_step(step: int) -> None:
             steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps

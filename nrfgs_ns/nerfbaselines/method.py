@@ -66,7 +66,8 @@ class Nrfgs:
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.trainer: NrfgsTrainer | None = None
         if self.checkpoint is None:
-            self.config = configure(self.method, config_overrides or {}, train_dataset["metadata"])
+            config = configure(self.method, config_overrides or {}, train_dataset["metadata"])
+            self.config = config.for_views(len(train_dataset["image_paths"]))
             self.world = World.around(train_dataset["cameras"].poses, self.config.pipeline.datamanager.dataparser)
         else:
             self.config = _read_config(self.checkpoint)

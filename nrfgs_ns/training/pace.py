@@ -25,6 +25,12 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+STEPS = 30_000
+"""The training that the methods' schedules are laid out for."""
+STEPS_PER_VIEW = 120
+"""Steps for each training view, where their number is chosen; `bonsai`'s 255 views have as many in `STEPS`."""
+FEWEST_STEPS = 10_000
+"""Steps of a training of few views, where their number is chosen."""
 STEPS_BEFORE_PLANNING = 10
 """Steps at rate 1 before a timed training plans: the first ones also compile and warm up."""
 ROUNDING = 1e-6
@@ -32,6 +38,15 @@ ROUNDING = 1e-6
 STEPS_IN_MEDIAN = 51
 """The pace of the machine is the median of this many steps: evaluations and checkpoints in between do not count as
 steps."""
+
+
+def steps_for(views: int) -> int:
+    """How many steps suit a capture: few views are learnt by heart in many.
+
+    Args:
+        views: number of training views.
+    """
+    return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), STEPS)
 
 
 class Pace:

@@ -78,7 +78,7 @@ def train(
         record.steps, record.seconds, record.parts = earlier.steps, earlier.seconds, earlier.parts + 1
         record.splats, record.saved = list(earlier.splats), list(earlier.saved)
         record.peak_memory_bytes = earlier.peak_memory_bytes
-    last_step = record.steps + config.max_num_iterations
+    last_step = record.steps + trainer.config.max_num_iterations
     clock = _Clock(record)
 
     def before(step: int) -> None:

@@ -18,13 +18,25 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_eval_enabled
 from nerfstudio.utils.misc import step_check
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.averaging import ParameterMean, tell, tell_why_not
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.optimizers import in_world_units
-from nrfgs_ns.training.pace import Pace, TimedPace, resolution_phases
+from nrfgs_ns.training.pace import (
+    FEWEST_STEPS,
+    STEPS,
+    STEPS_PER_VIEW,
+    Pace,
+    TimedPace,
+    resolution_phases,
+    steps_for,
+)
 from nrfgs_ns.training.tracking import track
+
+AVERAGED = 200
+"""Last steps whose mean is the trained model, where their number is chosen and in the presets."""
 
 
 @dataclass
@@ -33,15 +45,19 @@ class NrfgsTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: NrfgsTrainer)
     """target class to instantiate"""
+    max_num_iterations: int = STEPS
+    """training steps. 0: chosen, 120 for each training view but at least 10,000 and at most 30,000, with all schedules
+    stretched to them (docs/captures.md)"""
     time_budget: float | None = None
     """minutes that training may take, from the first step to the end of the last. As many steps are made as fit, and
     all schedules are stretched to them. None: max_num_iterations steps"""
     schedule_steps: int | None = None
     """steps of the training that learning rates, resolution, harmonics and densification are laid out for; they are
     stretched to the steps that are made. None: not stretched, or with a time budget laid out for max_num_iterations"""
-    average_steps: int = 0
+    average_steps: int | None = None
     """the trained model is the mean of its parameters over the last so many steps, or over those since splats or the
-    field last changed if they are fewer; with a time budget about so many. 0: the last step's numbers"""
+    field last changed if they are fewer; with a time budget about so many. 0: the last step's numbers. None:
+    200 where the number of steps is chosen, 0 otherwise"""
 
     def setup(self, **kwargs) -> "NrfgsTrainer":
         """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
@@ -55,13 +71,34 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} is {value}; it must be positive.")
             if value is not None and kwargs.get("world_size", 1) > 1:
                 raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
-        if self.average_steps < 0:
-            raise InputError(f"average_steps is {self.average_steps}; it must be zero or positive.")
+        for name in ("max_num_iterations", "average_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 0:
+                raise InputError(f"{name} is {value}; it must be zero or positive.")
         if kwargs.get("world_size", 1) == 1:
             return super().setup(**kwargs)
         from nrfgs_ns.distributed.trainer import ShardedTrainer
 
-        return ShardedTrainer(self, **kwargs)
+        # Schedules are not stretched there.
+        whole = replace(
+            self, max_num_iterations=self.max_num_iterations or STEPS, average_steps=self.average_steps or 0
+        )
+        return ShardedTrainer(whole, **kwargs)
+
+    def for_views(self, views: int) -> "NrfgsTrainerConfig":
+        """The configuration with what is left open chosen: steps, schedules and mean of a training on one device.
+
+        Args:
+            views: number of training views.
+        """
+        if self.max_num_iterations > 0:
+            return replace(self, average_steps=self.average_steps or 0)
+        return replace(
+            self,
+            max_num_iterations=STEPS if self.time_budget is not None else steps_for(views),
+            schedule_steps=STEPS if self.schedule_steps is None else self.schedule_steps,
+            average_steps=AVERAGED if self.average_steps is None else self.average_steps,
+        )
 
     def save_config(self) -> None:
         """Save config.yml, as every training does before it starts; with several devices, also see to it that they
@@ -90,15 +127,21 @@ class NrfgsTrainer(Trainer):
 
     pace: Pace | None = None
     """how fast the training walks through its schedules; None: a step is a step"""
+    steps_are_chosen: bool = False
+    """whether the number of training views says how many steps are made"""
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
         super().setup(test_mode)
+        if comms.is_main_process():
+            self._tell_what_was_chosen()
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
+        self.steps_are_chosen = self.config.max_num_iterations == 0
+        self.config = self.config.for_views(len(self.pipeline.datamanager.train_dataset))
         self.guard = Guard(self.pipeline)
         self.pipeline.parameter_mean = ParameterMean() if self.config.average_steps > 0 else None
         every = self.pipeline.steps_per_log = self.config.logging.steps_per_log
@@ -106,6 +149,22 @@ class NrfgsTrainer(Trainer):
         optimizers = WatchedOptimizers(self.optimizer_configs(), groups, self.guard, every)
         self.pace = optimizers.pace = self.pipeline.model.pace = self._pace()
         return optimizers
+
+    def _tell_what_was_chosen(self) -> None:
+        """One line: how many steps, how much noise, and why."""
+        model, views = self.pipeline.model, len(self.pipeline.datamanager.train_dataset)
+        chosen = []
+        if self.steps_are_chosen and self.config.time_budget is None:
+            chosen.append(
+                f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
+            )
+        if model.view_noise.sigma > 0.0:
+            chosen.append(f"the head sees each splat from about {model.config.view_noise:g} of that beside the camera")
+        if chosen:
+            apart = model.camera_spacing / model.scene_unit
+            CONSOLE.print(
+                f"{views} training views, {apart:.2g} scene units apart: {'; '.join(chosen)}.", soft_wrap=True
+            )
 
     def _pace(self) -> Pace | None:
         """How fast to walk through the schedules (`pace.py`), or None for a step at a time."""
@@ -127,6 +186,9 @@ class NrfgsTrainer(Trainer):
             raise InputError(
                 "The checkpoint's training had a --time-budget or --schedule-steps. Give the same to go on from it."
             )
+        if self.steps_are_chosen:  # in all, not from here on
+            left = max(self.config.max_num_iterations - self._start_step, 0)
+            self.config = replace(self.config, max_num_iterations=left)
         if self.pace is not None and self.pace.position == 0.0:
             self.pace.position = float(self._start_step)  # of a checkpoint whose schedules were not stretched
         if self.pace is not None and not isinstance(self.pace, TimedPace):
@@ -154,7 +216,7 @@ class NrfgsTrainer(Trainer):
             self.guard.check_parameters(self.optimizers)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
             self.config = replace(self.config, max_num_iterations=0 if self.pace.is_spent else sys.maxsize // 2)
-            self.step = self._start_step - 1
+        self.step = self._start_step - 1  # the last one, if none is left
         gc.collect()
         gc.freeze()  # what is there now stays: the collector need not walk through it again and again
         try:

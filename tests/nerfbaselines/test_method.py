@@ -223,7 +223,7 @@ def test_options_are_typed_as_on_the_command_line():
 
 @pytest.mark.parametrize(
     "method, steps, schedule, densification",
-    [("nrfgs", 30_000, None, "splatfacto"), ("nrfgs-fast", 10_000, 30_000, "splatfacto")]
+    [("nrfgs", 0, None, "splatfacto"), ("nrfgs-fast", 10_000, 30_000, "splatfacto")]
     + [("nrfgs-best", 30_000, None, "original")],
 )
 def test_presets_are_those_of_ns_train(method, steps, schedule, densification):

@@ -148,7 +148,8 @@ def test_a_preset_keeps_its_steps(given, trained):
 
 def test_presets_steps_are_those_of_the_presets():
     own = {one.config.method_name: one.config.max_num_iterations for one in methods()}
-    assert PRESET_STEPS == {name: steps for name, steps in own.items() if steps != own["nrfgs"]}
+    assert own.pop("nrfgs") == 0, "chosen by the number of views; a benchmark says it"
+    assert PRESET_STEPS == {name: steps for name, steps in own.items() if steps != 30_000}
 
 
 # Commands.

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a capture cannot tell apart, the appearance head must not either: noise on where it is asked from.
+
+A head that stores many numbers for each splat can learn every training view by heart, and answers at random between
+them. A capture whose neighbouring cameras are a distance s apart says nothing of changes over less than s. So in
+training each splat i is seen, by the head alone, from a camera centre of its own,
+
+    o_i = o + e_i,    e_i ~ N(0, sigma^2 I),    sigma = factor * s / sqrt 3,
+
+drawn anew in each step: e_i is `factor` * s long in the root mean square. What the head learns is then the mean over
+views that the capture cannot tell apart. To second order in sigma that is its loss plus sigma^2 / 2 times the square
+of its slope by o (Bishop, Neural Computation 7, 1995), for each splat on its own: the angle that it smooths over is
+sigma / |o - x|, wide for near splats and narrow for far ones, as the angles between the capture's cameras are.
+Rendering, geometry and evaluation are as without it.
+"""
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+SAME_PLACE = 0.01
+"""Cameras nearer to each other than this share of the capture's reach stand at one place."""
+NEIGHBOURS = 2
+"""Nearest places that a place's spacing is measured to."""
+
+
+def camera_spacing(centers: Tensor) -> float:
+    """The distance between neighbouring training cameras, in the units of `centers`.
+
+    Each place of the capture has two distances, to its two nearest other places; the result is their median, in which
+    a distance counts by its length. Cameras that stand at one place, or in pairs, bring only short distances, and few
+    that stand far off few long ones: neither decides. Turning, moving or scaling the capture does to the result what
+    it does to distances.
+
+    Args:
+        centers: of the cameras, [V, 3].
+
+    Returns:
+        The spacing; 0 if all cameras stand at one place.
+    """
+    places = distinct_places(centers.double())
+    count = min(NEIGHBOURS, len(places) - 1)
+    if count == 0:
+        return 0.0
+    distances = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+    nearest = distances.fill_diagonal_(math.inf).topk(count, largest=False).values.flatten().sort().values
+    covered = nearest.cumsum(0)
+    return nearest[int((covered < 0.5 * covered[-1]).sum())].item()
+
+
+def distinct_places(centers: Tensor) -> Tensor:
+    """Cameras [V, 3] without those that stand where an earlier one does, [P, 3]."""
+    reach = (centers - centers.mean(dim=0)).norm(dim=-1).max()
+    kept = centers[:1]
+    for center in centers[1:]:
+        if (kept - center).norm(dim=-1).min() > SAME_PLACE * reach:
+            kept = torch.cat([kept, center[None]])
+    return kept
+
+
+class ViewNoise:
+    """Moves what the head sees.
+
+    To move the camera's centre by e_i for splat i is, for a head that looks along o - x_i, to move the mean by -e_i; so
+    the head is given other means, one camera centre serves all splats, and its fast paths stay open. Gradients by the
+    means are those without noise, taken at another place.
+
+    The noise of a step depends on the seed and the step alone: a training that goes on from a checkpoint draws what the
+    unbroken one does, and other generators stay where they are.
+
+    Args:
+        sigma: of each coordinate, world units; 0 for no noise.
+        seed: of the training; devices that hold different splats need different ones.
+    """
+
+    def __init__(self, sigma: float, seed: int):
+        self.sigma, self.seed = sigma, seed
+        self._generators: dict[torch.device, torch.Generator] = {}
+
+    def moved(self, splats: Mapping[str, Tensor], step: int) -> Mapping[str, Tensor]:
+        """The table as the head is to see it in a step: its "means" [N, 3] moved, all else the same tensors.
+
+        Args:
+            splats: the table; itself is returned if there is no noise.
+            step: training step.
+        """
+        if self.sigma == 0.0:
+            return splats
+        means = splats["means"]
+        if means.device not in self._generators:
+            self._generators[means.device] = torch.Generator(means.device)
+        # Two odd numbers of 64 bits, so that neighbouring steps and seeds have nothing to do with each other.
+        key = (self.seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9) % 2**63
+        generator = self._generators[means.device].manual_seed(key ^ key >> 31)
+        noise = torch.randn(means.shape, generator=generator, device=means.device, dtype=means.dtype)
+        return {**splats, "means": torch.add(means, noise, alpha=self.sigma)}

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise on where the head is asked from: how long it is, and that nothing else changes."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+from torch.testing import assert_close
+
+from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing, distinct_places
+
+NRFGS = {"--pipeline.model.num-downscales": 0, "--pipeline.model.warmup-length": 2, "--pipeline.model.refine-every": 4}
+
+
+def ring(count: int, radius: float = 1.0) -> torch.Tensor:
+    """Cameras evenly spaced on a circle, [count, 3]."""
+    angles = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+    return radius * torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], dim=-1)
+
+
+def test_even_cameras_are_apart_what_neighbours_are():
+    assert camera_spacing(ring(40)) == pytest.approx(2 * math.sin(math.pi / 40))
+    line = torch.arange(9.0)[:, None] * torch.tensor([0.0, 0.0, 2.0])
+    assert camera_spacing(line) == pytest.approx(2.0)
+
+
+def test_one_place_has_no_spacing_and_two_have_their_distance():
+    assert camera_spacing(torch.tensor([[3.0, 4.0, 5.0]])) == 0.0
+    assert camera_spacing(torch.ones(7, 3)) == 0.0
+    assert camera_spacing(torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]])) == 5.0
+
+
+@given(st.integers(0, 1000), st.floats(1e-3, 1e3), st.integers(4, 40))
+def test_moving_turning_and_scaling_do_what_they_do_to_distances(seed, scale, count):
+    generator = torch.Generator().manual_seed(seed)
+    cameras = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+    moved = scale * cameras @ turn.T + 10 * torch.randn(3, generator=generator, dtype=torch.float64)
+    assert camera_spacing(moved) == pytest.approx(scale * camera_spacing(cameras), rel=1e-6)
+
+
+def test_duplicates_pairs_and_strays_do_not_decide():
+    cameras, apart = ring(40), camera_spacing(ring(40))
+    assert camera_spacing(torch.cat([cameras, cameras, cameras[:10]])) == pytest.approx(apart)
+    assert len(distinct_places(torch.cat([cameras, cameras + 1e-4]))) == 40
+    stereo = torch.cat([cameras, 1.03 * cameras])  # a fifth of the spacing beside each
+    assert camera_spacing(stereo) == pytest.approx(apart, rel=0.1)
+    burst = torch.cat([cameras, cameras[3] + 0.005 * torch.randn(30, 3, dtype=torch.float64)])
+    assert camera_spacing(burst) == pytest.approx(apart, rel=0.1)
+    assert camera_spacing(torch.cat([cameras, torch.tensor([[0.0, 3.0, 0.0]])])) == pytest.approx(apart, rel=0.1)
+
+
+def test_noise_has_the_length_that_was_asked_for_and_moves_nothing_else():
+    splats = {"means": torch.zeros(20_000, 3), "latents": torch.ones(20_000, 4)}
+    moved = ViewNoise(0.3 / math.sqrt(3), 42).moved(splats, 7)
+    assert moved["means"].square().sum(dim=-1).mean().sqrt().item() == pytest.approx(0.3, rel=0.02)
+    assert moved["means"].mean(dim=0).abs().max() < 0.01
+    assert moved["latents"] is splats["latents"] and not splats["means"].any()
+    assert ViewNoise(0.0, 42).moved(splats, 7) is splats
+
+
+def test_noise_is_the_steps_and_the_seeds_alone():
+    splats = {"means": torch.zeros(500, 3)}
+    noise = ViewNoise(1.0, 42)
+    state = torch.get_rng_state()
+    first, second = noise.moved(splats, 0)["means"], noise.moved(splats, 1)["means"]
+    assert torch.equal(torch.get_rng_state(), state), "another generator moved"
+    assert torch.equal(ViewNoise(1.0, 42).moved(splats, 1)["means"], second)
+    for other in (first, ViewNoise(1.0, 43).moved(splats, 1)["means"]):
+        assert abs(torch.corrcoef(torch.stack([other.flatten(), second.flatten()]))[0, 1]) < 0.1
+
+
+def test_gradients_are_those_of_the_moved_means():
+    means = torch.randn(50, 3, dtype=torch.float64, requires_grad=True)
+    moved = ViewNoise(0.1, 1).moved({"means": means}, 3)["means"]
+    moved.square().sum().backward()
+    assert_close(means.grad, 2 * moved.detach())
+
+
+def train(scene, out, steps, *more):
+    return trained(command_line("nrfgs", scene, out, steps, NRFGS, *more))
+
+
+def test_training_on_is_the_unbroken_training_to_the_bit(tiny_scene, tmp_path, no_cuda):
+    whole = checkpoint_of(train(tiny_scene, tmp_path / "whole", 8))
+    half = train(tiny_scene, tmp_path / "half", 4)
+    rest = checkpoint_of(train(tiny_scene, tmp_path / "rest", 4, {"--load-dir": models_of(half)}))
+    assert_same_training(whole, rest, rtol=0.0, atol=0.0)
+    without = checkpoint_of(train(tiny_scene, tmp_path / "off", 8, {"--pipeline.model.view-noise": 0}))
+    latents = "_model.gauss_params.latents"
+    assert not torch.equal(without["pipeline"][latents], whole["pipeline"][latents]), "the noise did nothing"
+
+
+def test_evaluation_sees_no_noise(tiny_scene, tmp_path, no_cuda):
+    from nrfgs_ns.training.run import parse
+
+    trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, 1, NRFGS)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    model = trainer.pipeline.model
+    camera = trainer.pipeline.datamanager.eval_dataset.cameras[:1]
+    with torch.no_grad():
+        model.head.low[-1].weight.normal_()  # a field that says something
+    sigma = model.view_noise.sigma
+    assert sigma > 0
+
+    def pictures(training: bool) -> list[torch.Tensor]:
+        """With the noise and without."""
+        model.train(training)
+        rendered = []
+        for model.view_noise.sigma in (sigma, 0.0):
+            torch.manual_seed(0)  # of the background
+            rendered.append(model.get_outputs(camera)["rgb"])
+        return rendered
+
+    assert torch.equal(*pictures(training=False))
+    assert not torch.equal(*pictures(training=True))
+
+
+def test_a_negative_length_is_refused(tiny_scene, tmp_path, no_cuda):
+    from nrfgs_ns.errors import InputError
+    from nrfgs_ns.training.run import parse
+
+    config = parse(command_line("nrfgs", tiny_scene, tmp_path, 1, {"--pipeline.model.view-noise": -1}))
+    with pytest.raises(InputError, match="view_noise is -1"):
+        config.setup(local_rank=0, world_size=1).setup()
