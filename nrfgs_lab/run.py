@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from nrfgs_ns.files import write_whole
-from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.training.run import evaluate, machine, train
 
 

@@ -1,10 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one exception that is meant for the user rather than for the programmer."""
+"""The exceptions that are meant for the user rather than for the programmer."""
+
+import os
+
+DEBUG = os.environ.get("NRFGS_DEBUG", "0") not in ("", "0")
+"""NRFGS_DEBUG=1: such exceptions show their traceback, and ns-train its whole configuration."""
 
 
-class InputError(ValueError):
+class ForTheUser(Exception if DEBUG else SystemExit):
+    """Ends a command with its message as the last line and status 1, without a traceback.
+
+    It is a SystemExit because most commands are nerfstudio's: what nobody catches there ends the program, and Python
+    prints the message.
+    """
+
+
+class InputError(ForTheUser, ValueError):
     """Something the user handed over (a data set, a file, a checkpoint, an option) cannot be used.
 
-    The message has three parts: the file or field it is about, what was found there, and the mend, that is what
+    The message has three parts: the file or field it is about, what was found there, and the fix, that is what
     the user can do next. It is raised before time is spent on training.
     """

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -56,6 +56,7 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
             steps_per_save=2000,
             steps_per_eval_all_images=1000,
             mixed_precision=False,
+            logging=LoggingConfig(profiler="none"),  # its table of durations would end every command
             machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
             pipeline=NrfgsPipelineConfig(model=NrfgsModelConfig(appearance=appearance)),
             optimizers={

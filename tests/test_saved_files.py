@@ -80,7 +80,7 @@ def test_what_was_left_of_a_field_is_there(started_in, monkeypatch):
 def test_they_go_on(saved, tmp_path):
     name, path = saved
     config = yaml.load(path.read_text(), Loader=yaml.Loader)
-    config.load_dir, config.max_num_iterations, config.output_dir = path.parent / "nerfstudio_models", 3, tmp_path
+    config.load_dir, config.max_num_iterations, config.output_dir = path.parent / "nerfstudio_models", 15, tmp_path
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     assert type(trainer) is NrfgsTrainer

@@ -91,7 +91,6 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
             return earlier
         print(f"Going on from {checkpoint}")
         args = [args[0], "--load-dir", str(checkpoint.parent), *args[1:]]
-        args[args.index("--max-num-iterations") + 1] = str(job.steps - earlier.steps)
     return train(args, stepped, saved, earlier)
 
 

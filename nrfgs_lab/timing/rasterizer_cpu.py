@@ -93,7 +93,7 @@ def train(scene: Path | None, config: Path | None, steps: int, out: Path) -> Non
     if config:
         from nerfstudio.utils.eval_utils import eval_setup
 
-        from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
+        from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 
         allow_nerfstudio_checkpoints()
         pipeline = eval_setup(config, test_mode="val")[1]

@@ -2,12 +2,14 @@
 """What a photograph's file says about how it was taken."""
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
 from PIL import ExifTags, Image
 
 from nrfgs_ns.data.pictures import open_picture
+from nrfgs_ns.errors import InputError
 
 NUMBERS = {
     "exposure_time": ExifTags.Base.ExposureTime,
@@ -30,9 +32,22 @@ def read_exif(path: Path) -> dict[str, float | str]:
     """
     try:
         with open_picture(path) as image:
-            return known(image.getexif())
-    except Exception:  # PIL lets out whatever it meets in a broken file
+            return known(exif_of(image))
+    except InputError:
         return {}
+
+
+def exif_of(image: Image.Image) -> Image.Exif:
+    """An image's EXIF; empty where it is damaged, which is no reason to refuse the image."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # PIL's "corrupt EXIF data"
+            exif = image.getexif()
+            for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
+                exif.get_ifd(part)
+        return exif
+    except Exception:  # PIL lets out whatever it meets in damaged bytes
+        return Image.Exif()
 
 
 def known(exif: Image.Exif) -> dict[str, float | str]:
@@ -73,3 +88,26 @@ def exif_of_copy(exif: Image.Exif) -> bytes:
     if position := exif.get_ifd(ExifTags.IFD.GPSInfo):
         copy.get_ifd(ExifTags.IFD.GPSInfo).update(position)
     return copy.tobytes() if {*copy, *copy.get_ifd(ExifTags.IFD.Exif), *copy.get_ifd(ExifTags.IFD.GPSInfo)} else b""
+
+
+def read_position(path: Path) -> tuple[float, float] | None:
+    """Latitude and longitude in degrees where a photograph was taken, or None."""
+    try:
+        with open_picture(path) as image:
+            gps = exif_of(image).get_ifd(ExifTags.IFD.GPSInfo)
+    except InputError:
+        return None
+    found = []
+    for value, side, negative, bound in (
+        (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef, "S", 90.0),
+        (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef, "W", 180.0),
+    ):
+        try:
+            degrees, minutes, seconds = (float(part) for part in gps[value])
+        except (KeyError, TypeError, ValueError, ZeroDivisionError):
+            return None
+        angle = degrees + minutes / 60 + seconds / 3600
+        if not abs(angle) <= bound:
+            return None
+        found.append(-angle if str(gps.get(side, "")).strip(" \0").upper() == negative else angle)
+    return (found[0], found[1]) if any(found) else None  # 0, 0 is what devices without a fix write

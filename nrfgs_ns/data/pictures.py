@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
-from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -92,6 +91,8 @@ def smaller_copies(
     copies = [_copy_of(path, size, kind) for path, size in zip(paths, sizes, strict=True)]
     missing = [job for job in zip(paths, sizes, copies, strict=True) if not job[2].is_file()]
     if missing:
+        from nerfstudio.utils.rich_utils import CONSOLE  # 20 seconds, which `nrfgs prepare` need not spend
+
         columns = TextColumn(f"Resizing {kind}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with ThreadPoolExecutor(os.cpu_count()) as pool, Progress(*columns, console=CONSOLE, transient=True) as bar:
             list(bar.track(pool.map(lambda job: _resize(*job, kind), missing), total=len(missing)))

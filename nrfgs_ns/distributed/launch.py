@@ -26,13 +26,14 @@ from nerfstudio.scripts.train import train_loop
 from nerfstudio.utils import comms, profiler
 from torch.multiprocessing import ProcessExitedException
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import ForTheUser, InputError
+from nrfgs_ns.training.stopping import SIGNALS, StopRequest, heard_signals
 
 TIMEOUT = timedelta(minutes=30)
 """Longest that a device waits for another: nerfstudio's. The main device may evaluate or write for a while."""
 
 
-class DeviceLost(RuntimeError):
+class DeviceLost(ForTheUser, RuntimeError):
     """A process of a training on several devices has ended before its time."""
 
 
@@ -52,12 +53,19 @@ def prepare(config: TrainerConfig) -> None:
     show = sys.excepthook
 
     def short(kind, error, trace):
+        if was_asked_to(error):
+            sys.exit(error.exit_code)
         if isinstance(error, mp.ProcessExitedException | mp.ProcessRaisedException):
             print(explain(error, config), file=sys.stderr)
         else:
             show(kind, error, trace)
 
     sys.excepthook = short
+
+
+def was_asked_to(error: BaseException) -> bool:
+    """Whether a process has ended because of a signal that it had heard, and has said so (`training.stopping`)."""
+    return isinstance(error, ProcessExitedException) and error.exit_code in [128 + one for one in SIGNALS]
 
 
 def check_devices(config: TrainerConfig) -> None:
@@ -112,6 +120,7 @@ def launch(config: TrainerConfig, timeout: timedelta = TIMEOUT) -> None:
     Raises:
         InputError: this machine has fewer GPUs, or several machines have no address to meet at.
         DeviceLost: a process has ended before its time; the others have been ended.
+        SystemExit: the training was asked to stop; its state has been written.
     """
     check_devices(config)
     machine = config.machine
@@ -121,10 +130,17 @@ def launch(config: TrainerConfig, timeout: timedelta = TIMEOUT) -> None:
             raise InputError("machine.dist_url is 'auto', but several machines need one address: tcp://HOST:PORT.")
         url = f"tcp://127.0.0.1:{free_port()}"
     context = mp.spawn(work, args=(config, url, timeout), nprocs=machine.num_devices, join=False)
+    request, is_passed_on = StopRequest(quiet=True), False
     try:
-        while not context.join():
-            pass
+        with heard_signals(request):
+            while not context.join(timeout=0.2):
+                if request.signal is not None and not is_passed_on:
+                    for process in context.processes:  # those that have heard it from the terminal take no notice
+                        process.terminate()
+                    is_passed_on = True
     except (mp.ProcessExitedException, mp.ProcessRaisedException) as error:
+        if was_asked_to(error):
+            raise SystemExit(request.exit_status or error.exit_code) from None
         raise DeviceLost(explain(error, config)) from None
     finally:
         for process in context.processes:
@@ -181,11 +197,8 @@ def main(args: list[str] | None = None) -> None:
     if config.data:
         config.pipeline.datamanager.data = config.data
     config.set_timestamp()
-    TrainerConfig.save_config(config)  # not this project's, which prepares for nerfstudio's launcher
-    try:
-        launch(config)
-    except (DeviceLost, InputError) as error:
-        sys.exit(str(error))
+    config.save_config()
+    launch(config)
 
 
 if __name__ == "__main__":

@@ -52,12 +52,10 @@ class ShardedPipeline(NrfgsPipeline):
         return {**result, "splats": sum(self.model.counts)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the order of the cameras and the mean over the last steps, and this device's generators
-        if as many devices wrote the checkpoint."""
+        """Restore the order of the cameras, and this device's generators if as many devices wrote the checkpoint."""
         devices = state.get("devices", ())
         if len(devices) == comm.world():
             super().set_extra_state({**state, **devices[comm.rank()]})
         else:
             self.check_schedules(state)
             self.datamanager.load_sampling_state(state["sampling"])
-            self.loaded_mean = state.get("parameter_mean")

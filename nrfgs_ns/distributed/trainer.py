@@ -4,7 +4,6 @@ main one writes checkpoints of the whole."""
 
 import math
 import random
-import re
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -12,6 +11,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -21,24 +21,51 @@ from nrfgs_ns.distributed.pipeline import ShardedPipeline
 from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import cut_optimizer_state, gather_model_state, gather_optimizer_state
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, WatchedOptimizers
+from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, WatchedOptimizers
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
+from nrfgs_ns.training.stopping import StopRequest
 from nrfgs_ns.training.trainer import NrfgsTrainer, NrfgsTrainerConfig
 
 ELSEWHERE = "a number on another device"
+ASKED = "a signal"
 WITHOUT_VIEWER = {"viewer": "tensorboard", "viewer_legacy": "tensorboard"}
 """What `--vis` becomes: the viewer renders when it likes, and a rendering takes all devices."""
 
 
 class ShardedGuard(Guard):
-    """The guard of one device. What one device finds stops all of them, at the same step and with one message."""
+    """The guard of one device. What one device finds stops all of them, at the same step and with one message; so does
+    a signal that one of them has heard.
 
-    def _share(self, names: list[str], tensors: list[Tensor], sizes: Tensor) -> tuple[list[str], list[Tensor], Tensor]:
-        here = (~(sizes <= MAX_GRADIENT)).any().to(sizes.dtype)
+    Args:
+        pipeline: as for `Guard`.
+        request: what signals have asked this device for.
+    """
+
+    def __init__(self, pipeline, request: StopRequest):
+        super().__init__(pipeline)
+        self.request = request
+        self.all_stop = False
+        """whether any device was asked to stop before the last verdict that was read; the same on all of them"""
+
+    def _share(self, verdict: Verdict) -> Verdict:
+        sizes = verdict.sizes
+        bad = (~(sizes <= MAX_GRADIENT)).any().to(sizes.dtype)
+        here = torch.stack([bad, torch.full_like(bad, float(self.request.signal is not None))])
         anywhere = here.clone()
         dist.all_reduce(anywhere, dist.ReduceOp.MAX)
-        elsewhere = torch.where(anywhere > here, math.inf, 0.0)
-        return [*names, ELSEWHERE], [*tensors, elsewhere], torch.cat([sizes, elsewhere[None]])
+        elsewhere = torch.where(anywhere[0] > bad, math.inf, 0.0)
+        return replace(
+            verdict,
+            names=[*verdict.names, ELSEWHERE, ASKED],
+            origins=[*verdict.origins, "elsewhere", "elsewhere"],
+            tensors=[*verdict.tensors, elsewhere, anywhere[1]],
+            sizes=torch.cat([sizes, elsewhere[None], anywhere[1:]]),
+        )
+
+    def _read(self, verdict: Verdict) -> list[float]:
+        sizes = super()._read(verdict)
+        self.all_stop = self.all_stop or sizes[-1] > 0
+        return sizes
 
     def _out_of_sight(self) -> bool:
         return False  # one device's shard may be, and others are not asked
@@ -64,17 +91,13 @@ class ShardedGuard(Guard):
     def _together(self, stopped: TrainingStopped | None) -> TrainingStopped:
         """One exception for all devices, with the message of the first whose own image or loss is bad, since from
         there it spreads to the gradients of all; else of the first that found something itself."""
-        of_others = f"Training stopped at step {self.step if stopped is None else stopped.step}: {ELSEWHERE}"
-        own = None
-        if stopped is not None and not str(stopped).startswith(of_others):
-            own = str(stopped)
-        found = comm.gather_objects((own, stopped is None or stopped.savable, stopped and stopped.step))
-        told = [(rank, text) for rank, (text, _, _) in enumerate(found) if text is not None]
-        sources = [(rank, text) for rank, text in told if re.match(r".* step \d+: (the rendered image|loss )", text)]
-        device, message = (sources or told)[0]
-        steps = [step for _, _, step in found if step is not None]
-        savable = all(good for _, good, _ in found)
-        return TrainingStopped(f"On device {device} of {comm.world()}: {message}", steps[0], savable)
+        here = None if stopped is None else (str(stopped), stopped.step, stopped.origin, stopped.savable)
+        everywhere = comm.gather_objects(here)
+        found = [(device, *one) for device, one in enumerate(everywhere) if one is not None]
+        own = [one for one in found if one[3] != "elsewhere"]
+        device, message, _, origin, _ = next((one for one in own if one[3] == "rendering"), own[0])
+        savable = all(one[4] for one in found)
+        return TrainingStopped(f"On device {device} of {comm.world()}: {message}", found[0][2], origin, savable)
 
 
 class ShardedOptimizers(WatchedOptimizers):
@@ -125,6 +148,7 @@ class ShardedTrainer(NrfgsTrainer):
             config = with_fewer_steps(config, world_size)
         config = replace(config, vis=vis, pipeline=replace(config.pipeline, _target=ShardedPipeline))
         super().__init__(config, local_rank, world_size)
+        self.request.quiet = comm.rank() > 0
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         # nerfstudio seeds each device differently; the initial splats and the order of the cameras must be the same.
@@ -134,11 +158,18 @@ class ShardedTrainer(NrfgsTrainer):
         torch.manual_seed(seed)
         super().setup(test_mode)
 
+    @property
+    def _is_asked_to_stop(self) -> bool:
+        return self.guard.all_stop
+
+    def _end(self, line: str, status: int) -> None:
+        comms.synchronize()  # until the main device has written
+        super()._end(line, status)
+
     def setup_optimizers(self) -> Optimizers:
-        self.guard = ShardedGuard(self.pipeline)
-        self.pipeline.parameter_mean = ShardedMean() if self.config.average_steps > 0 else None
-        every = self.pipeline.steps_per_log = self.config.logging.steps_per_log
-        groups = self.pipeline.get_param_groups()
+        self.guard = ShardedGuard(self.pipeline, self.request)
+        self.mean = ShardedMean() if self.config.average_steps > 0 else None
+        groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
         optimizers = ShardedOptimizers(self.optimizer_configs(), groups, self.guard, every)
         if self.count_images:
             forget_faster(optimizers.optimizers, self.world_size)
@@ -152,9 +183,9 @@ class ShardedTrainer(NrfgsTrainer):
         gather_model_state(content["pipeline"], model.counts, "_model.")
         for name in model.gauss_params:
             content["optimizers"][name] = gather_optimizer_state(content["optimizers"][name], model.counts)
-        extra = content["pipeline"]["_extra_state"]
-        if extra.pop("parameter_mean", None) is not None:  # on all devices, or on none
-            extra |= self.pipeline.parameter_mean.whole_state(model, self.optimizers.optimizers)
+        training, extra = content["training"], content["pipeline"]["_extra_state"]
+        if training.pop("parameter_mean", None) is not None:  # on all devices, or on none
+            training |= self.mean.whole_state(model, self.optimizers.optimizers)
         own = {name: extra[name] for name in ("torch_rng", "cuda_rng", "python_rng")}
         images = self.world_size if self.count_images else 1
         content["pipeline"]["_extra_state"] = {

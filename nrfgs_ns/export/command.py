@@ -9,6 +9,7 @@ import tyro
 
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.ply_options import PlyOptions
 from nrfgs_ns.export.web.options import WebOptions
 
 
@@ -29,6 +30,8 @@ class Export:
     """render the test views from the model and from the written file, and tell what the fit loses"""
     report: Path | None = None
     """also write the numbers to this file, as JSON"""
+    ply: PlyOptions = field(default_factory=PlyOptions)
+    """how splats lie in a PLY file"""
     compact: CompactOptions = field(default_factory=CompactOptions)
     """what a compact file may leave out, and the scene in a page"""
     web: WebOptions = field(default_factory=WebOptions)
@@ -49,4 +52,4 @@ class Export:
         else:
             from nrfgs_ns.export.ply import export_ply
 
-            export_ply(self.load_config, self.output, self.measure, self.report)
+            export_ply(self.load_config, self.output, self.ply, self.measure, self.report)

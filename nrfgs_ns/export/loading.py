@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trained models, for what looks at them or writes them."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -34,24 +35,50 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
         InputError: there is no such training, or it is not one of this project's methods.
     """
     import torch
-    from nerfstudio.utils.eval_utils import eval_load_checkpoint
 
+    from nrfgs_ns.training.checkpoint_files import find, read_latest
     from nrfgs_ns.training.config_file import read_config
     from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
 
     config = read_config(path)
     if not isinstance(config.pipeline, NrfgsPipelineConfig):
         raise InputError(f"{path}: a training of {config.method_name}. Use nerfstudio's own commands for it.")
-    config.load_dir = config.get_checkpoint_dir()
+    places = [path.parent / config.relative_model_dir, config.get_checkpoint_dir()]
+    folder = next((place for place in places if find(place)), None)
+    if folder is None:
+        raise InputError(
+            f"{path}: no checkpoints beside it ({places[0]}), nor where it was trained ({places[1]}). Put the "
+            f"training's {config.relative_model_dir} beside it."
+        )
+    _find_data(config, path)
     pipeline = config.pipeline.setup(device="cuda" if torch.cuda.is_available() else "cpu", test_mode=mode)
     pipeline.eval()
-    try:
-        return Trained(config, pipeline, *eval_load_checkpoint(config, pipeline))
-    except (SystemExit, IndexError) as error:  # nerfstudio has said on the screen where it looked
+    checkpoint, content = read_latest(folder)
+    pipeline.load_pipeline(content["pipeline"], content["step"])
+    return Trained(config, pipeline, checkpoint, content["step"])
+
+
+def _find_data(config: "TrainerConfig", path: Path) -> None:
+    """Let a configuration name its data set where that is now: as it is stored, else in the same place as seen from
+    config.yml, so that outputs and data can be moved together.
+
+    Raises:
+        InputError: it is in neither.
+    """
+    manager = config.pipeline.datamanager
+    stored = manager.data or manager.dataparser.data
+    if stored is None or stored.exists():
+        return
+    begin, now = config.output_dir.absolute(), path.absolute().parents[3:4]  # outputs/EXPERIMENT/METHOD/TIME/config.yml
+    places = [(folder / os.path.relpath(stored.absolute(), begin)).resolve() for folder in now]
+    found = next((place for place in places if place.exists()), None)
+    if found is None:
+        tried = "".join(f", nor at {place}" for place in places)
         raise InputError(
-            f"{path}: its checkpoints cannot be found. Run this in the folder where the training was started: paths in "
-            "config.yml are relative to it."
-        ) from error
+            f"{path}: its data set is not at {stored}{tried}. Put it there, or change both `data` in the file."
+        )
+    config.data = manager.data = found
+    manager.dataparser.data = found
 
 
 def load_model(path: Path, mode: Literal["test", "inference"]) -> "NrfgsPipeline":

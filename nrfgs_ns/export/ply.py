@@ -4,12 +4,13 @@
 One vertex for each splat, 62 little-endian floats: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44, opacity (a logit),
 scale_0..2 (logarithms), rot_0..3 (w x y z, of unit length). A viewer's colour is max(0, 1/2 + SH_C0 f_dc + ...), and
 f_rest is channel-major: 15 coefficients of red, then of green, then of blue. `harmonics_fit.py` says how a head's
-colours become harmonics; `ns-export gaussian-splat` gets them from the model's properties and writes the same numbers.
+colours become harmonics; `ns-export gaussian-splat` gets them from the model's properties and writes the same numbers,
+in the training's world.
 """
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,8 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole, write_whole
 
 if TYPE_CHECKING:  # nerfstudio takes seconds to import: `nrfgs --help` answers at once
+    from nrfgs_ns.export.frames import Similarity
+    from nrfgs_ns.export.ply_options import PlyOptions
     from nrfgs_ns.model.harmonics_fit import PlainSplats
 
 PROPERTIES = (
@@ -37,20 +40,39 @@ FAINTEST_LOGIT = -5.5373
 """Splats with a smaller opacity logit are left out, as by ns-export: logit(1/255), below which nothing is drawn."""
 
 
-def export_ply(load_config: Path, output: Path, measure: bool, report_file: Path | None) -> None:
+SPARKS_EDGE = 1.4
+"""How far from a picture's middle, in halves of its size, a splat's centre may lie for Spark 2.2 to draw it: clipXY."""
+WORTH_A_WORD = 0.1
+"""Loss in dB from which the command speaks of it."""
+
+
+def export_ply(load_config: Path, output: Path, options: "PlyOptions", measure: bool, report_file: Path | None) -> None:
     """See `nrfgs export --help`."""
     from nerfstudio.utils.rich_utils import CONSOLE
 
+    from nrfgs_ns.data.world import CaptureFrame
+    from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, to_capture
     from nrfgs_ns.export.loading import load_model
     from nrfgs_ns.export.loss import measure_loss
 
+    if options.largest is not None and not 0 < options.largest < math.inf:
+        raise InputError(f"--ply.largest is {options.largest}; it must be positive.")
     # Set up exactly as in ns-export, so that both fit over the same cameras.
-    fit = load_model(load_config, "inference").model.fit
-    written = write_splats(fit.splats, output)
+    pipeline = load_model(load_config, "inference")
+    fit, splats, comments = pipeline.model.fit, pipeline.model.fit.splats, []
+    if options.largest is not None:
+        splats = splats._replace(scales=splats.scales.clamp_max(math.log(options.largest)))
+    placed = {"viewers": Y_DOWN, "training": NOWHERE}.get(options.world)
+    if placed is None:
+        frame = CaptureFrame.of(pipeline.datamanager.train_dataparser_outputs)
+        placed = to_capture(frame)
+        comments = [f"origin {' '.join(f'{number:.17g}' for number in frame.origin)}"]
+    written = write_splats(placed.moved(splats), output, comments)
     report = {
         "splats": len(fit.splats.means),
         "written": written,
         "bytes": output.stat().st_size,
+        "world": options.world,
         "exact": fit.exact,
         "ridge_views": fit.strength,
         "training_views": fit.views,
@@ -64,11 +86,14 @@ def export_ply(load_config: Path, output: Path, measure: bool, report_file: Path
         markup=False,
         soft_wrap=True,
     )
+    if comments and frame.origin.any():
+        report["origin"] = frame.origin.tolist()
+        CONSOLE.print(f"Its coordinates are the capture's less {tuple(report['origin'])}, as its header says.")
     if not fit.exact and fit.unseen:
         CONSOLE.print(f"{fit.unseen:,} splats are seen by no training view and have their base colour.")
     if measure:
         pipeline = load_model(load_config, "test")
-        report |= measure_loss(pipeline, pictures_of_file(pipeline.model, output, fit.splats))
+        report |= measure_loss(pipeline, pictures_of_file(pipeline.model, output, fit.splats, placed))
         lost = round(report["loss_db"], 2) + 0.0  # without the sign of a -0.0
         CONSOLE.print(
             f"PSNR on {len(report['per_image'])} test views: model {report['psnr_model']:.2f} dB, "
@@ -77,14 +102,26 @@ def export_ply(load_config: Path, output: Path, measure: bool, report_file: Path
             f"{report['psnr_colors']:.2f} dB; base colours and opacities {report['psnr_base']:.2f} dB.",
             soft_wrap=True,
         )
+        if report["psnr_file"] - report["psnr_on_screen"] > WORTH_A_WORD:
+            CONSOLE.print(
+                f"Viewers that leave out splats centred off the screen, as Spark does, show "
+                f"{report['psnr_on_screen']:.2f} dB. In Spark raise clipXY from {SPARKS_EDGE}; for all viewers "
+                "--ply.largest cuts large splats down.",
+                soft_wrap=True,
+            )
     if report_file is not None:
         write_whole(report_file, json.dumps(report, indent=1) + "\n")
 
 
-def write_splats(splats: "PlainSplats", path: Path) -> int:
+def write_splats(splats: "PlainSplats", path: Path, comments: Sequence[str] = ()) -> int:
     """Write a 3DGS PLY file, whole or not at all.
 
     Splats that are not finite or too faint to be drawn are left out.
+
+    Args:
+        splats: the splats, in the file's world.
+        path: the file.
+        comments: lines for its header.
 
     Returns:
         How many were written.
@@ -111,7 +148,7 @@ def write_splats(splats: "PlainSplats", path: Path) -> int:
     table = np.ascontiguousarray(columns[keep].cpu().numpy(), dtype="<f4")
     vertices = table.view([(name, "<f4") for name in PROPERTIES])[:, 0]
     with whole(path) as aside:
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(aside))
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=list(comments)).write(str(aside))
     return len(vertices)
 
 
@@ -182,31 +219,56 @@ def render_splats(
     return composite_view(view, field.seen_from(view), background.to(device))[0]["rgb"]
 
 
-def pictures_of_file(model, path: Path, fitted: "PlainSplats") -> Callable[[Any], dict[str, Tensor]]:
+def on_screen(means: Tensor, camera) -> Tensor:
+    """Which splats' centres lie no farther from the picture's middle than SPARKS_EDGE.
+
+    Args:
+        means: [N, 3].
+        camera: nerfstudio's, a batch of one.
+
+    Returns:
+        bool [N].
+    """
+    from nrfgs_ns.model.pinhole import pinhole
+
+    pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
+    seen_from = pinhole(camera, pose.to(means.device), 1)
+    viewmat, intrinsics = seen_from.viewmat.reshape(4, 4), seen_from.K.reshape(3, 3)
+    pixels = (means @ viewmat[:3, :3].T + viewmat[:3, 3]) @ intrinsics.T
+    half = pixels.new_tensor((seen_from.width, seen_from.height)) / 2
+    return ((pixels[:, :2] - half * pixels[:, 2:]).abs() <= SPARKS_EDGE * half * pixels[:, 2:]).all(dim=1)
+
+
+def pictures_of_file(
+    model, path: Path, fitted: "PlainSplats", placed: "Similarity"
+) -> Callable[[Any], dict[str, Tensor]]:
     """What a file shows beside the model that it was written from.
 
     Args:
         model: an NrfgsModel in evaluation mode.
-        fitted: what was written, one row for each of the model's splats.
+        fitted: the harmonics that were written, one row for each of the model's splats.
+        placed: from the training's world to the file's.
 
     Returns:
-        camera -> "file"; "colors", the fitted colours with the model's own opacities; "base", the model's base colours
-        and opacities.
+        camera -> "file"; "on_screen", of the file's splats whose centres lie within SPARKS_EDGE; "colors", the fitted
+        colours with the model's own opacities; "base", the model's base colours and opacities.
     """
     from nrfgs_ns.appearance.field import Field
     from nrfgs_ns.appearance.sh import ShConfig
 
-    file = read_splats(path)
+    file = placed.inverse.moved(read_splats(path))
     file, fitted = (type(file)(*(value.to(model.device) for value in splats)) for splats in (file, fitted))
     harmonics = Field(ShConfig(degree=3).setup(), fitted._asdict())
+    how = model.background_color, model.config.rasterize_mode, model.scene_unit
 
     def pictures(camera) -> dict[str, Tensor]:
         field = model.field
         view = model.project(camera, field.splats)
         appearance = field.seen_from(view)._replace(colors=harmonics.seen_from(view).colors)
-        background = model.background_color
+        within = on_screen(file.means, camera)
         return {
-            "file": render_splats(file, camera, background, model.config.rasterize_mode, model.scene_unit),
+            "file": render_splats(file, camera, *how),
+            "on_screen": render_splats(type(file)(*(value[within] for value in file)), camera, *how),
             "colors": model.composite(view, appearance)[0]["rgb"],
             "base": model.get_base_color(camera),
         }

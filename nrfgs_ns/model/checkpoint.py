@@ -1,28 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a checkpoint must satisfy before it is loaded, and what torch must allow for it to be read at all."""
+"""What a checkpoint must satisfy before it is loaded."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.errors import InputError
-
-
-def allow_nerfstudio_checkpoints() -> None:
-    """Let `torch.load(weights_only=True)`, the default since torch 2.6, read nerfstudio's checkpoints.
-
-    They hold the learning-rate schedulers' state, in which learning rates are numpy scalars. These three types are
-    plain data; nothing that could run code is allowed.
-    """
-    scalar = np._core.multiarray.scalar if hasattr(np, "_core") else np.core.multiarray.scalar
-    torch.serialization.add_safe_globals(
-        [scalar, (scalar, "numpy.core.multiarray.scalar"), np.dtype, np.dtypes.Float64DType]
-    )
 
 
 def reduced_config(config: AppearanceHeadConfig, state: Mapping[str, Any]) -> AppearanceHeadConfig:

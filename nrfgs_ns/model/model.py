@@ -43,7 +43,6 @@ from nrfgs_ns.model.pinhole import Pinhole, pinhole
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.training.pace import Pace
 
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
@@ -99,8 +98,7 @@ class NrfgsModel(SplatfactoModel):
     _fit: Fit | None = None
     camera_spacing: float = 0.0
     """world units between neighbouring training cameras; 0 until a training begins"""
-    pace: Pace | None = None
-    """how fast the training walks through its schedules; None: a step is a step"""
+    _scheduled: int | None = None
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
@@ -387,7 +385,11 @@ class NrfgsModel(SplatfactoModel):
     @property
     def schedule_step(self) -> int:
         """The step that the head and the resolution are scheduled by."""
-        return self.step if self.pace is None else int(self.pace.position)
+        return self.step if self._scheduled is None else self._scheduled
+
+    def schedule_at(self, step: int) -> None:
+        """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
+        self._scheduled = step
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
@@ -494,7 +496,7 @@ class NrfgsModel(SplatfactoModel):
         }
         if self.reduced_head is not None:
             state["capacity"] = {"head": self.reduced_head}
-        return state if self.pace is None else {**state, "pace": self.pace.state()}
+        return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         written_by = state.get("densification", "splatfacto")  # older checkpoints do not say
@@ -504,9 +506,10 @@ class NrfgsModel(SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
-        if "pace" in state:
-            self.pace = self.pace or Pace(state["pace"]["length"])
-            self.pace.load_state(state["pace"])
+        if "pace" in state:  # of version 0.1.0
+            state = {**state, "schedule_step": int(state["pace"]["position"])}
+        if "schedule_step" in state:
+            self.schedule_at(state["schedule_step"])
             self.head.set_step(self.schedule_step)
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):

@@ -35,8 +35,7 @@ def warm_up(model, cameras: Cameras, steps: int, lr: float) -> None:
             continue
         last = loss.item() ** 0.5
         first = last if first is None else first
-        if last == 0.0:
-            CONSOLE.log("Warm-up: the head adds nothing from the start; skipped.")
+        if last == 0.0:  # the head adds nothing from the start
             return
         for weight, gradient in zip(weights, gradients, strict=True):
             weight.grad = gradient

@@ -26,9 +26,9 @@ from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory
+from nrfgs_ns.training.checkpoint_files import read_or_refuse
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.run import parse
 from nrfgs_ns.training.trainer import NrfgsTrainer, NrfgsTrainerConfig
@@ -62,7 +62,6 @@ class Nrfgs:
     ):
         if checkpoint is None and train_dataset is None:
             raise InputError("Give a training data set to train on, or a checkpoint to render from.")
-        allow_nerfstudio_checkpoints()
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.trainer: NrfgsTrainer | None = None
         if self.checkpoint is None:
@@ -75,7 +74,7 @@ class Nrfgs:
             self.world = World(torch.tensor(record["transform"], dtype=torch.float64), record["scale"])
         if train_dataset is None:
             self.record = record
-            self.loaded = torch.load(_checkpoint_file(self.checkpoint), map_location="cpu")
+            self.loaded = read_or_refuse(_checkpoint_file(self.checkpoint))
             self.model = _build_model(copy.deepcopy(self.config), record, self.loaded)
             self.step = self.loaded["step"] + 1
         else:
@@ -90,8 +89,6 @@ class Nrfgs:
         config.output_dir = Path(self.folder.name)
         if self.checkpoint is not None:
             config.load_checkpoint = _checkpoint_file(self.checkpoint)
-            # Nerfstudio's trainer makes this many steps more, and stretches what is left of the schedules to them.
-            config.max_num_iterations -= _step_of(config.load_checkpoint) + 1
         _set_random_seed(config.machine.seed)
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
@@ -308,11 +305,6 @@ def _checkpoint_file(checkpoint: Path) -> Path:
     if len(files) != 1:
         raise InputError(f"{checkpoint / MODELS} holds {len(files)} checkpoints; it must hold one.")
     return files[0]
-
-
-def _step_of(file: Path) -> int:
-    """The last step of a checkpoint."""
-    return int(file.stem.split("-")[1])
 
 
 def _build_model(config: NrfgsTrainerConfig, record: dict[str, Any], content: dict[str, Any]) -> NrfgsModel:

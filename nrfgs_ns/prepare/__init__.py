@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Photographs or a video to a posed scene.
 
-`photos` collects them, `structure` finds the cameras, `scene` writes the data set, `verb` runs one after the other.
+`photos` collects them, `pairs` says which may show the same thing, `structure` finds the cameras, `scene` writes the
+data set, `verb` runs one after the other and tells how long it will take (`forecast`).
 pycolmap does the geometry. Nothing here needs a COLMAP program, ffmpeg or a GPU.
 """

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, ImageOps
 
-from nrfgs_ns.data.exif import exif_of_copy
+from nrfgs_ns.data.exif import exif_of, exif_of_copy, known
+from nrfgs_ns.data.pictures import open_picture, read_header
 from nrfgs_ns.errors import InputError
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -23,8 +24,10 @@ FEWEST = 3
 """Photographs from which a scene can be reconstructed at all."""
 SHARPNESS_WIDTH = 320
 """Frames are shrunk to this width before their sharpness is compared, pixels: motion blur counts, not noise."""
-UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
-"""What PIL raises for files that are damaged, or no images at all."""
+SMALLEST = 16
+"""Pixels of the shorter side, at least."""
+LONGEST_STEM = 120
+"""Letters of a stored name: file systems allow 255 bytes, some of which others need."""
 
 Advance = Callable[[], None]
 
@@ -68,7 +71,7 @@ def digest(paths: list[Path]) -> str:
     """SHA-256 over names and contents."""
     total = hashlib.sha256()
     for path in paths:
-        total.update(path.name.encode())
+        total.update(os.fsencode(path.name))
         with path.open("rb") as file:
             for block in iter(lambda: file.read(1 << 20), b""):
                 total.update(block)
@@ -76,11 +79,12 @@ def digest(paths: list[Path]) -> str:
 
 
 def stored_names(photos: list[Path]) -> list[str]:
-    """File names in the scene, in order: all different, and without blanks, which end names in COLMAP's lists."""
+    """File names in the scene, in order: all different, short, and of ASCII letters without blanks, which end names in
+    COLMAP's lists."""
     names: list[str] = []
     for index, path in enumerate(photos):
         suffix = path.suffix.lower() if path.suffix.lower() in KEPT else ".png"
-        name = re.sub(r"[^\w.-]", "_", path.stem) + suffix
+        name = re.sub(r"[^\w.-]", "_", path.stem, flags=re.ASCII)[:LONGEST_STEM] + suffix
         names.append(name if name not in names else f"{index:05d}_{name}")
     return names
 
@@ -96,11 +100,8 @@ def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
         target = folder / name
         if not target.exists():
             aside = folder.with_name("photo" + target.suffix)  # an interrupted copy must not look like a whole one
-            try:
-                with Image.open(path) as image:
-                    _store(image, path, aside)
-            except UNREADABLE as error:
-                raise InputError(f"{path} cannot be read as an image ({error}). Restore or remove it.") from error
+            with open_picture(path) as image:
+                _store(image, path, aside)
             os.replace(aside, target)
         advance()
 
@@ -109,27 +110,38 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
     """Write one photograph: as it is if it can be, else upright in 8-bit RGB, JPEG as JPEG and the rest as PNG."""
     if image.mode[0] in "IF":
         raise InputError(f"{path} has more than 8 bits per channel (mode {image.mode}). Convert it to 8 bits.")
-    image.load()
-    upright = image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+    if min(image.size) < SMALLEST:
+        raise InputError(f"{path} is {image.width} x {image.height} pixels, too small to show anything. Remove it.")
+    try:
+        image.load()
+    except Exception as error:  # PIL lets out whatever it meets in a broken file
+        raise InputError(
+            f"{path} cannot be decoded ({error or type(error).__name__}). Restore or remove it."
+        ) from error
+    exif = exif_of(image)
+    upright = exif.get(ExifTags.Base.Orientation, 1) == 1
     if upright and image.mode in ("RGB", "L") and path.suffix.lower() in KEPT:
         shutil.copyfile(path, target)
         return
     turned = ImageOps.exif_transpose(image)
     if turned.mode in ("RGBA", "LA", "PA") or "transparency" in turned.info:  # nothing is behind a cut-out object
         turned = Image.alpha_composite(Image.new("RGBA", turned.size, "white"), turned.convert("RGBA"))
-    exif = exif_of_copy(image.getexif())  # has the focal length
-    turned.convert("RGB").save(target, quality=97, subsampling=0, exif=exif)
+    turned.convert("RGB").save(target, quality=97, subsampling=0, exif=exif_of_copy(exif))  # has the focal length
 
 
 def same_camera(folder: Path, names: list[str]) -> bool:
     """Whether all photographs have one size, and one camera model and focal length as far as EXIF says."""
     seen = set()
     for name in names:
-        with Image.open(folder / name) as image:
-            exif = image.getexif()
-            lens = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
-            seen.add((image.size, exif.get(ExifTags.Base.Model), None if lens is None else round(float(lens), 2)))
+        with open_picture(folder / name) as image:
+            taken = known(exif_of(image))
+            seen.add((image.size, taken.get("model"), round(float(taken.get("focal_length", 0)), 2)))
     return len(seen) == 1
+
+
+def sizes(folder: Path, names: list[str]) -> list[tuple[int, int]]:
+    """Width and height of stored photographs, pixels."""
+    return [read_header(folder / name)[0] for name in names]
 
 
 def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:

@@ -17,7 +17,8 @@ import numpy as np
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-from nrfgs_ns.data.exif import exif_of_copy, known
+from nrfgs_ns.data.exif import exif_of, exif_of_copy, known
+from nrfgs_ns.data.pictures import open_picture
 from nrfgs_ns.data.split import interior_test_images
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare.structure import colmap
@@ -42,8 +43,8 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[]
     taken: dict[str, dict[str, float | str]] = {}
     for image in images:
         source = undistorted / "images" / image.name
-        with Image.open(photos / image.name) as photo:
-            exif = photo.getexif()
+        with open_picture(photos / image.name) as photo:
+            exif = exif_of(photo)
             taken[image.name] = known(exif)
             kept = exif_of_copy(exif)
         with Image.open(source) as picture:

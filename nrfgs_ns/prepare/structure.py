@@ -2,36 +2,34 @@
 """Cameras and sparse points from photographs: SIFT, matching, incremental mapping and undistortion, by pycolmap.
 
 Every step takes up what an interrupted run has left: features and matches are kept in COLMAP's database, which skips
-what it has. Which pairs are matched is decided here, not by COLMAP:
-
-    exhaustive  every pair
-    sequential  each photograph with its NEIGHBOURS successors, and with those 16, 32, ... 512 further on (a camera that
-                moves slowly); and every pair among LANDMARKS of them, spread evenly over the row, which closes loops
+what it has. Which pairs are matched is decided in `pairs`, not by COLMAP.
 """
 
-import itertools
+import contextlib
 import os
-import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
+
+from nrfgs_ns.data.pictures import read_header
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.prepare.forecast import looked_at
+from nrfgs_ns.prepare.pairs import Pairs
 
-Matching = Literal["exhaustive", "sequential"]
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
-EXHAUSTIVE_UP_TO = 100
-"""Photographs of which every pair is matched: 4,950 pairs."""
-NEIGHBOURS = 10
-LANDMARKS = 40
-NUMBERED_SHARE = 0.9
-"""Share of neighbours by name whose numbers must follow each other closely for a folder to look like one walk."""
-LARGEST_GAP = 3
-"""Numbers that differ by no more follow each other closely: a blurred photograph or two may have been thrown away."""
+LARGE = 1.5
+"""Millions of pixels from which a photograph has enough features without being doubled, which costs four times as much
+and is worth three times the features in smaller ones."""
 PAIRS_AT_ONCE = 64
 """Pairs handed to COLMAP together: between them progress is shown, and an interruption loses no more."""
+SMALLEST_MODEL = 3
+"""Photographs of a model that is worth anything."""
+FEWEST_POINTS = 10
+"""Points for each photograph of a model by global mapping, at least."""
 SEED = 0
 
 Advance = Callable[[int], None]
@@ -52,27 +50,6 @@ def colmap():
     pycolmap.logging.minloglevel = 3
     pycolmap.set_random_seed(SEED)
     return pycolmap
-
-
-def choose_matching(names: list[str], is_video: bool) -> Matching:
-    """Exhaustive for up to 100 images. More are matched in sequence if they are the frames of a video, or if nine in
-    ten neighbours by name have numbers that differ by at most three; and exhaustively otherwise."""
-    if len(names) <= EXHAUSTIVE_UP_TO:
-        return "exhaustive"
-    numbers = [re.findall(r"\d+", Path(name).stem) for name in names]
-    steps = [int(b[-1]) - int(a[-1]) if a and b else 0 for a, b in itertools.pairwise(numbers)]
-    close = sum(1 <= step <= LARGEST_GAP for step in steps)
-    return "sequential" if is_video or close >= NUMBERED_SHARE * len(steps) else "exhaustive"
-
-
-def pairs_of(count: int, matching: Matching) -> list[tuple[int, int]]:
-    """Pairs of indices to be matched, each once, first < second, sorted."""
-    if matching == "exhaustive":
-        return list(itertools.combinations(range(count), 2))
-    steps = {*range(1, NEIGHBOURS + 1), *(2**power for power in range(NEIGHBOURS))}
-    pairs = {(i, i + step) for i in range(count) for step in steps if i + step < count}
-    landmarks = sorted({round(i * (count - 1) / (LANDMARKS - 1)) for i in range(LANDMARKS)})
-    return sorted(pairs | set(itertools.combinations(landmarks, 2)))
 
 
 def extract_features(
@@ -101,6 +78,8 @@ def extract_features(
     batch = max(os.cpu_count() or 1, 4)
     for first in range(0, len(names), batch):
         part = names[first : first + batch]
+        large = min(looked_at([read_header(photos / name)[0]], longest_side) for name in part) >= LARGE
+        options.sift.first_octave = 0 if large else -1  # -1: the photograph is doubled first
         if one_camera and first > 0:
             reader.existing_camera_id = 1  # each call would make a camera of its own
         pycolmap.extract_features(
@@ -115,7 +94,33 @@ def extract_features(
         advance(len(part))
 
 
-def match_features(database: Path, names: list[str], matching: Matching, folder: Path, advance: Advance) -> int:
+def largest_features(database: Path, names: list[str], number: int) -> list[np.ndarray]:
+    """Descriptors [n <= number, 128] uint8 of each photograph, largest feature first."""
+    found = []
+    with colmap().Database.open(database) as opened:
+        for name in names:
+            image = opened.read_image_with_name(name)
+            shapes = np.asarray(opened.read_keypoints(image.image_id))  # x, y and a matrix [2, 2] by rows
+            descriptors = np.asarray(opened.read_descriptors(image.image_id).data).reshape(-1, 128)
+            sizes = np.hypot(shapes[:, 2], shapes[:, 4]) if len(shapes) else np.zeros(0)
+            found.append(descriptors[np.argsort(-sizes, kind="stable")[:number]])
+    return found
+
+
+def feature_counts(database: Path, names: list[str]) -> list[int]:
+    """How many features each photograph has."""
+    with colmap().Database.open(database) as opened:
+        return [opened.num_keypoints_for_image(opened.read_image_with_name(name).image_id) for name in names]
+
+
+def focal_lengths(database: Path, model: Any) -> list[tuple[float, float]]:
+    """Of each camera for which EXIF tells a focal length: that one, and the reconstruction's, in pixels."""
+    with colmap().Database.open(database) as opened:
+        told = {camera.camera_id: camera for camera in opened.read_all_cameras() if camera.has_prior_focal_length}
+    return [(told[i].mean_focal_length(), model.cameras[i].mean_focal_length()) for i in model.cameras if i in told]
+
+
+def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance) -> int:
     """Match and verify pairs of photographs.
 
     Args:
@@ -126,50 +131,101 @@ def match_features(database: Path, names: list[str], matching: Matching, folder:
         How many pairs show the same thing.
     """
     pycolmap = colmap()
-    pairs = pairs_of(len(names), matching)
-    pairing = pycolmap.ImportedPairingOptions()
+    pairing, verification = pycolmap.ImportedPairingOptions(), pycolmap.TwoViewGeometryOptions()
     pairing.match_list_path = folder / "pairs.txt"
+    verification.ransac.random_seed = SEED
     for first in range(0, len(pairs), PAIRS_AT_ONCE):
         part = pairs[first : first + PAIRS_AT_ONCE]
         lines = [f"{names[a]} {names[b]}\n" for a, b in part]
         (folder / "pairs.txt").write_text("".join(lines), encoding="utf-8")
-        pycolmap.match_image_pairs(database, pairing_options=pairing, device=pycolmap.Device.cpu)
+        pycolmap.match_image_pairs(
+            database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
+        )
         advance(len(part))
     with pycolmap.Database.open(database) as opened:
         _, inliers = opened.read_two_view_geometry_num_inliers()
         return sum(number > 0 for number in inliers)
 
 
-def map_incrementally(database: Path, photos: Path, folder: Path, advance: Advance) -> int:
+def find_cameras(database: Path, photos: Path, folder: Path, enough: float, advance: Advance) -> tuple[int, str]:
     """Cameras and points; the largest model is written to `folder`.
 
+    Incremental mapping first. It begins with two photographs from well separated places that share much, which a walk
+    straight ahead does not have: each next photograph sees less of the same, from hardly another angle. If it places
+    fewer than `enough`, global mapping, which solves for all positions at once, is tried; the larger model is taken.
+
     Args:
+        enough: so many photographs are as many as can be hoped for.
         advance: called with 1 for each photograph that found its place.
 
     Returns:
-        How many separate models were found; 0 if none, and then nothing is written.
+        How many separate models were found, and by which mapping; 0 if none, and then nothing is written.
     """
+    shutil.rmtree(folder, ignore_errors=True)
+    models, mapping = _map_incrementally(database, photos, folder, advance), "incremental"
+    if _size(models)[0] < enough:
+        others = _map_globally(database, photos, folder)
+        if _size(others)[0] > _size(models)[0]:
+            models, mapping = others, "global"
+    if models:
+        folder.mkdir(parents=True)
+        max(models, key=lambda model: _size([model])).write(folder)
+    return len(models), mapping
+
+
+def _size(models: list[Any]) -> tuple[int, int]:
+    """Photographs and points of the largest model."""
+    return max(((model.num_reg_images(), model.num_points3D()) for model in models), default=(0, 0))
+
+
+def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Advance) -> list[Any]:
     pycolmap = colmap()
     options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = 3
+    options.min_model_size = SMALLEST_MODEL
     options.random_seed = SEED
+    with _aside(folder) as attempts:
+        models = pycolmap.incremental_mapping(
+            database,
+            photos,
+            attempts,
+            options=options,
+            initial_image_pair_callback=lambda: advance(2),
+            next_image_callback=lambda: advance(1),
+        )
+    return [model for model in models.values() if model.num_reg_images() >= SMALLEST_MODEL]
+
+
+def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
+    """Global mapping keeps points that are 15 pixels off: they are triangulated again, as by incremental mapping."""
+    pycolmap = colmap()
+    options = pycolmap.GlobalPipelineOptions()
+    options.min_model_size = SMALLEST_MODEL
+    options.random_seed = SEED
+    with _aside(folder) as attempts:
+        models = list(pycolmap.global_mapping(database, photos, attempts, options=options).values())
+        models = [model for model in models if model.num_reg_images() >= SMALLEST_MODEL]
+        for model in models:
+            pycolmap.triangulate_points(model, database, photos, attempts)
+            everything = pycolmap.BundleAdjustmentConfig()
+            for image in model.reg_image_ids():
+                everything.add_image(image)
+            everything.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+            options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+            pycolmap.create_default_bundle_adjuster(options, everything, model).solve()
+            model.update_point_3d_errors()
+    return [model for model in models if model.num_points3D() >= FEWEST_POINTS * model.num_reg_images()]
+
+
+@contextlib.contextmanager
+def _aside(folder: Path) -> Iterator[Path]:
+    """An empty folder that vanishes; COLMAP writes its models there."""
     attempts = folder.with_name(folder.name + ".attempts")
-    for path in (attempts, folder):
-        shutil.rmtree(path, ignore_errors=True)
-        path.mkdir(parents=True)
-    models = pycolmap.incremental_mapping(
-        database,
-        photos,
-        attempts,
-        options=options,
-        initial_image_pair_callback=lambda: advance(2),
-        next_image_callback=lambda: advance(1),
-    )
-    if models:
-        best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-        best.write(folder)
-    shutil.rmtree(attempts)
-    return len(models)
+    shutil.rmtree(attempts, ignore_errors=True)
+    attempts.mkdir(parents=True)
+    try:
+        yield attempts
+    finally:
+        shutil.rmtree(attempts, ignore_errors=True)
 
 
 def undistort(model: Path, photos: Path, folder: Path) -> None:

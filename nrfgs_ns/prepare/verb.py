@@ -10,7 +10,10 @@ it.
 import contextlib
 import hashlib
 import json
+import math
+import shlex
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,18 +21,21 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from nrfgs_ns.data.exif import read_position
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
+from nrfgs_ns.prepare import forecast, pairs, structure
 from nrfgs_ns.prepare import photos as files
-from nrfgs_ns.prepare import structure
 from nrfgs_ns.prepare.structure import CameraModel
 
-STAGES = ("import", "features", "match", "map", "undistort", "write")
+STAGES = ("import", "features", "pairs", "match", "map", "undistort", "write")
 """In the order of work; each builds on the one before it."""
 GOOD_SHARE = 0.9
 """Share of the photographs that find their place in a capture that went well."""
+FOCAL_TOLERANCE = 0.15
+"""EXIF's focal lengths, in whole millimetres of a 35 mm camera, are right to about this share."""
 GOOD_ERROR = 1.5
 """Mean reprojection error of a reconstruction that went well, pixels."""
 
@@ -42,9 +48,9 @@ class Prepare:
     """folder of photographs, or a video"""
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     """folder for the scene; interrupted work in it is taken up"""
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """which pairs are compared. auto: every pair up to 100 images; of more, neighbours only if they are a video or
-    numbered in a row, and every pair otherwise"""
+    matching: Literal["auto", "exhaustive"] = "auto"
+    """which pairs are matched. auto: those that are likely to show the same thing, by their largest features, EXIF
+    positions and order. exhaustive: every pair"""
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """lens that is fitted, and undistorted to a pinhole. OPENCV for strong distortion and many photographs"""
     camera: Literal["auto", "single", "per-image"] = "auto"
@@ -57,14 +63,18 @@ class Prepare:
     """a video: number of frames taken from it"""
 
     def main(self) -> None:
-        run = Run(self)
-        run.import_input()
-        run.find_features()
-        run.match()
-        run.map()
-        run.undistort()
-        run.write()
-        run.verdict()
+        try:
+            run = Run(self)
+            run.import_input()
+            run.find_features()
+            run.choose_pairs()
+            run.match()
+            run.map()
+            run.undistort()
+            run.write()
+            run.verdict()
+        except OSError as error:  # no permission, no space, ...
+            raise InputError(f"{error.filename or self.out}: {error.strerror or error}.") from error
 
 
 class Run:
@@ -72,7 +82,7 @@ class Run:
 
     def __init__(self, options: Prepare, screen: Console | None = None):
         for name in ("feature_size", "features", "frames"):
-            if getattr(options, name) < structure.NEIGHBOURS:
+            if getattr(options, name) < 10:
                 raise InputError(f"--{name.replace('_', '-')} is {getattr(options, name)}. Give at least 10.")
         self.options, self.screen = options, screen or Console()
         self.inputs = files.find_inputs(options.photos)
@@ -80,7 +90,8 @@ class Run:
         structure.colmap()  # a missing package is told before any work
         self.out, self.work = options.out, options.out / "work"
         self.stored, self.database, self.model = self.work / "photos", self.work / "database.db", self.work / "model"
-        self.undistorted = self.work / "undistorted"
+        self.undistorted, self.pairs_file = self.work / "undistorted", self.work / "likely_pairs.json"
+        self.speed: float | None = None  # seconds for the features of a million pixels
         self.state_file = self.work / "state.json"
         if self.out.exists() and not self.state_file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
@@ -121,17 +132,37 @@ class Run:
         database = [self.database, *(self.database.with_name(self.database.name + end) for end in ("-wal", "-shm"))]
         with self.stage("features", "find features", database, len(names), **chosen) as advance:
             if advance is not None:
+                begun = time.monotonic()
                 structure.extract_features(self.database, self.stored, names, **chosen, advance=advance)
+                sizes = files.sizes(self.stored, names)
+                self.speed = (time.monotonic() - begun) / forecast.looked_at(sizes, options.feature_size)
 
-    def match(self) -> None:
+    def choose_pairs(self) -> None:
         names, matching = self.names, self.options.matching
-        if matching == "auto":
-            matching = structure.choose_matching(names, self.is_video)
-        pairs = len(structure.pairs_of(len(names), matching))
-        with self.stage("match", f"match {matching} pairs", [], pairs, matching=matching) as advance:
+        with self.stage("pairs", "choose pairs", [self.pairs_file], len(names), matching=matching) as advance:
             if advance is None:
                 return
-            found = structure.match_features(self.database, names, matching, self.work, advance)
+            if matching == "exhaustive":
+                chosen = pairs.every_pair(len(names))
+            else:
+                descriptors = structure.largest_features(self.database, names, pairs.LARGEST)
+                positions = pairs.metres([read_position(self.stored / name) for name in names])
+                in_a_row = self.is_video or pairs.numbered_in_a_row(names)
+                chosen = pairs.likely_pairs(pairs.shared_features(descriptors, advance), positions, in_a_row)
+            write_whole(self.pairs_file, json.dumps(chosen) + "\n")
+
+    def match(self) -> None:
+        names, chosen = self.names, [tuple(pair) for pair in json.loads(self.pairs_file.read_text())]
+        every = len(names) * (len(names) - 1) // 2
+        if self.speed is not None:
+            counts = structure.feature_counts(self.database, names)
+            seconds = self.speed * forecast.still_to_do(files.sizes(self.stored, names), counts, chosen)
+            rest = forecast.in_words(seconds)
+            self.screen.print(f"{len(chosen):,} of {every:,} pairs to match; {rest} to go.", highlight=False)
+        with self.stage("match", "match pairs", [], len(chosen)) as advance:
+            if advance is None:
+                return
+            found = structure.match_features(self.database, names, chosen, self.work, advance)
             if found == 0:
                 raise InputError(
                     f"{self.options.photos}: no two of the {len(names)} photographs show the same thing. Take them "
@@ -142,13 +173,14 @@ class Run:
         with self.stage("map", "find the cameras", [self.model], len(self.names)) as advance:
             if advance is None:
                 return
-            models = structure.map_incrementally(self.database, self.stored, self.model, advance)
+            enough = GOOD_SHARE * len(self.names)
+            models, mapping = structure.find_cameras(self.database, self.stored, self.model, enough, advance)
             if models == 0:
                 raise InputError(
                     f"{self.options.photos}: photographs match, but no two of them are far enough apart to tell depth. "
                     "Move the camera sideways instead of turning it; with few photographs try --features 8192."
                 )
-            self.state["models"] = models
+            self.state |= {"models": models, "mapping": mapping}
 
     def undistort(self) -> None:
         with self.stage("undistort", "undistort", [self.undistorted], 1) as advance:
@@ -193,11 +225,15 @@ class Run:
             for path in made:
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         self._remember(slot, done=False)
-        columns = TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        begun = time.monotonic(), time.process_time()
+        columns = [TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn()]
+        columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
         with Progress(*columns, console=self.screen) as progress:
             task = progress.add_task(name, total=total)
             yield lambda steps: progress.advance(task, steps)
             progress.update(task, completed=total)
+        spent = time.monotonic() - begun[0], time.process_time() - begun[1]
+        self.state.setdefault("seconds", {})[slot] = [round(each, 1) for each in spent]
         self._remember(slot, done=True)
 
     def _remember(self, slot: str, done: bool) -> None:
@@ -219,6 +255,9 @@ class Run:
             "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
             "mean_track_length": model.compute_mean_track_length(),
             "models": self.state.get("models", 1),
+            "mapping": self.state.get("mapping", "incremental"),
+            "pairs": len(json.loads(self.pairs_file.read_text())),
+            "seconds_and_cpu_seconds": self.state.get("seconds", {}),
             "options": {name: value for name, value in asdict(self.options).items() if name not in ("photos", "out")},
         }
         write_whole(self.out / "prepare.json", json.dumps(numbers, indent=1) + "\n")
@@ -228,9 +267,10 @@ class Run:
             f"{error:.2f} px.",
             soft_wrap=True,
         )
-        for advice in self._advice(registered, total, error):
-            self.screen.print(f"- {advice}", soft_wrap=True)
-        self.screen.print(f"Train with: ns-train nrfgs --data {self.out}", markup=False, soft_wrap=True)
+        lengths = structure.focal_lengths(self.database, model)
+        for advice in (*self._advice(registered, total, error), *_focal_advice(lengths)):
+            self.screen.print(f"- {advice}", markup=False, soft_wrap=True)
+        self.screen.print(train_line(self.out), markup=False, highlight=False, soft_wrap=True)
 
     def _advice(self, registered: int, total: int, error: float) -> Iterator[str]:
         """What is wrong with a reconstruction, and the mend; nothing for a good one."""
@@ -240,8 +280,29 @@ class Run:
             yield f"Without a camera: {', '.join(left[:5])}{' ...' if len(left) > 5 else ''}. They are left out."
             if self.state.get("models", 1) > 1:
                 yield f"They fall into {self.state['models']} groups; the largest is used. Take some in between."
-            if self.options.matching != "exhaustive" and total > structure.EXHAUSTIVE_UP_TO:
+            if self.options.matching != "exhaustive" and total > pairs.ALIKE + 1:
                 yield "Try --matching exhaustive: slower, but it finds every overlap."
             yield "Try --features 8192, or take more photographs, sharp and with more overlap."
         if error > GOOD_ERROR:
             yield "The error is large: try --camera-model OPENCV, or --camera per-image if the zoom was changed."
+
+
+def _focal_advice(lengths: list[tuple[float, float]]) -> Iterator[str]:
+    """A word about a focal length that EXIF contradicts, from pairs of EXIF's and the reconstruction's in pixels."""
+    told, found = max(lengths, key=lambda pair: abs(math.log(pair[1] / pair[0])), default=(1.0, 1.0))
+    if abs(math.log(found / told)) > math.log(1 + FOCAL_TOLERANCE):
+        yield (
+            f"EXIF tells a focal length of {told:.0f} pixels, {found:.0f} fit best. A walk straight ahead hardly tells "
+            "one from the other, and depths are stretched by as much; photographs to the side would tell."
+        )
+
+
+def train_line(out: Path) -> str:
+    """What to type next; where there is no CUDA device, what gives a good result all the same."""
+    import torch
+
+    from nrfgs_ns.training.cpu_command import ten_minute_command
+
+    if torch.cuda.is_available():
+        return f"Train with: {shlex.join(['ns-train', 'nrfgs', '--data', str(out)])}"
+    return f"No CUDA device: for a good result in ten minutes, train with: {ten_minute_command(out)}"

@@ -22,15 +22,17 @@ rasterizer does not draw them, so no gradient betrays them) are taken out before
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from nrfgs_ns.densification.rows import take_rows
+from nrfgs_ns.errors import ForTheUser
 from nrfgs_ns.training.guard_report import Finding, report
 from nrfgs_ns.training.in_sight import PATIENCE, InSight
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
+from nrfgs_ns.training.pace import Pace
 
 MAX_GRADIENT = 2.0**63
 """Largest gradient that is let through. Its square, 2^126, and Adam's mean of squares stay below float32's 2^128; from
@@ -39,28 +41,36 @@ PARAMETERS_EVERY = 100
 """Steps between two looks at the parameters."""
 
 
-class TrainingStopped(RuntimeError):
-    """A training met a number that is not finite.
+Origin = Literal["rendering", "gradient", "parameter", "elsewhere", "nothing visible", "memory"]
+"""What stops a training: a number in the image or a loss, in a gradient or a parameter, or on another device; that
+nothing is visible; or that the memory has run out."""
+
+
+class TrainingStopped(ForTheUser, RuntimeError):
+    """A training cannot go on: it met a number that is not finite, sees nothing, or its memory has run out.
 
     Args:
         message: what was met, where, and the likely cause.
         step: the condemned step.
+        origin: where it was met first.
         savable: whether the state that is left is good.
     """
 
-    def __init__(self, message: str, step: int, savable: bool = True):
+    def __init__(self, message: str, step: int, origin: Origin, savable: bool = True):
         super().__init__(message)
         self.step = step
+        self.origin = origin
         self.savable = savable
 
 
 @dataclass
-class _Verdict:
+class Verdict:
     """A step that has been looked at, and whose numbers are on their way to the host."""
 
     step: int
     names: list[str]
     """what was looked at; of gradients, the name of their optimiser"""
+    origins: list[Origin]
     tensors: list[Tensor]
     sizes: Tensor
     """largest absolute values, in host memory once `arrived` has happened"""
@@ -78,7 +88,7 @@ class Guard:
         self.pipeline = pipeline
         self.step = 0
         self.in_sight = InSight()
-        self._verdict: _Verdict | None = None
+        self._verdict: Verdict | None = None
         # Pinned memory and events are dear to make; one of each will do, for a verdict is read before the next is made.
         self._in_host_memory: Tensor | None = None
         self._arrival: torch.cuda.Event | None = None
@@ -101,6 +111,7 @@ class Guard:
                 "not of one world, or a learning rate has thrown the splats out of sight. The viewer shows where the "
                 "cameras are.",
                 step,
+                "nothing visible",
             )
         if step % PARAMETERS_EVERY == 0:
             self.check_parameters(optimizers)
@@ -116,14 +127,17 @@ class Guard:
         Raises:
             TrainingStopped: on a CPU, if the step is condemned.
         """
-        watched = list(self.model.watched.items())
+        watched: list[tuple[str, Origin, Tensor]]
+        watched = [(name, "rendering", value) for name, value in self.model.watched.items()]
         if not gradients_are_scaled:
             for name, optimizer in optimizers.optimizers.items():
                 gradients = [parameter.grad for parameter in parameters_of(optimizer)]
-                watched += [(name, gradient) for gradient in gradients if gradient is not None and gradient.numel() > 0]
-        names, tensors = [list(column) for column in zip(*watched, strict=True)]
-        names, tensors, sizes = self._share(names, tensors, torch.stack(torch._foreach_norm(tensors, math.inf)))
-        self._verdict = _Verdict(self.step, names, tensors, sizes, None)
+                found = [gradient for gradient in gradients if gradient is not None and gradient.numel() > 0]
+                watched += [(name, "gradient", gradient) for gradient in found]
+        names, origins, tensors = [list(column) for column in zip(*watched, strict=True)]
+        own = Verdict(self.step, names, origins, tensors, torch.stack(torch._foreach_norm(tensors, math.inf)), None)
+        self._verdict = self._share(own)
+        sizes = self._verdict.sizes
         if not gradients_are_scaled and optimizers.all_fused:
             verdict = (~(sizes <= MAX_GRADIENT)).any().float()  # NaN compares as false
             for optimizer in optimizers.optimizers.values():
@@ -138,11 +152,11 @@ class Guard:
         """Whether nothing has been visible for long."""
         return not self.in_sight.see(getattr(self.model, "info", {}))
 
-    def _share(self, names: list[str], tensors: list[Tensor], sizes: Tensor) -> tuple[list[str], list[Tensor], Tensor]:
+    def _share(self, verdict: Verdict) -> Verdict:
         """Here joins in what other devices have found, where there are any (`distributed`)."""
-        return names, tensors, sizes
+        return verdict
 
-    def _send_home(self, verdict: _Verdict) -> None:
+    def _send_home(self, verdict: Verdict) -> None:
         """Copy a verdict's sizes to the host without waiting for them."""
         if self._in_host_memory is None or self._in_host_memory.shape != verdict.sizes.shape:
             self._in_host_memory = torch.empty_like(verdict.sizes, device="cpu", pin_memory=True)
@@ -160,21 +174,25 @@ class Guard:
         verdict, self._verdict = self._verdict, None
         if verdict is None:
             return
-        if verdict.arrived is not None:
-            verdict.arrived.synchronize()
-        sizes = verdict.sizes.tolist()
-        findings = [
-            Finding(self._full_name(name, tensor), size, tensor)
-            for name, size, tensor in zip(verdict.names, sizes, verdict.tensors, strict=True)
-            if not size <= MAX_GRADIENT
-        ]
-        if findings:
+        sizes = self._read(verdict)
+        bad = [row for row, size in enumerate(sizes) if not size <= MAX_GRADIENT]
+        if bad:
+            findings = [
+                Finding(self._full_name(verdict.names[row], verdict.tensors[row]), sizes[row], verdict.tensors[row])
+                for row in bad
+            ]
             message = report(self.pipeline, verdict.step, findings, MAX_GRADIENT)
             message += (
                 f"\nThe update of step {verdict.step} was not made. The state before it is in that step's checkpoint; "
                 "with --load-dir, training goes on from there."
             )
-            raise TrainingStopped(message, verdict.step)
+            raise TrainingStopped(message, verdict.step, verdict.origins[bad[0]])
+
+    def _read(self, verdict: Verdict) -> list[float]:
+        """A verdict's sizes, for which the host waits."""
+        if verdict.arrived is not None:
+            verdict.arrived.synchronize()
+        return verdict.sizes.tolist()
 
     def _full_name(self, name: str, tensor: Tensor) -> str:
         """Of a gradient, known by its optimiser's name only: which parameter's it is."""
@@ -208,7 +226,7 @@ class Guard:
             message += f"\nThe checkpoint of step {self.step} is this state without them; with --load-dir, it goes on."
         else:
             message += "\nNothing has been written: the checkpoint before, if there is one, is the last good state."
-        raise TrainingStopped(message, self.step, savable=only_splats)
+        raise TrainingStopped(message, self.step, "parameter", savable=only_splats)
 
     def _silence_densification(self) -> None:
         """Let a gradient on the image plane that is not finite count as zero in densification's statistics."""
@@ -227,11 +245,18 @@ class WatchedOptimizers(LeanOptimizers):
         config: optimiser configurations by group, as nerfstudio passes them.
         param_groups: parameters by group.
         guard: whom to ask.
-        steps_per_log: steps between two learning rates that are logged.
+        steps_per_log, pace: as for `LeanOptimizers`.
     """
 
-    def __init__(self, config: dict[str, Any], param_groups: dict[str, Any], guard: Guard, steps_per_log: int = 10):
-        super().__init__(config, param_groups, steps_per_log)
+    def __init__(
+        self,
+        config: dict[str, Any],
+        param_groups: dict[str, Any],
+        guard: Guard,
+        steps_per_log: int = 10,
+        pace: Pace | None = None,
+    ):
+        super().__init__(config, param_groups, steps_per_log, pace)
         self.guard = guard
 
     def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:

@@ -28,12 +28,13 @@ class LeanOptimizers(Optimizers):
         config: optimiser configurations by group, as nerfstudio passes them.
         param_groups: parameters by group.
         steps_per_log: steps between two learning rates that are logged.
+        pace: moved on by each step, and where the schedules are looked up; None: a step is a step.
     """
 
-    def __init__(self, config, param_groups, steps_per_log: int = 10):
+    def __init__(self, config, param_groups, steps_per_log: int = 10, pace: Pace | None = None):
         super().__init__(config, param_groups)
         self.steps_per_log = steps_per_log
-        self.pace: Pace | None = None
+        self.pace = pace
         self._warm: set[Optimizer] = set()
         self.fuse()
 

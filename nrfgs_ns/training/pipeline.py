@@ -9,6 +9,7 @@ from time import perf_counter
 from typing import Any
 
 import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -19,9 +20,9 @@ from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.distributed.config import ShardingConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.metrics import METRIC_NAMES
-from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.model.model import NrfgsModelConfig
-from nrfgs_ns.training.averaging import ParameterMean
+from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
+from nrfgs_ns.training.evaluation_table import print_evaluation
 from nrfgs_ns.viewer.panel import ViewerPanel
 
 
@@ -52,10 +53,8 @@ class NrfgsPipeline(VanillaPipeline):
     config: NrfgsPipelineConfig
     images_per_step: int = 1
     """images for which a step counts in the schedules (`distributed.schedules`)"""
-    parameter_mean: ParameterMean | None = None
-    """the trainer's, over the last steps; here because a checkpoint has the pipeline's state. None: there is none"""
-    loaded_mean: dict[str, Any] | None = None
-    """what the checkpoint that was loaded says of such a mean, until the trainer takes it"""
+    steps_per_log: int = 1
+    """steps between two at which metrics are taken"""
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
         allow_nerfstudio_checkpoints()
@@ -64,7 +63,6 @@ class NrfgsPipeline(VanillaPipeline):
                 f"pipeline.compact is {config.compact}, but a training does not begin with a compact file. Leave it "
                 "out; --load-dir goes on from a checkpoint."
             )
-        self.steps_per_log = 1  # the trainer knows better
         super().__init__(config, device, test_mode, **kwargs)
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
@@ -76,8 +74,9 @@ class NrfgsPipeline(VanillaPipeline):
         """Load a checkpoint, or the compact file that the configuration names.
 
         Raises:
-            InputError: either cannot be this model's.
+            InputError: either cannot be this model's, or the checkpoint is damaged.
         """
+        check_seal(loaded_state, step)
         if self.config.compact is not None:
             state = model_state(self.model, self.config.compact)
             loaded_state = {f"_model.{name}": value for name, value in state.items()}
@@ -86,6 +85,12 @@ class NrfgsPipeline(VanillaPipeline):
     def train(self, mode: bool = True):
         # Nerfstudio asks before every step; to walk through all modules for nothing costs the host time.
         return self if self.training == self.model.training == mode else super().train(mode)
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """Nerfstudio's; it also learns from the trainer how often metrics are logged."""
+        if attributes.trainer is not None:
+            self.steps_per_log = attributes.trainer.config.logging.steps_per_log
+        return super().get_training_callbacks(attributes)
 
     def get_train_loss_dict(self, step: int):
         """Nerfstudio's step, whose metrics are taken only when they are logged."""
@@ -145,23 +150,20 @@ class NrfgsPipeline(VanillaPipeline):
         result["parameter_bytes"] = self.model.parameter_bytes
         if get_std:
             result["per_image"] = per_image
+            print_evaluation(result)
         return result
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What decides the rest of a training beside its parameters: random generators, the order of the cameras, and
-        the mean over its last steps, if that has begun.
+        """What decides the rest of a training beside its parameters: random generators and the order of the cameras.
 
         Plain numbers, strings and tensors only, which torch reads without trusting the file.
         """
-        state = {
+        return {
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
             "python_rng": json.dumps(random.getstate()),
             "sampling": self.datamanager.sampling_state(),
         }
-        if self.parameter_mean is not None and self.parameter_mean.count > 0:
-            state["parameter_mean"] = self.parameter_mean.state()
-        return state
 
     def check_schedules(self, state: dict[str, Any]) -> None:
         """Raise InputError where a training goes on whose step numbers mean another number of images."""
@@ -184,7 +186,6 @@ class NrfgsPipeline(VanillaPipeline):
         version, numbers, gauss_next = json.loads(state["python_rng"])
         random.setstate((version, tuple(numbers), gauss_next))
         self.datamanager.load_sampling_state(state["sampling"])
-        self.loaded_mean = state.get("parameter_mean")
 
 
 def _mean(values: list[float]) -> float | None:

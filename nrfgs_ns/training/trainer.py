@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's trainer, with checkpoints that are whole or not there, a guard over every number, a time budget, and a
-mean over the last steps."""
+"""Nerfstudio's trainer, with checkpoints that are whole or not there, a guard over every number, a time budget, a mean
+over the last steps, and an end in order whatever ends it."""
 
 import gc
 import math
-import os
+import re
 import sys
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from itertools import count
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -20,9 +23,14 @@ from nerfstudio.utils.decorators import check_eval_enabled
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.data.checks import warn
+from nrfgs_ns.errors import DEBUG, InputError
+from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, tell, tell_why_not
+from nrfgs_ns.training.checkpoint_files import DiskFull
+from nrfgs_ns.training.cpu_command import ten_minute_command
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
+from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 from nrfgs_ns.training.optimizers import in_world_units
 from nrfgs_ns.training.pace import (
     FEWEST_STEPS,
@@ -33,10 +41,20 @@ from nrfgs_ns.training.pace import (
     resolution_phases,
     steps_for,
 )
+from nrfgs_ns.training.stopping import (
+    StopRequest,
+    command_to_go_on,
+    heard_signals,
+    is_out_of_memory,
+    rows_agree,
+)
 from nrfgs_ns.training.tracking import track
 
 AVERAGED = 200
 """Last steps whose mean is the trained model, where their number is chosen and in the presets."""
+NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
+TIME_STAMP = re.compile(r"\d{4}-\d\d-\d\d_\d{6}")
+"""What nerfstudio calls a training's folder if it is not told."""
 
 
 @dataclass
@@ -63,19 +81,28 @@ class NrfgsTrainerConfig(TrainerConfig):
         """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
 
         Raises:
-            InputError: an option is out of range, or cannot be had on several devices.
+            InputError: an option is out of range, cannot be had on several devices, or there is nothing to go on from.
         """
+        devices = kwargs.get("world_size", 1)
         for name in ("time_budget", "schedule_steps"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"{name} is {value}; it must be positive.")
-            if value is not None and kwargs.get("world_size", 1) > 1:
+            if value is not None and devices > 1:
                 raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
         for name in ("max_num_iterations", "average_steps"):
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise InputError(f"{name} is {value}; it must be zero or positive.")
-        if kwargs.get("world_size", 1) == 1:
+        scale = self.pipeline.datamanager.camera_res_scale_factor
+        if not 0 < scale < math.inf:
+            raise InputError(f"pipeline.datamanager.camera_res_scale_factor is {scale}; it must be positive.")
+        warmup = self.pipeline.model.warmup_steps
+        if warmup is not None and warmup < 0:
+            raise InputError(f"pipeline.model.warmup_steps is {warmup}; it must be zero or positive.")
+        if self.load_dir is not None:
+            checkpoint_files.checkpoints_in(self.load_dir)
+        if devices == 1:
             return super().setup(**kwargs)
         from nrfgs_ns.distributed.trainer import ShardedTrainer
 
@@ -100,14 +127,49 @@ class NrfgsTrainerConfig(TrainerConfig):
             average_steps=AVERAGED if self.average_steps is None else self.average_steps,
         )
 
-    def save_config(self) -> None:
-        """Save config.yml, as every training does before it starts; with several devices, also see to it that they
-        are there, and that a message about one that is lost can be read."""
-        super().save_config()
-        if self.machine.num_devices * self.machine.num_machines > 1:
+    def print_to_terminal(self) -> None:
+        """What ns-train says before it begins: one line, and on several devices whether they are there. The whole
+        configuration is in config.yml, and shown with NRFGS_DEBUG=1.
+
+        Raises:
+            InputError: there are fewer devices than were asked for.
+        """
+        if DEBUG:
+            super().print_to_terminal()
+        machine = self.machine
+        if machine.num_devices * machine.num_machines > 1:
             from nrfgs_ns.distributed.launch import prepare
 
             prepare(self)
+        data = self.data or self.pipeline.datamanager.data
+        lines = [f"{self.method_name} on {data}"]
+        if machine.device_type == "cpu" and self.time_budget is None:
+            lines.append(f"No CUDA device: the CPU trains. A good result in ten minutes: {ten_minute_command(data)}")
+        CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+    def save_config(self) -> None:
+        """Save config.yml, with paths that lead to the same places from any folder."""
+        if TIME_STAMP.fullmatch(self.timestamp):
+            self._take_a_folder()
+        data = self.pipeline.datamanager
+        dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
+        pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
+        whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
+        TrainerConfig.save_config(whole)
+
+    def _take_a_folder(self) -> None:
+        """Make this training's folder; another one may have begun in the same second."""
+        first = self.timestamp
+        for number in count(2):
+            try:
+                self.get_base_dir().mkdir(parents=True)
+                return
+            except FileExistsError:
+                self.timestamp = f"{first}_{number}"
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else Path(path).absolute()
 
 
 def end_earlier_logs() -> None:
@@ -123,16 +185,51 @@ def end_earlier_logs() -> None:
 
 
 class NrfgsTrainer(Trainer):
-    """Trainer that never leaves a torn checkpoint, or one with NaN, where `--load-dir` would find it."""
+    """Trainer that never leaves a torn checkpoint, or one with NaN, where `--load-dir` would find it.
 
-    pace: Pace | None = None
-    """how fast the training walks through its schedules; None: a step is a step"""
-    steps_are_chosen: bool = False
-    """whether the number of training views says how many steps are made"""
+    Attributes:
+        total_steps: steps of the whole training, those before a checkpoint included.
+        pace: how fast the training walks through its schedules; None: a step is a step.
+        steps_are_chosen: whether the number of training views says how many steps are made.
+        mean: of the parameters over the last steps; None if none was asked for.
+        request: what signals have asked for.
+    """
+
+    def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        self.request = StopRequest()
+        self._stop = False
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's GradScaler
+            super().__init__(config, local_rank, world_size)
+        self.total_steps = config.max_num_iterations
+        self.steps_are_chosen = False
+        self.pace: Pace | None = None
+        self.mean: ParameterMean | None = None
+        self._saved_step: int | None = None
+        self._is_ending = False
+
+    @property
+    def stop_training(self) -> bool:
+        """Whether the step that was made is the last. Nerfstudio's loop asks, and sets it."""
+        return self._stop or self._is_asked_to_stop
+
+    @stop_training.setter
+    def stop_training(self, stop: bool) -> None:
+        self._stop = stop
+
+    @property
+    def _is_asked_to_stop(self) -> bool:
+        return self.request.signal is not None
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
-        super().setup(test_mode)
+        try:
+            super().setup(test_mode)
+        except KeyboardInterrupt:
+            NrfgsTrainer._end(self, NOTHING_TO_SAVE, 130)
+        writer.GLOBAL_BUFFER["max_iter"] = self.total_steps
+        self._made = self._start_step - 1
+        """the last step that was made"""
         if comms.is_main_process():
             self._tell_what_was_chosen()
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
@@ -142,13 +239,12 @@ class NrfgsTrainer(Trainer):
         """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
         self.steps_are_chosen = self.config.max_num_iterations == 0
         self.config = self.config.for_views(len(self.pipeline.datamanager.train_dataset))
+        self.total_steps = self.config.max_num_iterations
         self.guard = Guard(self.pipeline)
-        self.pipeline.parameter_mean = ParameterMean() if self.config.average_steps > 0 else None
-        every = self.pipeline.steps_per_log = self.config.logging.steps_per_log
-        groups = self.pipeline.get_param_groups()
-        optimizers = WatchedOptimizers(self.optimizer_configs(), groups, self.guard, every)
-        self.pace = optimizers.pace = self.pipeline.model.pace = self._pace()
-        return optimizers
+        self.mean = ParameterMean() if self.config.average_steps > 0 else None
+        self.pace = self._pace()
+        groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
+        return WatchedOptimizers(self.optimizer_configs(), groups, self.guard, every, self.pace)
 
     def _tell_what_was_chosen(self) -> None:
         """One line: how many steps, how much noise, and why."""
@@ -168,36 +264,100 @@ class NrfgsTrainer(Trainer):
 
     def _pace(self) -> Pace | None:
         """How fast to walk through the schedules (`pace.py`), or None for a step at a time."""
-        length = self.config.schedule_steps or self.config.max_num_iterations
+        length = self.config.schedule_steps or self.total_steps
         if self.config.time_budget is not None:
             model = self.config.pipeline.model
             phases = resolution_phases(model.num_downscales, model.resolution_schedule)
             return TimedPace(length, 60.0 * self.config.time_budget, phases)
-        return None if self.config.schedule_steps is None else Pace(length)
+        return None if self.config.schedule_steps is None else Pace(length, length / self.total_steps)
+
+    # Going on from a checkpoint.
 
     def _load_checkpoint(self) -> None:
-        """Nerfstudio's; and the pace and the mean go on from where they were.
+        """Go on from the checkpoint that the configuration names, if it names one.
 
         Raises:
-            InputError: the checkpoint's schedules were stretched, and this training's are not.
+            InputError: it is damaged, is of another data set or of options with another meaning, or is the end of the
+                training.
         """
-        super()._load_checkpoint()
-        if self.pace is None and self.pipeline.model.pace is not None:
+        config = self.config
+        if config.load_dir is not None:
+            path, content = checkpoint_files.read_latest(config.load_dir, config.load_step)
+        elif config.load_checkpoint is not None:
+            path = config.load_checkpoint
+            content = checkpoint_files.read_or_refuse(path)
+        else:
+            return
+        if "optimizers" not in content:
+            raise InputError(f"{path} is of a compact file, which no training goes on from. Use its training's own.")
+        self._start_step = content["step"] + 1
+        training = _training_in(content)
+        if "scene" in training:  # older checkpoints do not say
+            check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
+        self.pipeline.load_pipeline(content["pipeline"], content["step"])
+        self._check_options(training.get("options", {}), path)
+        self.optimizers.load_optimizers(content["optimizers"])
+        if "schedulers" in content and config.load_scheduler:
+            self.optimizers.load_schedulers(content["schedulers"])
+        self.grad_scaler.load_state_dict(content["scalers"])
+        self._follow(training.get("pace"))
+        if self.mean is not None and training.get("parameter_mean") is not None:
+            self.mean.load_state(training["parameter_mean"], self.pipeline.model, self.optimizers.optimizers)
+        CONSOLE.print(
+            f"Going on from {path}, at step {self._start_step} of {self._total}.", markup=False, soft_wrap=True
+        )
+
+    @property
+    def _total(self) -> str:
+        budget = self.config.time_budget
+        return f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
+
+    def _check_options(self, written: dict[str, str], path: Path) -> None:
+        """Refuse to go on where that makes no sense; see `_load_checkpoint`."""
+        changed = check_options(written, options_of(self.config))
+        if changed:
+            shown = "; ".join(changed[:5]) + ("; ..." if len(changed) > 5 else "")
+            warn(f"Going on with other options than {path.name} was trained with: {shown}.")
+        if self.config.time_budget is None and self._start_step >= self.total_steps:
+            raise InputError(
+                f"{path} is the end of a training of {self.total_steps:,} steps: there is nothing left to do. "
+                f"--max-num-iterations {2 * self._start_step} makes as many more."
+            )
+
+    def _scene(self) -> dict[str, Any]:
+        data = self.pipeline.datamanager.train_dataset
+        return scene_of([Path(name).name for name in data.image_filenames], data.cameras)
+
+    def _follow(self, written: dict[str, Any] | None) -> None:
+        """Go on in the schedules where the checkpoint was, and at the rate that is left for the steps that are left.
+
+        Args:
+            written: the state of the checkpoint's pace; None: it had none.
+        """
+        pace = self.pace
+        if pace is None and written is not None:
             raise InputError(
                 "The checkpoint's training had a --time-budget or --schedule-steps. Give the same to go on from it."
             )
-        if self.steps_are_chosen:  # in all, not from here on
-            left = max(self.config.max_num_iterations - self._start_step, 0)
-            self.config = replace(self.config, max_num_iterations=left)
-        if self.pace is not None and self.pace.position == 0.0:
-            self.pace.position = float(self._start_step)  # of a checkpoint whose schedules were not stretched
-        if self.pace is not None and not isinstance(self.pace, TimedPace):
-            rate = (self.pace.length - self.pace.position) / max(self.config.max_num_iterations, 1)
-            if not math.isclose(rate, self.pace.rate, rel_tol=1e-9):  # the same to the last bit, if it is the same
-                self.pace.rate = max(rate, 1e-9)
-        loaded, self.pipeline.loaded_mean = self.pipeline.loaded_mean, None
-        if self.pipeline.parameter_mean is not None and loaded is not None:
-            self.pipeline.parameter_mean.load_state(loaded, self.pipeline.model, self.optimizers.optimizers)
+        if not isinstance(pace, TimedPace):
+            self.config = replace(self.config, max_num_iterations=self.total_steps - self._start_step)
+        if pace is None:
+            return
+        if written is not None:
+            pace.load_state(written)
+        if pace.position == 0.0:
+            pace.position = float(self._start_step)  # of a checkpoint whose schedules were not stretched
+        if isinstance(pace, TimedPace):
+            if pace.is_spent:
+                raise InputError(
+                    f"The training has used its time budget of {self.config.time_budget:g} minutes: there is nothing "
+                    "left to do. A larger --time-budget goes on."
+                )
+        else:
+            rate = (pace.length - pace.position) / self.config.max_num_iterations
+            if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # the same to the last bit, if it is the same
+                pace.rate = max(rate, 1e-9)
+        self.pipeline.model.schedule_at(int(pace.position))
 
     def optimizer_configs(self) -> dict[str, Any]:
         """The configured optimisers; the means', whose learning rate is a length, in world units."""
@@ -205,24 +365,27 @@ class NrfgsTrainer(Trainer):
         groups["means"] = in_world_units(groups["means"], self.pipeline.model.scene_unit)
         return groups
 
+    # Training.
+
     def train(self) -> None:
         """Train, from parameters that are finite.
 
         Raises:
-            TrainingStopped: a number is not finite; what is good has been written.
+            TrainingStopped: a number is not finite, or the memory has run out; what is good has been written.
+            SystemExit: a signal has ended it, with the status of that; the state has been written.
         """
         with self._last_good_state_on_disk():  # the warm-up comes before the first step
             self.guard.step = self._start_step
             self.guard.check_parameters(self.optimizers)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
-            self.config = replace(self.config, max_num_iterations=0 if self.pace.is_spent else sys.maxsize // 2)
-        self.step = self._start_step - 1  # the last one, if none is left
+            self.config = replace(self.config, max_num_iterations=sys.maxsize // 2)
         gc.collect()
         gc.freeze()  # what is there now stays: the collector need not walk through it again and again
         try:
             if self.pace is not None:
                 self.pace.start()
-            super().train()
+            with heard_signals(self.request), self._state_on_disk_if_it_fails():
+                super().train()
         finally:
             gc.unfreeze()
 
@@ -250,17 +413,20 @@ class NrfgsTrainer(Trainer):
         Raises:
             TrainingStopped: this step, or on a GPU the one before, met a number that is not finite.
         """
-        if self.pace is not None:
-            self.pace.begin_step()
-            self.pipeline.model.densification.reschedule(lambda position: self.pace.step_at(position, step))
+        model, pace = self.pipeline.model, self.pace
+        if pace is not None:
+            pace.begin_step()
+            model.densification.reschedule(lambda position: pace.step_at(position, step))
         with self._last_good_state_on_disk():
             self.guard.begin(step, self.optimizers)
-            result = super().train_iteration(step)
-        if isinstance(self.pace, TimedPace):  # the step that brings the time's end is the last
-            self._last_step = step
-            self.stop_training = self.stop_training or self.pace.is_spent
-            writer.GLOBAL_BUFFER["max_iter"] = step + 1 + self.pace.steps_left  # what the terminal counts towards
-        return result
+            loss, losses, metrics = super().train_iteration(step)
+        self._made = step
+        if pace is not None:
+            model.schedule_at(int(pace.position))
+        if isinstance(pace, TimedPace):  # the step that brings the time's end is the last
+            self.stop_training = self._stop or pace.is_spent
+            writer.GLOBAL_BUFFER["max_iter"] = step + 1 + pace.steps_left  # what the terminal counts towards
+        return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     @property
     def last_step(self) -> int:
@@ -269,7 +435,7 @@ class NrfgsTrainer(Trainer):
 
     def _average(self, step: int) -> None:
         """Take the step's numbers into the mean, if it is one of the last `average_steps`."""
-        mean, window = self.pipeline.parameter_mean, self.config.average_steps
+        mean, window = self.mean, self.config.average_steps
         if isinstance(self.pace, TimedPace):
             left = self.pace.steps_left  # as things look now; to within a step at a constant pace
             is_of_earlier_steps = left >= 2 * window  # once begun it goes on, unless the end was far from foreseen
@@ -281,15 +447,90 @@ class NrfgsTrainer(Trainer):
         if left < window or mean.count > 0:
             mean.add(self.pipeline.model, self.optimizers.optimizers)
 
+    # The end.
+
     def _after_train(self) -> None:
         """Nerfstudio's, whose step number is one too many when it stopped early; the model is the mean from here on."""
-        self.step = getattr(self, "_last_step", self.step)
+        self.step, self._is_ending = self._made, True
+        if self._is_asked_to_stop:
+            self._stop_as_asked()
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
-        if self.config.average_steps > 0 and self.stop_training and not timed_out:
+        if self.mean is not None and self._stop and not timed_out:
             tell_why_not(self.config.average_steps, "the training was stopped before its last step")
         else:
             self.take_the_mean()
         super()._after_train()
+
+    def _stop_as_asked(self) -> None:
+        """Save, say so, and end the process with the status of the signal."""
+        if self._made < self._start_step:
+            self._end(NOTHING_TO_SAVE, self.request.exit_status)
+        if self._saved_step != self._made:
+            self.save_checkpoint(self._made)
+        writer.write_out_storage()
+        self._end(f"Stopped at step {self._made}, {self._where_it_goes_on}", self.request.exit_status)
+
+    @property
+    def _where_it_goes_on(self) -> str:
+        folder = self.checkpoint_dir
+        return f"saved in {folder}; go on with: {command_to_go_on(folder, self.config.method_name)}"
+
+    def _end(self, line: str, status: int) -> None:
+        if comms.is_main_process():
+            print(line, flush=True)
+        raise SystemExit(status or 130)  # another device has heard the signal
+
+    def _train_complete_viewer(self) -> None:
+        """Nerfstudio's: the viewer goes on showing the model until Ctrl-C."""
+        self.request.is_over = True
+        with suppress(KeyboardInterrupt):
+            super()._train_complete_viewer()
+
+    @contextmanager
+    def _state_on_disk_if_it_fails(self) -> Iterator[None]:
+        """Save what there is when something else than a signal or the guard ends the training.
+
+        Raises:
+            TrainingStopped: the memory has run out. Other exceptions are raised again.
+        """
+        try:
+            yield
+        except (InputError, TrainingStopped, DiskFull):
+            raise
+        except Exception as error:
+            if self.world_size > 1:  # one device alone cannot write the whole
+                raise
+            memory, what = is_out_of_memory(error), str(error).partition("\n")[0]
+            error.__traceback__ = error.__traceback__ if not memory else None  # whose frames hold the step's tensors
+            said = self._save_what_there_is()
+            if memory:
+                message = f"Out of memory in step {self.step}: {what}\n{said}"
+                advice = "Fewer splats or smaller images take less (docs/troubleshooting.md)."
+                saved = self._saved_step == self._made
+                raise TrainingStopped(f"{message} {advice}", self.step, "memory", savable=saved) from None
+            print(f"The training failed in step {self.step}. {said}", flush=True)
+            raise
+
+    def _save_what_there_is(self) -> str:
+        """Save the state after the last step that was made, if it is one; what came of it."""
+        self._is_ending = True
+        last = next(iter(checkpoint_files.find(self.checkpoint_dir).values()), None)
+        kept = f"The last checkpoint is {last}." if last else "No checkpoint had been written."
+        if self._made < self._start_step:
+            return f"No step had been made. {kept}"
+        self.optimizers.zero_grad_some(list(self.optimizers.optimizers))
+        gc.collect()
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
+        model = self.pipeline.model
+        if not rows_agree(model.gauss_params, self.optimizers.optimizers, model.densification.state.values()):
+            return f"Splats were being added or removed, so that nothing could be saved. {kept}"
+        try:
+            if self._saved_step != self._made:
+                self.save_checkpoint(self._made)
+        except Exception as error:
+            return f"The state could not be saved ({error}). {kept}"
+        return f"Step {self._made} is {self._where_it_goes_on}."
 
     def take_the_mean(self) -> None:
         """Let the model be the mean over the last steps, if one was asked for, and say so; or say why it is not.
@@ -297,32 +538,39 @@ class NrfgsTrainer(Trainer):
         Raises:
             TrainingStopped: the last step met a number that is not finite; what is good has been written.
         """
-        mean, window = self.pipeline.parameter_mean, self.config.average_steps
-        if window == 0:
+        mean, window = self.mean, self.config.average_steps
+        if mean is None:
             return
         with self._last_good_state_on_disk():
             self.guard.settle()
         if mean.count == 0:
-            late = isinstance(self.pace, TimedPace) and self.step >= self._start_step
-            tell_why_not(window, "the time was up sooner than foreseen" if late else "no step was made")
+            tell_why_not(window, "the time was up sooner than foreseen")
         else:
             tell(mean.count, window, mean.began_anew)
             with self.train_lock:
                 mean.install()
 
+    # Checkpoints.
+
     def save_checkpoint(self, step: int) -> None:
-        """Write a checkpoint of finite numbers.
+        """Write a checkpoint of finite numbers. Where the disk is full the training goes on, with a warning.
 
         Args:
             step: training step that the checkpoint is named after.
 
         Raises:
             TrainingStopped: there is a number that is not finite; what is good has been written.
+            DiskFull: at the end of the training.
         """
         with self._last_good_state_on_disk():
             self.guard.settle()
             self.guard.check_parameters(self.optimizers)
-        self._write_checkpoint(step)
+        try:
+            self._write_checkpoint(step)
+        except DiskFull as full:
+            if self._is_ending:
+                raise
+            warn(f"{full} The training goes on.")
 
     @contextmanager
     def _last_good_state_on_disk(self) -> Iterator[None]:
@@ -330,35 +578,52 @@ class NrfgsTrainer(Trainer):
             yield
         except TrainingStopped as stopped:
             if stopped.savable:
-                self._write_checkpoint(stopped.step)
+                try:
+                    self._write_checkpoint(stopped.step)
+                except DiskFull as full:
+                    raise TrainingStopped(f"{stopped}\n{full}", stopped.step, stopped.origin) from full
             raise
 
     def _write_checkpoint(self, step: int) -> None:
-        """Write the checkpoint aside, then move it into place, then let go of the older ones.
+        """Write a checkpoint (`checkpoint_files`).
 
         Args:
             step: training step that the checkpoint is named after.
+
+        Raises:
+            DiskFull: there is no room.
         """
         content = self._checkpoint(step)
-        if not comms.is_main_process():
-            return
-        name, final = f"step-{step:09d}.ckpt", self.checkpoint_dir
-        aside = final.with_name(final.name + ".writing")
-        aside.mkdir(parents=True, exist_ok=True)
-        torch.save(content, aside / name)
-        final.mkdir(parents=True, exist_ok=True)
-        os.replace(aside / name, final / name)
-        if self.config.save_only_latest_checkpoint:
-            for older in set(final.glob("*.ckpt")) - {final / name}:
-                older.unlink()
-        aside.rmdir()
+        if comms.is_main_process():
+            checkpoint_files.seal(content["pipeline"], step)
+            checkpoint_files.write(self.checkpoint_dir, step, content, self.config.save_only_latest_checkpoint)
+        self._saved_step = step
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
-        """What a checkpoint holds: nerfstudio's entries."""
+        """What a checkpoint holds: nerfstudio's entries, and "training", what this class needs to go on."""
+        training: dict[str, Any] = {"scene": self._scene(), "options": options_of(self.config)}
+        training["options"]["max_num_iterations"] = str(self.total_steps)
+        if self.pace is not None:
+            training["pace"] = self.pace.state()
+        if self.mean is not None and self.mean.count > 0:
+            training["parameter_mean"] = self.mean.state()
         return {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
             "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
             "schedulers": {name: value.state_dict() for name, value in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
+            "training": training,
         }
+
+
+def _training_in(content: dict[str, Any]) -> dict[str, Any]:
+    """What a checkpoint says to the trainer. Version 0.1.0 kept that among the pipeline's and the model's state."""
+    if "training" in content:
+        return content["training"]
+    pipeline = content["pipeline"]
+    older = {
+        "parameter_mean": pipeline.get("_extra_state", {}).get("parameter_mean"),
+        "pace": pipeline.get("_model._extra_state", {}).get("pace"),
+    }
+    return {name: value for name, value in older.items() if value is not None}

@@ -99,6 +99,10 @@ def _guarded(open_viewer):
         if tunnel is not None and tunnel.get_url():
             server._websock_server.names.add(urlsplit(tunnel.get_url()).hostname)
         port, machine = server.get_port(), socket.gethostname()
+        wanted = config.websocket_port or config.websocket_port_default
+        if port != wanted:
+            self.viewer_info = [line.replace(f":{wanted}", f":{port}") for line in self.viewer_info]
+            self.viewer_info.append(f"Port {wanted} is busy; the viewer is at {port}.")
         if config.websocket_host in (LOCAL, "localhost"):
             self.viewer_info.append(f"From another machine: ssh -L {port}:localhost:{port} {machine}")
         else:

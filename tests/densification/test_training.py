@@ -4,8 +4,8 @@
 from pathlib import Path
 
 import pytest
-import torch
 from densification_cases import arguments, tensors, trainer_of
+from short_trainings import checkpoint_of, models_of
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE, UNSEEN
@@ -47,11 +47,10 @@ def test_resumed_training_is_the_unbroken_one(densification, seen, tiny_scene, t
     def run(name: str, steps: int, *more: str) -> dict:
         args = arguments(tiny_scene, tmp_path / name, densification, steps, **model)
         config = Path(train([*args, *more]).config_path)
-        (path,) = (config.parent / "nerfstudio_models").glob("*.ckpt")
-        return torch.load(path, weights_only=True) | {"folder": path.parent}
+        return checkpoint_of(config) | {"folder": models_of(config)}
 
     whole, half = run("whole", 26), run("half", 14)
-    rest = run("rest", 12, "--load-dir", str(half["folder"]))
+    rest = run("rest", 26, "--load-dir", str(half["folder"]))
     assert whole["step"] == rest["step"] == 25
     counts = [len(part["pipeline"]["_model.gauss_params.means"]) for part in (half, whole)]
     if densification == "mcmc":

@@ -38,7 +38,7 @@ def unbroken(scene: Path, folder: Path) -> None:
     world = dist.get_world_size()
     whole = told(train(scene, folder / "whole", world, 24, **PLAIN, **MORE))
     half = told(train(scene, folder / "half", world, 12, **PLAIN, **MORE))
-    rest = told(train(scene, folder / "rest", world, 12, load=half, **PLAIN, **MORE))
+    rest = told(train(scene, folder / "rest", world, 24, load=half, **PLAIN, **MORE))
     if dist.get_rank() == 0:
         torch.save([str(path) for path in (whole, half, rest)], folder / "unbroken.pt")
 
@@ -76,8 +76,8 @@ def there_and_back(scene: Path, folder: Path) -> None:
 
         return see
 
-    one = told(train(scene, folder / "one", 1, 6, load=half, watch=look("one"), **PLAIN) if main else None)
-    again = told(train(scene, folder / "two", world, 6, load=one, watch=look("two"), **PLAIN, **MORE))
+    one = told(train(scene, folder / "one", 1, 12, load=half, watch=look("one"), **PLAIN) if main else None)
+    again = told(train(scene, folder / "two", world, 18, load=one, watch=look("two"), **PLAIN, **MORE))
     torch.save(scores, folder / f"scores-{dist.get_rank()}.pt")
     if main:
         torch.save([str(path) for path in (half, one, again)], folder / "there-and-back.pt")
@@ -164,7 +164,7 @@ def averaged(scene: Path, folder: Path) -> None:
 
         def keep(step: int) -> None:
             after.append(parameters(trainer))
-            counts.append(trainer.pipeline.parameter_mean.count)
+            counts.append(trainer.mean.count)
 
         note(trainer, keep)
 
@@ -183,17 +183,17 @@ def averaged(scene: Path, folder: Path) -> None:
         trainer = train(scene, folder / "averaged", world, 12, watch=watch, **options)
     whole, ended = told(trainer), parameters(trainer)
     from_between = {**options, "--load-step": 7}
-    rest = told(train(scene, folder / "averaged-rest", world, 4, load=whole, watch=lopsided, **from_between))
+    rest = told(train(scene, folder / "averaged-rest", world, 12, load=whole, watch=lopsided, **from_between))
     again = {**from_between, "--steps-per-save": 9}
     try:
-        train(scene, folder / "averaged-nan", world, 4, load=whole, watch=spoil, **again)
+        train(scene, folder / "averaged-nan", world, 12, load=whole, watch=spoil, **again)
         stopped = False
     except TrainingStopped:
         stopped = True
     result = {"after": after, "counts": counts, "ended": ended, "said": log.get(), "stopped": stopped}
     if main:
         alone = trainer_of(scene, folder / "averaged-alone", 1, **from_between, **{"--load-dir": whole})
-        mean = alone.pipeline.parameter_mean
+        mean = alone.mean
         result |= {"saved": [str(whole), str(rest)], "alone": mean and mean.state()}
     torch.save(result, folder / f"averaged-{dist.get_rank()}.pt")
     dist.barrier()

@@ -10,8 +10,8 @@ import torch
 from torch.testing import assert_close
 
 from nrfgs_ns.distributed.averaging import ShardedMean
-from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
 from nrfgs_ns.training.averaging import ParameterMean
+from nrfgs_ns.training.checkpoint_files import read
 
 SPLATS = "gauss_params."
 
@@ -21,9 +21,8 @@ def devices(two_devices) -> tuple[dict, dict]:
     return tuple(torch.load(two_devices / f"averaged-{rank}.pt") for rank in (0, 1))
 
 
-def saved(folder: str | Path, step: int) -> dict:
-    allow_nerfstudio_checkpoints()
-    return torch.load(Path(folder) / f"step-{step:09d}.ckpt", weights_only=True)["pipeline"]
+def saved(folder: str | Path, step: int, part: str = "pipeline") -> dict:
+    return read(Path(folder) / f"step-{step:09d}.ckpt")[part]
 
 
 def whole_after(devices: tuple[dict, dict], step: int) -> dict[str, torch.Tensor]:
@@ -51,7 +50,7 @@ def test_the_trained_model_is_the_mean_of_the_whole(devices):
             content[f"_model.{name}"].double(), mean, rtol=0, atol=5e-6, msg=lambda text, name=name: name + text
         )
         assert (mean - last).abs().max() > 1e-4, name
-    assert "parameter_mean" not in content["_extra_state"]
+    assert "parameter_mean" not in saved(devices[0]["saved"][0], 11, "training")
 
 
 def test_shared_weights_are_the_same_on_all(devices):
@@ -62,7 +61,7 @@ def test_shared_weights_are_the_same_on_all(devices):
 
 def test_a_checkpoint_in_between_has_the_mean_of_the_whole(devices):
     """As one device would have written it, and as one reads it. Four roundings of numbers up to 10."""
-    state = saved(devices[0]["saved"][0], 7)["_extra_state"]["parameter_mean"]
+    state = saved(devices[0]["saved"][0], 7, "training")["parameter_mean"]
     assert (state["count"], state["began_anew"]) == (4, True)
     means = [whole_after(devices, step) for step in range(4, 8)]
     for name in ("means", "latents"):
@@ -87,7 +86,7 @@ def test_a_mean_of_splats_that_one_device_took_out_is_not_written(devices, two_d
     content = saved(folder, 9)
     before = len(saved(devices[0]["saved"][0], 11)[f"_model.{SPLATS}means"])
     assert len(content[f"_model.{SPLATS}means"]) == before - 1
-    assert "parameter_mean" not in content["_extra_state"]
+    assert "parameter_mean" not in saved(folder, 9, "training")
 
 
 @pytest.mark.parametrize("written, count", [(5, 3), (6, 0)])

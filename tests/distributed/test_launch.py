@@ -16,7 +16,7 @@ from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 from nrfgs_ns.distributed import launch
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
-from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.training.checkpoint_files import read_latest
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_of_a_failed_process_the_error_is_shown_without_its_traceback(config):
 
 def test_what_cannot_start_is_refused_before_it_does(config, monkeypatch):
     with pytest.raises(InputError, match="nrfgs_ns.distributed.launch"):
-        config.save_config()  # what ns-train does, on CPUs
+        config.print_to_terminal()  # what ns-train does, on CPUs
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(InputError, match="num_devices is 2, but this machine shows 1"):
         launch.prepare(replace(config, machine=replace(config.machine, device_type="cuda")))
@@ -60,10 +60,14 @@ def test_nerfstudio_s_launcher_says_it_in_one_message(config, monkeypatch, capsy
     own."""
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(sys, "excepthook", lambda kind, error, trace: print("as ever:", error, file=sys.stderr))
-    replace(config, machine=replace(config.machine, device_type="cuda")).save_config()
+    replace(config, machine=replace(config.machine, device_type="cuda")).print_to_terminal()
     error = ProcessExitedException("died", error_index=1, error_pid=7, exit_code=-9, signal_name="SIGKILL")
     sys.excepthook(type(error), error, None)
     sys.excepthook(ValueError, ValueError("another"), None)
+    asked = ProcessExitedException("ended", error_index=1, error_pid=7, exit_code=130)
+    with pytest.raises(SystemExit) as ended:
+        sys.excepthook(type(asked), asked, None)
+    assert ended.value.code == 130
     said = capsys.readouterr().err
     assert said.startswith("Training stopped: the process of device 1 of 2 was killed by SIGKILL.")
     assert said.endswith("as ever: another\n")
@@ -81,13 +85,11 @@ def workers(parent: int) -> list[int]:
     return [int(pid) for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
-@pytest.mark.parametrize("victim", [0, 1])
-def test_a_killed_process_ends_the_others_and_leaves_the_checkpoint(victim, tiny_scene, tmp_path):
+def endless(scene: Path, out: Path) -> list[str]:
+    """A command that trains on two CPU processes for longer than anybody waits."""
     options = {
-        "--data": tiny_scene,
-        "--output-dir": tmp_path,
+        "--data": scene,
+        "--output-dir": out,
         "--machine.num-devices": 2,
         "--machine.device-type": "cpu",
         "--max-num-iterations": 100_000,
@@ -98,8 +100,46 @@ def test_a_killed_process_ends_the_others_and_leaves_the_checkpoint(victim, tiny
         "--pipeline.model.stop-split-at": 0,
     }
     words = [str(word) for option in options.items() for word in option]
-    command = [sys.executable, "-m", "nrfgs_ns.distributed.launch", "nrfgs", *words]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return [sys.executable, "-m", "nrfgs_ns.distributed.launch", "nrfgs", *words]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("to_all", [True, False])
+def test_a_signal_stops_all_devices_with_one_checkpoint(to_all, tiny_scene, tmp_path):
+    """From the terminal, which all processes hear, and sent to the second device alone."""
+    process = subprocess.Popen(
+        endless(tiny_scene, tmp_path),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+    try:
+        deadline = time.time() + 300
+        while not list(tmp_path.rglob("*.ckpt")) and process.poll() is None and time.time() < deadline:
+            time.sleep(0.1)
+        if to_all:
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            os.kill(workers(process.pid)[1], signal.SIGTERM)
+        said, _ = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode == (130 if to_all else 143), said
+    assert said.count("Stopped at step") == 1 and "Traceback" not in said, said
+    (folder,) = tmp_path.rglob("nerfstudio_models")
+    _, content = read_latest(folder)
+    assert f"Stopped at step {content['step']}, saved in {folder}; go on with: python -m" in said
+    assert len(content["pipeline"]["_extra_state"]["devices"]) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_process_ends_the_others_and_leaves_the_checkpoint(victim, tiny_scene, tmp_path):
+    command, environment = endless(tiny_scene, tmp_path), {**os.environ, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
     try:
         deadline = time.time() + 300
@@ -119,8 +159,7 @@ def test_a_killed_process_ends_the_others_and_leaves_the_checkpoint(victim, tiny
     assert process.returncode == 1 and took < 60, "waited for a dead process"
     for pid in ranks:
         assert not Path(f"/proc/{pid}").exists(), "a process was left behind"
-    path = max(tmp_path.rglob("nerfstudio_models/*.ckpt"))
+    (folder,) = tmp_path.rglob("nerfstudio_models")
+    path, content = read_latest(folder)
     assert str(path) in said
-    allow_nerfstudio_checkpoints()
-    content = torch.load(path, weights_only=True)
     assert len(content["pipeline"]["_model.gauss_params.means"]) == 300

@@ -8,13 +8,11 @@ import torch
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE
-from nrfgs_ns.model.checkpoint import allow_nerfstudio_checkpoints
+from nrfgs_ns.training.checkpoint_files import read_latest
 
 
 def checkpoint(folder: str | Path) -> dict:
-    allow_nerfstudio_checkpoints()
-    (path,) = Path(folder).glob("*.ckpt")
-    return torch.load(path, weights_only=True)
+    return read_latest(Path(folder))[1]
 
 
 def splats_of(content: dict) -> dict[str, torch.Tensor]:

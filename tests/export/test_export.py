@@ -19,7 +19,9 @@ from nrfgs_ns.appearance.sh import SphericalHarmonics
 from nrfgs_ns.appearance.spherical_harmonics import sh_bases
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.options import CompactOptions
+from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export import ply
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.ply import read_splats, render_splats, write_splats
@@ -280,10 +282,47 @@ def test_the_command_writes_the_splats_and_says_what_was_lost(method, trained, t
     assert numbers["exact"] == (method == "nrfgs-sh")
 
 
+def test_every_world_holds_the_same_scene(trained, tmp_path, capsys):
+    """Turned, scaled and with harmonics that turn along, it looks the same from cameras that do."""
+    reports, means = {}, {}
+    for world in ("training", "viewers", "capture"):
+        out, report = tmp_path / f"{world}.ply", tmp_path / f"{world}.json"
+        words = ["ply", "--load-config", str(trained("nrfgs")), "--output", str(out), "--report", str(report)]
+        tyro.cli(Export, args=[*words, "--ply.world", world]).main()
+        reports[world], means[world] = json.loads(report.read_text()), read_splats(out).means
+        # The same pictures but for float32's rounding, at 16 dB.
+        assert reports[world]["psnr_file"] == pytest.approx(reports["training"]["psnr_file"], abs=1e-3)
+    x, y, z = means["training"].unbind(-1)
+    assert_close(means["viewers"], torch.stack([x, -z, y], dim=-1), rtol=0, atol=1e-6)  # z up becomes y down
+    pipeline = load_model(trained("nrfgs"), "inference")
+    frame = CaptureFrame.of(pipeline.datamanager.train_dataparser_outputs)
+    assert_close(means["capture"].numpy(), frame.to_capture(means["training"].numpy()).astype(np.float32))
+    assert reports["viewers"]["world"] == "viewers" and "origin" not in reports["capture"]
+
+
+def test_large_splats_are_cut_down_and_spoken_of(trained, tmp_path, capsys, monkeypatch):
+    config, report = trained("nrfgs"), tmp_path / "report.json"
+    words = ["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--report", str(report)]
+    tyro.cli(Export, args=[*words, "--ply.largest", "0.02"]).main()
+    largest = read_splats(tmp_path / "s.ply").scales.exp().max()
+    assert largest == pytest.approx(0.02, rel=1e-5)
+    assert "leave out splats" not in capsys.readouterr().out
+    # An edge so narrow that every viewer would leave out most of them.
+    monkeypatch.setattr(ply, "SPARKS_EDGE", 0.2)
+    monkeypatch.setattr(ply, "WORTH_A_WORD", -100.0)
+    tyro.cli(Export, args=words).main()
+    numbers = json.loads(report.read_text())
+    assert numbers["psnr_on_screen"] != pytest.approx(numbers["psnr_file"], abs=0.01)
+    assert f"show {numbers['psnr_on_screen']:.2f} dB" in " ".join(capsys.readouterr().out.split())
+    for value in ("0", "-1", "nan", "inf"):
+        with pytest.raises(InputError, match="--ply.largest"):
+            tyro.cli(Export, args=[*words, "--ply.largest", value]).main()
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_ns_export_writes_the_same_splats(method, trained, tmp_path, export_gaussian_splat):
     config, ours = trained(method), tmp_path / "ours.ply"
-    words = ["ply", "--load-config", str(config), "--output", str(ours), "--no-measure"]
+    words = ["ply", "--load-config", str(config), "--output", str(ours), "--no-measure", "--ply.world", "training"]
     tyro.cli(Export, args=words).main()
     export_gaussian_splat(load_config=config, output_dir=tmp_path, output_filename="theirs.ply").main()
     a, b = (PlyData.read(tmp_path / f"{name}.ply")["vertex"].data for name in ("ours", "theirs"))
@@ -313,9 +352,8 @@ def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
     from nrfgs_ns.rasterizer import rasterization
 
     config = trained("nrfgs-sh")
-    tyro.cli(
-        Export, args=["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--no-measure"]
-    ).main()
+    words = ["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--no-measure"]
+    tyro.cli(Export, args=[*words, "--ply.world", "training"]).main()
     vertices = PlyData.read(tmp_path / "s.ply")["vertex"]
 
     def table(*names: str) -> torch.Tensor:
@@ -361,7 +399,7 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
     lost = tmp_path / "config.yml"
     text = trained("nrfgs").read_text()
     lost.write_text(text.replace("timestamp: ", "timestamp: no-"))
-    with pytest.raises(InputError, match="Run this in the folder"):
+    with pytest.raises(InputError, match="no checkpoints beside it"):
         Export("ply", lost, tmp_path / "s.ply").main()
 
 

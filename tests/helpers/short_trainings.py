@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch.testing import assert_close
 
+from nrfgs_ns.training.checkpoint_files import read_latest
 from nrfgs_ns.training.run import train
 
 QUIET = {
@@ -26,7 +27,7 @@ def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict
         method: name of a registered method.
         scene: folder of the data set.
         out: folder for what the training writes.
-        steps: steps of this training; one that goes on from a checkpoint makes as many more.
+        steps: of the whole training, those before the checkpoint that it goes on from included.
         options: values by option, dashes included. Of several values the last counts, and None takes the option away
             ("None" is a value).
     """
@@ -47,9 +48,8 @@ def models_of(config: Path) -> Path:
 
 
 def checkpoint_of(config: Path) -> dict:
-    """The one checkpoint that the training with this config.yml has kept."""
-    (path,) = models_of(config).glob("*.ckpt")
-    return torch.load(path, weights_only=True)
+    """The last checkpoint of the training with this config.yml."""
+    return read_latest(models_of(config))[1]
 
 
 def assert_same_training(one: dict, other: dict, rtol: float = 1e-5, atol: float = 1e-7) -> None:

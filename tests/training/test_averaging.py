@@ -14,6 +14,7 @@ from torch.testing import assert_close
 from nrfgs_ns.densification import relocation
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.averaging import ParameterMean
+from nrfgs_ns.training.checkpoint_files import read_latest
 from nrfgs_ns.training.guard import TrainingStopped, remove_splats
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.run import parse
@@ -49,7 +50,7 @@ def ready(tiny_scene, tmp_path_factory) -> NrfgsTrainer:
 @pytest.fixture
 def trainer(ready) -> NrfgsTrainer:
     """The same one with an empty mean and without a pace."""
-    ready.pipeline.parameter_mean.forget()
+    ready.mean.forget()
     ready.pace, ready._start_step, ready.stop_training = None, 0, False
     ready.config.average_steps, ready.config.max_num_iterations = 4, 10
     return ready
@@ -129,7 +130,7 @@ def counts(trainer: NrfgsTrainer, steps: range) -> list[int]:
     found = []
     for step in steps:
         trainer._average(step)
-        found.append(trainer.pipeline.parameter_mean.count)
+        found.append(trainer.mean.count)
     return found
 
 
@@ -137,7 +138,7 @@ def counts(trainer: NrfgsTrainer, steps: range) -> list[int]:
 def test_the_window_of_a_training_with_known_length(pace, trainer):
     trainer.pace = pace
     assert counts(trainer, range(10)) == [0, 0, 0, 0, 0, 0, 1, 2, 3, 4]
-    trainer.pipeline.parameter_mean.forget()
+    trainer.mean.forget()
     trainer.config.average_steps = 100
     assert counts(trainer, range(10)) == list(range(1, 11))  # all that there are
 
@@ -146,7 +147,7 @@ def test_the_window_of_a_training_that_goes_on(trainer):
     """Interrupted after step 7 of 10. Ten steps more instead of two: the last is 17, and what was in the mean is old.
     Three more instead of two: the window is 7 to 10, and the mean of 6 and 7 is not of that window."""
     for more, expected in ((10, [0] * 6 + [1, 2, 3, 4]), (3, [1, 2, 3]), (2, [3, 4])):
-        trainer.pipeline.parameter_mean.forget()
+        trainer.mean.forget()
         trainer._start_step, trainer.config.max_num_iterations = 0, 10
         assert counts(trainer, range(8))[-1] == 2
         trainer._start_step, trainer.config.max_num_iterations = 8, more
@@ -173,7 +174,7 @@ def test_the_window_of_a_timed_training(trainer):
     step's. At a changing pace it has about as many, and none is left out once it has begun."""
     even = walk(trainer, 300.0, 3000, 40, lambda step: 1.0)
     assert len(even) == 300 and abs(even[-1] - 40) <= 1
-    trainer.pipeline.parameter_mean.forget()
+    trainer.mean.forget()
     uneven = walk(trainer, 300.0, 3000, 40, lambda step: 1.0 if step < 262 else 0.5)
     begun = uneven.index(1)
     assert uneven[begun:] == list(range(1, len(uneven) - begun + 1)) and 60 < uneven[-1] < 80
@@ -236,7 +237,7 @@ def test_the_trained_model_is_the_mean(averaged):
     expected = mean_after(training.after, range(6, 12))
     assert_close({name: saved[name].double() for name in expected}, expected, rtol=0, atol=4e-6)
     assert (saved["_model.gauss_params.means"] - training.after[11]["gauss_params.means"]).abs().max() > 1e-5
-    assert "parameter_mean" not in saved["_extra_state"]
+    assert "parameter_mean" not in checkpoint_of(training.config)["training"]
     assert "over the last 6 steps." in training.said
 
     _, pipeline, _, _ = eval_setup(training.config)
@@ -263,11 +264,11 @@ def test_splats_that_change_cut_the_window_short(averaged):
 def test_a_mean_continues_to_the_bit(name, more, averaged, tiny_scene, tmp_path):
     """From the middle of the window; and where opacity is reset in the first step that is made then."""
     training = averaged(name, more)
-    (path,) = training.kept.glob("*.ckpt")
-    state = torch.load(path, weights_only=True)["pipeline"]["_extra_state"]["parameter_mean"]
+    _, content = read_latest(training.kept)
+    state = content["training"]["parameter_mean"]
     assert state["count"] == 2  # steps 6 and 7
     words = {"--average-steps": 6, "--load-dir": training.kept}
-    rest = trained(command_line("nrfgs", tiny_scene, tmp_path, 4, CALM, words, more))
+    rest = trained(command_line("nrfgs", tiny_scene, tmp_path, 12, CALM, words, more))
     one, other = checkpoint_of(training.config), checkpoint_of(rest)
     assert one["step"] == 11
     assert_same_training(one, other, rtol=0, atol=0)
@@ -285,9 +286,9 @@ def test_checkpoints_with_and_without_a_mean_load(averaged, tiny_scene, tmp_path
     assert step == 7
     assert_close(pipeline.model.means.detach(), training.after[7]["gauss_params.means"], rtol=0, atol=0)
     loaded = set_up(tiny_scene, tmp_path, {"--load-dir": training.kept})
-    assert loaded._start_step == 8 and loaded.pipeline.parameter_mean is loaded.pipeline.loaded_mean is None
-    loaded = set_up(tiny_scene, tmp_path, {"--load-dir": models_of(training.config), "--average-steps": 6})
-    assert loaded._start_step == 12 and loaded.pipeline.parameter_mean.count == 0
+    assert loaded._start_step == 8 and loaded.mean is None
+    loaded = set_up(tiny_scene, tmp_path, {"--load-dir": models_of(training.config), "--average-steps": 6}, steps=13)
+    assert loaded._start_step == 12 and loaded.mean.count == 0
 
 
 def test_averaging_changes_no_step(averaged, tiny_scene, tmp_path):
@@ -300,7 +301,7 @@ def test_averaging_changes_no_step(averaged, tiny_scene, tmp_path):
     with_it = checkpoint_of(training.config)
     with_it["pipeline"] = plain["pipeline"]
     assert_same_training(plain, with_it, rtol=0, atol=0)
-    assert set(plain["pipeline"]["_extra_state"]) == {"torch_rng", "cuda_rng", "python_rng", "sampling"}
+    assert set(plain["training"]) == {"scene", "options"}
 
 
 class Seconds(TimedPace):
@@ -316,23 +317,17 @@ class Seconds(TimedPace):
 
 
 def test_a_timed_training_is_averaged(tiny_scene, tmp_path, monkeypatch):
-    """20 steps, of which the pace sees one less to come than there is: its last position is the last step's. Going on
-    from there is over at once, has nothing to average and says so."""
+    """20 steps, of which the pace sees one less to come than there is: its last position is the last step's."""
     monkeypatch.setattr("nrfgs_ns.training.trainer.TimedPace", Seconds)
     timed = {"--average-steps": 5, "--time-budget": 20.0 / 60.0}
     with CONSOLE.capture() as log:
         config = trained(command_line("nrfgs", tiny_scene, tmp_path / "a", 400, CALM, timed))
     assert checkpoint_of(config)["step"] == 19 and "over the last 6 steps." in log.get()
-    again = {"--load-dir": models_of(config)}
-    with CONSOLE.capture() as log:
-        rest = trained(command_line("nrfgs", tiny_scene, tmp_path / "b", 400, CALM, timed, again))
-    assert "nothing was averaged: no step was made" in log.get()
-    assert_same_training(checkpoint_of(config), checkpoint_of(rest), rtol=0, atol=0)
 
 
 def test_what_ends_early_stays_the_last_steps(trainer, monkeypatch):
     """Stopped from outside, timed out before its window, or condemned in its last step."""
-    mean, means = trainer.pipeline.parameter_mean, trainer.pipeline.model.means
+    mean, means = trainer.mean, trainer.pipeline.model.means
     monkeypatch.setattr("nrfgs_ns.training.trainer.Trainer._after_train", lambda trainer: None)
 
     def end() -> str:
@@ -350,7 +345,7 @@ def test_what_ends_early_stays_the_last_steps(trainer, monkeypatch):
     trainer.stop_training = False
 
     def condemned():
-        raise TrainingStopped("a number", 9, savable=False)
+        raise TrainingStopped("a number", 9, "gradient", savable=False)
 
     with monkeypatch.context() as patch:
         patch.setattr(trainer.guard, "settle", condemned)

@@ -132,7 +132,7 @@ def test_resumed_training_is_the_unbroken_one(method, finished, tiny_scene, tmp_
     """
     whole = trained(options(tiny_scene, tmp_path / "whole", method, steps=40))
     half = finished(method)
-    rest = trained(options(tiny_scene, tmp_path / "rest", method, {"--load-dir": models_of(half)}, steps=20))
+    rest = trained(options(tiny_scene, tmp_path / "rest", method, {"--load-dir": models_of(half)}, steps=40))
     assert checkpoint_of(rest)["step"] == 39
     counts = [len(checkpoint_of(run)["pipeline"]["_model.gauss_params.means"]) for run in (half, whole)]
     assert counts[0] != counts[1], "nothing was densified in the second half: the test would prove nothing"
@@ -141,7 +141,7 @@ def test_resumed_training_is_the_unbroken_one(method, finished, tiny_scene, tmp_
 
 def test_optimisers_hold_the_loaded_parameters(finished, tiny_scene, tmp_path):
     """The host's way, replacing parameters on load, would leave the optimisers with orphans."""
-    config = parse(options(tiny_scene, tmp_path, "nrfgs", {"--load-dir": models_of(finished("nrfgs"))}))
+    config = parse(options(tiny_scene, tmp_path, "nrfgs", {"--load-dir": models_of(finished("nrfgs"))}, steps=21))
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     for name, parameter in trainer.pipeline.model.gauss_params.items():

@@ -198,12 +198,12 @@ def test_a_stretched_training(tiny_scene, tmp_path):
     whole = trained(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, SH, {"--schedule-steps": 40}))
     _, pipeline, _, step = eval_setup(whole)
     assert step == 19 and pipeline.model.head.active_degree == 3
-    assert pipeline.model.pace.position == 40.0
+    assert pipeline.model.schedule_step == 40
     # 8 training images hold densification back for 8 + 2 steps after the reset at 0: it acts at steps 10, 12 and 14.
     short = train(options(tiny_scene, tmp_path / "short", "nrfgs-sh", 12, SH, {"--schedule-steps": 24}))
     assert short.splats[-1][1] > short.splats[0][1] and short.splats[-1][1] < pipeline.model.num_points
-    state = checkpoint_of(whole)["pipeline"]["_model._extra_state"]
-    assert state["pace"] == {"length": 40, "rate": 2.0, "position": 40.0}
+    state = checkpoint_of(whole)
+    assert state["training"]["pace"] == {"length": 40, "rate": 2.0, "position": 40.0}
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -220,13 +220,13 @@ def test_a_stretched_training_continues_to_the_bit(tiny_scene, tmp_path, monkeyp
     monkeypatch.setattr(NrfgsTrainer, "_write_checkpoint", keep)
     stretched = {"--schedule-steps": 40, "--steps-per-save": 9}
     whole = trained(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, SH, stretched))
-    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 10, SH, stretched, {"--load-dir": kept}))
+    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 20, SH, stretched, {"--load-dir": kept}))
     one, other = checkpoint_of(whole), checkpoint_of(rest)
     assert one["step"] == 19
     assert_same_training(one, other, rtol=0, atol=0)
     assert one["schedulers"] == other["schedulers"]
     with pytest.raises(InputError, match="schedule-steps"):
-        train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 10, SH, {"--load-dir": kept}))
+        train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 20, SH, {"--load-dir": kept}))
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -239,7 +239,7 @@ def test_mcmc_begins_and_ends_with_the_pace(tiny_scene, tmp_path):
 @pytest.mark.usefixtures("no_cuda")
 def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
     """3 s of this process's own time, which other processes cannot lengthen; a step takes some 20 ms, so 10 % is many
-    steps. The checkpoint is named after the last step, going on from it with the same budget is over at once, and with
+    steps. The checkpoint is named after the last step, going on from it with the same budget is refused, and with
     1.2 s more it takes those."""
     import nrfgs_ns.training.trainer
 
@@ -249,12 +249,13 @@ def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
         record = train(options(tiny_scene, tmp_path / name, "nrfgs", 40, CALM, {"--time-budget": minutes}, *more))
         config = Path(record.config_path)
         state = checkpoint_of(config)
-        return record.steps, models_of(config), state["step"], state["pipeline"]["_model._extra_state"]["pace"]
+        return record.steps, models_of(config), state["step"], state["training"]["pace"]
 
     steps, folder, last, pace = run("a", 0.05)
     assert last == steps - 1
     assert pace["position"] > 39 and pace["seconds"] == pytest.approx(3.0, rel=0.1)
-    assert run("b", 0.05, {"--load-dir": folder})[0] == 0
+    with pytest.raises(InputError, match="used its time budget of 0.05 minutes.*A larger --time-budget goes on"):
+        run("b", 0.05, {"--load-dir": folder})
     more, _, end, pace = run("c", 0.07, {"--load-dir": folder})
     assert more > 0 and end == last + more and pace["seconds"] == pytest.approx(4.2, rel=0.1)
 
@@ -283,5 +284,5 @@ def test_bad_options_are_named(option, bad, tiny_scene, tmp_path):
 def test_without_them_there_is_no_pace(tiny_scene, tmp_path):
     trainer = parse(options(tiny_scene, tmp_path, "nrfgs", 5)).setup(local_rank=0, world_size=1)
     trainer.setup()
-    assert trainer.pace is None and trainer.pipeline.model.pace is None and trainer.optimizers.pace is None
+    assert trainer.pace is None and trainer.optimizers.pace is None
     assert trainer.pipeline.model.schedule_step == 0

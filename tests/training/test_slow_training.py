@@ -63,5 +63,5 @@ def test_killed_training_goes_on_from_its_checkpoint(tiny_scene, tmp_path):
     checkpoint = max(tmp_path.rglob("nerfstudio_models/*.ckpt"))
     reached = int(checkpoint.stem.split("-")[1])
     assert reached >= 100
-    record = train(command_line("nrfgs", tiny_scene, tmp_path, 3, usual, {"--load-dir": checkpoint.parent}))
+    record = train(command_line("nrfgs", tiny_scene, tmp_path, reached + 4, usual, {"--load-dir": checkpoint.parent}))
     assert record.splats[-1][0] == reached + 3

@@ -109,6 +109,17 @@ def test_the_network_is_refused_unless_it_is_asked_for(open_viewer, interface, c
     assert "127.0.0.1" in viewer.viewer_info[0] and f"ssh -L {port}:localhost:{port}" in viewer.viewer_info[1]
 
 
+def test_a_busy_port_is_named_with_the_one_instead(open_viewer):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        busy = other.getsockname()[1]
+        viewer = open_viewer(LocalViewerConfig(websocket_port=busy))
+    port = viewer.viser_server.get_port()
+    assert port != busy and f"http://127.0.0.1:{port}" in viewer.viewer_info[0]
+    assert f"Port {busy} is busy; the viewer is at {port}." in viewer.viewer_info
+
+
 def test_the_network_is_served_if_it_is_asked_for(to_all, interface):
     port = to_all.viser_server.get_port()
     status, body = answer(interface, port, "/")

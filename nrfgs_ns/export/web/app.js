@@ -6,10 +6,12 @@ const about = JSON.parse(byId("about").textContent);
 const canvas = byId("scene");
 
 function fail(error) {
-  const message = error instanceof BadFile ? error.message : `Something went wrong: ${error?.message ?? error}`;
+  const told = error instanceof BadFile || error instanceof Lacking;
+  const message = told ? error.message : `Something went wrong: ${error?.message ?? error}.`;
+  const hint = error instanceof BadFile ? " Load the page again, or ask for it again where it came from." : "";
   byId("loading").hidden = true;
   byId("failed").hidden = false;
-  byId("failed").textContent = `${message} Try to load the page again, or ask where it came from.`;
+  byId("failed").textContent = message + hint;
   refuse(error);
 }
 window.addEventListener("error", (event) => fail(event.error ?? event.message));
@@ -162,6 +164,7 @@ function frame(now) {
     const { view, lens, size: pixels } = seenBy(state.camera);
     reader.post({ camera: { view, lens, size: pixels, near: painter.near } });
   }
+  if (measuring) return;
 
   const asked = JSON.stringify([state.frozen ?? [state.camera, size], state.show, state.gain]);
   if (asked !== fieldFor) {
@@ -207,7 +210,10 @@ function paint(resolution) {
 
 let sortedOnce = false;
 
-function sorted(rows) {
+let measuring = false, sortTook = 0;
+
+function sorted({ rows, seconds }) {
+  sortTook = seconds;
   painter.setOrder(rows);
   sorting = false;
   sortedOnce = stale = true;
@@ -352,7 +358,7 @@ function picked(along) {
   const to = { eye, axes: [side, cross(direction, side), direction], distance: along };
   journey = { from: state.camera, to, start: performance.now() - (still.matches ? 700 : 0) };
 }
-canvas.addEventListener("webglcontextlost", () => fail(new BadFile("The graphics device has gone away.")));
+canvas.addEventListener("webglcontextlost", () => fail(new Lacking("The graphics device has gone away. Load the page again.")));
 
 const held = new Set();  // keys that fly
 let flewAt = null;
@@ -502,7 +508,7 @@ function startReader() {
   const handlers = {
     progress: (value) => tell("Unpacking", value),
     failed: (message) => fail(new BadFile(message)),
-    rows: sorted,
+    sorted,
     picked,
   };
   const receive = (message) => {
@@ -543,17 +549,33 @@ window.nrfgs = {
     wake();
   }),
   visit: (index) => visit(index, true),
-  // Seconds of a picture while the camera goes around: field, projection and blending, sorting as it comes.
-  async secondsPerPicture(count) {
-    const start = performance.now();
+  // Seconds for a picture while the camera goes around: the field of all that is seen, projection, blending, on the
+  // GPU until they are done. Splats are sorted beside that, in the worker: the last sorting's seconds.
+  async measure(count) {
+    await ready;
+    measuring = true;
+    let seconds = 0;
     for (let i = 0; i < count; i++) {
       turn(0.02, 0);
-      painter.evaluate({ center: state.camera.eye, camera: seenBy(state.camera), mode: "full", gain: 1 }, 0, painter.rows);
+      const camera = seenBy(state.camera), start = performance.now();
+      painter.evaluate({ center: state.camera.eye, camera, mode: "full", gain: 1 }, 0, painter.rows);
       paint(1);
       painter.finish();
-      if (i % 8 === 7) await new Promise((resolve) => setTimeout(resolve));
+      seconds += (performance.now() - start) / 1000;
+      await new Promise((resolve) => requestAnimationFrame(resolve));
     }
-    return (performance.now() - start) / 1000 / count;
+    measuring = false;
+    fieldFor = null;
+    wake();
+    const info = painter.gl.getExtension("WEBGL_debug_renderer_info");
+    return {
+      seconds_per_picture: seconds / count,
+      seconds_to_sort: sortTook,
+      size: [canvas.width, canvas.height],
+      splats: painter.count,
+      renderer: painter.gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : painter.gl.RENDERER),
+      browser: navigator.userAgent,
+    };
   },
 };
 

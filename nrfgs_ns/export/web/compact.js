@@ -6,8 +6,9 @@ const VERSION = 1;
 const BYTES = { uint8: 1, uint16: 2, uint32: 4, uint64: 8, float16: 2, float32: 4 };
 const LARGEST_STREAM = 2 ** 31;
 
-// A fault of the file, to be shown to a reader.
+// What is said to a reader: a fault of the file, or what a device lacks.
 class BadFile extends Error {}
+class Lacking extends Error {}
 
 // The scene in a file's bytes. `progress` is told the share that is done.
 //   table    Float32Array [N, 16]: mean, logit of opacity; rotation (w, x, y, z); standard deviations, 0; base colour, 0

@@ -105,7 +105,7 @@ class Painter {
     const gl = (this.gl = canvas.getContext("webgl2", {
       alpha: false, antialias: false, depth: false, stencil: false, powerPreference: "high-performance",
     }));
-    if (!gl) throw new BadFile("This browser has no WebGL 2, which the scene is drawn with.");
+    if (!gl) throw new Lacking("This browser has no WebGL 2, which the scene is drawn with.");
     this.canvas = canvas;
     const floats = gl.getExtension("EXT_color_buffer_float"), halfs = gl.getExtension("EXT_color_buffer_half_float");
     this.exact = Boolean(floats || halfs);  // else pictures are blended in 8 bits
@@ -117,7 +117,7 @@ class Painter {
     this.largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.plan = plan(scene.header.head.config, scene.weights);
     if (this.largest < WIDTH || this._height(scene.count, TABLE_TEXELS) > this.largest) {
-      throw new BadFile(`This device's textures are too small for ${scene.count.toLocaleString()} splats.`);
+      throw new Lacking(`This device's textures are too small for ${scene.count.toLocaleString()} splats.`);
     }
 
     gl.bindVertexArray((this.none = gl.createVertexArray()));
@@ -140,7 +140,7 @@ class Painter {
     const { gl, plan } = this;
     const own = ownWeights(plan, scene.weights), view = viewWeights(plan, scene.weights);
     const room = gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
-    if (view.byteLength > room) throw new BadFile(`This device's shaders have no room for ${view.length} weights.`);
+    if (view.byteLength > room) throw new Lacking(`This device's shaders have no room for ${view.length} weights.`);
     const ownTexture = this._texture(gl.RGBA32F, own.width, plan.groups, own.values);
     const latents = this._floats(scene.latents, plan.latentTexels, scene.viewDependent);
     const height = this._height(scene.viewDependent, plan.groups);
@@ -294,7 +294,7 @@ class Painter {
     gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
     if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) {
-      throw new BadFile("This device cannot draw into the textures that the scene needs.");
+      throw new Lacking("This device cannot draw into the textures that the scene needs.");
     }
     return buffer;
   }

@@ -110,8 +110,8 @@ function answer(post) {
       } else if (pick) {
         post({ picked: order.picked(pick) });
       } else {
-        const rows = order.sorted(camera);
-        post({ rows }, [rows.buffer]);
+        const start = performance.now(), rows = order.sorted(camera);
+        post({ sorted: { rows, seconds: (performance.now() - start) / 1000 } }, [rows.buffer]);
       }
     } catch (error) {
       post({ failed: error instanceof BadFile ? error.message : `The scene cannot be read (${error.message}).` });

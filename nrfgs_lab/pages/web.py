@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How fast a browser draws a page of `nrfgs export web`, and whether what it draws is what we draw.
+
+    python -m nrfgs_lab.pages.web PAGE.html RECORD.json --browser "chromium --headless=new ..." --config CONFIG
+
+Any browser that can be started with an address will do. It is given a page of this program's own, from a server on this
+machine, which holds PAGE in a frame, waits for it, measures, and sends back what it found and three pictures. Without
+--config it needs nothing but Python's own library.
+"""
+
+import argparse
+import base64
+import http.server
+import json
+import shlex
+import subprocess
+import tempfile
+import threading
+from pathlib import Path
+
+SOFTWARE = "chromium --headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
+"""Without a GPU."""
+PICTURES = 3
+
+OUTER = """<!DOCTYPE html><body style="margin:0"><script>
+const tell = (what) => fetch("done", { method: "POST", body: JSON.stringify(what) });
+const frame = document.createElement("iframe"), start = performance.now();
+Object.assign(frame, { src: "page.html", width: WIDTH, height: HEIGHT, style: "border:0" });
+frame.onload = async () => {
+  const page = frame.contentWindow.nrfgs;
+  try {
+    await page.ready;
+    const loaded = (performance.now() - start) / 1000;
+    const count = frame.contentDocument.getElementById("photograph").length;
+    const pictures = [];
+    for (let k = 0; k < PICTURES; k++) {
+      page.visit(Math.floor((k * count) / PICTURES));
+      await page.finished();
+      pictures.push(page.picture());
+    }
+    const found = await page.measure(COUNT);
+    await tell({ seconds_to_load: loaded, ...found, pictures });
+  } catch (error) {
+    await tell({ failed: `${error} ${frame.contentDocument.getElementById("failed").textContent}` });
+  }
+};
+document.body.append(frame);
+</script>"""
+
+
+def measured(page: Path, browser: list[str], size: tuple[int, int], count: int, patience: float) -> dict:
+    """What a browser says of a page.
+
+    Args:
+        page: the .html file, or the folder of one whose scene lies apart.
+        browser: command and options; a profile's folder and the address are added.
+        size: of the frame, in CSS pixels.
+        count: pictures over which seconds are averaged.
+        patience: seconds after which it is given up.
+
+    Returns:
+        `nrfgs.measure`'s answer, "seconds_to_load", and "pictures", PNG bytes of some photographs' places.
+
+    Raises:
+        RuntimeError: the page failed, or said nothing.
+    """
+    folder, name = (page, "index.html") if page.is_dir() else (page.parent, page.name)
+    outer = OUTER.replace("WIDTH", str(size[0])).replace("HEIGHT", str(size[1])).replace("COUNT", str(count))
+    outer = outer.replace("PICTURES", str(PICTURES))
+    answers: list[dict] = []
+    there = threading.Event()
+
+    class Host(http.server.SimpleHTTPRequestHandler):
+        def __init__(self, *args):
+            super().__init__(*args, directory=str(folder))
+
+        def log_message(self, *_):
+            pass
+
+        def do_GET(self):
+            if self.path == "/page.html":
+                self.path = "/" + name
+            if self.path != "/outer":
+                return super().do_GET()
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(outer.encode())
+
+        def do_POST(self):
+            answers.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+            there.set()
+
+    with (
+        http.server.ThreadingHTTPServer(("127.0.0.1", 0), Host) as server,
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+    ):
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        own = ["--profile", profile] if "firefox" in browser[0] else [f"--user-data-dir={profile}"]
+        command = [*browser, *own, f"http://127.0.0.1:{server.server_port}/outer"]
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        try:
+            there.wait(patience)
+        finally:
+            process.terminate()
+            process.wait()
+            server.shutdown()
+    if not answers or "failed" in answers[0]:
+        raise RuntimeError(answers[0]["failed"] if answers else f"no answer within {patience:g} seconds")
+    answer = answers[0]
+    answer["pictures"] = [base64.b64decode(picture.split(",")[1]) for picture in answer["pictures"]]
+    return answer
+
+
+def alike(page: Path, config: Path, browser: list[str], patience: float) -> list[float]:
+    """PSNR, dB, of a page's pictures of some photographs' places against a model's.
+
+    Args:
+        config: config.yml of the model: the training's, or the one that `nrfgs export compact` writes for what is in
+            the page.
+    """
+    import io
+
+    import numpy as np
+    import torch
+    from PIL import Image
+
+    from nrfgs_ns.export.loading import load_model
+    from nrfgs_ns.image.metrics import psnr
+
+    pipeline = load_model(config, "test")
+    cameras = pipeline.datamanager.train_dataset.cameras
+    if not len(cameras):
+        raise RuntimeError(f"{config}: no training views")
+    size = int(cameras.width[0]), int(cameras.height[0])
+    scores = []
+    for k, picture in enumerate(measured(page, browser, size, 1, patience)["pictures"]):
+        place = k * len(cameras) // PICTURES
+        pixels = torch.from_numpy(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")) / np.float32(255))
+        expected = pipeline.model.get_outputs_for_camera(cameras[place : place + 1])["rgb"].cpu()
+        scores.append(psnr(pixels, expected))
+    return scores
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("page", type=Path, help="what nrfgs export web has written")
+    parser.add_argument("record", type=Path, help="JSON to write; the pictures go beside it")
+    parser.add_argument("--browser", default=SOFTWARE, help="command that opens an address")
+    parser.add_argument("--config", type=Path, help="compare the page's pictures with those of this model")
+    parser.add_argument("--size", type=int, nargs=2, default=(1920, 1080), help="width and height, pixels")
+    parser.add_argument("--count", type=int, default=50, help="pictures over which seconds are averaged")
+    parser.add_argument("--patience", type=float, default=300, help="seconds")
+    options = parser.parse_args()
+    browser = shlex.split(options.browser)
+    found = measured(options.page, browser, options.size, options.count, options.patience)
+    options.record.parent.mkdir(parents=True, exist_ok=True)
+    for k, picture in enumerate(found.pop("pictures")):
+        options.record.with_name(f"{options.record.stem}-{k}.png").write_bytes(picture)
+    files = [options.page] if options.page.is_file() else list(options.page.iterdir())
+    found["bytes"] = sum(file.stat().st_size for file in files)
+    if options.config:
+        found["psnr"] = alike(options.page, options.config, browser, options.patience)
+    options.record.write_text(json.dumps(found, indent=1) + "\n")
+    print(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splats in another coordinate frame: means, rotations, scales, and harmonics, which turn with them."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nrfgs_ns.appearance.spherical_harmonics import sh_bases
+from nrfgs_ns.data.world import CaptureFrame
+from nrfgs_ns.model.harmonics_fit import PlainSplats
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x -> scale rotation x + translation, in float64."""
+
+    rotation: Tensor
+    """[3, 3]"""
+    scale: float
+    """> 0"""
+    translation: Tensor
+    """[3]"""
+
+    @property
+    def inverse(self) -> "Similarity":
+        if self is NOWHERE:
+            return self
+        back = self.rotation.T / self.scale
+        return Similarity(self.rotation.T, 1.0 / self.scale, -back @ self.translation)
+
+    def moved(self, splats: PlainSplats) -> PlainSplats:
+        """The splats, seen from a camera that moves with them, look the same."""
+        if self is NOWHERE:  # to the bit
+            return splats
+        rotation = self.rotation.to(splats.means.device)
+        means = self.scale * splats.means.double() @ rotation.T + self.translation.to(rotation)
+        return splats._replace(
+            means=means.to(splats.means.dtype),
+            quats=torch.nn.functional.normalize(_product(_quaternion(rotation), splats.quats.double()), dim=-1).to(
+                splats.quats.dtype
+            ),
+            scales=splats.scales + torch.tensor(self.scale).log().item(),
+            features_rest=torch.einsum(
+                "ab,nbc->nac", _turned_harmonics(rotation).to(splats.features_rest), splats.features_rest
+            ),
+        )
+
+
+def turn(*rows: tuple[float, float, float]) -> Similarity:
+    """A rotation about the origin by the rows of its matrix."""
+    return Similarity(torch.tensor(rows, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64))
+
+
+NOWHERE = turn((1, 0, 0), (0, 1, 0), (0, 0, 1))
+"""Stays where it is."""
+Y_DOWN = turn((1, 0, 0), (0, 0, -1), (0, 1, 0))
+"""From nerfstudio's world, whose z points up, to that of 3DGS's viewers, whose y points down."""
+
+
+def to_capture(frame: CaptureFrame) -> Similarity:
+    """From the training's world to the capture's own, less `frame.origin`."""
+    rotation = torch.from_numpy(frame.rotation).T
+    translation = -rotation @ torch.from_numpy(frame.translation) - torch.from_numpy(frame.origin)
+    return Similarity(rotation, 1.0 / frame.scale, translation)
+
+
+def _turned_harmonics(rotation: Tensor) -> Tensor:
+    """What a rotation makes of the 15 coefficients of degree 1 to 3, [15, 15] in float64.
+
+    A turned function f'(d) = f(R^T d) has the coefficients k' with B(d) k' = B(R^T d) k for all d. Each degree stays
+    among itself; 64 directions determine it, and the system has no error but rounding's.
+    """
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(64, 3, dtype=torch.float64, generator=generator).to(rotation.device)
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    bases, turned = sh_bases(3, directions), sh_bases(3, directions @ rotation)  # rows d^T R are (R^T d)^T
+    return torch.linalg.lstsq(bases, turned).solution[1:, 1:]
+
+
+def _quaternion(rotation: Tensor) -> Tensor:
+    """Unit quaternion (w, x, y, z) of a rotation matrix: the eigenvector of Bar-Itzhack's matrix (2000), [4]."""
+    r = rotation
+    k = torch.stack(
+        [
+            torch.stack([r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]),
+            torch.stack([r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]]),
+            torch.stack([r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]]),
+            torch.stack([r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1]]),
+        ]
+    )
+    return torch.linalg.eigh(k).eigenvectors[:, -1]
+
+
+def _product(one: Tensor, others: Tensor) -> Tensor:
+    """Hamilton products of a quaternion [4] with others [N, 4]."""
+    w, v = one[0], one[1:]
+    scalar = w * others[:, :1] - (others[:, 1:] * v).sum(-1, keepdim=True)
+    vector = w * others[:, 1:] + others[:, :1] * v + torch.linalg.cross(v.expand_as(others[:, 1:]), others[:, 1:])
+    return torch.cat([scalar, vector], dim=-1)

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoint files: written whole or not at all, and read only if they are what was written.
+
+torch's files are zip archives that carry a CRC of each record, which torch itself does not look at: a flipped bit is
+loaded as another model. Here every byte is checked first, which takes 0.3 s for 500 MB. Nerfstudio's own commands read
+the file without; for them the pipeline's part carries a checksum of its own (`seal`, `check_seal`).
+"""
+
+import os
+import re
+import secrets
+import shutil
+import time
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nrfgs_ns.data.checks import warn
+from nrfgs_ns.errors import ForTheUser, InputError
+
+NAME = re.compile(r"step-(\d{9,})\.ckpt")
+"""What checkpoints are called; other files in their folder are not looked at."""
+KEPT = 2
+"""Checkpoints that stay: should the last one be damaged, there is the one before."""
+ABANDONED = 3600.0
+"""Seconds after which a file that was being written is taken for that of a process that was killed."""
+
+
+class DiskFull(ForTheUser, RuntimeError):
+    """A checkpoint found no room. The message says what was kept."""
+
+
+class Damaged(ValueError):
+    """A file is not the checkpoint that was written."""
+
+
+def allow_nerfstudio_checkpoints() -> None:
+    """Let `torch.load(weights_only=True)` read nerfstudio's checkpoints.
+
+    They hold the learning-rate schedulers' state, in which learning rates are numpy scalars. These three types are
+    plain data; nothing that could run code is allowed.
+    """
+    scalar = np._core.multiarray.scalar if hasattr(np, "_core") else np.core.multiarray.scalar
+    torch.serialization.add_safe_globals(
+        [scalar, (scalar, "numpy.core.multiarray.scalar"), np.dtype, np.dtypes.Float64DType]
+    )
+
+
+def find(folder: Path) -> dict[int, Path]:
+    """Checkpoints in a folder by step, the newest first; none if there is no such folder."""
+    files = folder.iterdir() if folder.is_dir() else ()
+    found = {int(match[1]): file for file in files if (match := NAME.fullmatch(file.name))}
+    return dict(sorted(found.items(), reverse=True))
+
+
+def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = True) -> Path:
+    """Write a checkpoint beside its folder, move it there when it is on the disk, then let go of older ones.
+
+    Args:
+        folder: of the checkpoints; made if it is not there.
+        step: that the file is named after.
+        content: numbers, strings, tensors, and lists, tuples and dictionaries of them.
+        only_latest: remove all but the last `KEPT`.
+
+    Raises:
+        DiskFull: there was no room.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    final = folder / f"step-{step:09d}.ckpt"
+    remove_abandoned(folder)
+    # Beside the folder: nerfstudio's commands take every file within for a checkpoint.
+    aside = folder.with_name(f"{folder.name}.{secrets.token_hex(8)}.writing")
+    try:
+        torch.save(content, aside)
+        _to_disk(aside)
+        os.replace(aside, final)
+        _to_disk(folder)
+    except (OSError, RuntimeError) as error:  # torch says RuntimeError, and not why
+        aside.unlink(missing_ok=True)
+        needed, free = _bytes_in(content), shutil.disk_usage(folder).free
+        if free < 1.01 * needed + 2**20:
+            raise DiskFull(_no_room(folder, step, needed, free)) from error
+        raise
+    finally:
+        aside.unlink(missing_ok=True)
+    if only_latest:
+        for older in list(find(folder).values())[KEPT:]:
+            older.unlink(missing_ok=True)
+    return final
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove what processes that were killed had begun to write."""
+    for aside in folder.parent.glob(f"{folder.name}.*.writing"):
+        try:
+            if time.time() - aside.stat().st_mtime > ABANDONED:
+                aside.unlink()
+        except OSError:  # another process was faster, or it is not ours
+            pass
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read a checkpoint, tensors in host memory, if every byte is as it was written.
+
+    Raises:
+        Damaged: it is not.
+        FileNotFoundError: there is none.
+    """
+    allow_nerfstudio_checkpoints()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            bad = archive.testzip()
+        if bad is not None:
+            raise Damaged(f"the checksum of its record {bad} is wrong")
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise
+    except Damaged:
+        raise
+    except Exception as error:  # whatever damage makes of a zip archive and of a pickle within
+        raise Damaged(str(error).splitlines()[0][:200] if str(error) else type(error).__name__) from error
+    if not isinstance(content, dict) or not {"step", "pipeline"} <= content.keys():
+        raise Damaged("it is not a checkpoint of nerfstudio")
+    return content
+
+
+def read_or_refuse(path: Path) -> dict[str, Any]:
+    """As `read`.
+
+    Raises:
+        InputError: there is no such file, or it is damaged.
+    """
+    try:
+        return read(path)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file. Check the path that --load-checkpoint names.") from error
+    except Damaged as damage:
+        raise InputError(f"{path} is damaged: {damage}. Restore it from a copy, or take an older one.") from damage
+
+
+def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, Any]]:
+    """Read a folder's last checkpoint; where that is damaged the one before, with a warning.
+
+    Args:
+        folder: of the checkpoints.
+        step: read this one and no other.
+
+    Raises:
+        InputError: there is none, or none that can be read.
+    """
+    found = checkpoints_in(folder)
+    if step is not None:
+        if step not in found:
+            raise InputError(f"{folder} has no checkpoint of step {step}, only of {', '.join(map(str, found))}.")
+        found = {step: found[step]}
+    damages = []
+    for path in found.values():
+        try:
+            content = read(path)
+        except Damaged as damage:
+            damages.append(f"{path} is damaged: {damage}.")
+            continue
+        if damages:
+            warn(f"{' '.join(damages)} Taking the one before, {path.name}.")
+        return path, content
+    raise InputError(f"{' '.join(damages)} Restore it from a copy, or train anew.")
+
+
+def checkpoints_in(folder: Path) -> dict[int, Path]:
+    """As `find`.
+
+    Raises:
+        InputError: there are none.
+    """
+    found = find(folder)
+    if found:
+        return found
+    within = next((inner.parent for inner in sorted(folder.glob("*/step-*.ckpt"))), None)
+    mend = (
+        f"They are in {within}."
+        if within
+        else "Give the folder nerfstudio_models of a training, beside its config.yml."
+    )
+    what = "holds no checkpoints (step-*.ckpt)" if folder.is_dir() else "is no folder"
+    raise InputError(f"{folder} {what}. {mend}")
+
+
+def seal(pipeline: dict[str, Any], step: int) -> None:
+    """Give the pipeline's part of a checkpoint a checksum of itself."""
+    pipeline["_extra_state"] = {**pipeline["_extra_state"], "checksum": _checksum(pipeline, step)}
+
+
+def check_seal(pipeline: Mapping[str, Any], step: int) -> None:
+    """Raise InputError where the pipeline's part of a checkpoint is not as it was written. Unsealed ones pass."""
+    written = pipeline.get("_extra_state", {}).get("checksum")
+    if written is not None and written != _checksum(pipeline, step):
+        raise InputError(
+            f"The checkpoint of step {step} is damaged: its checksum is wrong. Remove it, so that the one before is "
+            "taken, or restore it from a copy."
+        )
+
+
+def _checksum(pipeline: Mapping[str, Any], step: int) -> int:
+    """CRC32 of everything but the checksum itself."""
+    value = zlib.crc32(str(step).encode())
+    for path, leaf in _leaves(pipeline):
+        if path == "/_extra_state/checksum":
+            continue
+        if isinstance(leaf, Tensor):
+            data = leaf.detach().cpu().contiguous()
+            value = zlib.crc32(f"{path} {data.dtype} {list(data.shape)}".encode(), value)
+            value = zlib.crc32(data.reshape(-1).view(torch.uint8).numpy(), value) if data.numel() else value
+        else:
+            value = zlib.crc32(f"{path} {leaf!r}".encode(), value)
+    return value
+
+
+def _leaves(tree: Any, path: str = "") -> list[tuple[str, Any]]:
+    """What a tree of dictionaries, lists and tuples holds, with its place."""
+    if isinstance(tree, Mapping):
+        return [leaf for key, value in tree.items() for leaf in _leaves(value, f"{path}/{key}")]
+    if isinstance(tree, (list, tuple)) and any(isinstance(value, (Tensor, Mapping, list, tuple)) for value in tree):
+        return [leaf for key, value in enumerate(tree) for leaf in _leaves(value, f"{path}/{key}")]
+    return [(path, tree)]
+
+
+def _bytes_in(content: Any) -> int:
+    return sum(leaf.nbytes for _, leaf in _leaves(content) if isinstance(leaf, Tensor))
+
+
+def _no_room(folder: Path, step: int, needed: int, free: int) -> str:
+    kept = next(iter(find(folder).values()), None)
+    return (
+        f"The disk of {folder} is full: the checkpoint of step {step} takes {needed / 1e6:,.0f} MB, and "
+        f"{free / 1e6:,.0f} MB are free. {f'Kept: {kept}.' if kept else 'None has been written before.'} Make room."
+    )
+
+
+def _to_disk(path: Path) -> None:
+    """Have the system write a file, or a folder's list of files, to the disk now."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An evaluation's numbers as a table, and which test views are far below the rest."""
+
+from collections.abc import Mapping, Sequence
+from statistics import median, quantiles
+from typing import Any
+
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.table import Table
+
+SHOWN = ("psnr", "ssim", "ms_ssim", "lpips", "l1", "seconds_per_image", "splats")
+ENOUGH = 5
+"""Fewer views have no "rest" to be below."""
+BELOW = 3.0
+"""A view is far below the rest if its PSNR is, by this many dB, below the median, and below Tukey's fence: the lower
+quartile less one and a half times the distance between the quartiles (Exploratory Data Analysis, 1977)."""
+
+
+def print_evaluation(result: Mapping[str, Any]) -> None:
+    """Show the means over the test views, and name the views that are far below the rest.
+
+    Args:
+        result: as of `NrfgsPipeline.get_average_eval_image_metrics`, with "per_image".
+    """
+    names = [name for name in SHOWN if result.get(name) is not None]
+    table = Table(title=f"Means over {len(result['per_image'])} test views", title_justify="left")
+    for name in names:
+        table.add_column(name, justify="right")
+    table.add_row(*(f"{result[name]:,}" if name == "splats" else f"{result[name]:.4g}" for name in names))
+    CONSOLE.print(table)
+    for name, value, middle in far_below(result["per_image"]):
+        CONSOLE.print(
+            f"{name}: {value:.1f} dB, {middle - value:.1f} below the median view. Look at its picture "
+            "(--render-output-path): its pose may be wrong, or it shows what no training view does.",
+            style="bold yellow",
+            markup=False,
+            soft_wrap=True,
+        )
+
+
+def far_below(images: Sequence[Mapping[str, Any]]) -> list[tuple[str, float, float]]:
+    """Views whose PSNR is far below that of the rest, the worst first.
+
+    Args:
+        images: "image" and "psnr" of each view.
+
+    Returns:
+        name, PSNR and the median of all, for each.
+    """
+    values = [image["psnr"] for image in images if image.get("psnr") is not None]
+    if len(values) < ENOUGH:
+        return []
+    lower, middle, upper = quantiles(values, n=4, method="inclusive")
+    fence = min(median(values) - BELOW, lower - 1.5 * (upper - lower))
+    bad = [(image["psnr"], image["image"]) for image in images if image.get("psnr") is not None]
+    return [(name, value, middle) for value, name in sorted(bad) if value < fence]

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a checkpoint says of its training, so that no other one goes on from it: on which data set, with which options.
+
+Options are of two kinds. Some say what the stored numbers mean (the head's, where the world's centre is, how splats
+come and go): with others the same numbers are another model, and the checkpoint is refused. The rest say how learning
+goes on (learning rates, thresholds, steps): they may change, and are named when they do.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from nrfgs_ns.data.checks import some
+from nrfgs_ns.errors import InputError
+
+MEANING = (
+    "pipeline.model.appearance",
+    "pipeline.model.densification",
+    "pipeline.model.camera_optimizer.mode",
+    "pipeline.model.rasterize_mode",
+    "pipeline.model.use_bilateral_grid",
+    "pipeline.datamanager.dataparser",
+    "pipeline.datamanager.camera_res_scale_factor",
+)
+"""Options, or groups of them, that say what the numbers mean."""
+NEUTRAL = (
+    "pipeline._target",
+    "pipeline.model._target",
+    "pipeline.model.appearance.implementation",
+    "pipeline.datamanager._target",
+    "pipeline.datamanager.data",
+    "pipeline.datamanager.dataparser.data",
+    "pipeline.datamanager.dataparser.colmap_path",
+    "pipeline.datamanager.dataparser.images_path",
+    "pipeline.datamanager.cache_images",
+    "pipeline.datamanager.images_on_gpu",
+    "pipeline.datamanager.masks_on_gpu",
+    "pipeline.compact",
+    "pipeline.sharding",
+)
+"""Those that change no number, or that are compared by what they lead to."""
+FAR = 0.01
+"""Distance between the same camera's centres, as a share of the cameras' extent, from which on it is another one."""
+
+
+def options_of(config: Any) -> dict[str, str]:
+    """Every option of a training that its numbers may depend on.
+
+    Args:
+        config: an NrfgsTrainerConfig.
+    """
+    parts = {"pipeline": config.pipeline, "optimizers": config.optimizers}
+    steps = ("schedule_steps", "time_budget", "average_steps", "max_num_iterations", "gradient_accumulation_steps")
+    parts |= {name: getattr(config, name) for name in steps}
+    found = dict(leaf for name, part in parts.items() for leaf in _leaves(part, name))
+    return {name: value for name, value in found.items() if not _is_among(name, NEUTRAL)}
+
+
+def scene_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
+    """What tells a data set from others.
+
+    Args:
+        names: of the training images' files, without folders.
+        cameras: theirs, [V].
+    """
+    return {"images": names, "centers": cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()}
+
+
+def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: object) -> None:
+    """Raise InputError where a checkpoint was trained on another data set.
+
+    Args:
+        written, here: of `scene_of`.
+        data: how the data set is called.
+    """
+    mend = "Go on with the data set that it was trained on, or train anew."
+    gone, new = ([name for name in a if name not in b] for a, b in _pairs(written["images"], here["images"]))
+    if gone or new or len(written["images"]) != len(here["images"]):
+        what = "; ".join(
+            [f"it had {some(gone)}, which are not training images here"] * bool(gone)
+            + [f"it did not have {some(new)}"] * bool(new)
+        )
+        counts = f"{len(written['images'])} training images, there are {len(here['images'])}"
+        raise InputError(f"{data}: the checkpoint was trained on other images ({what or counts}). {mend}")
+    centers, now = written["centers"].double(), here["centers"].double()
+    extent = float((centers.amax(0) - centers.amin(0)).max())
+    moved = (centers - now).norm(dim=1) > FAR * max(extent, 1e-12)
+    if bool(moved.any()):
+        which = some([here["images"][i] for i in moved.nonzero().flatten().tolist()])
+        raise InputError(f"{data}: the checkpoint was trained on other poses ({which} elsewhere). {mend}")
+
+
+def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
+    """Compare a checkpoint's options with this training's. Options that one of the versions lacks are let be.
+
+    Args:
+        written, here: of `options_of`.
+
+    Returns:
+        Those that changed and may, as "name: old -> new".
+
+    Raises:
+        InputError: one changed that says what the stored numbers mean.
+    """
+    changed = [name for name in written if name in here and written[name] != here[name]]
+    meant = [name for name in changed if _is_among(name, MEANING)]
+    if meant:
+        was = "; ".join(f"{_typed(name)} was {written[name]} and is {here[name]}" for name in meant[:3])
+        raise InputError(
+            f"The checkpoint's training had other options, without which its numbers mean something else: {was}. "
+            "Give the same ones, or train anew."
+        )
+    return [f"{_typed(name)} {written[name]} -> {here[name]}" for name in changed]
+
+
+def _typed(name: str) -> str:
+    """An option as it is typed."""
+    return "--" + name.replace("_", "-")
+
+
+def _is_among(name: str, groups: tuple[str, ...]) -> bool:
+    return any(name == group or name.startswith(f"{group}.") for group in groups)
+
+
+def _pairs(one: Any, other: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    return (one, other), (other, one)
+
+
+def _leaves(value: Any, name: str) -> Iterator[tuple[str, str]]:
+    """Options of a configuration with their values as text; classes by their name."""
+    if is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            if not (field.name.startswith("_") and field.name != "_target"):
+                yield from _leaves(getattr(value, field.name), f"{name}.{field.name}")
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _leaves(inner, f"{name}.{key}")
+    elif isinstance(value, type):
+        yield name, value.__name__
+    elif not isinstance(value, (Tensor, torch.nn.Module)):
+        yield name, repr(value) if not isinstance(value, str) else value

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a training ends before its last step: signals, memory that ran out, and what is said in the end.
+
+A first Ctrl-C, SIGTERM or SIGHUP (a terminal that was closed) lets the step that is under way end, evaluation included,
+so that the state on disk is that of an unbroken training. A second Ctrl-C ends the process at once.
+"""
+
+import os
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+PATIENCE = 0.5
+"""Seconds within which a second Ctrl-C is the first one, heard twice: from the terminal and from a parent process."""
+TO_LOAD = ("--load-dir", "--load-checkpoint", "--load-step")
+"""Options of `ns-train` that say what it goes on from."""
+
+
+class StopRequest:
+    """What signals have asked for.
+
+    Args:
+        quiet: say nothing on the terminal: another process does.
+
+    Attributes:
+        signal: the first that was heard; None: the training goes on.
+        is_over: whether the training has ended, so that signals end the process as usual.
+    """
+
+    def __init__(self, quiet: bool = False):
+        self.quiet = quiet
+        self.signal: signal.Signals | None = None
+        self.is_over = False
+        self._heard_at = 0.0
+
+    def hear(self, number: int, frame: object = None) -> None:
+        """A signal has come. Called between two of Python's instructions, in the main thread."""
+        if self.is_over:
+            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+        if self.signal is None:
+            self.signal, self._heard_at = signal.Signals(number), monotonic()
+            if self.signal.name == "SIGHUP":
+                _let_go_of_terminal()
+            elif not self.quiet:
+                _say("Stopping when this step is done. Ctrl-C again stops at once, and saves nothing.")
+        elif number == signal.SIGINT and monotonic() - self._heard_at > PATIENCE:
+            _say("Stopped at once; what was not saved yet is lost.")
+            os._exit(128 + number)
+
+    @property
+    def exit_status(self) -> int:
+        """As a shell reports the end of a process by a signal: 130 for SIGINT, 143 for SIGTERM."""
+        return 0 if self.signal is None else 128 + self.signal
+
+
+@contextmanager
+def heard_signals(request: StopRequest) -> Iterator[None]:
+    """Let signals make a request instead of ending the process. Those that are ignored (`nohup`) stay so.
+
+    Only the main thread can do that; in another one nothing changes.
+    """
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {one: signal.getsignal(one) for one in SIGNALS}
+        before = {one: handler for one, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    for one in before:
+        signal.signal(one, request.hear)
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether the memory of a GPU or of the host has run out."""
+    if isinstance(error, (torch.OutOfMemoryError, MemoryError)):
+        return True
+    # What torch's allocator of host memory raises is known by its words alone.
+    return isinstance(error, RuntimeError) and "DefaultCPUAllocator: " in str(error)
+
+
+def rows_agree(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], counted: Iterable[object]) -> bool:
+    """Whether a state that was interrupted anywhere is one: each splat has a row in every tensor.
+
+    Args:
+        splats: the table.
+        optimizers: by group; those of `splats` among them.
+        counted: densification's statistics; tensors with a row for each splat, or others.
+    """
+    counts = {len(value) for value in splats.values()}
+    counts |= {len(value) for value in counted if isinstance(value, Tensor) and value.dim() > 0}
+    held = [(parameter, optimizers[name]) for name, parameter in splats.items()]
+    same = all(optimizer.param_groups[0]["params"][0] is parameter for parameter, optimizer in held)
+    moments = [
+        value.shape == parameter.shape
+        for parameter, optimizer in held
+        for value in optimizer.state.get(parameter, {}).values()
+        if isinstance(value, Tensor) and value.dim() > 0
+    ]
+    return len(counts) == 1 and same and all(moments)
+
+
+def command_to_go_on(folder: Path, method: str) -> str:
+    """The command that goes on from a folder's last checkpoint: this process's own, if it is `ns-train`'s.
+
+    Args:
+        folder: of the checkpoints.
+        method: the registered method's name.
+    """
+    words, load = sys.argv[1:], ["--load-dir", str(folder)]
+    program = "ns-train" if Path(sys.argv[0]).name != "launch.py" else "python -m nrfgs_ns.distributed.launch"
+    if words[:1] != [method]:  # a program of another kind
+        return f"{program} {shlex.join([method])} ... {shlex.join(load)}"
+    rest = iter(words[1:])
+    kept = []
+    for word in rest:
+        option, has_value, _ = word.partition("=")
+        if option.replace("_", "-") in TO_LOAD:
+            None if has_value else next(rest, None)
+        else:
+            kept.append(word)
+    return f"{program} {shlex.join([method, *load, *kept])}"
+
+
+def _say(line: str) -> None:
+    """Write a line to the terminal from within a signal's handler, where print may not be called."""
+    try:
+        os.write(2, f"\n{line}\n".encode())
+    except OSError:
+        pass
+
+
+def _let_go_of_terminal() -> None:
+    """Let what is still printed go nowhere: writing to a terminal that is gone is an error."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nowhere, stream)
+    os.close(nowhere)

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How trainings end before their last step, and that they go on from there to the parameters of the unbroken one."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.training import checkpoint_files
+from nrfgs_ns.training.checkpoint_files import DiskFull, find
+from nrfgs_ns.training.guard import TrainingStopped
+from nrfgs_ns.training.run import _set_random_seed, parse
+from nrfgs_ns.training.trainer import NrfgsTrainer, writer
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+STEPS = 12
+BUSY = {
+    "--pipeline.model.warmup-length": 2,
+    "--pipeline.model.refine-every": 4,
+    "--pipeline.model.reset-alpha-every": 100,
+    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.num-downscales": 0,
+    "--steps-per-eval-image": 5,
+    "--steps-per-eval-all-images": 5,
+    "--average-steps": 4,
+}
+"""Refinements at every 4th step, evaluations that draw random numbers, and a mean over the last steps."""
+
+
+def ready(scene: Path, out: Path, *more: dict, steps: int = STEPS) -> NrfgsTrainer:
+    """A trainer before its first step, with the seed that ns-train sets."""
+    config = parse(command_line("nrfgs", scene, out, steps, BUSY, *more))
+    config.save_config()
+    _set_random_seed(config.machine.seed)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+def at_step(trainer: NrfgsTrainer, step: int, then) -> None:
+    """Call `then` in the middle of a step."""
+    original = trainer.pipeline.get_train_loss_dict
+
+    def spoilt(step_now: int = -1, **named):
+        if (named.get("step", step_now)) == step:
+            then()
+        return original(step=named.get("step", step_now))
+
+    trainer.pipeline.get_train_loss_dict = spoilt
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_scene, tmp_path_factory) -> dict:
+    """The checkpoint of the unbroken training."""
+    return checkpoint_of(trained(command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("whole"), STEPS, BUSY)))
+
+
+@pytest.mark.parametrize(
+    ("number", "step", "status"), [(signal.SIGINT, 0, 130), (signal.SIGTERM, 5, 143), (signal.SIGINT, 9, 130)]
+)
+def test_a_signal_at_any_step_saves_and_the_training_goes_on_to_the_bit(
+    number, step, status, whole, tiny_scene, tmp_path, capsys, monkeypatch
+):
+    """The first step, one after which test images are evaluated, and one within the window of the mean."""
+    monkeypatch.setattr(sys, "argv", ["ns-train", "nrfgs", "--data", "x"])
+    trainer = ready(tiny_scene, tmp_path / "a")
+    at_step(trainer, step, lambda: os.kill(os.getpid(), number))
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        trainer.train()
+    assert ended.value.code == status
+    folder = trainer.checkpoint_dir
+    assert capsys.readouterr().out.splitlines()[-1] == (
+        f"Stopped at step {step}, saved in {folder}; go on with: ns-train nrfgs --load-dir {folder} --data x"
+    )
+    assert list(find(folder)) == [step]
+    rest = trained(command_line("nrfgs", tiny_scene, tmp_path / "b", STEPS, BUSY, {"--load-dir": folder}))
+    assert_same_training(whole, checkpoint_of(rest), rtol=0, atol=0)
+
+
+def test_a_signal_before_the_first_step_saves_nothing(tiny_scene, tmp_path, capsys):
+    trainer = ready(tiny_scene, tmp_path)
+    trainer.request.hear(signal.SIGINT)
+    with pytest.raises(SystemExit) as ended:
+        trainer.train()
+    assert ended.value.code == 130 and not find(trainer.checkpoint_dir)
+    assert capsys.readouterr().out.endswith("Stopped before the first step; there is nothing to save.\n")
+
+
+def test_ctrl_c_while_images_are_read_is_one_line(tiny_scene, tmp_path, capsys, monkeypatch):
+    trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS)).setup(local_rank=0, world_size=1)
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nrfgs_ns.data.datamanager.NrfgsDatamanager.load_all_images", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        trainer.setup()
+    assert ended.value.code == 130 and "Stopped before the first step" in capsys.readouterr().out
+
+
+def test_a_paused_training_hears_signals(tiny_scene, tmp_path):
+    trainer = ready(tiny_scene, tmp_path, {"--start-paused": True})
+    trainer.request.hear(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ended:
+        trainer.train()
+    assert ended.value.code == 143
+
+
+def out_of_memory():
+    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.")
+
+
+def test_memory_that_runs_out_costs_no_step(tiny_scene, tmp_path):
+    trainer = ready(tiny_scene, tmp_path / "a")
+    at_step(trainer, 6, out_of_memory)
+    with pytest.raises(TrainingStopped) as stopped:
+        trainer.train()
+    assert (stopped.value.step, stopped.value.origin, stopped.value.savable) == (6, "memory", True)
+    first, second = str(stopped.value).split("\n")
+    assert first == "Out of memory in step 6: CUDA out of memory. Tried to allocate 2 GiB."
+    assert second.startswith("Step 5 is saved in")
+    assert list(find(trainer.checkpoint_dir)) == [5]
+    again = ready(tiny_scene, tmp_path / "b", {"--load-dir": trainer.checkpoint_dir})
+    again.train()
+    assert max(find(again.checkpoint_dir)) == STEPS - 1
+
+
+def test_memory_that_runs_out_while_splats_are_added_saves_nothing_half_done(tiny_scene, tmp_path):
+    trainer = ready(tiny_scene, tmp_path, {"--steps-per-save": 3})
+    model = trainer.pipeline.model
+
+    def half_done(*_):
+        means = torch.nn.Parameter(torch.cat([model.gauss_params["means"].detach()] * 2))
+        model.gauss_params["means"] = means
+        out_of_memory()
+
+    at_step(trainer, 5, lambda: setattr(model.densification, "post_backward", half_done))
+    with pytest.raises(TrainingStopped, match="added or removed.*The last checkpoint is .*step-000000003.ckpt"):
+        trainer.train()
+    assert list(find(trainer.checkpoint_dir)) == [3]
+
+
+def test_another_failure_saves_too_and_is_raised(tiny_scene, tmp_path, capsys):
+    trainer = ready(tiny_scene, tmp_path)
+
+    def broken():
+        raise BrokenPipeError("the log is gone")
+
+    at_step(trainer, 4, broken)
+    with pytest.raises(BrokenPipeError):
+        trainer.train()
+    assert list(find(trainer.checkpoint_dir)) == [3]
+    assert "The training failed in step 4. Step 3 is saved in" in capsys.readouterr().out
+
+
+def test_a_full_disk_is_survived_until_the_end(tiny_scene, tmp_path, monkeypatch, capsys):
+    trainer = ready(tiny_scene, tmp_path, {"--steps-per-save": 3})
+    original = checkpoint_files.write
+
+    def full(folder, step, *rest):
+        if step > 3:
+            raise DiskFull(f"The disk of {folder} is full.")
+        return original(folder, step, *rest)
+
+    monkeypatch.setattr(checkpoint_files, "write", full)
+    with pytest.raises(DiskFull):
+        trainer.train()
+    said = capsys.readouterr().out
+    assert said.count("is full. The training goes on.") == 2  # steps 6 and 9
+    assert list(find(trainer.checkpoint_dir)) == [3]
+
+
+def test_a_finished_training_says_so_and_how_to_extend_it(whole, tiny_scene, tmp_path):
+    out = tmp_path / "a"
+    folder = models_of(trained(command_line("nrfgs", tiny_scene, out, STEPS, BUSY)))
+    with pytest.raises(InputError, match="is the end of a training of 12 steps: .* --max-num-iterations 24 makes"):
+        ready(tiny_scene, tmp_path / "b", {"--load-dir": folder})
+    longer = ready(tiny_scene, tmp_path / "c", {"--load-dir": folder}, steps=STEPS + 2)
+    assert writer.GLOBAL_BUFFER["max_iter"] == STEPS + 2
+    longer.train()
+    assert max(find(longer.checkpoint_dir)) == STEPS + 1
+
+
+def test_a_folder_without_checkpoints_is_refused_before_the_data_is_read(tmp_path):
+    config = parse(command_line("nrfgs", tmp_path / "nowhere", tmp_path, STEPS, {"--load-dir": tmp_path}))
+    with pytest.raises(InputError, match="holds no checkpoints"):
+        config.setup(local_rank=0, world_size=1)
+
+
+@pytest.mark.parametrize(
+    ("option", "bad"),
+    [
+        ("--max-num-iterations", -1),
+        ("--pipeline.model.warmup-steps", -1),
+        ("--pipeline.datamanager.camera-res-scale-factor", 0),
+    ],
+)
+def test_options_without_sense_are_refused(option, bad, tiny_scene, tmp_path):
+    config = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS, {option: bad}))
+    with pytest.raises(InputError, match=f"{option[2:].replace('-', '_')} is {bad}"):
+        config.setup(local_rank=0, world_size=1)
+
+
+def test_another_scene_and_other_options_are_refused(whole, tiny_scene, tmp_path):
+    from nrfgs_ns.scenes import SceneConfig, write_scene
+
+    folder = models_of(trained(command_line("nrfgs", tiny_scene, tmp_path / "a", 1, BUSY)))
+    other = write_scene(SceneConfig(views=10, width=48, height=36, points=300, samples=1, seed=5), tmp_path / "other")
+    resumed = {"--load-dir": folder}
+    with pytest.raises(InputError, match="trained on other (poses|images)"):
+        ready(other, tmp_path / "b", resumed)
+    with pytest.raises(InputError, match="--pipeline.model.appearance.color-scale was 0.2 and is 0.3"):
+        ready(tiny_scene, tmp_path / "c", resumed, {"--pipeline.model.appearance.color-scale": 0.3})
+
+
+def test_two_trainings_of_one_second_have_a_folder_each(tiny_scene, tmp_path):
+    configs = [parse(command_line("nrfgs", tiny_scene, tmp_path, 1)) for _ in range(3)]
+    for config in configs:
+        config.timestamp = "2026-01-02_030405"
+        config.save_config()
+    names = [config.get_base_dir().name for config in configs]
+    assert names == ["2026-01-02_030405", "2026-01-02_030405_2", "2026-01-02_030405_3"]
+    assert all((config.get_base_dir() / "config.yml").is_file() for config in configs)
+
+
+def test_a_configuration_leads_to_its_data_from_any_folder(tiny_scene, tmp_path, monkeypatch):
+    import yaml
+
+    monkeypatch.chdir(tiny_scene.parent)
+    config = parse(command_line("nrfgs", tiny_scene.name, "out", 1))
+    config.save_config()
+    saved = yaml.load((config.get_base_dir() / "config.yml").read_text(), Loader=yaml.Loader)
+    assert saved.pipeline.datamanager.data == tiny_scene and saved.output_dir == tiny_scene.parent / "out"
+    assert config.output_dir == Path("out"), "the configuration itself stays what it is"
+
+
+def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, capsys):
+    config = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS))
+    capsys.readouterr()
+    config.print_to_terminal()
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == f"nrfgs on {tiny_scene}" and len(said) <= 3
+    if config.machine.device_type == "cpu":
+        assert "No CUDA device" in " ".join(said) and f"--data {tiny_scene}" in said[-1]

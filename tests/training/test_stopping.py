@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What signals ask for, what can be saved, and the command that goes on."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+
+from nrfgs_ns.training import stopping
+from nrfgs_ns.training.stopping import StopRequest, command_to_go_on, heard_signals, is_out_of_memory, rows_agree
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_is_a_request_and_handlers_are_given_back(number, status, capfd):
+    request, before = StopRequest(), signal.getsignal(number)
+    with heard_signals(request):
+        assert request.signal is None and request.exit_status == 0
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), number)  # the same one, heard twice
+        assert request.signal == number and request.exit_status == status
+    assert signal.getsignal(number) is before
+    assert capfd.readouterr().err.count("Stopping when this step is done") == 1
+
+
+def test_what_is_ignored_stays_so():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        request = StopRequest()
+        with heard_signals(request):
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert request.signal is None
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_another_thread_changes_nothing():
+    before, seen = signal.getsignal(signal.SIGINT), []
+
+    def look():
+        with heard_signals(StopRequest()):
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    thread.join()
+    assert seen == [before]
+
+
+SECOND = """
+import os, signal, sys, time
+from nrfgs_ns.training.stopping import StopRequest, heard_signals
+with heard_signals(StopRequest()):
+    os.kill(os.getpid(), signal.SIGINT)
+    print("first", flush=True)
+    time.sleep(0.6)
+    os.kill(os.getpid(), getattr(signal, sys.argv[1]))
+    time.sleep(0.1)
+print("went on", flush=True)
+"""
+
+
+@pytest.mark.parametrize(("second", "status", "went_on"), [("SIGINT", 130, False), ("SIGTERM", 0, True)])
+def test_only_a_second_ctrl_c_stops_at_once(second, status, went_on):
+    run = subprocess.run([sys.executable, "-c", SECOND, second], capture_output=True, text=True, timeout=60)
+    assert run.returncode == status and ("went on" in run.stdout) == went_on
+    assert "first" in run.stdout and "Traceback" not in run.stderr
+
+
+def test_memory_that_ran_out_is_known():
+    assert is_out_of_memory(torch.OutOfMemoryError("CUDA out of memory."))
+    with pytest.raises(RuntimeError) as found:
+        torch.empty(2**60)
+    assert is_out_of_memory(found.value)
+    assert not is_out_of_memory(RuntimeError("size mismatch")) and not is_out_of_memory(KeyboardInterrupt())
+
+
+def table(rows: int):
+    splats = {name: torch.nn.Parameter(torch.zeros(rows, 3)) for name in ("means", "scales")}
+    optimizers = {name: torch.optim.Adam([value]) for name, value in splats.items()}
+    for name, value in splats.items():
+        value.grad = torch.ones_like(value)
+        optimizers[name].step()
+    return splats, optimizers
+
+
+def test_a_table_that_is_half_changed_is_known():
+    splats, optimizers = table(5)
+    assert rows_agree(splats, optimizers, [torch.zeros(5), None, 0.5, torch.tensor(3)])
+    assert not rows_agree(splats, optimizers, [torch.zeros(6)])
+    longer = torch.nn.Parameter(torch.zeros(6, 3))
+    assert not rows_agree({**splats, "means": longer}, optimizers, [])
+    assert not rows_agree({name: torch.nn.Parameter(torch.zeros(6, 3)) for name in splats}, optimizers, [])
+    optimizers["scales"].state[splats["scales"]]["exp_avg"] = torch.zeros(4, 3)
+    assert not rows_agree(splats, optimizers, [])
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        ("/bin/ns-train nrfgs --data a", "ns-train nrfgs --load-dir out/models --data a"),
+        (
+            "ns-train nrfgs --load-dir old --data a --load_step=3 nrfgs-data --scene-scale 2",
+            "ns-train nrfgs --load-dir out/models --data a nrfgs-data --scene-scale 2",
+        ),
+        ("/x/launch.py nrfgs --data a", "python -m nrfgs_ns.distributed.launch nrfgs --load-dir out/models --data a"),
+        ("nrfgs demo --quick", "ns-train nrfgs ... --load-dir out/models"),
+    ],
+)
+def test_the_command_that_goes_on(words, command, monkeypatch):
+    monkeypatch.setattr(sys, "argv", words.split())
+    assert command_to_go_on(stopping.Path("out/models"), "nrfgs") == command
