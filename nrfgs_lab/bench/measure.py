@@ -35,9 +35,9 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
 
     Returns:
         "test" and "train" (null without views), each with the means of psnr, ssim, ms_ssim, l1, lpips (null where it
-        cannot be had) and "per_image"; "fps" at the photographs' size and "fps_1080p" (null on a CPU); "splats", of
-        which "diffuse" have no residual; "parameter_bytes" (what a renderer needs); "checkpoint_bytes" (the file, with
-        the optimisers' moments).
+        cannot be had), of the same colour-corrected (cc_psnr, ...), and "per_image"; "fps" at the photographs' size and
+        "fps_1080p" (null on a CPU); "splats", of which "diffuse" have no residual; "parameter_bytes" (what a renderer
+        needs); "checkpoint_bytes" (the file, with the optimisers' moments).
     """
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
     model, data = pipeline.model, pipeline.datamanager
@@ -73,6 +73,8 @@ def over_views(model, metrics: ImageMetrics, views: Iterable) -> dict[str, Any]:
     per_image = []
     for name, (camera, batch) in views:
         outputs = model.get_outputs_for_camera(camera)
+        if hasattr(model, "as_photographed"):
+            outputs = model.as_photographed(outputs, camera)
         truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
         mask = batch["mask"].to(model.device).float() >= 0.5 if "mask" in batch else None
         per_image.append({"image": name, **metrics(outputs["rgb"], truth, mask)})

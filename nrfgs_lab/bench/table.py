@@ -56,6 +56,8 @@ COLUMNS = (
     Column("LPIPS", _measured("test", "lpips"), "{:.4f}", better=-1),
     Column("L1", _measured("test", "l1"), "{:.4f}", better=-1),
     Column("PSNR", _measured("test", "psnr"), "{:.2f}", better=1),
+    Column("cc PSNR", _measured("test", "cc_psnr"), "{:.2f}", better=1),
+    Column("cc SSIM", _measured("test", "cc_ssim"), "{:.4f}", better=1),
     Column("FPS", _in("measured", "fps"), "{:.1f}", better=1, is_time=True),
     Column("FPS 1080p", _in("measured", "fps_1080p"), "{:.1f}", better=1, is_time=True),
     Column("MB", _in("measured", "parameter_bytes"), "{:.2f}", 1e6, better=-1),
@@ -63,6 +65,10 @@ COLUMNS = (
     Column("peak MB", _in("train", "peak_memory_bytes"), "{:.1f}", 1e6, better=-1),
     Column("train PSNR", _measured("train", "psnr"), "{:.2f}"),
     Column("gap", _gap, "{:.2f}"),
+    Column("cc MS-SSIM", _measured("test", "cc_ms_ssim"), "{:.4f}", better=1, in_files_only=True),
+    Column("cc LPIPS", _measured("test", "cc_lpips"), "{:.4f}", better=-1, in_files_only=True),
+    Column("cc L1", _measured("test", "cc_l1"), "{:.4f}", better=-1, in_files_only=True),
+    Column("train cc PSNR", _measured("train", "cc_psnr"), "{:.2f}", in_files_only=True),
     Column("train SSIM", _measured("train", "ssim"), "{:.4f}", in_files_only=True),
     Column("train MS-SSIM", _measured("train", "ms_ssim"), "{:.4f}", in_files_only=True),
     Column("train LPIPS", _measured("train", "lpips"), "{:.4f}", in_files_only=True),
@@ -298,7 +304,10 @@ def as_csv(rows: list[Row]) -> str:
     return file.getvalue()
 
 
-PER_VIEW = {"PSNR": "psnr", "SSIM": "ssim", "MS-SSIM": "ms_ssim", "LPIPS": "lpips", "L1": "l1"}
+PER_VIEW = {
+    **{"PSNR": "psnr", "SSIM": "ssim", "MS-SSIM": "ms_ssim", "LPIPS": "lpips", "L1": "l1"},
+    **{"cc PSNR": "cc_psnr", "cc SSIM": "cc_ssim"},
+}
 """Column -> its key in a view's measurement."""
 
 

@@ -46,6 +46,7 @@ from nrfgs_ns.data.checks import (
     warn,
 )
 from nrfgs_ns.data.colmap import read_model
+from nrfgs_ns.data.exif import stored_exif
 from nrfgs_ns.data.pictures import read_header, smaller_copies
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import MARGIN, check_sight, in_reach
@@ -155,6 +156,7 @@ class NrfgsDataParser(DataParser):
             dataparser_transform=after(scene.transform, scene.to_frames),
             metadata={
                 "depth_filenames": files["depth_file_path"] or None,
+                "exif": [stored_exif(frame, scene.source) for frame in frames],
                 "depth_unit_scale_factor": self.config.depth_unit_scale_factor,
                 "mask_color": getattr(self.config, "mask_color", None),
             },

@@ -37,6 +37,26 @@ def read_exif(path: Path) -> dict[str, float | str]:
         return {}
 
 
+def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, float | str]:
+    """The same from a frame of transforms.json, as `nrfgs prepare` writes it; nothing where there is no "exif".
+
+    Raises:
+        InputError: it is no dictionary, or one of its numbers is none above 0.
+    """
+    told = frame.get("exif", {})
+    good = isinstance(told, dict) and all(
+        isinstance(told[name], int | float) and math.isfinite(told[name]) and told[name] > 0
+        for name in NUMBERS
+        if name in told
+    )
+    if not good:
+        raise InputError(
+            f'{source}: "exif" of {frame.get("file_path")} must hold numbers above 0 ({", ".join(NUMBERS)}). '
+            "Correct or remove it."
+        )
+    return told
+
+
 def exif_of(image: Image.Image) -> Image.Exif:
     """An image's EXIF; empty where it is damaged, which is no reason to refuse the image."""
     try:

@@ -15,6 +15,7 @@ from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.config import ShardingConfig
 from nrfgs_ns.distributed.exchange import scale_gradient, send_to_cameras
 from nrfgs_ns.distributed.shards import cut_model_state, rebalance, rows_of, shard_counts
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import View, project_splats, project_view
@@ -46,6 +47,8 @@ class ShardedModel(NrfgsModel):
 
     def populate_modules(self):
         super().populate_modules()
+        if self.trimming is not None:
+            raise InputError("pipeline.model.robust_loss is for one device. Leave it out, or use one.")
         self.view_noise.seed += comm.rank()  # each device has other splats
         self.sizes: list[tuple[int, int]] = []
         if isinstance(self.densification, Mcmc):
@@ -92,7 +95,8 @@ class ShardedModel(NrfgsModel):
         absgrad = self.training and self.densification.needs_absgrad(self.step)
         own, colored = send_to_cameras(projection, appearance, *self.sizes[comm.rank()], absgrad)
         background = self._get_background_color()
-        outputs, _ = self.composite(View(own, pinholes[comm.rank()].center), colored, background)
+        view = View(own, pinholes[comm.rank()].center)
+        outputs, _ = self.composite(view, colored, background, self._photograph_of(cameras[comm.rank()]))
         if self.training:
             if len(own.depths) == 0:  # all devices must go backward through the exchange, the one that sees nothing too
                 outputs["rgb"] = outputs["rgb"] + colored.colors.sum()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image metrics that honour masks: PSNR, L1, SSIM, MS-SSIM, LPIPS.
+"""Image metrics that honour masks: PSNR, L1, SSIM, MS-SSIM, LPIPS, as they are and colour-corrected.
 
 Conventions, for every function of this module:
 
@@ -12,6 +12,9 @@ Conventions, for every function of this module:
 - Under a mask PSNR and L1 are means over the pixels inside. The windowed metrics first replace the prediction outside
   the mask by the truth, so that nothing outside can cost anything; SSIM and MS-SSIM then average over the windows whose
   centre is inside. LPIPS cannot leave pixels out of its average: under a mask it is a lower bound.
+- Colour-corrected metrics (cc_psnr, cc_ssim, ...) are those of the prediction after the affine map of its colours that
+  takes it nearest to the truth (`color_fit.py`), one for each image: what is left of the error when exposure and white
+  balance of a test photograph, which no method can know, are put aside. They never stand alone.
 - Arithmetic is float32, or float64 if the images are, or if they are on CUDA: there a float32 convolution may run in
   TF32, whose 10 bits of mantissa SSIM's differences of squares cannot stand. On a CPU float64 convolutions are several
   times slower, and not needed. No gradient is recorded.
@@ -27,8 +30,11 @@ import torch.nn.functional as F
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-METRIC_NAMES = ("psnr", "ssim", "ms_ssim", "l1", "lpips")
-"""The keys of ImageMetrics' answer, in the order of reports."""
+from nrfgs_ns.image.color_fit import fit_colors
+
+AS_THEY_ARE = ("psnr", "ssim", "ms_ssim", "l1", "lpips")
+METRIC_NAMES = (*AS_THEY_ARE, *(f"cc_{name}" for name in AS_THEY_ARE))
+"""The keys of ImageMetrics' answer, in the order of reports; cc: colour-corrected."""
 WINDOW_SIZE = 11
 """Side of the SSIM window, pixels (Wang et al. 2004)."""
 WINDOW_SIGMA = 1.5
@@ -141,10 +147,14 @@ class ImageMetrics:
         """Compares `pred` with `gt` (shapes, range and masks: see the module), on the device of `pred`.
 
         Returns:
-            psnr (dB), ssim, ms_ssim, l1 and lpips; None where undefined.
+            psnr (dB), ssim, ms_ssim, l1 and lpips, and the same colour-corrected; None where undefined.
         """
         gt = gt.to(pred.device)
         mask = None if mask is None else mask.to(pred.device)
+        corrected = self._all(fit_colors(pred, gt, mask), gt, mask)
+        return {**self._all(pred, gt, mask), **{f"cc_{name}": value for name, value in corrected.items()}}
+
+    def _all(self, pred: Tensor, gt: Tensor, mask: Tensor | None) -> dict[str, float | None]:
         return {
             "psnr": psnr(pred, gt, mask),
             "ssim": ssim(pred, gt, mask),

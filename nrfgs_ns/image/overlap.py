@@ -11,21 +11,20 @@ So a picture is divided into regions. The shift of a pair of photographs is the 
 its noise is how far the regions disagree.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from nrfgs_ns.image.photograph import GAMMA, TOE
 
 LONGEST_SIDE = 400
-"""Photographs are averaged down to this many pixels or a little more: a point's position is not good to the pixel."""
+"""Pixels to which a photograph is averaged down where a point lies: its position is not good to the pixel."""
 MOST_POINTS = 20_000
 """Of the reconstruction; of more, as many are drawn."""
 CELL, NEARER = 8, 0.02
-"""A point is hidden if, in its square of so many pixels, another is nearer by more than this share of its depth."""
+"""A point is hidden if, in its square of so many averaged pixels, another is nearer by more than this share."""
 DARKEST, BRIGHTEST = 0.06, 0.94
 """Values between which a pixel tells its light: noise below, clipped above."""
 REGIONS = 4
@@ -42,6 +41,8 @@ BEYOND_NOISE = 1.5
 ENOUGH_PAIRS = 0.2
 """Share of the pairs beyond noise from which on the capture's exposure varies. Captures with fixed exposure have 0.02
 to 0.15 (what is left is gloss), those of cameras that choose it by themselves 0.25 to 0.5."""
+
+FEWEST_PAIRS = 8
 
 SMALLEST_SPREAD = 0.02
 """Stops; regions that agree by chance do not make a pair certain."""
@@ -63,8 +64,9 @@ class Pairs(NamedTuple):
 
     @property
     def share_beyond_noise(self) -> float:
-        """Share of the pairs whose exposure or white balance differs by more than noise: the largest column's."""
-        if len(self.first) == 0:
+        """Share of the pairs whose exposure or white balance differs by more than noise: the largest column's. 0 for so
+        few pairs that they tell nothing."""
+        if len(self.first) < FEWEST_PAIRS:
             return 0.0
         size = self.shift.abs()
         return float(((size > SMALLEST_SHIFT) & (size > BEYOND_NOISE * self.spread)).double().mean(dim=0).max())
@@ -87,34 +89,40 @@ def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tenso
     Args:
         points: [N, 3].
         viewmat: world to camera, x right, y down, z forward. [4, 4]
-        K: intrinsics in pixels of the image. [3, 3]
-        image: in [0, 1], [H, W, 3]; at 1/2, 1/3, ... of the photograph's size its intrinsics are, too.
+        K: intrinsics in pixels. [3, 3]
+        image: uint8, or in [0, 1]. [H, W, 3]
         mask: bool [H, W], what counts; None: everything.
+
+    Returns:
+        On the host.
     """
     height, width = image.shape[:2]
+    window = max(round(max(height, width) / LONGEST_SIDE), 1)
+    points, viewmat, K = (value.to(image.device, torch.float32) for value in (points, viewmat, K))
     seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = seen[:, 2]
     pixel = seen @ K.T
     x, y = pixel[:, 0] / depth, pixel[:, 1] / depth
-    rows = ((depth > 0) & (x >= 1) & (x < width - 1) & (y >= 1) & (y < height - 1)).nonzero()[:, 0]
+    rows = ((depth > 0) & (x >= window) & (x < width - window) & (y >= window) & (y < height - window)).nonzero()[:, 0]
     x, y, depth = x[rows].long(), y[rows].long(), depth[rows]
-    cell = (y // CELL) * (width // CELL + 1) + x // CELL
-    nearest = depth.new_full(((height // CELL + 1) * (width // CELL + 1),), torch.inf)
+    side = CELL * window
+    cell = (y // side) * (width // side + 1) + x // side
+    nearest = depth.new_full(((height // side + 1) * (width // side + 1),), torch.inf)
     nearest.scatter_reduce_(0, cell, depth, "amin")
-    colors = image[y, x]
-    good = (depth <= nearest[cell] * (1 + NEARER)) & ((colors > DARKEST) & (colors < BRIGHTEST)).all(dim=-1)
+    visible = depth <= nearest[cell] * (1 + NEARER)
     if mask is not None:
-        good &= mask[y, x]
+        visible &= mask.to(image.device)[y, x]
+    rows, x, y = rows[visible], x[visible], y[visible]
+    colors = torch.zeros(len(rows), 3, device=image.device)
+    around = range(-(window // 2), window - window // 2)
+    for down in around:
+        for across in around:
+            colors += image[y + down, x + across]
+    colors /= window**2 * (255 if image.dtype == torch.uint8 else 1)
+    good = ((colors > DARKEST) & (colors < BRIGHTEST)).all(dim=-1)
     light = GAMMA * torch.log2((colors[good] + TOE) / (1 + TOE))
     region = (REGIONS * y[good] // height) * REGIONS + REGIONS * x[good] // width
-    return Sighting(rows[good], light, region)
-
-
-def shrunk(image: Tensor) -> tuple[Tensor, int]:
-    """A photograph [H, W, 3 or 4], uint8 or in [0, 1], averaged down: [h, w, 3 or 4] in [0, 1], and by which factor."""
-    factor = max(round(max(image.shape[:2]) / LONGEST_SIDE), 1)
-    pixels = image.float() / 255.0 if image.dtype == torch.uint8 else image.float()
-    return F.avg_pool2d(pixels.permute(2, 0, 1), factor).permute(1, 2, 0), factor
+    return Sighting(rows[good].cpu(), light.cpu(), region.cpu())
 
 
 def drawn(points: Tensor) -> Tensor:
@@ -125,13 +133,12 @@ def drawn(points: Tensor) -> Tensor:
     return points[order[:MOST_POINTS].sort().values.to(points.device)]
 
 
-def compare(sightings: Sequence[Sighting], centers: Tensor, tell: Callable[[], None] = lambda: None) -> Pairs:
+def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
     """Compare photographs with those that were taken next to them.
 
     Args:
         sightings: of each photograph. [V]
         centers: where they were taken, [V, 3].
-        tell: called after each photograph.
     """
     distance = torch.cdist(centers.double(), centers.double())
     distance.fill_diagonal_(torch.inf)
@@ -149,7 +156,6 @@ def compare(sightings: Sequence[Sighting], centers: Tensor, tell: Callable[[], N
             if shift is not None:
                 done.add(pair)
                 found.append((*pair, *shift))
-        tell()
     if not found:
         none = torch.zeros(0, dtype=torch.int64)
         return Pairs(none, none, torch.zeros(0, 3), torch.zeros(0, 3))

@@ -19,10 +19,12 @@ its own and the mean of all is the scene's.
 
 What all photographs have in common belongs to the scene: exposure and white balance have mean zero over the
 photographs (`center_`, after each step), so that the scene, and what is exported of it, has the photographs' mean look.
+All parameters are zero where nothing happens.
 
 The parts are those of PPISP (Deutsch et al., arXiv 2601.18336), in the pixels' own space instead of a linear one.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
@@ -36,6 +38,7 @@ PARTS: tuple[Part, ...] = get_args(Part)
 
 GAMMA = 2.4
 """sRGB's exponent."""
+LOG_2 = math.log(2.0)
 TOE = 0.055
 """sRGB's offset."""
 LARGEST_TOE, LARGEST_SHOULDER = 0.3, 0.9
@@ -46,10 +49,10 @@ BASIS = {
     "white-balance": ((2 / 3, -1 / 3, -1 / 3), (-1 / 3, -1 / 3, 2 / 3)),
 }
 """Stops of red, green and blue for one stop of each number of a photograph."""
+TOE_STEP = 0.05
+"""The toe's unit where it is learnt."""
 PENALTY = 0.01
 """Weight of the squared stops in the loss."""
-TOE_SCALE = 0.05
-"""A change of the toe that costs as much as a stop."""
 
 
 class PhotographModel(nn.Module):
@@ -86,12 +89,13 @@ class PhotographModel(nn.Module):
         self.register_buffer("lenses", lenses.float().clone())
         self.register_buffer("share", share[:, None], persistent=False)
         self.falloff = Parameter(torch.zeros(len(lenses), 2)) if "vignetting" in parts else None
-        curves = torch.tensor([TOE, 0.0]).repeat(len(lenses), 1)
-        self.curves = Parameter(curves) if "response" in parts else None
+        self.curves = Parameter(torch.zeros(len(lenses), 2)) if "response" in parts else None
         self.shots = None
         if rows := [row for part in self.parts for row in BASIS.get(part, ())]:
             basis = torch.tensor(rows)
             self.register_buffer("basis", basis, persistent=False)
+            self.register_buffer("exponents", basis.T / GAMMA, persistent=False)
+            self.register_buffer("offset", torch.full((3,), -TOE), persistent=False)
             stops = torch.zeros(len(names), 3) if start is None else start.float()
             self.shots = Parameter(stops @ torch.linalg.pinv(basis))
             self.center_()
@@ -112,7 +116,7 @@ class PhotographModel(nn.Module):
         """
         camera = self.camera_of[index]
         if self.falloff is None and self.curves is None:
-            return image if self.shots is None else _Gain.apply(image, self.shots, index, self.basis)
+            return image if self.shots is None else _Gain.apply(image, self.shots, index, self.exponents, self.offset)
         stops = image.new_zeros(3) if self.shots is None else self.shots[index] @ self.basis
         return self._taken(image, stops, camera)
 
@@ -129,8 +133,9 @@ class PhotographModel(nn.Module):
         gain = torch.exp2(stops / GAMMA)
         if self.curves is None:
             return with_gain(image, gain)
-        mean_toe, mean_shoulder = (self.share * self.curves).sum(0)
-        toe, shoulder = self.curves[camera]
+        curves = self.curves * self.curves.new_tensor([TOE_STEP, 1.0]) + self.curves.new_tensor([TOE, 0.0])
+        mean_toe, mean_shoulder = (self.share * curves).sum(0)
+        toe, shoulder = curves[camera]
         above = image * (gain + toe * mean_shoulder) + (gain * mean_toe - toe)
         below = 1.0 + shoulder * gain * mean_toe + image * (shoulder * gain - mean_shoulder)
         return above / below.clamp_min(SMALLEST_DENOMINATOR)
@@ -150,19 +155,16 @@ class PhotographModel(nn.Module):
     # What is learnt.
 
     def penalty(self, index: int) -> Tensor:
-        """What a photograph's stops, and its camera's part, cost in the loss, a scalar: nothing for what does nothing.
+        """What a photograph's numbers, and its camera's, cost in the loss, a scalar: nothing for what does nothing.
 
-        The photometric loss grows with the absolute error and this with the square, so that it holds back what the
-        picture says little about, and little else.
+        The photometric loss grows with the error and this with the square, so that it holds back what the pictures say
+        little about, and little else.
         """
+        camera = self.camera_of[index]
         numbers = [] if self.shots is None else [self.shots[index]]
-        if self.falloff is not None:
-            numbers.append(self.falloff[self.camera_of[index]])
-        if self.curves is not None:
-            toe, shoulder = self.curves[self.camera_of[index]]
-            numbers.append(torch.stack([(toe - TOE) / TOE_SCALE, shoulder]))
-        numbers = numbers[0] if len(numbers) == 1 else torch.cat(numbers)
-        return PENALTY * torch.dot(numbers, numbers)
+        numbers += [table[camera] for table in (self.falloff, self.curves) if table is not None]
+        own = numbers[0] if len(numbers) == 1 else torch.cat(numbers)
+        return PENALTY * torch.dot(own, own)
 
     @torch.no_grad()
     def center_(self) -> None:
@@ -172,7 +174,7 @@ class PhotographModel(nn.Module):
         if self.falloff is not None:
             self.falloff.clamp_(min=0.0)
         if self.curves is not None:
-            self.curves[:, 0].clamp_(0.0, LARGEST_TOE)
+            self.curves[:, 0].clamp_(-TOE / TOE_STEP, (LARGEST_TOE - TOE) / TOE_STEP)
             self.curves[:, 1].clamp_(0.0, LARGEST_SHOULDER)
 
     @torch.no_grad()
@@ -218,21 +220,20 @@ class _Gain(torch.autograd.Function):
     """`with_gain` of one photograph's stops. By hand, because a step on a GPU waits for the host: half the calls."""
 
     @staticmethod
-    def forward(ctx, image: Tensor, shots: Tensor, index: int, basis: Tensor) -> Tensor:
-        gain = torch.exp2(torch.mv(basis.T, shots[index]) / GAMMA)
-        ctx.save_for_backward(image, gain, basis)
+    def forward(ctx, image: Tensor, shots: Tensor, index: int, exponents: Tensor, offset: Tensor) -> Tensor:
+        gain = torch.mv(exponents, shots[index]).exp2_()
+        ctx.save_for_backward(image, gain, exponents)
         ctx.row = shots.shape, index
-        return with_gain(image, gain)
+        return torch.addcmul(torch.add(offset, gain, alpha=TOE), image, gain)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_taken: Tensor):
-        image, gain, basis = ctx.saved_tensors
+        image, gain, exponents = ctx.saved_tensors
         shape, index = ctx.row
-        d_image = d_taken * gain if ctx.needs_input_grad[0] else None
         d_shots = None
         if ctx.needs_input_grad[1]:
-            d_gain = ((image + TOE) * d_taken).sum(dim=(0, 1))
+            d_gain = (image + TOE).mul_(d_taken).sum(dim=(0, 1))
             d_shots = d_taken.new_zeros(shape)
-            d_shots[index] = torch.mv(basis, d_gain * gain) * (0.6931471805599453 / GAMMA)
-        return d_image, d_shots, None, None
+            torch.mv(exponents.T, d_gain.mul_(gain).mul_(LOG_2), out=d_shots[index])
+        return d_taken * gain, d_shots, None, None, None

@@ -8,9 +8,10 @@ hold, so that an interrupted training can go on.
 """
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -35,7 +36,9 @@ from nrfgs_ns.densification import (
     build_densification,
 )
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.image import robust
 from nrfgs_ns.image.metrics import ImageMetrics
+from nrfgs_ns.image.photograph import Part, PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.checkpoint import check_compatible, reduced_config
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
@@ -44,6 +47,8 @@ from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_vi
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 
+LOOK = "NRFGS_LOOK"
+"""Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
 
@@ -76,6 +81,14 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """thresholds of the densification 'original'"""
     mcmc: McmcDensification = field(default_factory=McmcDensification)
     """constants of the densification 'mcmc'"""
+    photographs: Literal["auto", "on", "off"] = "auto"
+    """whether each photograph's exposure and white balance are learnt. auto: where EXIF says that exposure varies, or
+    where photographs disagree about the same points by more than noise; a line in the log says why"""
+    photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
+    """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
+    robust_loss: float = 0.0
+    """share of the pixels, those with the largest residuals, that the loss leaves out: passers-by, moving shadows.
+    0: none"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -116,6 +129,8 @@ class NrfgsModel(SplatfactoModel):
         if self.config.use_bilateral_grid:
             self.bil_grids = BilateralGrid(self.num_train_data, *self.config.grid_shape)
 
+        self.photograph: PhotographModel | None = None  # the pipeline knows the photographs
+        self.trimming = _trimming(self.config.robust_loss)
         self.image_metrics = ImageMetrics()
         self.step = 0
         self.crop_box = None
@@ -200,13 +215,18 @@ class NrfgsModel(SplatfactoModel):
         return project_view(self.field.splats if splats is None else splats, self.pinhole(camera), self.projecting)
 
     def composite(
-        self, view: View, appearance: SplatAppearance, background: Tensor | None = None
+        self,
+        view: View,
+        appearance: SplatAppearance,
+        background: Tensor | None = None,
+        photograph: int | None = None,
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Composite visible splats as this model is configured (`composite_view`).
 
         Args:
             view, appearance: as for `composite_view`.
             background: a colour [3] instead of the configuration's.
+            photograph: the picture has the look of this one; None: the mean look.
         """
         return composite_view(
             view,
@@ -215,6 +235,7 @@ class NrfgsModel(SplatfactoModel):
             with_depth=self.config.output_depth_during_training or not self.training,
             absgrad=self.training and self.densification.needs_absgrad(self.step),
             assume_finite=self.training,
+            look=None if photograph is None else lambda rgb: self.photograph(rgb, photograph),
         )
 
     def pinhole(self, camera: Cameras) -> Pinhole:
@@ -248,11 +269,24 @@ class NrfgsModel(SplatfactoModel):
         view = self.project(camera, field.splats)
         appearance = self._as_learnt(field).seen_from(view)
         background = self._get_background_color()
-        outputs, self.info = self.composite(view, appearance, background)
+        outputs, self.info = self.composite(view, appearance, background, self._photograph_of(camera))
         if self.training:
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._finish_for_training(outputs, camera, background)
         return outputs
+
+    def _photograph_of(self, camera: Cameras) -> int | None:
+        """Which photograph's look a rendering has: in training, the one that the camera took; None: the mean look."""
+        if self.photograph is None:
+            return None
+        if self.training:
+            return (camera.metadata or {}).get("cam_idx")
+        name = os.environ.get(LOOK)
+        if name and name not in self.photograph.names:
+            raise InputError(
+                f"{LOOK} is {name!r}, which is none of the training photographs, such as {self.photograph.names[0]!r}."
+            )
+        return self.photograph.names.index(name) if name else None
 
     def _as_learnt(self, field: Field) -> Field:
         """The field as its head is asked about it in this step (`view_noise.py`); outside of training, the field."""
@@ -357,10 +391,13 @@ class NrfgsModel(SplatfactoModel):
         return {name: [parameter] for name, parameter in self.gauss_params.items()}
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """One group for each per-splat tensor, and "field" for the head's shared weights if it has any."""
+        """One group for each per-splat tensor, "field" for the head's shared weights if it has any, "photograph" for
+        the photographs' exposures if they are learnt."""
         groups = super().get_param_groups()
-        shared = list(self.head.parameters())
-        return {**groups, "field": shared} if shared else groups
+        others = {"field": list(self.head.parameters())}
+        if self.photograph is not None:
+            others["photograph"] = list(self.photograph.parameters())
+        return {**groups, **{name: parameters for name, parameters in others.items() if parameters}}
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
@@ -373,10 +410,14 @@ class NrfgsModel(SplatfactoModel):
             steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
             warm_up(self, cameras, steps, self.config.warmup_lr)
 
-        return [
+        callbacks = [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before_first_step, iters=(0,)),
             *super().get_training_callbacks(attributes),
         ]
+        if self.photograph is not None:
+            after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+            callbacks.append(TrainingCallback(after, lambda step: self.photograph.center_()))
+        return callbacks
 
     def step_cb(self, optimizers, step: int) -> None:
         super().step_cb(optimizers, step)
@@ -410,6 +451,8 @@ class NrfgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params)
+            if self.photograph is not None:
+                losses["photograph"] = self.photograph.penalty(batch["image_idx"])
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")
@@ -422,7 +465,18 @@ class NrfgsModel(SplatfactoModel):
         if "mask" in batch:  # what is outside is black in both
             mask = self._downscale_if_required(batch["mask"]).to(self.device)
             truth, rgb = truth * mask, rgb * mask
+        if self.trimming is not None and self.training and self.schedule_step >= robust.FIRST_STEP:
+            kept = self.trimming(rgb, truth, mask if "mask" in batch else None)
+            truth, rgb = truth * kept, rgb * kept
         return photometric_loss(rgb, truth, self.config.ssim_lambda)
+
+    def truth_of(self, batch: Mapping[str, Any], background: Tensor) -> Tensor:
+        """The photograph at the rendered size, [H, W, 3]; where it is transparent, with what is behind the splats."""
+        image = self.get_gt_img(batch["image"])
+        if image.shape[-1] == 4 and self.training and self.photograph is not None:
+            with torch.no_grad():
+                background = self.photograph(background.expand(*image.shape[:2], 3), batch["image_idx"])
+        return self.composite_with_background(image, background)
 
     def far_from_neutral(
         self, camera: Cameras, weights: list[Parameter]
@@ -471,9 +525,14 @@ class NrfgsModel(SplatfactoModel):
             {"img": torch.cat([truth, rgb], dim=1)},
         )
 
-    def truth_of(self, batch: Mapping[str, Any], background: Tensor) -> Tensor:
-        """The photograph at the rendered size [H, W, 3], over the background where it is transparent."""
-        return self.composite_with_background(self.get_gt_img(batch["image"]), background)
+    def as_photographed(self, outputs: dict[str, Tensor], camera: Cameras) -> dict[str, Tensor]:
+        """What the mean look becomes in the camera that took a test photograph: its vignetting and response, if learnt.
+        Exposure and white balance of that photograph stay unknown."""
+        if self.photograph is None:
+            return outputs
+        sizes = (float(value.flatten()[0]) for value in (camera.width, camera.height, camera.fx, camera.fy))
+        rgb = self.photograph.by_camera(outputs["rgb"], self.photograph.camera_like(*sizes))
+        return {**outputs, "rgb": rgb.clamp(0.0, 1.0)}
 
     def mask_of(self, batch: Mapping[str, Any]) -> Tensor | None:
         """The image's mask at the rendered size, bool [H, W, 1], or None. A pixel half covered counts as inside."""
@@ -522,11 +581,21 @@ class NrfgsModel(SplatfactoModel):
             InputError: the checkpoint belongs to another head, or to another size of this one.
         """
         self._shape_head(state)
+        self._take_photographs(state)
         check_compatible(self, state)
         self._fit = None
         for name, parameter in self.gauss_params.items():
             parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)
         return super(SplatfactoModel, self).load_state_dict(state, strict=strict, **kwargs)
+
+    def _take_photographs(self, state: dict[str, Any]) -> None:
+        """Know the photographs that a checkpoint knows; a training, whose optimisers hold them, knows them already."""
+        prefix = "photograph."
+        known = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+        if not known:
+            self.photograph = None
+        elif self.photograph is None:
+            self.photograph = PhotographModel.from_state(known).to(self.device)
 
     def _shape_head(self, state: dict[str, Any]) -> None:
         """Take the head of a checkpoint that has a smaller one than the configuration; its weights come later."""
@@ -539,3 +608,12 @@ class NrfgsModel(SplatfactoModel):
         for name, value in head.splat_params(self.gauss_params["means"]).items():
             # In place: the optimiser was built on this very parameter.
             self.gauss_params[name].data = value.to(self.device)
+
+
+def _trimming(share: float) -> robust.Trimming | None:
+    """What the robust loss remembers, if it is asked for."""
+    if share == 0.0:
+        return None
+    if not 0.0 < share < 1.0:
+        raise InputError(f"pipeline.model.robust_loss is {share}; it must be 0, or above 0 and below 1.")
+    return robust.Trimming(share)

@@ -8,7 +8,7 @@
 Nothing here needs CUDA.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -80,6 +80,7 @@ def composite_view(
     with_depth: bool = True,
     absgrad: bool = False,
     assume_finite: bool = False,
+    look: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Composite the visible splats over a background.
 
@@ -90,6 +91,7 @@ def composite_view(
         with_depth: whether depth is wanted, too.
         absgrad: as in `rasterizer.composite`.
         assume_finite: colours and opacities that are not finite need not be looked for.
+        look: what a photograph makes of the picture [H, W, 3] before it is cut off at 0 and 1.
 
     Returns:
         "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1] if wanted;
@@ -105,8 +107,9 @@ def composite_view(
         assume_finite=assume_finite,
     )
     render, alpha = render.squeeze(0), alpha.squeeze(0)  # a view; what [0] sends back is a copy among zeros
+    rgb = render[..., :3] if with_depth else render
     outputs = {
-        "rgb": torch.clamp(render[..., :3] if with_depth else render, 0.0, 1.0),
+        "rgb": torch.clamp(rgb if look is None else look(rgb), 0.0, 1.0),
         "accumulation": alpha,
         "background": background.expand(*alpha.shape[:2], 3),
     }

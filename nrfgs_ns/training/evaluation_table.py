@@ -8,7 +8,7 @@ from typing import Any
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
-SHOWN = ("psnr", "ssim", "ms_ssim", "lpips", "l1", "seconds_per_image", "splats")
+SHOWN = ("psnr", "cc_psnr", "ssim", "cc_ssim", "ms_ssim", "lpips", "l1", "seconds_per_image", "splats")
 ENOUGH = 5
 """Fewer views have no "rest" to be below."""
 BELOW = 3.0

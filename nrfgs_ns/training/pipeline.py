@@ -23,6 +23,7 @@ from nrfgs_ns.image.metrics import METRIC_NAMES
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.evaluation_table import print_evaluation
+from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
 from nrfgs_ns.viewer.panel import ViewerPanel
 
 
@@ -67,6 +68,8 @@ class NrfgsPipeline(VanillaPipeline):
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             self.datamanager.load_all_images()
+            photographs = photograph_model(config.model, self.datamanager)
+            self.model.photograph = None if photographs is None else photographs.to(device)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
             self.model.fit_on(self.datamanager.train_dataset.cameras)
 
@@ -80,6 +83,8 @@ class NrfgsPipeline(VanillaPipeline):
         if self.config.compact is not None:
             state = model_state(self.model, self.config.compact)
             loaded_state = {f"_model.{name}": value for name, value in state.items()}
+        if self.test_mode == "val":
+            check_same_photographs(self.model.photograph, loaded_state.get("_model.photograph._extra_state"))
         super().load_pipeline(loaded_state, step)
 
     def train(self, mode: bool = True):
@@ -111,8 +116,8 @@ class NrfgsPipeline(VanillaPipeline):
                 numbers, which a tensorboard can show.
 
         Returns:
-            Mean over images of psnr, ssim, ms_ssim, l1, lpips; seconds_per_image (rendering alone, the first image
-            left out) and its inverse fps; splats; parameter_bytes.
+            Mean over images of psnr, ssim, ms_ssim, l1, lpips, and of the same colour-corrected (cc_psnr, ...);
+            seconds_per_image (rendering alone, the first image left out) and its inverse fps; splats; parameter_bytes.
         """
         self.eval()
         if output_path is not None:
@@ -128,6 +133,7 @@ class NrfgsPipeline(VanillaPipeline):
                 if outputs["rgb"].is_cuda:
                     torch.cuda.synchronize()
                 seconds = perf_counter() - start
+                outputs = self.model.as_photographed(outputs, camera)
                 metrics, pictures = self.model.get_image_metrics_and_images(outputs, batch)
                 per_image.append({"image": name, **metrics, "seconds_per_image": seconds})
                 if output_path is not None:

@@ -2,10 +2,11 @@
 """One hostile input, and what comes of it.
 
 The promise (docs/stability.md): an input that cannot be used is refused with one clear sentence, at once, before
-anything is written, in less than a second of computing and a gigabyte of memory. Every attempt runs in a process of its
-own, which may be killed.
+anything is written, in less than a second of computing and a gigabyte of memory. Attempts are made in a child
+process, which may be killed.
 """
 
+import contextlib
 import json
 import os
 import resource
@@ -13,7 +14,7 @@ import select
 import shutil
 import signal
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,44 +50,68 @@ class Outcome(NamedTuple):
 
 
 def attempt(case: Case) -> Outcome:
-    """Let a child process read the input."""
-    folder = Path(tempfile.mkdtemp(prefix="attack-"))
+    """Let a child process read one input."""
+    return attempts([case])[0]
+
+
+def attempts(cases: Sequence[Case]) -> list[Outcome]:
+    """Let a child process read the inputs, one after the other; another one goes on where it hangs or dies."""
+    outcomes: list[Outcome] = []
+    while len(outcomes) < len(cases):
+        outcomes += _in_one_process(cases[len(outcomes) :])
+    return outcomes
+
+
+def _in_one_process(cases: Sequence[Case]) -> list[Outcome]:
+    """The outcomes up to the first input that takes the process with it."""
     receive, send = os.pipe()
     child = os.fork()
     if child == 0:
         try:
             os.close(receive)
-            os.write(send, json.dumps(_in_child(case, folder)).encode("ascii"))
+            _child(cases, send)
         finally:
             os._exit(0)
     os.close(send)
+    outcomes, rest = [], b""
     try:
-        answer = b""
-        while select.select([receive], [], [], PATIENCE)[0]:
-            part = os.read(receive, 2**16)
-            answer += part
+        while len(outcomes) < len(cases):
+            part = os.read(receive, 2**16) if select.select([receive], [], [], PATIENCE)[0] else b""
             if not part:
+                outcomes.append(Outcome("hang", f"no answer in {PATIENCE:.0f} s, or the process died"))
                 break
-        else:
-            os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        return Outcome(*json.loads(answer)) if answer else Outcome("hang", f"more than {PATIENCE} s, or killed")
+            *lines, rest = (rest + part).split(b"\n")
+            outcomes += [Outcome(*json.loads(line)) for line in lines]
     finally:
         os.close(receive)
-        shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    return outcomes
 
 
-def _in_child(case: Case, folder: Path) -> tuple[str, str]:
+def _child(cases: Sequence[Case], send: int) -> None:
     import cv2
     import torch
-
-    from nrfgs_ns.errors import InputError
 
     torch.set_num_threads(1)
     cv2.setNumThreads(0)
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):
         os.dup2(nothing, stream)
+    for case in cases:
+        folder = Path(tempfile.mkdtemp(prefix="attack-"))
+        try:
+            outcome = _read(case, folder)
+        finally:
+            os.chdir("/")
+            shutil.rmtree(folder, ignore_errors=True)
+        os.write(send, json.dumps(outcome).encode("ascii") + b"\n")
+
+
+def _read(case: Case, folder: Path) -> tuple[str, str]:
+    from nrfgs_ns.errors import InputError
+
     data, work = folder / "data", folder / "work"
     work.mkdir()
     data.mkdir()

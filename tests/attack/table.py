@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python tests/attack/table.py [--examples N] [--record FILE]`: attack, and print what came of it, as a table.
+"""`python tests/attack/table.py [--examples N] [--record FILE NAME]`: attack, and print what came of it, as a table.
 
 Every module area_*.py beside this one is an area: AREA (its name), CASES (a list of Case), and inputs(), a hypothesis
 strategy of further ones. The installed `nrfgs_ns` is attacked, or another in PYTHONPATH.
@@ -17,7 +17,7 @@ for folder in (HERE, HERE.parent / "helpers"):
     if str(folder) not in sys.path:
         sys.path.insert(0, str(folder))
 
-from attempt import Case, Outcome, attempt  # noqa: E402
+from attempt import Case, Outcome, attempts  # noqa: E402
 from hypothesis import HealthCheck, Phase, given, settings  # noqa: E402
 
 COLUMNS = {
@@ -71,7 +71,7 @@ def table(found: dict[str, list[tuple[str, Outcome]]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--examples", type=int, default=100, help="random inputs in each area, beside the list")
-    parser.add_argument("--record", type=Path, help="also write the counts and the inputs that did not hold, as JSON")
+    parser.add_argument("--record", nargs=2, help="a JSON file, and the name of the entry in it that is written")
     parser.add_argument("--area", help="this area alone")
     options = parser.parse_args()
     found: dict[str, list[tuple[str, Outcome]]] = {}
@@ -79,7 +79,7 @@ def main() -> None:
         if options.area not in (None, area.AREA):
             continue
         cases = [*area.CASES, *drawn(area, options.examples)]
-        found[area.AREA] = [(case.name, attempt(case)) for case in cases]
+        found[area.AREA] = [(case.name, outcome) for case, outcome in zip(cases, attempts(cases), strict=True)]
         for name, outcome in found[area.AREA]:
             if outcome.kind not in ("refused", "read"):
                 print(f"{area.AREA}: {ascii(name)}: {outcome.kind}: {ascii(outcome.said[:300])}", file=sys.stderr)
@@ -92,8 +92,11 @@ def main() -> None:
             }
             for area, outcomes in found.items()
         }
-        options.record.parent.mkdir(parents=True, exist_ok=True)
-        options.record.write_text(json.dumps({"examples": options.examples, "areas": record}, indent=1) + "\n")
+        path = Path(options.record[0])
+        whole = json.loads(path.read_text()) if path.exists() else {}
+        whole[options.record[1]] = {"examples": options.examples, "table": table(found), "areas": record}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(whole, indent=1) + "\n")
 
 
 if __name__ == "__main__":

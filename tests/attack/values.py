@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values that nobody expects, and ways to put them where something else was."""
 
+from copy import deepcopy
 from typing import Any
 
 from hypothesis import strategies as st
@@ -37,7 +38,7 @@ def replace_in(tree: Any, chosen: list[tuple[float, Any]]) -> None:
     for share, value in chosen:
         every = places(tree)
         if every:
-            put(tree, every[int(share * len(every))], value)
+            put(tree, every[int(share * len(every))], deepcopy(value))
 
 
 @st.composite

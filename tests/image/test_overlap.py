@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from nrfgs_ns.image.overlap import compare, drawn, estimate, shrunk, sight, slope, varies
+from nrfgs_ns.image.overlap import compare, drawn, estimate, sight, slope, varies
 from nrfgs_ns.image.photograph import exposed
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 110.0
@@ -115,9 +115,19 @@ def test_exif_alone():
     assert estimate(nothing, known)[:, 1].tolist() == pytest.approx([-1.0, 0.0, 0.0, 1.0])
 
 
-def test_shrunk_and_drawn():
-    image, factor = shrunk(torch.full((1200, 900, 3), 255, dtype=torch.uint8))
-    assert (image.shape, factor) == ((400, 300, 3), 3)
-    assert (image == 1).all()
-    few = torch.rand(50_000, 3)
-    assert len(drawn(few)) == 20_000 and torch.equal(drawn(few), drawn(few))
+def test_bytes_and_large_pictures_are_the_same_as_small_ones_in_floats():
+    cameras, images = photographs(torch.zeros(1, 3))
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    large = images[0].repeat_interleave(8, dim=0).repeat_interleave(8, dim=1)
+    one = sight(wall(), cameras[0], K, images[0])
+    other = sight(wall(), cameras[0], K * torch.tensor([[8.0], [8.0], [1.0]]), (large * 255).round().to(torch.uint8))
+    common = torch.isin(one.points, other.points)
+    assert common.sum() > 1000
+    difference = one.light[common] - other.light[torch.isin(other.points, one.points)]
+    assert difference.abs().median() < 0.02
+
+
+def test_many_points_are_thinned_alike_each_time():
+    many = torch.rand(50_000, 3)
+    assert len(drawn(many)) == 20_000 and torch.equal(drawn(many), drawn(many))
+    assert len(drawn(many[:10])) == 10

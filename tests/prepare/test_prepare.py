@@ -17,8 +17,8 @@ from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.exif import read_exif, read_position
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.prepare import photos, structure
+from nrfgs_ns.prepare.command import Prepare, Run
 from nrfgs_ns.prepare.pairs import metres
-from nrfgs_ns.prepare.verb import Prepare, Run
 
 pytest.importorskip("pycolmap")
 
@@ -86,7 +86,7 @@ def prepared(walls, tmp_path_factory) -> Path:
 
 
 def run_quietly(source: Path, out: Path, **options) -> str:
-    """Run the verb; what it says."""
+    """Run the command; what it says."""
     screen = Console(record=True, width=200, file=io.StringIO())
     run = Run(Prepare(source, out, **options), screen)
     for stage in (run.import_input, run.find_features, run.choose_pairs, run.match, run.map, run.undistort, run.write):
@@ -254,7 +254,7 @@ def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, 
 
 
 def test_a_focal_length_that_exif_contradicts_is_told():
-    from nrfgs_ns.prepare.verb import _focal_advice
+    from nrfgs_ns.prepare.command import _focal_advice
 
     assert list(_focal_advice([])) == list(_focal_advice([(1000.0, 900.0)])) == []
     assert "1035 pixels, 762 fit best" in " ".join(_focal_advice([(1000.0, 1010.0), (1035.0, 762.0)]))
@@ -262,7 +262,7 @@ def test_a_focal_length_that_exif_contradicts_is_told():
 
 @pytest.mark.parametrize("cuda", [True, False])
 def test_the_last_line_says_what_to_type(monkeypatch, cuda):
-    from nrfgs_ns.prepare.verb import train_line
+    from nrfgs_ns.prepare.command import train_line
 
     monkeypatch.setattr("torch.cuda.is_available", lambda: cuda)
     said = train_line(Path("my scene"))
@@ -321,12 +321,29 @@ def test_a_missing_package_is_told_with_its_mend(tmp_path, monkeypatch):
         Run(Prepare(tmp_path / "in", tmp_path / "out"))
 
 
-def test_the_verb_says_it_in_one_line(tmp_path, monkeypatch):
+def test_the_command_says_it_in_one_line(tmp_path, monkeypatch):
     from nrfgs_ns.cli import entrypoint
 
     monkeypatch.setattr(sys, "argv", ["nrfgs", "prepare", str(tmp_path / "none"), str(tmp_path / "out")])
     with pytest.raises(SystemExit, match="^nrfgs: .*no such folder or video"):
         entrypoint()
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "said"),
+    [
+        ("state.json", "[1, 2]", "state.json is damaged"),
+        ("state.json", "{", "state.json is damaged"),
+        ("database.db", "no database", "COLMAP stops with"),
+    ],
+)
+def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, content, said):
+    out = tmp_path / "scene"
+    shutil.copytree(prepared, out)
+    shutil.rmtree(out / "work" / "model")
+    (out / "work" / file).write_text(content)
+    with pytest.raises(InputError, match=said):
+        Prepare(walls, out).main()
 
 
 # Collecting.

@@ -1,0 +1,313 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs prepare PHOTOS OUT`: the stages in order, what each depends on, and the verdict.
+
+A stage is done when state.json in OUT's folder `work` says so under the stage's key: a digest of the input's bytes, of
+the options that the stage depends on, and of the stage before it. A stage whose key is known is skipped; one that was
+begun under the same key goes on from what it left; else what it left is removed. Running a stage forgets the ones after
+it.
+"""
+
+import contextlib
+import hashlib
+import json
+import math
+import shlex
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from nrfgs_ns.data.exif import read_position
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import write_whole
+from nrfgs_ns.prepare import forecast, pairs, structure
+from nrfgs_ns.prepare import photos as files
+from nrfgs_ns.prepare.structure import CameraModel
+
+STAGES = ("import", "features", "pairs", "match", "map", "undistort", "write")
+"""In the order of work; each builds on the one before it."""
+GOOD_SHARE = 0.9
+"""Share of the photographs that find their place in a capture that went well."""
+FOCAL_TOLERANCE = 0.15
+"""EXIF's focal lengths, in whole millimetres of a 35 mm camera, are right to about this share."""
+GOOD_ERROR = 1.5
+"""Mean reprojection error of a reconstruction that went well, pixels."""
+
+
+@dataclass
+class Prepare:
+    """Turn photographs, or a video, into a posed scene that ns-train reads."""
+
+    photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")]
+    """folder of photographs, or a video"""
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """folder for the scene; interrupted work in it is taken up"""
+    matching: Literal["auto", "exhaustive"] = "auto"
+    """which pairs are matched. auto: those that are likely to show the same thing, by their largest features, EXIF
+    positions and order. exhaustive: every pair"""
+    camera_model: CameraModel = "SIMPLE_RADIAL"
+    """lens that is fitted, and undistorted to a pinhole. OPENCV for strong distortion and many photographs"""
+    camera: Literal["auto", "single", "per-image"] = "auto"
+    """single: all photographs share one set of intrinsics. auto: they do if sizes, models and focal lengths agree"""
+    feature_size: int = 1600
+    """features are found at this length of the longest side, pixels"""
+    features: int = 4096
+    """most features in a photograph; more find more points, and take longer to match"""
+    frames: int = 150
+    """a video: number of frames taken from it"""
+
+    def main(self) -> None:
+        try:
+            run = Run(self)
+            run.import_input()
+            run.find_features()
+            run.choose_pairs()
+            run.match()
+            run.map()
+            run.undistort()
+            run.write()
+            run.verdict()
+        except OSError as error:  # no permission, no space, ...
+            raise InputError(f"{error.filename or self.out}: {error.strerror or error}.") from error
+        except RuntimeError as error:  # COLMAP's
+            work = self.out / "work"
+            raise InputError(
+                f"{work}: COLMAP stops with {str(error)!r}. If the disk has room, delete {work} and run this again."
+            ) from error
+
+
+class Run:
+    """One call of the command: where things are, and what is done already."""
+
+    def __init__(self, options: Prepare, screen: Console | None = None):
+        for name in ("feature_size", "features", "frames"):
+            if getattr(options, name) < 10:
+                raise InputError(f"--{name.replace('_', '-')} is {getattr(options, name)}. Give at least 10.")
+        self.options, self.screen = options, screen or Console()
+        self.inputs = files.find_inputs(options.photos)
+        self.is_video = options.photos.is_file()
+        structure.colmap()  # a missing package is told before any work
+        self.out, self.work = options.out, options.out / "work"
+        self.stored, self.database, self.model = self.work / "photos", self.work / "database.db", self.work / "model"
+        self.undistorted, self.pairs_file = self.work / "undistorted", self.work / "likely_pairs.json"
+        self.speed: float | None = None  # seconds for the features of a million pixels
+        self.state_file = self.work / "state.json"
+        if self.out.exists() and not self.state_file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
+            raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
+        try:
+            self.state = dict(json.loads(self.state_file.read_text())) if self.state_file.is_file() else {}
+        except (ValueError, TypeError) as error:
+            raise InputError(f"{self.state_file} is damaged ({error}). Delete {self.out} and begin again.") from error
+        self.key = files.digest(self.inputs)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the stored photographs, sorted."""
+        return sorted(path.name for path in self.stored.iterdir())
+
+    # The stages.
+
+    def import_input(self) -> None:
+        total = self.options.frames if self.is_video else len(self.inputs)
+        frames = {"frames": self.options.frames} if self.is_video else {}
+        with self.stage("import", "read the photographs", [self.stored], total, **frames) as advance:
+            if advance is None:
+                return
+            if self.is_video:
+                shutil.rmtree(self.stored, ignore_errors=True)
+                files.import_video(self.inputs[0], self.stored, self.options.frames, lambda: advance(1))
+            else:
+                files.import_photos(self.inputs, self.stored, lambda: advance(1))
+
+    def find_features(self) -> None:
+        names, options = self.names, self.options
+        one = options.camera == "single" or options.camera == "auto" and files.same_camera(self.stored, names)
+        chosen = {
+            "camera_model": options.camera_model,
+            "one_camera": one,
+            "longest_side": options.feature_size,
+            "features": options.features,
+        }
+        database = [self.database, *(self.database.with_name(self.database.name + end) for end in ("-wal", "-shm"))]
+        with self.stage("features", "find features", database, len(names), **chosen) as advance:
+            if advance is not None:
+                begun = time.monotonic()
+                structure.extract_features(self.database, self.stored, names, **chosen, advance=advance)
+                sizes = files.sizes(self.stored, names)
+                self.speed = (time.monotonic() - begun) / forecast.looked_at(sizes, options.feature_size)
+
+    def choose_pairs(self) -> None:
+        names, matching = self.names, self.options.matching
+        with self.stage("pairs", "choose pairs", [self.pairs_file], len(names), matching=matching) as advance:
+            if advance is None:
+                return
+            if matching == "exhaustive":
+                chosen = pairs.every_pair(len(names))
+            else:
+                descriptors = structure.largest_features(self.database, names, pairs.LARGEST)
+                positions = pairs.metres([read_position(self.stored / name) for name in names])
+                in_a_row = self.is_video or pairs.numbered_in_a_row(names)
+                chosen = pairs.likely_pairs(pairs.shared_features(descriptors, advance), positions, in_a_row)
+            write_whole(self.pairs_file, json.dumps(chosen) + "\n")
+
+    def match(self) -> None:
+        names, chosen = self.names, [tuple(pair) for pair in json.loads(self.pairs_file.read_text())]
+        every = len(names) * (len(names) - 1) // 2
+        if self.speed is not None:
+            counts = structure.feature_counts(self.database, names)
+            seconds = self.speed * forecast.still_to_do(files.sizes(self.stored, names), counts, chosen)
+            rest = forecast.in_words(seconds)
+            self.screen.print(f"{len(chosen):,} of {every:,} pairs to match; {rest} to go.", highlight=False)
+        with self.stage("match", "match pairs", [], len(chosen)) as advance:
+            if advance is None:
+                return
+            found = structure.match_features(self.database, names, chosen, self.work, advance)
+            if found == 0:
+                raise InputError(
+                    f"{self.options.photos}: no two of the {len(names)} photographs show the same thing. Take them "
+                    "closer to each other, with texture in view, and sharp; or try --features 8192."
+                )
+
+    def map(self) -> None:
+        with self.stage("map", "find the cameras", [self.model], len(self.names)) as advance:
+            if advance is None:
+                return
+            enough = GOOD_SHARE * len(self.names)
+            models, mapping = structure.find_cameras(self.database, self.stored, self.model, enough, advance)
+            if models == 0:
+                raise InputError(
+                    f"{self.options.photos}: photographs match, but no two of them are far enough apart to tell depth. "
+                    "Move the camera sideways instead of turning it; with few photographs try --features 8192."
+                )
+            self.state |= {"models": models, "mapping": mapping}
+
+    def undistort(self) -> None:
+        with self.stage("undistort", "undistort", [self.undistorted], 1) as advance:
+            if advance is not None:
+                structure.undistort(self.model, self.stored, self.undistorted)
+
+    def write(self) -> None:
+        from nrfgs_ns.prepare.scene import DOWNSCALES, write_scene
+
+        made = [self.out / "transforms.json", self.out / "sparse.ply", self.out / "images"]
+        made += [self.out / f"images_{factor}" for factor in DOWNSCALES]
+        registered = len(list((self.undistorted / "images").iterdir()))
+        with self.stage("write", "write the scene", made, registered) as advance:
+            if advance is not None:
+                write_scene(self.undistorted, self.stored, self.out, lambda: advance(1))
+
+    @contextlib.contextmanager
+    def stage(
+        self, slot: str, name: str, made: list[Path], total: int, **depends_on: Any
+    ) -> Iterator[Callable[[int], None] | None]:
+        """One stage, with a progress bar.
+
+        Args:
+            slot: its name in state.json, one of STAGES.
+            name: what is shown.
+            made: what the stage writes; removed where it belongs to another input or other options.
+            total: steps of the bar.
+            depends_on: the options that matter to this stage.
+
+        Yields:
+            What advances the bar by a number of steps, or None if the stage is done already.
+        """
+        self.key = hashlib.sha256(json.dumps([self.key, slot, depends_on], sort_keys=True).encode()).hexdigest()
+        before = self.state.get(slot, {})
+        if before == {"key": self.key, "done": True} and all(path.exists() for path in made[:1]):
+            self.screen.print(f"{name}: done before", style="dim")
+            yield None
+            return
+        if before and before["key"] != self.key:
+            self.screen.print(f"{name}: again, since the photographs or the options are others than before")
+        if before.get("key") != self.key:
+            for path in made:
+                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        self._remember(slot, done=False)
+        begun = time.monotonic(), time.process_time()
+        columns = [TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn()]
+        columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
+        with Progress(*columns, console=self.screen) as progress:
+            task = progress.add_task(name, total=total)
+            yield lambda steps: progress.advance(task, steps)
+            progress.update(task, completed=total)
+        spent = time.monotonic() - begun[0], time.process_time() - begun[1]
+        self.state.setdefault("seconds", {})[slot] = [round(each, 1) for each in spent]
+        self._remember(slot, done=True)
+
+    def _remember(self, slot: str, done: bool) -> None:
+        for later in STAGES[STAGES.index(slot) + 1 :]:
+            self.state.pop(later, None)
+        self.state[slot] = {"key": self.key, "done": done}
+        write_whole(self.state_file, json.dumps(self.state, indent=1) + "\n")
+
+    # The end.
+
+    def verdict(self) -> None:
+        """Print what was achieved and what to do next; the numbers go to OUT/prepare.json."""
+        model = structure.colmap().Reconstruction(self.model)
+        total, registered = len(self.names), model.num_reg_images()
+        numbers = {
+            "photographs": total,
+            "registered": registered,
+            "points": model.num_points3D(),
+            "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
+            "mean_track_length": model.compute_mean_track_length(),
+            "models": self.state.get("models", 1),
+            "mapping": self.state.get("mapping", "incremental"),
+            "pairs": len(json.loads(self.pairs_file.read_text())),
+            "seconds_and_cpu_seconds": self.state.get("seconds", {}),
+            "options": {name: value for name, value in asdict(self.options).items() if name not in ("photos", "out")},
+        }
+        write_whole(self.out / "prepare.json", json.dumps(numbers, indent=1) + "\n")
+        error = numbers["mean_reprojection_error_px"]
+        self.screen.print(
+            f"{registered} of {total} photographs have a camera, {numbers['points']:,} points, mean reprojection error "
+            f"{error:.2f} px.",
+            soft_wrap=True,
+        )
+        lengths = structure.focal_lengths(self.database, model)
+        for advice in (*self._advice(registered, total, error), *_focal_advice(lengths)):
+            self.screen.print(f"- {advice}", markup=False, soft_wrap=True)
+        self.screen.print(train_line(self.out), markup=False, highlight=False, soft_wrap=True)
+
+    def _advice(self, registered: int, total: int, error: float) -> Iterator[str]:
+        """What is wrong with a reconstruction, and the mend; nothing for a good one."""
+        if registered < GOOD_SHARE * total:
+            placed = {path.name for path in (self.out / "images").iterdir()}
+            left = [name for name in self.names if name not in placed]
+            yield f"Without a camera: {', '.join(left[:5])}{' ...' if len(left) > 5 else ''}. They are left out."
+            if self.state.get("models", 1) > 1:
+                yield f"They fall into {self.state['models']} groups; the largest is used. Take some in between."
+            if self.options.matching != "exhaustive" and total > pairs.ALIKE + 1:
+                yield "Try --matching exhaustive: slower, but it finds every overlap."
+            yield "Try --features 8192, or take more photographs, sharp and with more overlap."
+        if error > GOOD_ERROR:
+            yield "The error is large: try --camera-model OPENCV, or --camera per-image if the zoom was changed."
+
+
+def _focal_advice(lengths: list[tuple[float, float]]) -> Iterator[str]:
+    """A word about a focal length that EXIF contradicts, from pairs of EXIF's and the reconstruction's in pixels."""
+    told, found = max(lengths, key=lambda pair: abs(math.log(pair[1] / pair[0])), default=(1.0, 1.0))
+    if abs(math.log(found / told)) > math.log(1 + FOCAL_TOLERANCE):
+        yield (
+            f"EXIF tells a focal length of {told:.0f} pixels, {found:.0f} fit best. A walk straight ahead hardly tells "
+            "one from the other, and depths are stretched by as much; photographs to the side would tell."
+        )
+
+
+def train_line(out: Path) -> str:
+    """What to type next; where there is no CUDA device, what gives a good result all the same."""
+    import torch
+
+    from nrfgs_ns.training.cpu_command import ten_minute_command
+
+    if torch.cuda.is_available():
+        return f"Train with: {shlex.join(['ns-train', 'nrfgs', '--data', str(out)])}"
+    return f"No CUDA device: for a good result in ten minutes, train with: {ten_minute_command(out)}"

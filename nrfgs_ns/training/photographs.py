@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a training learns what happened to each photograph, and from where it starts.
+
+It does if the capture needs it: if EXIF says that exposure varies, or if photographs taken next to each other disagree
+about the same points by more than noise (`image/overlap.py`). What they say is where it starts.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from nrfgs_ns.data.exif import read_exif
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.overlap import ENOUGH_PAIRS, Pairs, compare, drawn, estimate, sight, slope, varies
+from nrfgs_ns.image.photograph import PhotographModel
+from nrfgs_ns.model.pinhole import world_to_camera
+
+Choice = Literal["auto", "on", "off"]
+Exif = dict[str, Any]
+
+
+def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
+    """What a training learns of its photographs, and one line that says why.
+
+    Args:
+        config: an NrfgsModelConfig.
+        datamanager: with its images read.
+
+    Returns:
+        None where nothing is learnt.
+
+    Raises:
+        InputError: it is asked for together with the bilateral grid.
+    """
+    if config.photographs == "off" or not config.photograph_parts:
+        return None
+    if config.use_bilateral_grid:
+        if config.photographs == "on":
+            raise InputError(
+                "pipeline.model.photographs is on and use_bilateral_grid, too: both would learn the same. Use one."
+            )
+        return None
+    dataset = datamanager.train_dataset
+    paths, cameras = dataset.image_filenames, dataset.cameras
+    told = datamanager.train_dataparser_outputs.metadata
+    exif = exif_of(paths, told.get("exif"))
+    known = torch.tensor([exposure(of_one) for of_one in exif])
+    pairs = compare_photographs(told.get("points3D_xyz"), cameras, datamanager.cached_train)
+    wanted, why = verdict(config.photographs, pairs, known)
+    what = " and ".join(part.replace("-", " ") for part in config.photograph_parts)
+    CONSOLE.print(f"Photographs: {what} {'learnt' if wanted else 'not learnt'}: {why}.", soft_wrap=True, markup=False)
+    if not wanted:
+        return None
+    camera_of, lenses = physical_cameras(cameras, exif)
+    start = estimate(pairs, known)
+    return PhotographModel([path.name for path in paths], camera_of, lenses, config.photograph_parts, start)
+
+
+def verdict(choice: Choice, pairs: Pairs, known: Tensor) -> tuple[bool, str]:
+    """Whether photographs differ enough, and the evidence in words.
+
+    Args:
+        choice: of the user.
+        pairs: of photographs.
+        known: exposures from EXIF in stops, NaN where it says nothing. [V]
+    """
+    share = pairs.share_beyond_noise
+    count = len(pairs.first)
+    seen = f"{share:.0%} of {count} neighbouring pairs differ beyond noise" if count else "no points to compare them by"
+    there = known[torch.isfinite(known)]
+    if len(there) == 0:
+        told = "EXIF says nothing"
+    elif not varies(known):
+        told = "EXIF says that exposure is the same"
+    else:
+        told = f"EXIF says that exposure varies by {float(there.max() - there.min()):.1f} stops"
+        _, explained = slope(pairs, known)
+        if explained is not None:
+            told += f", which explains {explained:.0%} of their difference"
+    needed = share >= ENOUGH_PAIRS or varies(known)
+    enough = "" if needed or not count else f" ({ENOUGH_PAIRS:.0%} would be enough)"
+    asked = "asked for; " if choice == "on" else ""
+    return needed or choice == "on", f"{asked}{seen}{enough}; {told}"
+
+
+def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
+    """Raise InputError where a training goes on that had learnt other photographs, or other parts of them.
+
+    Args:
+        own: of the training that goes on.
+        written: what the checkpoint says of its own, None if it learnt none.
+    """
+    if (own is None) != (written is None):
+        theirs, ours = ("on", "off") if own is None else ("off", "on")
+        raise InputError(
+            f"The checkpoint was trained with photographs {theirs}, this training has them {ours}. Set "
+            f"--pipeline.model.photographs {theirs}, or train anew."
+        )
+    if own is None:
+        return
+    if list(own.parts) != written["parts"]:
+        raise InputError(
+            "The checkpoint's training learnt other parts of its photographs. Set "
+            f"--pipeline.model.photograph-parts {' '.join(written['parts'])}, or train anew."
+        )
+    if own.names != written["names"]:
+        raise InputError("The checkpoint was trained on other photographs. Go on with the same ones, or train anew.")
+
+
+def exif_of(paths: Sequence[Path], stored: Sequence[Exif] | None) -> list[Exif]:
+    """What the data set says of each photograph, or else its file. [V]"""
+    return [told or read_exif(path) for path, told in zip(paths, stored or [{}] * len(paths), strict=True)]
+
+
+def exposure(exif: Exif) -> float:
+    """A photograph's exposure in stops, up to a constant; NaN if it cannot be told."""
+    if "exposure_time" not in exif or "iso" not in exif:
+        return float("nan")
+    light = exif["exposure_time"] * exif["iso"] / exif.get("f_number", 1.0) ** 2
+    return float(torch.tensor(light, dtype=torch.float64).log2())
+
+
+def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequence[Mapping[str, Any]]) -> Pairs:
+    """Compare photographs at the points that they share.
+
+    Args:
+        points: of the reconstruction, [N, 3]; None: there are none.
+        cameras: [V].
+        images: "image" [H, W, 3 or 4] and perhaps "mask" [H, W, 1] of each. [V]
+    """
+    centers = cameras.camera_to_worlds[:, :3, 3].cpu()
+    if points is None or len(points) == 0:
+        return compare([], centers[:0])
+    points = drawn(points)
+    viewmats = world_to_camera(cameras.camera_to_worlds)
+    matrices = cameras.get_intrinsics_matrices()
+    sightings = []
+    for viewmat, K, batch in zip(viewmats, matrices, images, strict=True):
+        image, mask = batch["image"], None
+        if image.shape[-1] == 4:
+            mask, image = image[..., 3] >= (128 if image.dtype == torch.uint8 else 0.5), image[..., :3]
+        if "mask" in batch:
+            inside = batch["mask"][..., 0] >= 0.5
+            mask = inside if mask is None else mask & inside.to(mask.device)
+        sightings.append(sight(points, viewmat, K, image, mask))
+    return compare(sightings, centers)
+
+
+def physical_cameras(cameras: Cameras, exif: Sequence[Exif]) -> tuple[list[int], Tensor]:
+    """Which camera took each photograph: told apart by make, model and focal length of EXIF, by size, and by the focal
+    length in pixels (to 2 %) where EXIF does not name the camera.
+
+    Returns:
+        A number for each photograph, [V]; and of each camera principal point and focal length as shares of width and
+        height, [C, 4].
+    """
+    columns = (cameras.cx, cameras.cy, cameras.fx, cameras.fy, cameras.width, cameras.height)
+    cx, cy, fx, fy, width, height = (value.flatten().double().cpu() for value in columns)
+    shares = torch.stack([cx / width, cy / height, fx / width, fy / height], dim=-1)
+    angles = (shares[:, 2].log() * 50).round().long().tolist()
+    keys = []
+    for size, angle, of_one in zip(zip(width.tolist(), height.tolist(), strict=True), angles, exif, strict=True):
+        named = of_one.get("make"), of_one.get("model"), of_one.get("focal_length")
+        keys.append((size, named if of_one.get("model") else angle))
+    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    camera_of = [numbers[key] for key in keys]
+    members = torch.tensor(camera_of)
+    return camera_of, torch.stack([shares[members == number].mean(dim=0) for number in range(len(numbers))]).float()

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When photographs' exposure is learnt, what a training makes of it, and what comes out: on a scene of known stops."""
+
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import ExifTags, Image
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.overlap import Pairs
+from nrfgs_ns.training.photographs import exif_of, exposure, physical_cameras, verdict
+
+NAN = math.nan
+
+
+def pairs_with(shifts, spread: float = 0.05) -> Pairs:
+    """Pairs of photographs 0 and 1, 1 and 2, ... whose exposure differs by these stops."""
+    count = len(shifts)
+    shift = torch.zeros(count, 3)
+    shift[:, 0] = torch.tensor(shifts)
+    return Pairs(torch.arange(count), torch.arange(count) + 1, shift, torch.full((count, 3), spread))
+
+
+SAME, DIFFERENT = pairs_with([0.01] * 10), pairs_with([0.5, -0.5] * 5)
+
+
+@pytest.mark.parametrize(
+    ("choice", "pairs", "known", "wanted", "words"),
+    [
+        (
+            "auto",
+            SAME,
+            [NAN] * 11,
+            False,
+            "0% of 10 neighbouring pairs differ beyond noise (20% would be enough)",
+        ),
+        ("auto", DIFFERENT, [NAN] * 11, True, "100% of 10 neighbouring pairs"),
+        ("auto", pairs_with([0.5, -0.5] * 5, spread=0.5), [NAN] * 11, False, "0% of 10"),
+        ("auto", pairs_with([]), [NAN] * 11, False, "no points to compare them by; EXIF says nothing"),
+        ("auto", pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "0% of 3"),
+        ("auto", pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 1.5 stops"),
+        ("auto", SAME, [0.3] * 11, False, "EXIF says that exposure is the same"),
+        ("auto", DIFFERENT, [0.0, 0.5] * 5 + [0.0], True, "which explains 100% of their difference"),
+        ("on", SAME, [NAN] * 11, True, "asked for; 0% of 10"),
+    ],
+)
+def test_the_evidence_decides_and_is_told(choice, pairs, known, wanted, words):
+    found, why = verdict(choice, pairs, torch.tensor(known))
+    assert found == wanted
+    assert words in why
+
+
+def test_exposure_in_stops():
+    assert exposure({"exposure_time": 0.02, "iso": 100, "f_number": 4.0}) - exposure(
+        {"exposure_time": 0.01, "iso": 50, "f_number": 4.0}
+    ) == pytest.approx(2.0)
+    assert exposure({"exposure_time": 0.01, "iso": 100, "f_number": 2.0}) - exposure(
+        {"exposure_time": 0.01, "iso": 100, "f_number": 4.0}
+    ) == pytest.approx(2.0)
+    assert math.isnan(exposure({"f_number": 2.0, "iso": 100})) and math.isnan(exposure({}))
+
+
+def test_exif_comes_from_the_data_set_or_else_from_the_file(tmp_path):
+    photo = tmp_path / "a.jpg"
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = 0.25
+    Image.new("RGB", (8, 8)).save(photo, exif=exif)
+    other = tmp_path / "b.jpg"
+    assert exif_of([photo, other], [{}, {"iso": 50}]) == [{"exposure_time": 0.25}, {"iso": 50}]
+
+
+def cameras_of(focals, width: int = 100):
+    column = torch.tensor(focals)[:, None]
+    ones = torch.ones_like(column)
+    return SimpleNamespace(cx=50 * ones, cy=40 * ones, fx=column, fy=column, width=width * ones, height=80 * ones)
+
+
+def test_cameras_are_told_apart_by_exif_or_by_their_angle():
+    camera_of, lenses = physical_cameras(cameras_of([100.0, 101.0, 200.0, 100.2]), [{}] * 4)
+    assert camera_of == [0, 0, 1, 0]
+    assert lenses[1].tolist() == pytest.approx([0.5, 0.5, 2.0, 2.5])
+    one, other = {"make": "A", "model": "X"}, {"make": "A", "model": "Y"}
+    assert physical_cameras(cameras_of([100.0, 130.0, 100.0]), [one, one, other])[0] == [0, 0, 1]
+
+
+# Trainings.
+
+
+@pytest.fixture(scope="module")
+def exposed_scene(tmp_path_factory):
+    """A procedural data set of 24 photographs, 128 x 96, with known stops, and those stops by name."""
+    from nrfgs_lab.exposure import exposed
+    from nrfgs_ns.scenes import SceneConfig, write_scene
+
+    config = SceneConfig(views=24, width=128, height=96, points=4000, samples=1)
+    scene = write_scene(config, tmp_path_factory.mktemp("data") / "exposed")
+    meta = json.loads((scene / "transforms.json").read_text())
+    random, stops = np.random.default_rng(0), {}
+    for frame in meta["frames"]:
+        path = scene / frame["file_path"]
+        drawn = random.uniform(-1, 1) + 0.1 * random.standard_normal(3)
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("RGB"))
+        Image.fromarray(exposed(pixels, drawn)).save(path)
+        stops[path.name] = drawn
+    return scene, stops
+
+
+QUICK = {
+    "--pipeline.model.num-downscales": 1,
+    "--pipeline.model.background-color": "black",
+    "--pipeline.model.warmup-steps": 0,
+    "--pipeline.model.refine-every": 1000,
+}
+
+
+@pytest.fixture(scope="module")
+def finished(exposed_scene, tmp_path_factory):
+    """config.yml of a training of four steps, whose exposures come from the photographs themselves."""
+    return trained(command_line("nrfgs-sh", exposed_scene[0], tmp_path_factory.mktemp("whole"), 4, QUICK))
+
+
+def test_known_exposures_are_found(exposed_scene, finished):
+    _, stops = exposed_scene
+    state = checkpoint_of(finished)["pipeline"]
+    names = state["_model.photograph._extra_state"]["names"]
+    learnt = state["_model.photograph.shots"][:, 0].numpy()
+    truth = np.array([np.mean(stops[name]) for name in names])
+    assert np.corrcoef(learnt, truth)[0, 1] > 0.95
+    assert np.abs(learnt - (truth - truth.mean())).mean() < 0.15
+    assert abs(learnt.mean()) < 1e-6
+
+
+def test_resumed_is_the_unbroken_one(exposed_scene, finished, tmp_path, capsys):
+    scene, _ = exposed_scene
+    half = trained(command_line("nrfgs-sh", scene, tmp_path / "half", 2, QUICK))
+    assert "Photographs: exposure and white balance learnt: " in " ".join(capsys.readouterr().out.split())
+    rest = trained(command_line("nrfgs-sh", scene, tmp_path / "rest", 4, QUICK, {"--load-dir": models_of(half)}))
+    assert_same_training(checkpoint_of(finished), checkpoint_of(rest), rtol=0, atol=0)
+
+
+def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path):
+    config = trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 2, QUICK))
+    checkpoint = checkpoint_of(config)
+    assert not any("photograph" in name for name in checkpoint["pipeline"])
+    assert "photograph" not in checkpoint["optimizers"]
+
+
+def test_a_checkpoint_of_the_other_choice_is_refused(tiny_scene, tmp_path):
+    config = trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 2, QUICK))
+    more = {"--load-dir": models_of(config), "--pipeline.model.photographs": "on"}
+    with pytest.raises(InputError, match="pipeline.model.photographs off"):
+        trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "on", 2, QUICK, more))
+
+
+def test_both_corrections_at_once_are_refused(tiny_scene, tmp_path):
+    both = {"--pipeline.model.photographs": "on", "--pipeline.model.use-bilateral-grid": True}
+    with pytest.raises(InputError, match="bilateral"):
+        trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 2, QUICK, both))
+
+
+def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished, monkeypatch):
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    _, stops = exposed_scene
+    _, pipeline, _, _ = eval_setup(finished)
+    model = pipeline.model
+    camera = pipeline.datamanager.train_dataset.cameras[:1]
+    mean = model.get_outputs_for_camera(camera)["rgb"]
+    brightest = max(model.photograph.names, key=lambda name: stops[name].mean())
+    monkeypatch.setenv("NRFGS_LOOK", brightest)
+    assert (model.get_outputs_for_camera(camera)["rgb"] - mean).mean() > 0.02
+    monkeypatch.setenv("NRFGS_LOOK", "nobody.jpg")
+    with pytest.raises(InputError, match="nobody.jpg"):
+        model.get_outputs_for_camera(camera)
