@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 STEP_FORWARD = 5.0
 """In sizes of the little cameras that mark the photographs: those of up to 30 degrees and more are behind."""
+MEAN_LOOK = "all photographs' mean"
 MARKER_COLOR = (255, 211, 105)
 """Of the frustum that stands where the view was frozen: the viewer's yellow."""
 
@@ -64,6 +65,15 @@ class ViewerPanel(ViewerControl):
                 initial_value=1.0,
                 hint="How much of what depends on the view is added: 0 nothing, 1 as trained",
             )
+            self.stops = gui.add_slider(
+                "Exposure", min=-3.0, max=3.0, step=0.1, initial_value=0.0, hint="Stops by which the image is brighter"
+            )
+            self.look = None
+            if self.model.photograph is not None:
+                names = [MEAN_LOOK, *self.model.photograph.names]
+                self.look = gui.add_dropdown(
+                    "Look", names, initial_value=MEAN_LOOK, hint="The photograph whose exposure and colour are shown"
+                )
             self.freeze = gui.add_checkbox(
                 "Freeze view",
                 initial_value=False,
@@ -73,6 +83,8 @@ class ViewerPanel(ViewerControl):
         # One callback each: viser runs a control's callbacks in no particular order.
         self.mode.on_update(lambda _: self._change_mode())
         self.gain.on_update(lambda _: viewer._trigger_rerender())
+        for control in filter(None, (self.stops, self.look)):
+            control.on_update(lambda _: viewer._trigger_rerender())
         self.freeze.on_update(lambda event: self._freeze(event.client))
         self.marker = None
         self.waiting: list = []  # browsers that came before the scene
@@ -122,7 +134,10 @@ class ViewerPanel(ViewerControl):
         """What the controls say now; the image as trained if there is no viewer."""
         if not self.installed:
             return Shown()
-        return Shown(self.mode.value, float(self.gain.value), self.frozen_center if self.freeze.value else None)
+        center = self.frozen_center if self.freeze.value else None
+        of_mean = self.look is None or self.look.value == MEAN_LOOK
+        photograph = None if of_mean else self.model.photograph.names.index(self.look.value)
+        return Shown(self.mode.value, float(self.gain.value), center, float(self.stops.value), photograph)
 
     def render(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Render one camera as the controls say.

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import Component, SplatAppearance
+from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.rasterizer import composite
 
 if TYPE_CHECKING:
@@ -67,6 +68,10 @@ class Shown:
     """factor of the residuals, >= 0; 1 is as trained."""
     frozen_center: Tensor | None = None
     """where splats are seen from [3], in world units, if that is not where the camera is"""
+    stops: float = 0.0
+    """by how much the image is exposed more"""
+    photograph: int | None = None
+    """the training photograph whose exposure and colour the image has; None: the mean look"""
 
 
 def offered_components(field: Field) -> dict[str, str]:
@@ -105,8 +110,10 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
     if shown.frozen_center is not None:
         view = view._replace(center=shown.frozen_center.to(view.center))
     appearance = with_gain(field, view, 0.0 if shown.mode == BASE else shown.gain)
-    outputs, _ = model.composite(view, appearance, background)
+    outputs, _ = model.composite(view, appearance, background, shown.photograph)
     if shown.mode in (FULL, BASE):
+        if shown.stops != 0.0:
+            outputs["rgb"] = exposed(outputs["rgb"], shown.stops)
         return outputs
 
     if shown.mode == DEPTH:

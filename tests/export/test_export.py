@@ -441,8 +441,10 @@ def test_a_page_apart_from_its_scene(trained, tmp_path):
     assert {path.name for path in (tmp_path / "served").iterdir()} == {"index.html", "scene.nrf"}
     decode(tmp_path / "served/scene.nrf")
     (tmp_path / "taken").write_text("")
-    with pytest.raises(InputError, match="ends in .html"):
-        Export("web", trained("nrfgs"), tmp_path / "taken").main()
+    (tmp_path / "taken.html").mkdir()
+    for name, kind in (("taken", "file"), ("taken.html", "folder")):
+        with pytest.raises(InputError, match=f"is a {kind}. Name a file that ends in .html"):
+            Export("web", trained("nrfgs"), tmp_path / name).main()
 
 
 def test_a_page_of_another_head_is_refused(trained, tmp_path):

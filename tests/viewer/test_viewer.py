@@ -37,6 +37,7 @@ from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.ply import read_splats
+from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.run import parse
@@ -370,6 +371,28 @@ def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
     after = model.get_outputs_for_camera(camera)
     assert all(torch.equal(after[name], before[name]) for name in before)
     assert model.get_image_metrics_and_images(after, batch)[0] == before_metrics
+
+
+def test_exposure_and_a_photographs_look(build, open_viewer):
+    pipeline = build("nrfgs", "--pipeline.model.photographs", "on")
+    model, (camera, _) = pipeline.model, two_cameras(pipeline)
+    with torch.no_grad():
+        model.photograph.shots[3] = torch.tensor([-1.0, 0.5, 0.0])
+    plain = picture(model, camera, Shown())["rgb"]
+    assert torch.equal(plain, model.get_outputs_for_camera(camera)["rgb"])  # the mean look
+    assert_close(picture(model, camera, Shown(stops=1.0))["rgb"], exposed(plain, 1.0))
+    third = picture(model, camera, Shown(photograph=3))["rgb"]
+    assert_close(third, exposed(plain, model.photograph.stops()[3]))
+    assert third.mean() < plain.mean() - 0.02
+
+    viewer, panel, pose = open_viewer(pipeline), model.viewer_panel, camera.camera_to_worlds[0]
+    seen = coarse(Browser.sees(viewer, pose)["rgb"])
+    panel.look.value = model.photograph.names[3]
+    assert panel.shown.photograph == 3
+    assert coarse(Browser.sees(viewer, pose)["rgb"]).mean() < seen.mean() - 0.01
+    panel.stops.value = 1.5
+    assert panel.shown.stops == 1.5
+    assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], plain)
 
 
 STEPS = 18

@@ -52,8 +52,11 @@ def export_web(
     """
     check_options(options)
     alone = output.suffix.lower() in (".html", ".htm")
-    if not alone and output.is_file():
-        raise InputError(f"--output {output} is a file. Name one that ends in .html, or a folder.")
+    if output.exists() and output.is_file() != alone:
+        raise InputError(
+            f"--output {output} is a {'file' if output.is_file() else 'folder'}. Name a file that ends in .html, or a "
+            "folder that does not."
+        )
     pipeline = load_model(load_config, "test")
     model = pipeline.model
     if not isinstance(model.head, NeuralResidualField):
