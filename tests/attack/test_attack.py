@@ -61,7 +61,7 @@ def test_the_attack_tells_outcomes_apart(tmp_path):
 
 def test_the_page_shows_the_tables():
     root = Path(__file__).resolve().parents[2]
-    record = json.loads((root / "docs" / "results" / "attack.json").read_text())
+    record = json.loads((root / "results" / "attack.json").read_text())
     page = (root / "docs" / "stability.md").read_text()
     assert record["before"]["table"] in page and record["after"]["table"] in page
     assert set(record["after"]["areas"]) <= set(AREAS)
