@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folder in nerfstudio's viewer whose controls say which picture of the appearance head is shown.
 
-A model renders by its panel only when one of the viewer's render threads asks (`asked_by_viewer`): what a browser sets
-cannot reach a training, an evaluation or ns-render, which run in other threads.
+A model that was handed a panel (`show_by`) renders by it only where the panel says that a browser is asking: what a
+browser sets cannot reach a training, an evaluation or ns-render.
 """
 
 import threading
@@ -25,13 +25,9 @@ if TYPE_CHECKING:
 
 STEP_FORWARD = 5.0
 """In sizes of the little cameras that mark the photographs: those of up to 30 degrees and more are behind."""
+MEAN_LOOK = "all photographs' mean"
 MARKER_COLOR = (255, 211, 105)
 """Of the frustum that stands where the view was frozen: the viewer's yellow."""
-
-
-def asked_by_viewer() -> bool:
-    """Whether this code runs for a browser: nerfstudio's viewer renders in a thread of its own for each."""
-    return isinstance(threading.current_thread(), RenderStateMachine)
 
 
 class ViewerPanel(ViewerControl):
@@ -69,6 +65,15 @@ class ViewerPanel(ViewerControl):
                 initial_value=1.0,
                 hint="How much of what depends on the view is added: 0 nothing, 1 as trained",
             )
+            self.stops = gui.add_slider(
+                "Exposure", min=-3.0, max=3.0, step=0.1, initial_value=0.0, hint="Stops by which the image is brighter"
+            )
+            self.look = None
+            if self.model.photograph is not None:
+                names = [MEAN_LOOK, *self.model.photograph.names]
+                self.look = gui.add_dropdown(
+                    "Look", names, initial_value=MEAN_LOOK, hint="The photograph whose exposure and colour are shown"
+                )
             self.freeze = gui.add_checkbox(
                 "Freeze view",
                 initial_value=False,
@@ -78,11 +83,22 @@ class ViewerPanel(ViewerControl):
         # One callback each: viser runs a control's callbacks in no particular order.
         self.mode.on_update(lambda _: self._change_mode())
         self.gain.on_update(lambda _: viewer._trigger_rerender())
+        for control in filter(None, (self.stops, self.look)):
+            control.on_update(lambda _: viewer._trigger_rerender())
         self.freeze.on_update(lambda event: self._freeze(event.client))
         self.marker = None
         self.waiting: list = []  # browsers that came before the scene
         viewer.viser_server.on_client_connect(self._welcome)
         self.installed = True
+
+    @staticmethod
+    def is_asking() -> bool:
+        """Whether this code runs for a browser: nerfstudio's viewer renders in a thread of its own for each."""
+        return isinstance(threading.current_thread(), RenderStateMachine)
+
+    def set_background(self, background: Tensor) -> None:
+        """Take the viewer's background colour [3]."""
+        self.background = background
 
     def _welcome(self, client) -> None:
         """Let a browser begin where the first of the training photographs was taken: nerfstudio's own first view may
@@ -109,24 +125,19 @@ class ViewerPanel(ViewerControl):
 
     def _legends(self) -> dict[str, str]:
         """What the line under the dropdown says in each mode."""
-        splats = dict(self.model.gauss_params.items())
-        kinds = offered_components(self.model.head, splats)
-        return {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(self.model.head, splats)}
-
-    def offer_modes(self) -> None:
-        """Offer what the model's head has to show, after it has become another one."""
-        if self.installed:
-            legends = self._legends()
-            if self.mode.value not in legends:
-                self.mode.value = FULL
-            self.mode.options, self.legends = list(legends), legends
+        field = self.model.field
+        kinds = offered_components(field)
+        return {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(field)}
 
     @property
     def shown(self) -> Shown:
         """What the controls say now; the image as trained if there is no viewer."""
         if not self.installed:
             return Shown()
-        return Shown(self.mode.value, float(self.gain.value), self.frozen_center if self.freeze.value else None)
+        center = self.frozen_center if self.freeze.value else None
+        of_mean = self.look is None or self.look.value == MEAN_LOOK
+        photograph = None if of_mean else self.model.photograph.names.index(self.look.value)
+        return Shown(self.mode.value, float(self.gain.value), center, float(self.stops.value), photograph)
 
     def render(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Render one camera as the controls say.

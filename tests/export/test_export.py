@@ -249,7 +249,7 @@ def test_the_fit_follows_a_random_field_closer_than_its_base_colour(trained):
         camera = cameras[index : index + 1]
         outputs = model.get_outputs_for_camera(camera)
         pictures = {
-            "file": render_splats(model.fit.splats, camera, outputs["background"]),
+            "file": render_splats(model.fit.splats, camera, model.background_color),
             "base": model.get_base_color(camera),
         }
         for name, picture in pictures.items():
@@ -383,7 +383,7 @@ def test_trainings_and_viewers_see_the_stored_tables(mode, tiny_scene, tmp_path,
     """The viewer reads every property of the model several times at its start: nothing may be fitted there."""
     config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path)])
     model = config.pipeline.setup(device="cpu", test_mode=mode).model
-    monkeypatch.setattr("nrfgs_ns.model.exported.fit_harmonics", None)
+    monkeypatch.setattr("nrfgs_ns.model.model.fit_harmonics", None)
     assert model.fit is None and model.shs_rest.shape == (model.num_points, 0, 3)
     for name in ("opacities", "quats", "features_dc"):
         assert getattr(model, name) is model.gauss_params[name]
@@ -441,8 +441,10 @@ def test_a_page_apart_from_its_scene(trained, tmp_path):
     assert {path.name for path in (tmp_path / "served").iterdir()} == {"index.html", "scene.nrf"}
     decode(tmp_path / "served/scene.nrf")
     (tmp_path / "taken").write_text("")
-    with pytest.raises(InputError, match="ends in .html"):
-        Export("web", trained("nrfgs"), tmp_path / "taken").main()
+    (tmp_path / "taken.html").mkdir()
+    for name, kind in (("taken", "file"), ("taken.html", "folder")):
+        with pytest.raises(InputError, match=f"is a {kind}. Name a file that ends in .html"):
+            Export("web", trained("nrfgs"), tmp_path / name).main()
 
 
 def test_a_page_of_another_head_is_refused(trained, tmp_path):
