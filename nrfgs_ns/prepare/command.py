@@ -297,9 +297,9 @@ def _focal_advice(lengths: list[tuple[float, float]]) -> Iterator[str]:
     told, found = max(lengths, key=lambda pair: abs(math.log(pair[1] / pair[0])), default=(1.0, 1.0))
     if abs(math.log(found / told)) > math.log(1 + FOCAL_TOLERANCE):
         yield (
-            f"EXIF tells a focal length of {told:.0f} pixels, {found:.0f} fit best. After cropping or zooming that is as "
-            "it should be. After a walk straight ahead depths may be stretched by as much: photographs to the side would "
-            "tell."
+            f"EXIF tells a focal length of {told:.0f} pixels, {found:.0f} fit best. After cropping or zooming that is "
+            "as it should be. After a walk straight ahead depths may be stretched by as much: photographs to the side "
+            "would tell."
         )
 
 
