@@ -186,14 +186,11 @@ def recovered(checkpoint: Path, truth: Path) -> dict[str, Any] | None:
         "rms_stops": of the exposures learnt, and if the truth is known "correlation" of exposures, "rms_error_stops",
         the same of white balance (log2 of red and blue over green), and "stops" by name.
     """
-    import torch
-
     from nrfgs_ns.image.photograph import PhotographModel
-    from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
+    from nrfgs_ns.training.checkpoint_files import read as read_checkpoint
 
-    allow_nerfstudio_checkpoints()
     prefix = "_model.photograph."
-    pipeline = torch.load(checkpoint, map_location="cpu", weights_only=True)["pipeline"]
+    pipeline = read_checkpoint(checkpoint)["pipeline"]
     state = {name.removeprefix(prefix): value for name, value in pipeline.items() if name.startswith(prefix)}
     if not state:
         return None

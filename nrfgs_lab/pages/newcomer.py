@@ -5,7 +5,7 @@
 
 Photographs -> `nrfgs prepare` -> `ns-train nrfgs`, watched in a browser -> `ns-viewer` -> `ns-eval` -> `nrfgs export
 ply`. Small sizes, on a CPU. Writes docs/images/first-scene-*.jpg (pages of the viewer, renderings only) and
-docs/results/newcomer/newcomer.json: each command, how long it took, and what it found. Interrupted, it goes on with the
+results/newcomer.json: each command, how long it took, and what it found. Interrupted, it goes on with the
 step that it was at; another --work begins anew. Needs a Chromium and
 `pip install -e '.[browser]'`.
 """
@@ -19,11 +19,12 @@ import time
 from pathlib import Path
 
 from nrfgs_lab.pages.browser import PATIENCE, TRAIN, VIEWER, Page, Served, chromium
+from nrfgs_lab.results import write
 from nrfgs_ns.training.run import machine
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES = ROOT / "docs" / "images"
-RESULTS = ROOT / "docs" / "results" / "newcomer"
+RESULTS = ROOT / "results" / "newcomer.json"
 BIN = Path(sys.executable).parent
 STEPS, WATCHED = 800, 200
 """Training steps, and that after which the page is looked at."""
@@ -157,9 +158,8 @@ def main() -> None:
         "eval": {name: value for name, value in evaluation.items() if value == value},  # NaN is no number
         "export": found["export"],
     }
-    RESULTS.mkdir(parents=True, exist_ok=True)
     text = json.dumps(record, indent=1).replace(str(photos), "PHOTOS").replace(f"{work}/", "")
-    (RESULTS / "newcomer.json").write_text(text + "\n", encoding="utf-8")
+    write(RESULTS, {"newcomer": json.loads(text)})
     print(f"{record['seconds']:.0f} s in all")
 
 

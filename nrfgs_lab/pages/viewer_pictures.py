@@ -29,7 +29,7 @@ def sheet(config: Path, view: int) -> Image.Image:
     _, pipeline, _, _ = eval_setup(config, test_mode="test")
     model = pipeline.model
     camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[view]
-    names = modes(model.head, dict(model.gauss_params.items()))
+    names = modes(model.field)
     height = round(WIDTH * camera.height.item() / camera.width.item())
     rows = -(-len(names) // COLUMNS)
     size = (COLUMNS * (WIDTH + GAP) - GAP, rows * (TITLE + height + GAP) - GAP)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time the appearance head alone on a CUDA device: the fused field beside PyTorch's and beside the other heads.
 
-    python -m nrfgs_lab.timing.head_gpu --out docs/results/head_gpu.json
+    python -m nrfgs_lab.timing.head_gpu --out head_gpu.json
     python -m nrfgs_lab.timing.head_gpu --sizes 1000000 --sweep               # launch constants of the fused kernels
-    python -m nrfgs_lab.timing.head_gpu --sizes --out docs/results/head_gpu_diffuse.json     # diffuse splats alone
+    python -m nrfgs_lab.timing.head_gpu --sizes --out head_gpu_diffuse.json     # diffuse splats alone
     TRITON_INTERPRET=1 python -m nrfgs_lab.timing.head_gpu --device cpu --sizes 200 --diffuse-sizes 200 --rounds 1
 
 A table of N splats of which M are visible, from one camera; M = N ("all"), and M = N / 2 picked at random ("half").

@@ -2,8 +2,8 @@
 """What several GPUs are worth on one scene: memory, images per second, and the same quality from as many images.
 
     python -m nrfgs_lab.timing.many_gpus load --scene SCENES/bonsai --splats 4000000 \
-        --out docs/results/many-gpus/load.json
-    python -m nrfgs_lab.timing.many_gpus quality --scene SCENES/bonsai --out docs/results/many-gpus/quality.json
+        --out load.json
+    python -m nrfgs_lab.timing.many_gpus quality --scene SCENES/bonsai --out quality.json
 
 `load` trains from random splats with densification off, at full resolution, on each number of devices in turn, and
 notes each device's peak memory and the images per second. `quality` runs `ns-train` with

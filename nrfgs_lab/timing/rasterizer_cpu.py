@@ -312,7 +312,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--no-bind", action="store_true", help="let the process wander over all cores")
     parser.add_argument("--no-loop", action="store_true", help="skip the baseline")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/rasterizer_cpu.json"))
+    parser.add_argument("--out", type=Path, default=Path("rasterizer_cpu.json"))
     parser.add_argument("--train", type=Path, metavar="FILE", help=argparse.SUPPRESS)
     parser.add_argument("--peak-memory", metavar="SIZE or FILE", help=argparse.SUPPRESS)
     arguments = parser.parse_args()

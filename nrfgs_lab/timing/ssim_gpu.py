@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time splatfacto's loss, (1 - lambda) L1 + lambda (1 - SSIM), on a CUDA device: nerfstudio's way beside the fused one.
 
-    python -m nrfgs_lab.timing.ssim_gpu --out docs/results/ssim_gpu.json
+    python -m nrfgs_lab.timing.ssim_gpu --out ssim_gpu.json
     python -m nrfgs_lab.timing.ssim_gpu --rows 8 16 24 32     # rows of a program, a launch constant
-    python -m nrfgs_lab.timing.ssim_gpu --device cpu --sizes 200x150 800x600 --out docs/results/ssim_cpu.json
+    python -m nrfgs_lab.timing.ssim_gpu --device cpu --sizes 200x150 800x600 --out ssim_cpu.json
 
 A call is the loss and its gradient by the image. Variants take turns within a round; a round is `repeats` calls between
 two CUDA events, and the host's time to issue them is taken beside it: where it is the larger one, the step is bound by

@@ -53,7 +53,7 @@ class StepCpu:
     """threads of torch"""
     quick: bool = False
     """the demo's quick scene"""
-    out: Path = Path("docs/results/step_cpu.json")
+    out: Path = Path("step_cpu.json")
     """JSON file of the results"""
 
     def main(self) -> None:
@@ -121,15 +121,15 @@ def take_apart(trainer: Any, step: int) -> dict[str, float]:
     with section("data"):
         camera, batch = trainer.pipeline.datamanager.next_train(step)
     with section("projection"):
-        view = model.look(camera)
+        view = model.project(camera)
     projected = {name: getattr(view.projection, name) for name in PROJECTED}
     leaves = {name: leaf(tensor) for name, tensor in projected.items()}
     with section("head"):
-        appearance = model.head(view.splats, view.visible, view.center)
+        appearance = model.field.seen_from(view)
     answered = SplatAppearance(*(leaf(tensor) for tensor in appearance))
     seen = view._replace(projection=replace(view.projection, **leaves))
     with section("compositing"), binning_apart(section):
-        outputs, _ = model.paint(seen, answered)
+        outputs, _ = model.composite(seen, answered)
     seconds["compositing"] -= seconds["binning"]
     rgb = leaf(outputs["rgb"])
     with section("loss"):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the time of one training step goes: kernels, launches, waits and the host, method by method.
 
-    python -m nrfgs_lab.timing.step_profile --scene SCENES/bonsai --splats 300000 --out docs/results/step_profile.json
+    python -m nrfgs_lab.timing.step_profile --scene SCENES/bonsai --splats 300000 --out step_profile.json
 
 Each method trains for a few hundred steps at full resolution from the same number of random splats, densification
 off, as `ns-train` would run it. Wall-clock is taken over steps that nothing watches; then the same steps are timed

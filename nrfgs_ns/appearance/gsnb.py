@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from nrfgs_ns.appearance.directions import unit_vectors
 from nrfgs_ns.appearance.encoding import fourier_bands
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import SplatAppearance, base_opacities
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics
 from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
 
@@ -35,6 +35,7 @@ from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
 class GsnbConfig(ShConfig):
     """Spherical harmonics and a learnt basis. The defaults are the paper's."""
 
+    STEPS = (*ShConfig.STEPS, "ramp_steps")
     _target: type = field(default_factory=lambda: NeuralBasis)
     """the head class that this configuration builds"""
     num_bands: int = 6
@@ -87,5 +88,5 @@ class NeuralBasis(SphericalHarmonics):
         colors = colors + self.ramp * (learnt[..., None] * coefficients).sum(dim=1)
         return SplatAppearance(
             colors=(colors + 0.5).clamp_min(0.0),
-            opacities=torch.sigmoid(splats["opacities"].index_select(0, visible)).squeeze(-1),
+            opacities=base_opacities(splats["opacities"].index_select(0, visible)),
         )

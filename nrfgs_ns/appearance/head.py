@@ -13,7 +13,7 @@ Nothing here knows nerfstudio or the rasterizer.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -47,14 +47,22 @@ class AppearanceHeadConfig:
     _target: type = field(default_factory=lambda: AppearanceHead)
     """the head class that this configuration builds"""
 
-    def setup(self) -> "AppearanceHead":
+    STEPS: ClassVar[tuple[str, ...]] = ()
+    """Fields that are numbers of training steps: where schedules are stretched, so are they."""
+
+    def setup(self, scene_unit: float = 1.0) -> "AppearanceHead":
         """Build the head.
+
+        Args:
+            scene_unit: world units in a scene unit.
 
         Raises:
             ValueError: a field is out of range; the message names it.
         """
         self.validate()
-        return self._target(self)
+        head = self._target(self)
+        head.scene_unit = scene_unit
+        return head
 
     def validate(self) -> None:
         """Raise ValueError, naming the field and the mend, if a value cannot work."""
@@ -80,10 +88,12 @@ class AppearanceHead(nn.Module, ABC):
     sh_degree: int = 0
     """Degree of the spherical harmonics among the splats' parameters; 0 if there are none."""
     scene_unit: float = 1.0
-    """World units in a scene unit, told by the model: the lengths in a head's configuration, and what it makes of
-    distances, are in scene units, so that a scene looks the same whatever it is measured in."""
+    """World units in a scene unit: the lengths in a head's configuration, and what it makes of distances, are in scene
+    units, so that a scene looks the same whatever it is measured in."""
     knows_diffuse: bool = False
     """Whether a table may have "diffuse" among its entries (`diffuse.py`)."""
+    residual_params: tuple[str, ...] = ()
+    """Those of `splat_params` that only the residual reads: a diffuse splat need not store them."""
     is_harmonics: bool = False
     """Whether colours are exactly the harmonics in `features_dc` and `features_rest`, and opacities the base's."""
 
@@ -113,7 +123,7 @@ class AppearanceHead(nn.Module, ABC):
         """The part of the visible splats' appearance that does not depend on the camera."""
         return SplatAppearance(
             colors=base_colors(splats["features_dc"].index_select(0, visible)).clamp_min(0.0),
-            opacities=torch.sigmoid(splats["opacities"].index_select(0, visible)).squeeze(-1),
+            opacities=base_opacities(splats["opacities"].index_select(0, visible)),
         )
 
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
@@ -140,6 +150,14 @@ class AppearanceHead(nn.Module, ABC):
         None if the head has no shared weights that could be taught.
         """
         return None
+
+
+def base_opacities(logits: Tensor) -> Tensor:
+    """Base opacities [M] from the stored logits [M, 1].
+
+    Rows are picked first, then comes the sigmoid: in the other order the last bit may differ.
+    """
+    return torch.sigmoid(logits).squeeze(-1)
 
 
 def base_colors(features_dc: Tensor) -> Tensor:

@@ -109,6 +109,7 @@ class NeuralResidualField(AppearanceHead):
 
     name = "nrf"
     knows_diffuse = True
+    residual_params = ("latents",)
 
     def __init__(self, config: NrfConfig):
         super().__init__()

@@ -16,30 +16,11 @@ import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 
 Layers = tuple[Tensor, Tensor, Tensor, Tensor]
 """Weights of a branch: W1 [H, I], b1 [H], W2 [O, H], b2 [O]."""
-
-
-class Field(NamedTuple):
-    """A head and the table of the splats that it draws."""
-
-    head: NeuralResidualField
-    splats: dict[str, Tensor]
-
-    @property
-    def bytes(self) -> int:
-        """Bytes that a renderer needs in float32: no latents for diffuse splats, and a bit each that says so."""
-        size = sum(weight.numel() * weight.element_size() for weight in self.head.parameters())
-        diffuse = self.splats.get(DIFFUSE)
-        for name, value in self.splats.items():
-            if name == DIFFUSE:
-                size += -(-len(value) // 8)
-            else:
-                rows = int((~diffuse).sum()) if name == "latents" and diffuse is not None else len(value)
-                size += rows * value[:1].numel() * value.element_size()
-        return size
 
 
 def input_columns(config: NrfConfig, branch: str) -> dict[str, list[int]]:

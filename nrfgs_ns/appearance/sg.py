@@ -24,7 +24,13 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.appearance.directions import unit_vectors
-from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_colors
+from nrfgs_ns.appearance.head import (
+    AppearanceHead,
+    AppearanceHeadConfig,
+    SplatAppearance,
+    base_colors,
+    base_opacities,
+)
 
 SHORTEST_AXIS = 1e-3
 """Stored axes shorter than this are divided by it instead of their length: they start at 1, and the bound is for the
@@ -35,6 +41,7 @@ gradient of one that training leads through zero."""
 class SgConfig(AppearanceHeadConfig):
     """Spherical Gaussians with free axes."""
 
+    STEPS = ("start_step",)
     _target: type = field(default_factory=lambda: SphericalGaussians)
     """the head class that this configuration builds"""
     lobes: int = 3
@@ -89,7 +96,7 @@ class SphericalGaussians(AppearanceHead):
             colors = colors + self._lobes(splats, visible, camera_centers)
         return SplatAppearance(
             colors=colors.clamp_min(0.0),
-            opacities=torch.sigmoid(splats["opacities"].index_select(0, visible)).squeeze(-1),
+            opacities=base_opacities(splats["opacities"].index_select(0, visible)),
         )
 
     def _lobes(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance
+from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_opacities
 from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
 
 
@@ -20,6 +20,7 @@ from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
 class ShConfig(AppearanceHeadConfig):
     """Spherical harmonics, as in splatfacto."""
 
+    STEPS = ("degree_interval",)
     _target: type = field(default_factory=lambda: SphericalHarmonics)
     """the head class that this configuration builds"""
     degree: int = 3
@@ -56,7 +57,7 @@ class SphericalHarmonics(AppearanceHead):
         directions = splats["means"].index_select(0, visible) - camera_centers
         return SplatAppearance(
             colors=(eval_sh(self.active_degree, directions, self.coefficients(splats, visible)) + 0.5).clamp_min(0.0),
-            opacities=torch.sigmoid(splats["opacities"].index_select(0, visible)).squeeze(-1),
+            opacities=base_opacities(splats["opacities"].index_select(0, visible)),
         )
 
     def coefficients(self, splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:

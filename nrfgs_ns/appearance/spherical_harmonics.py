@@ -68,7 +68,7 @@ def eval_sh(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
         [M, 3].
     """
     if directions.is_cuda:
-        from gsplat.cuda._wrapper import spherical_harmonics  # loads compiled kernels: never on a machine without CUDA
+        from gsplat import spherical_harmonics  # its kernels are compiled at the first call
 
         return spherical_harmonics(degree, directions, coefficients)
     bases = sh_bases(degree, torch.nn.functional.normalize(directions, dim=-1))

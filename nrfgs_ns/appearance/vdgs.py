@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from nrfgs_ns.appearance.directions import unit_vectors
 from nrfgs_ns.appearance.hash_grid import HashGrid
-from nrfgs_ns.appearance.head import Component, SplatAppearance
+from nrfgs_ns.appearance.head import Component, SplatAppearance, base_opacities
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics
 from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
 
@@ -102,7 +102,7 @@ class ViewDirectionFactors(SphericalHarmonics):
         coefficients = self.coefficients(splats, visible)
         if self.config.mode != "opacity":
             coefficients = coefficients * factors[:, -3 * self.bases :].unflatten(-1, (self.bases, 3))
-        opacities = torch.sigmoid(splats["opacities"].index_select(0, visible)).squeeze(-1)
+        opacities = base_opacities(splats["opacities"].index_select(0, visible))
         if self.config.mode != "sh":
             opacities = opacities * factors[:, 0]
         return SplatAppearance(

@@ -16,8 +16,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
-from nrfgs_ns.appearance.reduce import Field
 from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.compact.quantise import (
     MOST_BITS,

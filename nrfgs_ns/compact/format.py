@@ -22,7 +22,6 @@ and these against the size of the file: it cannot unpack to more than 32 times t
 import json
 import lzma
 import math
-import os
 import struct
 import zlib
 from collections.abc import Mapping
@@ -32,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import whole
 
 MAGIC = b"\x89NRF\r\n\x1a\n"
 VERSION = 1
@@ -78,10 +78,8 @@ def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str,
     text = json.dumps({**header, "streams": entries}, allow_nan=False).encode("utf-8")
     total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
     start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".writing")
-    aside.write_bytes(b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies]))
-    os.replace(aside, path)
+    with whole(path) as aside:
+        aside.write_bytes(b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies]))
     return total
 
 

@@ -141,7 +141,7 @@ class NrfgsDataParser(DataParser):
             warn(f"{scene.source}: no image is kept for {split}. The training images are evaluated instead.")
         rows = scene.splits[chosen]
         frames = [scene.meta["frames"][row] for row in rows]
-        files = {key: self._files(scene, frames, key) for key in FOLDERS}
+        files = {key: self._files(frames, key, scene.factor) for key in FOLDERS}
         cameras = scene.cameras[torch.from_numpy(rows)]
         if self._images_needed:
             sizes = list(zip(cameras.width.flatten().tolist(), cameras.height.flatten().tolist(), strict=True))
@@ -185,10 +185,14 @@ class NrfgsDataParser(DataParser):
                 f"{source}: --mask-color is set, but no frame has a mask_path. Add masks or drop the option."
             )
         if self._images_needed:
+            if config.downscale_factor is None:  # the first image in its full size decides
+                check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
+            factor = self._factor(frames)
             for key in FOLDERS:
                 what = "images" if key == "file_path" else f"files of {key}"
-                check_exist([self._file(frame[key], key) for frame in frames if key in frame], source, what)
-        factor = self._factor(frames) if self._images_needed else self.downscale_factor
+                check_exist(self._files(frames, key, factor), source, what)
+        else:
+            factor = self.downscale_factor
         frames = meta["frames"] = self._order(frames)
         paths = [self._file(frame["file_path"]) for frame in frames]
         check_unique(paths, f"{source}: frames")
@@ -267,16 +271,14 @@ class NrfgsDataParser(DataParser):
             factor *= 2
         return factor
 
-    def _files(self, scene: Scene, frames: list[dict[str, Any]], key: str) -> list[Path]:
+    def _files(self, frames: list[dict[str, Any]], key: str, factor: int) -> list[Path]:
         """The files of some frames, in full size or, where the data set has copies of the size wanted, those."""
         names = [frame[key] for frame in frames if key in frame]
-        if names and self._has_copies(scene, key):
-            return [self._copy(name, key, scene.factor) for name in names]
-        return [self._file(name, key) for name in names]
+        copies = names and self._has_copies(key, factor)
+        return [self._copy(name, key, factor) if copies else self._file(name, key) for name in names]
 
-    def _has_copies(self, scene: Scene, key: str) -> bool:
-        folder = self._copy(scene.meta["frames"][0][key], key, scene.factor).parent
-        return scene.factor > 1 and folder.is_dir()
+    def _has_copies(self, key: str, factor: int) -> bool:
+        return factor > 1 and (self._folder / f"{FOLDERS[key]}_{factor}").is_dir()
 
     def _checked_files(
         self,
@@ -293,9 +295,8 @@ class NrfgsDataParser(DataParser):
         ):
             if not files[key]:
                 continue
-            shrink = scene.factor > 1 and not self._has_copies(scene, key)
+            shrink = scene.factor > 1 and not self._has_copies(key, scene.factor)
             if not shrink:
-                check_exist(files[key], scene.source, what)
                 check_unique(files[key], f"{scene.source}: frames")
             expected = [_size(scene.meta, frame) for frame in frames] if shrink else sizes
             modes = check_headers(files[key], expected, what, mend)
@@ -469,9 +470,9 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         root = self._root(key)
         return root.with_name(f"{root.name}_{factor}") / self._file(name, key).relative_to(root)
 
-    def _has_copies(self, scene: Scene, key: str) -> bool:
+    def _has_copies(self, key: str, factor: int) -> bool:
         root = self._root(key)
-        return scene.factor > 1 and root.with_name(f"{root.name}_{scene.factor}").is_dir()
+        return factor > 1 and root.with_name(f"{root.name}_{factor}").is_dir()
 
     def _factor(self, frames: list[dict[str, Any]]) -> int:
         if self.config.downscale_factor is not None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
-from gsplat.strategy.ops import remove
+from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
 from nrfgs_ns.densification.protocol import Densification, OpacitySeen, Protocol
@@ -98,12 +98,45 @@ class GradientDensification(Densification):
 
     def post_backward(self, step, info, splats, optimizers) -> None:
         strategy = self.strategy
-        if step == 0 and not self.reset_at_start:
-            strategy._update_state(splats, self.state, info, packed=True)
-            return
-        strategy.step_post_backward(splats, optimizers, self.state, step, info, packed=True)
+        if step < strategy.refine_stop_iter:
+            self._take_statistics(info, len(splats["means"]))
+            if step == 0 and not self.reset_at_start:
+                return
+            if self._refines(step):
+                self._refine(step, splats, optimizers)
+            if step % strategy.reset_every == 0:
+                reset_opa(splats, optimizers, self.state, value=2.0 * strategy.prune_opa)
         if step % strategy.reset_every == 0 or self._refines(step):
             self.forget_views()
+
+    def _take_statistics(self, info: Mapping[str, Any], count: int) -> None:
+        """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side."""
+        state, rows, means2d = self.state, info["gaussian_ids"], info["means2d"]
+        grads = (means2d.absgrad if self.strategy.absgrad else means2d.grad).clone()
+        grads[..., 0] *= info["width"] / 2.0 * info["n_cameras"]
+        grads[..., 1] *= info["height"] / 2.0 * info["n_cameras"]
+        for name in ("grad2d", "count", "radii"):
+            if name in state and state[name] is None:
+                state[name] = torch.zeros(count, device=grads.device)
+        state["grad2d"].index_add_(0, rows, grads.norm(dim=-1))
+        state["count"].index_add_(0, rows, torch.ones_like(rows, dtype=torch.float32))
+        if "radii" in state:
+            share = info["radii"] / float(max(info["width"], info["height"]))
+            state["radii"][rows] = torch.maximum(state["radii"][rows], share)
+
+    def _refine(self, step: int, splats, optimizers) -> None:
+        """Grow and prune by gsplat's rules, and begin the statistics anew."""
+        strategy, state = self.strategy, self.state
+        duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
+        grown = len(splats["means"])
+        pruned = strategy._prune_gs(splats, optimizers, state, step)
+        if strategy.verbose:
+            print(f"Step {step}: {duplicated} GSs duplicated, {split} GSs split. Now having {grown} GSs.")
+            print(f"Step {step}: {pruned} GSs pruned. Now having {len(splats['means'])} GSs.")
+        for name in ("grad2d", "count", "radii"):
+            if name in state:
+                state[name].zero_()
+        torch.cuda.empty_cache()
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         for name, step in self.bounds.items():

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The model on one of several devices: a shard of the splats, seen from the cameras of all."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from nrfgs_ns.distributed.shards import cut_model_state, rebalance, rows_of, sha
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import Pinhole
-from nrfgs_ns.model.renderer import View
+from nrfgs_ns.model.renderer import View, project_splats, project_view
 from nrfgs_ns.rasterizer import Projection
 
 
@@ -84,18 +85,18 @@ class ShardedModel(NrfgsModel):
         Returns:
             See `NrfgsModel.get_outputs`.
         """
-        pinholes = [self._pinhole(camera) for camera in cameras]
+        pinholes = [self.pinhole(camera) for camera in cameras]
         self.sizes = [(one.width, one.height) for one in pinholes]
-        splats = self._splats_to_draw()
-        projection = self._project_everywhere(splats, pinholes)
+        field = self.field
+        projection = self._project_everywhere(field.splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
-        seen = self.view_noise.moved(splats, self.step) if self.training else splats
-        appearance = self.head(seen, projection.gaussian_ids, centers)
+        appearance = self._as_learnt(field).seen_from(View(projection, centers))
 
         absgrad = self.training and self.densification.needs_absgrad(self.step)
         own, colored = send_to_cameras(projection, appearance, *self.sizes[comm.rank()], absgrad)
-        view = View(own, {}, pinholes[comm.rank()].center)
-        outputs, _ = self.paint(view, colored, photograph=self._photograph_of(cameras[comm.rank()]))
+        background = self._get_background_color()
+        view = View(own, pinholes[comm.rank()].center)
+        outputs, _ = self.composite(view, colored, background, self._photograph_of(cameras[comm.rank()]))
         if self.training:
             if len(own.depths) == 0:  # all devices must go backward through the exchange, the one that sees nothing too
                 outputs["rgb"] = outputs["rgb"] + colored.colors.sum()
@@ -108,15 +109,15 @@ class ShardedModel(NrfgsModel):
                 "n_cameras": len(pinholes),
             }
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
-            self._correct_colors(outputs, cameras[comm.rank()])
+            self._finish_for_training(outputs, cameras[comm.rank()], background)
         return outputs
 
-    def _project_everywhere(self, splats: dict[str, Tensor], pinholes: list[Pinhole]) -> Projection:
+    def _project_everywhere(self, splats: Mapping[str, Tensor], pinholes: list[Pinhole]) -> Projection:
         """This device's splats in all cameras; at once if they have the same size."""
         if len(set(self.sizes)) == 1:
             viewmats, Ks = torch.cat([one.viewmat for one in pinholes]), torch.cat([one.K for one in pinholes])
-            return self._project(splats, viewmats, Ks, *self.sizes[0])
-        parts = [self._project(splats, one.viewmat, one.K, one.width, one.height) for one in pinholes]
+            return project_splats(splats, viewmats, Ks, *self.sizes[0], self.projecting)
+        parts = [project_view(splats, one, self.projecting).projection for one in pinholes]
         for index, part in enumerate(parts):
             part.camera_ids = torch.full_like(part.camera_ids, index)
         names = ("camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics")

@@ -29,8 +29,6 @@ MODEL_STEPS = (
     "sh_degree_interval",
 )
 """Options of the model that are step numbers. Resets are counted in refinements."""
-HEAD_STEPS = ("ramp_steps", "start_step", "degree_interval")
-"""The same, of the heads."""
 
 
 def fewer(steps: int | None, devices: int) -> int | None:
@@ -46,10 +44,8 @@ def with_fewer_steps(config: Any, devices: int) -> Any:
         devices: W.
     """
     model = config.pipeline.model
-    steps_of_head = [name for name in HEAD_STEPS if hasattr(model.appearance, name)]
-    head = replace(
-        model.appearance, **{name: fewer(getattr(model.appearance, name), devices) for name in steps_of_head}
-    )
+    head = model.appearance
+    head = replace(head, **{name: fewer(getattr(head, name), devices) for name in head.STEPS})
     unread = UNREAD.get(model.densification, ())
     changed = {name: fewer(getattr(model, name), devices) for name in MODEL_STEPS if name not in unread}
     if "mcmc" not in unread:

@@ -11,15 +11,17 @@ import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
-from nrfgs_ns.appearance.reduce import Field
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.compact.options import CompactOptions
+from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.loading import load_model
-from nrfgs_ns.image.metrics import psnr
+from nrfgs_ns.export.loss import measure_loss
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.simplify.field_views import FieldViews, slim
 from nrfgs_ns.simplify.residuals import look_over
 from nrfgs_ns.training.config_file import read_config
@@ -61,7 +63,7 @@ def export_compact(
         soft_wrap=True,
     )
     if measure:
-        numbers |= measure_loss(pipeline, config)
+        numbers |= measure_file(pipeline, config)
         lost = round(numbers["loss_db"], 3) + 0.0  # without the sign of a -0.0
         CONSOLE.print(
             f"PSNR on {len(numbers['per_image'])} test views: model {numbers['psnr_model']:.2f} dB, file "
@@ -69,8 +71,7 @@ def export_compact(
         )
     CONSOLE.print(f"Read it with:  ns-eval --load-config {config}", markup=False, soft_wrap=True)
     if report is not None:
-        report.parent.mkdir(parents=True, exist_ok=True)
-        report.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+        write_whole(report, json.dumps(numbers, indent=1) + "\n")
 
 
 def check_options(options: CompactOptions) -> None:
@@ -96,13 +97,13 @@ def chosen_field(pipeline, load_config: Path, options: CompactOptions) -> tuple[
     if options.rank is not None and not 1 <= options.rank <= size:
         raise InputError(f"--compact.rank is {options.rank}; this model's latents have ranks 1 to {size}.")
     with torch.no_grad():
-        field = Field(model.head, {name: value.detach() for name, value in model._splats_to_draw().items()})
+        field = model.field.detached()
         images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
         cameras = data.train_dataset.cameras
         with CONSOLE.status(f"Looking at the splats from {len(cameras)} training views"):
             seen = look_over(model, cameras)
-        chosen = [i * len(images) // options.views for i in range(options.views)] if images else []
-        views = FieldViews(model, [(cameras[i : i + 1].to(model.device), images[i]) for i in sorted(set(chosen))])
+        chosen = evenly_spaced(len(images), options.views)
+        views = FieldViews(model, [(cameras[i : i + 1].to(model.device), images[i]) for i in chosen])
         columns = TextColumn("{task.description:<40}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=CONSOLE, transient=True) as progress:
             task = progress.add_task("Choosing what to leave out", total=None)
@@ -156,32 +157,7 @@ def write_config(load_config: Path, output: Path) -> Path:
     return path
 
 
-@torch.no_grad()
-def measure_loss(pipeline, config: Path) -> dict[str, Any]:
-    """What a file has lost against the model that it was written from, on the test views, read as ns-eval reads it.
-
-    Args:
-        pipeline: of the model, with its test images.
-        config: the config.yml beside the file.
-
-    Returns:
-        Means over the images, dB, inside their masks: psnr_model, psnr_file; loss_db, their difference; per_image.
-    """
-    original, small = pipeline.model, load_model(config, "test").model
-    names = [Path(name).name for name in pipeline.datamanager.eval_dataset.image_filenames]
-    images = list(zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True))
-    per_image = []
-    columns = TextColumn("Measuring the loss"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=CONSOLE, transient=True) as progress:
-        for name, (camera, batch) in progress.track(images):
-            scores = {}
-            for key, model in (("psnr_model", original), ("psnr_file", small)):
-                outputs = model.get_outputs_for_camera(camera)
-                truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
-                scores[key] = psnr(outputs["rgb"], truth, model._mask(batch))
-            if None not in scores.values():  # nothing inside the mask
-                per_image.append({"image": name, **scores})
-    if not per_image:
-        raise InputError("The file is written, but no test image has pixels inside its mask. Use --no-measure.")
-    means = {key: sum(image[key] for image in per_image) / len(per_image) for key in ("psnr_model", "psnr_file")}
-    return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}
+def measure_file(pipeline, config: Path) -> dict[str, Any]:
+    """`measure_loss` of a file, read as ns-eval reads it, by the config.yml beside it."""
+    small = load_model(config, "test").model
+    return measure_loss(pipeline, lambda camera: {"file": small.get_outputs_for_camera(camera)["rgb"]})

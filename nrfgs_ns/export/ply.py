@@ -10,18 +10,17 @@ in the training's world.
 
 import json
 import math
-import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement, PlyParseError
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import whole, write_whole
 
 if TYPE_CHECKING:  # nerfstudio takes seconds to import: `nrfgs --help` answers at once
     from nrfgs_ns.export.frames import Similarity
@@ -54,6 +53,7 @@ def export_ply(load_config: Path, output: Path, options: "PlyOptions", measure: 
     from nrfgs_ns.data.world import CaptureFrame
     from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, to_capture
     from nrfgs_ns.export.loading import load_model
+    from nrfgs_ns.export.loss import measure_loss
 
     if options.largest is not None and not 0 < options.largest < math.inf:
         raise InputError(f"--ply.largest is {options.largest}; it must be positive.")
@@ -92,7 +92,8 @@ def export_ply(load_config: Path, output: Path, options: "PlyOptions", measure: 
     if not fit.exact and fit.unseen:
         CONSOLE.print(f"{fit.unseen:,} splats are seen by no training view and have their base colour.")
     if measure:
-        report |= measure_loss(load_model(load_config, "test"), output, fit.splats, placed)
+        pipeline = load_model(load_config, "test")
+        report |= measure_loss(pipeline, pictures_of_file(pipeline.model, output, fit.splats, placed))
         lost = round(report["loss_db"], 2) + 0.0  # without the sign of a -0.0
         CONSOLE.print(
             f"PSNR on {len(report['per_image'])} test views: model {report['psnr_model']:.2f} dB, "
@@ -109,8 +110,7 @@ def export_ply(load_config: Path, output: Path, options: "PlyOptions", measure: 
                 soft_wrap=True,
             )
     if report_file is not None:
-        report_file.parent.mkdir(parents=True, exist_ok=True)
-        report_file.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_whole(report_file, json.dumps(report, indent=1) + "\n")
 
 
 def write_splats(splats: "PlainSplats", path: Path, comments: Sequence[str] = ()) -> int:
@@ -147,10 +147,8 @@ def write_splats(splats: "PlainSplats", path: Path, comments: Sequence[str] = ()
         raise InputError(f"{path} is not written: none of the {count} splats is finite and opaque enough to be drawn.")
     table = np.ascontiguousarray(columns[keep].cpu().numpy(), dtype="<f4")
     vertices = table.view([(name, "<f4") for name in PROPERTIES])[:, 0]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".writing")
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=list(comments)).write(str(aside))
-    os.replace(aside, path)
+    with whole(path) as aside:
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=list(comments)).write(str(aside))
     return len(vertices)
 
 
@@ -195,41 +193,30 @@ def read_splats(path: Path) -> "PlainSplats":
 
 @torch.no_grad()
 def render_splats(
-    splats: "PlainSplats", camera, background: Tensor, rasterize_mode: str = "classic", near_plane: float = 0.01
+    splats: "PlainSplats", camera, background: Tensor, rasterize_mode: str = "classic", scene_unit: float = 1.0
 ) -> Tensor:
     """Render a file's splats as any viewer would, with this project's rasterizer.
 
     Args:
         splats: on one device, which picks the rasterizer's back end.
         camera: nerfstudio's, a batch of one.
-        background: [3] or [H, W, 3].
+        background: a colour [3].
         rasterize_mode: as the model was trained.
-        near_plane: smallest depth that is drawn, in the file's unit of length.
+        scene_unit: as in `Projecting`.
 
     Returns:
         [H, W, 3] in [0, 1].
     """
+    from nrfgs_ns.appearance.field import Field
     from nrfgs_ns.appearance.sh import ShConfig
     from nrfgs_ns.model.pinhole import pinhole
-    from nrfgs_ns.rasterizer import composite, project
+    from nrfgs_ns.model.renderer import Projecting, composite_view, project_view
 
     device = splats.means.device
     pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
-    seen_from = pinhole(camera, pose.to(device), 1)
-    projection = project(
-        splats.means,
-        splats.quats,
-        splats.scales.exp(),
-        seen_from.viewmat,
-        seen_from.K,
-        seen_from.width,
-        seen_from.height,
-        near_plane=near_plane,
-        rasterize_mode=rasterize_mode,
-    )
-    appearance = ShConfig(degree=3).setup()(splats._asdict(), projection.gaussian_ids, seen_from.center)
-    render, alphas, _ = composite(projection, appearance.colors, appearance.opacities)
-    return (render[0] + (1.0 - alphas[0]) * background.to(device)).clamp(0.0, 1.0)
+    field = Field(ShConfig(degree=3).setup(), splats._asdict())
+    view = project_view(field.splats, pinhole(camera, pose.to(device), 1), Projecting(rasterize_mode, scene_unit))
+    return composite_view(view, field.seen_from(view), background.to(device))[0]["rgb"]
 
 
 def on_screen(means: Tensor, camera) -> Tensor:
@@ -252,57 +239,38 @@ def on_screen(means: Tensor, camera) -> Tensor:
     return ((pixels[:, :2] - half * pixels[:, 2:]).abs() <= SPARKS_EDGE * half * pixels[:, 2:]).all(dim=1)
 
 
-@torch.no_grad()
-def measure_loss(pipeline, path: Path, fitted: "PlainSplats", placed: "Similarity") -> dict[str, Any]:
-    """What a file has lost against the model that it was written from, on the test views.
+def pictures_of_file(
+    model, path: Path, fitted: "PlainSplats", placed: "Similarity"
+) -> Callable[[Any], dict[str, Tensor]]:
+    """What a file shows beside the model that it was written from.
 
     Args:
-        pipeline: of the model, with its test images.
+        model: an NrfgsModel in evaluation mode.
         fitted: the harmonics that were written, one row for each of the model's splats.
         placed: from the training's world to the file's.
 
     Returns:
-        Means over the images, dB, inside their masks: psnr_model; psnr_file; psnr_on_screen, of the file's splats whose
-        centres lie within SPARKS_EDGE; psnr_colors, of the fitted colours with the model's own opacities; psnr_base, of
-        the model's base colours and opacities. loss_db: what the file lacks of the model. per_image: each image's
-        values.
+        camera -> "file"; "on_screen", of the file's splats whose centres lie within SPARKS_EDGE; "colors", the fitted
+        colours with the model's own opacities; "base", the model's base colours and opacities.
     """
-    from nerfstudio.utils.rich_utils import CONSOLE
-
+    from nrfgs_ns.appearance.field import Field
     from nrfgs_ns.appearance.sh import ShConfig
-    from nrfgs_ns.image.metrics import psnr
-    from nrfgs_ns.model.renderer import NEAR_PLANE
 
-    model = pipeline.model
-    near_plane = NEAR_PLANE * model.scene_unit
     file = placed.inverse.moved(read_splats(path))
     file, fitted = (type(file)(*(value.to(model.device) for value in splats)) for splats in (file, fitted))
-    harmonics = ShConfig(degree=3).setup()
-    names = [Path(name).name for name in pipeline.datamanager.eval_dataset.image_filenames]
-    images = list(zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True))
-    per_image = []
-    columns = TextColumn("Measuring the loss"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=CONSOLE, transient=True) as progress:
-        for image_name, (camera, batch) in progress.track(images):
-            outputs = model.get_outputs_for_camera(camera)
-            how = outputs["background"], model.config.rasterize_mode, near_plane
-            within = on_screen(file.means, camera)
-            truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
-            mask = model._mask(batch)
-            view = model.look(camera)
-            colors = harmonics(fitted._asdict(), view.visible, view.center).colors
-            appearance = model.head(view.splats, view.visible, view.center)._replace(colors=colors)
-            pictures = {
-                "model": outputs["rgb"],
-                "file": render_splats(file, camera, *how),
-                "on_screen": render_splats(type(file)(*(value[within] for value in file)), camera, *how),
-                "colors": model.paint(view, appearance)[0]["rgb"],
-                "base": model.get_base_color(camera),
-            }
-            scores = {f"psnr_{name}": psnr(picture, truth, mask) for name, picture in pictures.items()}
-            if None not in scores.values():  # nothing inside the mask
-                per_image.append({"image": image_name, **scores})
-    if not per_image:
-        raise InputError(f"{path} is written, but no test image has pixels inside its mask. Use --no-measure.")
-    means = {key: sum(image[key] for image in per_image) / len(per_image) for key in scores}
-    return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}
+    harmonics = Field(ShConfig(degree=3).setup(), fitted._asdict())
+    how = model.background_color, model.config.rasterize_mode, model.scene_unit
+
+    def pictures(camera) -> dict[str, Tensor]:
+        field = model.field
+        view = model.project(camera, field.splats)
+        appearance = field.seen_from(view)._replace(colors=harmonics.seen_from(view).colors)
+        within = on_screen(file.means, camera)
+        return {
+            "file": render_splats(file, camera, *how),
+            "on_screen": render_splats(type(file)(*(value[within] for value in file)), camera, *how),
+            "colors": model.composite(view, appearance)[0]["rgb"],
+            "base": model.get_base_color(camera),
+        }
+
+    return pictures

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.reduce import (
-    Field,
     LatentBasis,
     input_columns,
     latent_basis,

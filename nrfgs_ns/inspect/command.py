@@ -29,7 +29,7 @@ class Inspect:
 
         from nrfgs_lab.bench.measure import evenly_spaced
         from nrfgs_ns.appearance.nrf import NeuralResidualField
-        from nrfgs_ns.appearance.reduce import Field, latent_basis
+        from nrfgs_ns.appearance.reduce import latent_basis
         from nrfgs_ns.export.loading import load_model
         from nrfgs_ns.files import write_whole
         from nrfgs_ns.inspect.ablate import changes, row, together
@@ -58,7 +58,7 @@ class Inspect:
             CONSOLE.status(f"Looking at the splats from {len(pipeline.datamanager.train_dataset)} training views"),
         ):
             seen = look_over(model, pipeline.datamanager.train_dataset.cameras)
-        field = Field(model.head, {name: value.detach() for name, value in model.look(images[0][0]).splats.items()})
+        field = model.field.detached()
         basis = latent_basis(field, seen.weight)
         views = FieldViews(model, images)
         rows = [row("nothing", "full", field, views, None)]

@@ -34,8 +34,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
-from nrfgs_ns.appearance.head import base_colors
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.appearance.spherical_harmonics import num_bases, sh_bases
+from nrfgs_ns.model.renderer import View
 from nrfgs_ns.rasterizer import Projection, composite
 
 DEGREE = 3
@@ -239,22 +241,32 @@ def observe(model, camera: Cameras) -> Observations:
     Args:
         camera: a batch of one, [1].
     """
+    field = model.field
+    view, appearance, weights = look_through(model, field, camera)
+    towards = field.splats["means"].index_select(0, view.visible) - view.center
+    return Observations(
+        rows=view.visible,
+        weights=weights,
+        bases=sh_bases(DEGREE, torch.nn.functional.normalize(towards, dim=-1)),
+        residuals=appearance.colors - base_colors(field.splats["features_dc"].index_select(0, view.visible)),
+        opacities=appearance.opacities,
+    ).where(weights > 0, view.visible)
+
+
+def look_through(model, field: Field, camera: Cameras) -> tuple[View, SplatAppearance, Tensor]:
+    """What one training view sees of a model's field: its M splats, their looks, and what they contribute [M].
+
+    Args:
+        camera: a batch of one, [1]; halved until it is small enough.
+    """
     camera = camera.to(model.device)
     longest = max(int(camera.width.max()), int(camera.height.max()))
     halvings = max(math.ceil(math.log2(longest / LONGEST_SIDE)), 0)
     if halvings > 0:
         camera.rescale_output_resolution(0.5**halvings)
-    view = model.look(camera)
-    appearance = model.head(view.splats, view.visible, view.center)
-    weights = contributions(view.projection, appearance.opacities)
-    towards = view.splats["means"].index_select(0, view.visible) - view.center
-    return Observations(
-        rows=view.visible,
-        weights=weights,
-        bases=sh_bases(DEGREE, torch.nn.functional.normalize(towards, dim=-1)),
-        residuals=appearance.colors - base_colors(view.splats["features_dc"].index_select(0, view.visible)),
-        opacities=appearance.opacities,
-    ).where(weights > 0, view.visible)
+    view = model.project(camera, field.splats)
+    appearance = field.seen_from(view)
+    return view, appearance, contributions(view.projection, appearance.opacities)
 
 
 def contributions(projection: Projection, opacities: Tensor) -> Tensor:

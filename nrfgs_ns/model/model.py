@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splatfacto with an appearance head: what is trained, and how. `rendering.py` draws it.
+"""Splatfacto with an appearance head: nerfstudio's hooks. `renderer.py` has how a camera is rendered.
 
 Loss, schedules and crop are nerfstudio's, and so is densification unless another protocol is asked for
 (`densification/`). What differs: colours and opacities come from the head, for the splats that the camera sees only;
@@ -8,12 +8,15 @@ hold, so that an interrupted training can go on.
 """
 
 import math
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
@@ -22,7 +25,8 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.head import AppearanceHeadConfig
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import (
     McmcDensification,
@@ -37,12 +41,14 @@ from nrfgs_ns.image.metrics import ImageMetrics
 from nrfgs_ns.image.photograph import Part, PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.checkpoint import check_compatible, reduced_config
-from nrfgs_ns.model.exported import ExportedTables
-from nrfgs_ns.model.renderer import Rendering
+from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
+from nrfgs_ns.model.pinhole import Pinhole, pinhole
+from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.viewer.panel import ViewerPanel
 
+LOOK = "NRFGS_LOOK"
+"""Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
 
@@ -88,7 +94,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
 
-class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
+class NrfgsModel(SplatfactoModel):
     """Gaussian splatting with an appearance head.
 
     Args:
@@ -99,6 +105,10 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     config: NrfgsModelConfig
     reduced_head: dict[str, Any] | None = None
     """options of the head that a checkpoint was written with, where they are not the configuration's"""
+    viewer_panel: Any = None
+    """who says what a browser sees (`show_by`); None: there is no viewer"""
+    _fit_cameras: Cameras | None = None
+    _fit: Fit | None = None
     camera_spacing: float = 0.0
     """world units between neighbouring training cameras; 0 until a training begins"""
     _scheduled: int | None = None
@@ -112,8 +122,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             )
         self.scene_unit: float = (self.kwargs.get("metadata") or {}).get("scene_unit", 1.0)
         """World units in a scene unit; lengths in the configuration are in scene units."""
-        self.head = self.config.appearance.setup()
-        self.head.scene_unit = self.scene_unit
+        self.head = self.config.appearance.setup(self.scene_unit)
         self.config.sh_degree = self.head.sh_degree
         self.gauss_params = torch.nn.ParameterDict(self._initial_splats())
         self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
@@ -125,7 +134,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         self.image_metrics = ImageMetrics()
         self.step = 0
         self.crop_box = None
-        self.viewer_panel = ViewerPanel(self)
+        self._pinholes: dict[tuple[int, int], Pinhole] = {}  # training cameras by index and downscale
         self.background_color = (
             torch.tensor(VISER_BACKGROUND)
             if self.config.background_color == "random"
@@ -163,17 +172,218 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
 
     @property
     def parameter_bytes(self) -> int:
-        """Bytes of all that a renderer needs: the splats' parameters, but the latents of diffuse ones, and the head."""
+        """Bytes of all that a renderer needs: the head and the splats' parameters, of diffuse ones the base alone."""
         stored = [*self.gauss_params.values(), *self.head.parameters()]
         whole = sum(parameter.numel() * parameter.element_size() for parameter in stored)
-        diffuse = self.num_diffuse
-        return whole - diffuse * self.gauss_params["latents"][0].nbytes if diffuse else whole
+        row = sum(self.gauss_params[name][:1].nbytes for name in self.head.residual_params)
+        return whole - self.num_diffuse * row
 
     @property
     def num_diffuse(self) -> int:
         """How many splats have no residual."""
         diffuse = self.densification.state.get(DIFFUSE)
         return 0 if diffuse is None else int(diffuse.sum())
+
+    # Rendering.
+
+    @property
+    def field(self) -> Field:
+        """What is rendered: the head with all splats, or those in the crop box, and which of them are diffuse."""
+        splats: dict[str, Tensor] = dict(self.gauss_params.items())
+        if (diffuse := self.densification.state.get(DIFFUSE)) is not None:
+            splats[DIFFUSE] = diffuse
+        if self.crop_box is not None and not self.training:
+            inside = self.crop_box.within(splats["means"]).reshape(-1)
+            splats = {name: value[inside] for name, value in splats.items()}
+        return Field(self.head, splats)
+
+    @property
+    def projecting(self) -> Projecting:
+        """How this model projects its splats."""
+        mode = self.config.rasterize_mode
+        if mode not in ("antialiased", "classic"):
+            raise InputError(f"pipeline.model.rasterize_mode is {mode!r}; use 'classic' or 'antialiased'.")
+        return Projecting(mode, self.scene_unit, assume_finite=self.training)  # the trainer's guard watches
+
+    def project(self, camera: Cameras, splats: Mapping[str, Tensor] | None = None) -> View:
+        """Project splats into one camera (`project_view`).
+
+        Args:
+            camera: a batch of one camera, [1].
+            splats: another table than the field's.
+        """
+        return project_view(self.field.splats if splats is None else splats, self.pinhole(camera), self.projecting)
+
+    def composite(
+        self,
+        view: View,
+        appearance: SplatAppearance,
+        background: Tensor | None = None,
+        photograph: int | None = None,
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Composite visible splats as this model is configured (`composite_view`).
+
+        Args:
+            view, appearance: as for `composite_view`.
+            background: a colour [3] instead of the configuration's.
+            photograph: the picture has the look of this one; None: the mean look.
+        """
+        return composite_view(
+            view,
+            appearance,
+            self._get_background_color() if background is None else background,
+            with_depth=self.config.output_depth_during_training or not self.training,
+            absgrad=self.training and self.densification.needs_absgrad(self.step),
+            assume_finite=self.training,
+            look=None if photograph is None else lambda rgb: self.photograph(rgb, photograph),
+        )
+
+    def pinhole(self, camera: Cameras) -> Pinhole:
+        """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
+        downscale = self._get_downscale_factor()
+        if not self.training:
+            pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
+            return pinhole(camera, pose.to(self.device), downscale)
+        assert camera.shape[0] == 1, "Only one camera at a time"
+        index = (camera.metadata or {}).get("cam_idx")
+        if index is None or self.camera_optimizer.config.mode != "off":
+            return pinhole(camera, self.camera_optimizer.apply_to_camera(camera), downscale)
+        if (index, downscale) not in self._pinholes:
+            self._pinholes[index, downscale] = pinhole(camera, camera.camera_to_worlds, downscale)
+        return self._pinholes[index, downscale]
+
+    def _get_downscale_factor(self) -> int:
+        if not self.training:
+            return 1
+        risen = self.schedule_step // self.config.resolution_schedule
+        return 2 ** max(self.config.num_downscales - risen, 0)
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
+        """Render one camera.
+
+        Returns:
+            "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [3] in training and [H, W, 3] otherwise,
+            and "depth" [H, W, 1], which is left out of training unless `output_depth_during_training`.
+        """
+        field = self.field
+        view = self.project(camera, field.splats)
+        appearance = self._as_learnt(field).seen_from(view)
+        background = self._get_background_color()
+        outputs, self.info = self.composite(view, appearance, background, self._photograph_of(camera))
+        if self.training:
+            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
+            self._finish_for_training(outputs, camera, background)
+        return outputs
+
+    def _photograph_of(self, camera: Cameras) -> int | None:
+        """Which photograph's look a rendering has: in training, the one that the camera took; None: the mean look."""
+        if self.photograph is None:
+            return None
+        if self.training:
+            return (camera.metadata or {}).get("cam_idx")
+        name = os.environ.get(LOOK)
+        if name and name not in self.photograph.names:
+            raise InputError(
+                f"{LOOK} is {name!r}, which is none of the training photographs, such as {self.photograph.names[0]!r}."
+            )
+        return self.photograph.names.index(name) if name else None
+
+    def _as_learnt(self, field: Field) -> Field:
+        """The field as its head is asked about it in this step (`view_noise.py`); outside of training, the field."""
+        if not self.training:
+            return field
+        return field._replace(splats=self.view_noise.moved(field.splats, self.step))
+
+    def _finish_for_training(self, outputs: dict[str, Tensor], camera: Cameras, background: Tensor) -> None:
+        """Leave the background a colour [3], and apply the camera's bilateral grid, if there are grids."""
+        outputs["background"] = background
+        if self.config.use_bilateral_grid and "cam_idx" in (camera.metadata or {}):
+            height, width = outputs["rgb"].shape[:2]
+            index = camera.metadata["cam_idx"]
+            outputs["rgb"] = self._apply_bilateral_grid(outputs["rgb"][None], index, height, width)[0]
+
+    @torch.no_grad()
+    def get_base_color(self, camera: Cameras) -> Tensor:
+        """The image [H, W, 3] of the base colours and opacities alone, without what depends on the view."""
+        field = self.field
+        view = self.project(camera, field.splats)
+        return self.composite(view, field.base_of(view))[0]["rgb"]
+
+    def show_by(self, panel: Any) -> None:
+        """Let a viewer's panel (`viewer/panel.py`) say what its browsers see."""
+        self.viewer_panel = panel
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Render one camera as it was trained; for a browser, as the viewer's panel says.
+
+        Args:
+            camera: a batch of one camera, [1].
+            obb_box: only splats with their centre inside are drawn, if given.
+        """
+        if self.viewer_panel is not None and self.viewer_panel.is_asking():
+            return self.viewer_panel.render(camera.to(self.device), obb_box)
+        return super().get_outputs_for_camera(camera, obb_box)
+
+    def set_background(self, background_color: Tensor) -> None:
+        """Take the viewer's background [3], for the viewer's pictures alone: what evaluation uses must not change."""
+        if self.viewer_panel is not None:
+            self.viewer_panel.set_background(background_color)
+
+    # What nerfstudio's exporter and viewer read: splats with spherical harmonics, whatever the head is. The viewer
+    # reads all of it, often. Only where `fit_on` was called, as neither a training nor a viewer does, are colours and
+    # opacities those of harmonics fitted to the head (`harmonics_fit.py`).
+
+    def fit_on(self, cameras: Cameras) -> None:
+        """Let the properties below be fitted harmonics from now on, as seen from these cameras [V].
+
+        The fit is made when one of them is first read, and kept until a checkpoint is loaded.
+        """
+        self._fit_cameras, self._fit = cameras, None
+        self.config.sh_degree = DEGREE
+
+    @property
+    def fit(self) -> Fit | None:
+        """The fitted harmonics, or None where `fit_on` was not called."""
+        if self._fit is None and self._fit_cameras is not None:
+            self._fit = fit_harmonics(self, self._fit_cameras)
+        return self._fit
+
+    def _exported(self, name: str) -> Tensor:
+        """A table of the splats: the fit's if there is one, else the stored one."""
+        fit = self.fit
+        return self.gauss_params[name] if fit is None else getattr(fit.splats, name)
+
+    @property
+    def colors(self) -> Tensor:
+        """Base colours [N, 3]."""
+        return base_colors(self.shs_0)
+
+    @property
+    def opacities(self) -> Tensor:
+        """Opacities' logits [N, 1]."""
+        return self._exported("opacities")
+
+    @property
+    def quats(self) -> Tensor:
+        """Rotations (w, x, y, z) [N, 4]; of unit length if fitted."""
+        return self._exported("quats")
+
+    @property
+    def shs_0(self) -> Tensor:
+        """Coefficients of the constant harmonic [N, 3]."""
+        return self._exported("features_dc")
+
+    @property
+    def shs_rest(self) -> Tensor:
+        """Coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any, unless they are fitted."""
+        return self.features_rest if self.fit is None else self.fit.splats.features_rest
+
+    @property
+    def features_rest(self) -> Tensor:
+        """The stored coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any."""
+        if "features_rest" in self.gauss_params:
+            return self.gauss_params["features_rest"]
+        return self.features_dc.new_zeros(self.num_points, 0, 3)
 
     # Training.
 
@@ -250,7 +460,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
 
     def _photometric_loss(self, outputs, batch) -> Tensor:
         """Splatfacto's loss of an image against its photograph, a scalar."""
-        truth = self._truth(outputs, batch)
+        truth = self.truth_of(batch, outputs["background"])
         rgb = outputs["rgb"]
         if "mask" in batch:  # what is outside is black in both
             mask = self._downscale_if_required(batch["mask"]).to(self.device)
@@ -260,9 +470,9 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             truth, rgb = truth * kept, rgb * kept
         return photometric_loss(rgb, truth, self.config.ssim_lambda)
 
-    def _truth(self, outputs, batch) -> Tensor:
+    def truth_of(self, batch: Mapping[str, Any], background: Tensor) -> Tensor:
         """The photograph at the rendered size, [H, W, 3]; where it is transparent, with what is behind the splats."""
-        image, background = self.get_gt_img(batch["image"]), outputs["background"]
+        image = self.get_gt_img(batch["image"])
         if image.shape[-1] == 4 and self.training and self.photograph is not None:
             with torch.no_grad():
                 background = self.photograph(background.expand(*image.shape[:2], 3), batch["image_idx"])
@@ -282,8 +492,8 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
             if there is nothing that could be taught.
         """
         with torch.no_grad():
-            view = self.look(camera)
-        loss = self.head.neutral_loss(view.splats, view.visible, view.center)
+            view = self.project(camera)
+        loss = self.head.neutral_loss(self.field.splats, view.visible, view.center)
         if loss is None:
             return None
         # Only the shared weights learn: the splats' parameters keep no gradient from here.
@@ -294,9 +504,9 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
     @torch.no_grad()
     def get_metrics_dict(self, outputs, batch) -> dict[str, Any]:
         """What is logged while training: PSNR (inside the mask) and the number of splats. Nothing waits for the GPU."""
-        truth = self._truth(outputs, batch)
+        truth = self.truth_of(batch, outputs["background"])
         error = (outputs["rgb"] - truth).square().mean(dim=-1, keepdim=True)
-        mask = self._mask(batch)
+        mask = self.mask_of(batch)
         mse = error.mean() if mask is None else (error * mask).sum() / mask.sum()
         metrics = {"psnr": -10.0 * torch.log10(mse), "gaussian_count": self.num_points}
         self.camera_optimizer.get_metrics_dict(metrics)
@@ -307,9 +517,9 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
 
         A metric that cannot be had (LPIPS without its weights, MS-SSIM of a small image) is left out.
         """
-        truth = self._truth(outputs, batch)
+        truth = self.truth_of(batch, outputs["background"])
         rgb = outputs["rgb"]
-        metrics = self.image_metrics(rgb, truth, self._mask(batch))
+        metrics = self.image_metrics(rgb, truth, self.mask_of(batch))
         return (
             {name: value for name, value in metrics.items() if value is not None},
             {"img": torch.cat([truth, rgb], dim=1)},
@@ -324,7 +534,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         rgb = self.photograph.by_camera(outputs["rgb"], self.photograph.camera_like(*sizes))
         return {**outputs, "rgb": rgb.clamp(0.0, 1.0)}
 
-    def _mask(self, batch) -> Tensor | None:
+    def mask_of(self, batch: Mapping[str, Any]) -> Tensor | None:
         """The image's mask at the rendered size, bool [H, W, 1], or None. A pixel half covered counts as inside."""
         if "mask" not in batch:
             return None
@@ -373,7 +583,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         self._shape_head(state)
         self._take_photographs(state)
         check_compatible(self, state)
-        self.forget_fit()
+        self._fit = None
         for name, parameter in self.gauss_params.items():
             parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)
         return super(SplatfactoModel, self).load_state_dict(state, strict=strict, **kwargs)
@@ -393,8 +603,7 @@ class NrfgsModel(Rendering, ExportedTables, SplatfactoModel):
         self.reduced_head = state.get("_extra_state", {}).get("capacity", {}).get("head")
         if config == self.head.config:
             return
-        head = config.setup()
-        head.scene_unit = self.scene_unit
+        head = config.setup(self.scene_unit)
         self.head = head.to(self.device).train(self.training)
         for name, value in head.splat_params(self.gauss_params["means"]).items():
             # In place: the optimiser was built on this very parameter.

@@ -15,6 +15,7 @@ Rendering, geometry and evaluation are as without it.
 """
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -78,7 +79,7 @@ class ViewNoise:
         self.sigma, self.seed = sigma, seed
         self._generators: dict[torch.device, torch.Generator] = {}
 
-    def moved(self, splats: dict[str, Tensor], step: int) -> dict[str, Tensor]:
+    def moved(self, splats: Mapping[str, Tensor], step: int) -> Mapping[str, Tensor]:
         """The table as the head is to see it in a step: its "means" [N, 3] moved, all else the same tensors.
 
         Args:

@@ -2,7 +2,7 @@
 """How long the rest will take, from how long the features took on this machine as it is now.
 
 Costs are in units of finding the features of a million pixels. They were taken from `castle` and `caliterra`
-(docs/results/prepare), whose forecasts are within a third of what came.
+(results/prepare.json), whose forecasts are within a third of what came.
 """
 
 import numpy as np

@@ -12,7 +12,7 @@ from torch import Tensor
 class Projection:
     """What the cameras see: one row per (camera, visible splat) pair, M rows, ordered by camera, then by splat.
 
-    This is the packed layout of gsplat 1.4. Everything between projection and compositing (an appearance head, a
+    This is the packed layout of gsplat. Everything between projection and compositing (an appearance head, a
     strategy) works on these rows, so nothing is ever evaluated for a splat that no camera sees.
     """
 
@@ -36,3 +36,5 @@ class Projection:
     """Image height in pixels."""
     n_cameras: int
     """Number of cameras C."""
+    extents: Tensor | None = None
+    """Half the sides, in pixels, of the rectangle around each splat, where the back end has one. [M, 2], int32"""

@@ -1,13 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The CUDA back end: gsplat 1.4's kernels, called stage by stage as its packed rasterization calls them."""
+"""The CUDA back end: gsplat's kernels, called stage by stage as its packed rasterization calls them.
+
+gsplat 1.4.0 and 1.5.3 differ here, and nothing outside this file sees it. 1.5.3 has batches; bounds a splat by a
+rectangle of 3.33 standard deviations along each axis of the image, where 1.4.0 has a square of 3 along the longest one;
+names images, not cameras; and in the packed layout takes no backgrounds of several images.
+"""
 
 from __future__ import annotations
 
 import torch
-from gsplat.cuda._wrapper import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
+from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
 from torch import Tensor
 
+from nrfgs_ns.host import GSPLAT, gsplat_version
+
 from .contract import Projection
+
+HAS_BATCHES = gsplat_version() >= (1, 5)
+if HAS_BATCHES and gsplat_version() < (1, 5, 3):
+    raise ImportError(f"gsplat {'.'.join(map(str, gsplat_version()))} is not known here; use {' or '.join(GSPLAT)}.")
 
 CHANNEL_CHUNK = 32  # more channels at once slow the kernels down
 
@@ -46,7 +57,7 @@ def project(
     geometry = (means, quats, scales)
     rows = _visible_rows(*geometry, viewmats, Ks, width, height, **settings)
     if not (assume_finite or _finite(rows)):
-        camera_ids, gaussian_ids, _, means2d, depths, conics, _ = rows
+        camera_ids, gaussian_ids, _, means2d, depths, conics, _, _ = rows
         bad = ~torch.isfinite(torch.cat([means2d, depths[:, None], conics], dim=1)).all(dim=1)
         keep = torch.ones(len(means), dtype=torch.bool, device=means.device)
         keep[gaussian_ids[bad]] = False
@@ -54,18 +65,20 @@ def project(
         geometry = (table.index_select(0, kept) for table in geometry)
         camera_ids, gaussian_ids, *seen = _visible_rows(*geometry, viewmats, Ks, width, height, **settings)
         rows = (camera_ids, kept.index_select(0, gaussian_ids), *seen)
-    return Projection(*rows, width=width, height=height, n_cameras=viewmats.shape[0])
+    *columns, extents = rows
+    return Projection(*columns, width=width, height=height, n_cameras=viewmats.shape[0], extents=extents)
 
 
 def _finite(rows: tuple) -> bool:
     """Whether the projected numbers are finite; False also if only their sum is not."""
-    _, _, _, means2d, depths, conics, compensations = rows
+    _, _, _, means2d, depths, conics, _, _ = rows
     total = means2d.detach().sum() + depths.detach().sum() + conics.detach().sum()
     return bool(torch.isfinite(total))
 
 
 def _visible_rows(means, quats, scales, viewmats, Ks, width, height, *, packed: bool, **settings) -> tuple:
-    """gsplat's projection as packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations."""
+    """gsplat's projection as packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, and
+    extents where it has them."""
     rows = fully_fused_projection(
         means,
         None,
@@ -79,10 +92,16 @@ def _visible_rows(means, quats, scales, viewmats, Ks, width, height, *, packed: 
         **settings,
     )
     if not packed:
-        camera_ids, gaussian_ids = (rows[0] > 0).nonzero(as_tuple=True)
+        visible = (rows[0] > 0).all(dim=-1) if HAS_BATCHES else rows[0] > 0
+        camera_ids, gaussian_ids = visible.nonzero(as_tuple=True)
         seen = (None if dense is None else dense[camera_ids, gaussian_ids] for dense in rows)
         rows = (camera_ids, gaussian_ids, *seen)
-    return rows
+    elif HAS_BATCHES:
+        rows = rows[1:]  # one batch
+    if not HAS_BATCHES:
+        return (*rows, None)
+    camera_ids, gaussian_ids, extents, *others = rows
+    return camera_ids, gaussian_ids, extents.amax(dim=-1), *others, extents
 
 
 def composite(
@@ -96,22 +115,30 @@ def composite(
 ) -> tuple[Tensor, Tensor, dict]:
     """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`."""
     tile_width, tile_height = -(-projection.width // tile_size), -(-projection.height // tile_size)
+    if HAS_BATCHES:
+        extents = projection.extents  # a square where another device has projected them
+        bounds = projection.radii[:, None].expand(-1, 2) if extents is None else extents
+        images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
+    else:
+        bounds, images = projection.radii, {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
         projection.means2d,
-        projection.radii,
+        bounds,
         projection.depths,
         tile_size,
         tile_width,
         tile_height,
         packed=True,
-        n_cameras=projection.n_cameras,
-        camera_ids=projection.camera_ids,
         gaussian_ids=projection.gaussian_ids,
+        **images,
     )
     isect_offsets = isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height)
 
     def blend(colors: Tensor, backgrounds: Tensor | None) -> tuple[Tensor, Tensor]:
-        return rasterize_to_pixels(
+        behind = backgrounds
+        if HAS_BATCHES and behind is not None:  # its check knows one image only, and sends that one no gradient
+            behind = behind[0] if len(behind) == 1 and not behind.requires_grad else None
+        render, alphas = rasterize_to_pixels(
             projection.means2d,
             projection.conics,
             colors,
@@ -121,10 +148,13 @@ def composite(
             tile_size,
             isect_offsets,
             flatten_ids,
-            backgrounds=backgrounds,
+            backgrounds=behind,
             packed=True,
             absgrad=absgrad,
         )
+        if backgrounds is not None and behind is None:
+            render = render + (1.0 - alphas) * backgrounds[:, None, None]
+        return render, alphas
 
     if colors.shape[-1] <= CHANNEL_CHUNK:  # nothing to cut, and nothing to put together
         render, alphas = blend(colors, backgrounds)

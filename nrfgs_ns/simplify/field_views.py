@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.reduce import Field, LatentBasis, latent_basis, with_diffuse, with_rank
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.reduce import LatentBasis, latent_basis, with_diffuse, with_rank
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.simplify.residuals import Residuals
 
@@ -34,9 +35,9 @@ class FieldViews:
         self.views = []
         for camera, batch in views:
             with torch.no_grad():
-                view = model.look(camera.to(model.device))
-            truth = model.composite_with_background(model.get_gt_img(batch["image"]), model._get_background_color())
-            self.views.append((view, truth, model._mask(batch)))
+                view = model.project(camera.to(model.device))
+            truth = model.truth_of(batch, model.background_color.to(model.device))
+            self.views.append((view, truth, model.mask_of(batch)))
 
     def psnr(self, field: Field) -> float:
         """Mean over the views, inside masks, dB."""
@@ -48,8 +49,7 @@ class FieldViews:
         """PSNR of each view inside its mask, dB; views whose mask is empty are left out."""
         scores = []
         for view, truth, mask in self.views:
-            appearance = field.head(field.splats, view.visible, view.center)
-            score = psnr(self.model.paint(view, appearance)[0]["rgb"], truth, mask)
+            score = psnr(self.model.composite(view, field.seen_from(view))[0]["rgb"], truth, mask)
             scores += [] if score is None else [score]
         return scores
 

@@ -24,7 +24,6 @@ than min(a_v, w_v) in any one pixel, is spread over w_v / min(a_v, w_v) pixels o
 is what its residual changes of the pictures.
 """
 
-import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -33,7 +32,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import SH_C0, SplatAppearance
-from nrfgs_ns.model.harmonics_fit import LONGEST_SIDE, OPAQUE, contributions
+from nrfgs_ns.model.harmonics_fit import OPAQUE, look_through
 
 EIGHT_BIT_STEP = 1.0 / 255.0
 HALF_A_STEP = 0.5
@@ -123,14 +122,10 @@ def _columns(appearance: SplatAppearance) -> tuple[Tensor, Tensor]:
 
 
 def _sights(model, cameras: Cameras) -> Iterator[Sight]:
+    field = model.field
     for index in range(len(cameras)):
-        camera = cameras[index : index + 1].to(model.device)
-        longest = max(int(camera.width.max()), int(camera.height.max()))
-        if longest > LONGEST_SIDE:
-            camera.rescale_output_resolution(0.5 ** math.ceil(math.log2(longest / LONGEST_SIDE)))
-        view = model.look(camera)
-        appearance = model.head(view.splats, view.visible, view.center)
-        share = contributions(view.projection, appearance.opacities).clamp_min(0.0)
-        towards = view.center - view.splats["means"].index_select(0, view.visible)
+        view, appearance, share = look_through(model, field, cameras[index : index + 1])
+        share = share.clamp_min(0.0)
+        towards = view.center - field.splats["means"].index_select(0, view.visible)
         log_distance = (towards.norm(dim=-1) / model.head.scene_unit).clamp_min(1e-10).log()
         yield Sight(view.visible, share, appearance, log_distance)

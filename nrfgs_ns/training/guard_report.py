@@ -13,10 +13,11 @@ SHOWN = 3
 """Splats that are described."""
 NEAR = 0.1
 """Camera-space depth, scene units, below which a splat counts as on the camera: ten times the near plane."""
-HUGE = {"scales": 20.0, "opacities": 1e3, "means": 1e6, "features_dc": 1e3, "latents": 1e3}
-"""Sizes (of log-scales, logits, scene units, ...) that no training reaches with learning rates that suit it."""
-HUGE_WEIGHT = 1e3
-"""The same for the shared weights."""
+HUGE_OF = {"scales": 20.0, "means": 1e6, "quats": math.inf}
+"""Sizes (of log-scales, scene units) that no training reaches with learning rates that suit it. A quaternion's length
+means nothing."""
+HUGE = 1e3
+"""The same for all else: logits, what a head stores, the shared weights."""
 
 
 @dataclass
@@ -110,10 +111,10 @@ def _cause(pipeline, findings: list[Finding], rows: Tensor) -> str:
             "Replace or remove it."
         )
     for name, value in model.gauss_params.items():
-        if name in HUGE and value.numel() and float(value.abs().max()) > HUGE[name]:
+        if value.numel() and float(value.abs().max()) > HUGE_OF.get(name, HUGE):
             return _too_fast(name, float(value.abs().max()))
     for weight in model.head.parameters():
-        if float(weight.abs().max()) > HUGE_WEIGHT:
+        if float(weight.abs().max()) > HUGE:
             return _too_fast("field", float(weight.abs().max()))
     depths = [depth for row in rows[:SHOWN].tolist() if (depth := _depth(model, row)) is not None]
     if depths and min(depths) < NEAR:

@@ -24,6 +24,7 @@ from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.evaluation_table import print_evaluation
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
+from nrfgs_ns.viewer.panel import ViewerPanel
 
 
 @dataclass
@@ -64,6 +65,7 @@ class NrfgsPipeline(VanillaPipeline):
                 "out; --load-dir goes on from a checkpoint."
             )
         super().__init__(config, device, test_mode, **kwargs)
+        self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             self.datamanager.load_all_images()
             photographs = photograph_model(config.model, self.datamanager)

@@ -51,8 +51,9 @@ def track(model: NrfgsModel, camera: Cameras, step: int, pictures: bool) -> None
         step: training step, on the logs' horizontal axis.
         pictures: whether to render the base colours and each component, too.
     """
-    view = model.look(camera)
-    components = model.head.components(view.splats, view.visible, view.center)
+    field = model.field
+    view = model.project(camera, field.splats)
+    components = field.components_of(view)
     numbers = {"splats": model.num_points, "visible splats": len(view.visible), **summary(components)}
     writer.put_dict(name=GROUP, scalar_dict=numbers, step=step)
     for mode in (BASE, *components) if pictures else ():

@@ -467,7 +467,6 @@ class NrfgsTrainer(Trainer):
             self._end(NOTHING_TO_SAVE, self.request.exit_status)
         if self._saved_step != self._made:
             self.save_checkpoint(self._made)
-        writer.write_out_storage()
         self._end(f"Stopped at step {self._made}, {self._where_it_goes_on}", self.request.exit_status)
 
     @property

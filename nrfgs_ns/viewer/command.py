@@ -60,8 +60,10 @@ def view_file(path: Path, config):
     from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 
     from nrfgs_ns.export.loading import load_file
+    from nrfgs_ns.viewer.panel import ViewerPanel
 
     model = load_file(path)
+    model.show_by(ViewerPanel(model))
     pipeline = SimpleNamespace(model=model, datamanager=SimpleNamespace(includes_time=False))
     viewer = Viewer(config, path.parent / "viewer.log", datapath=path.parent, pipeline=pipeline)
     viewer.camera_handles, viewer.original_c2w = {}, {}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folder in nerfstudio's viewer whose controls say which picture of the appearance head is shown.
 
-A model renders by its panel only when one of the viewer's render threads asks (`asked_by_viewer`): what a browser sets
-cannot reach a training, an evaluation or ns-render, which run in other threads.
+A model that was handed a panel (`show_by`) renders by it only where the panel says that a browser is asking: what a
+browser sets cannot reach a training, an evaluation or ns-render.
 """
 
 import threading
@@ -28,11 +28,6 @@ STEP_FORWARD = 5.0
 MEAN_LOOK = "all photographs' mean"
 MARKER_COLOR = (255, 211, 105)
 """Of the frustum that stands where the view was frozen: the viewer's yellow."""
-
-
-def asked_by_viewer() -> bool:
-    """Whether this code runs for a browser: nerfstudio's viewer renders in a thread of its own for each."""
-    return isinstance(threading.current_thread(), RenderStateMachine)
 
 
 class ViewerPanel(ViewerControl):
@@ -96,6 +91,15 @@ class ViewerPanel(ViewerControl):
         viewer.viser_server.on_client_connect(self._welcome)
         self.installed = True
 
+    @staticmethod
+    def is_asking() -> bool:
+        """Whether this code runs for a browser: nerfstudio's viewer renders in a thread of its own for each."""
+        return isinstance(threading.current_thread(), RenderStateMachine)
+
+    def set_background(self, background: Tensor) -> None:
+        """Take the viewer's background colour [3]."""
+        self.background = background
+
     def _welcome(self, client) -> None:
         """Let a browser begin where the first of the training photographs was taken: nerfstudio's own first view may
         see nothing at all. A little in front of it, so that the photograph, which hangs there, hides nothing.
@@ -121,17 +125,9 @@ class ViewerPanel(ViewerControl):
 
     def _legends(self) -> dict[str, str]:
         """What the line under the dropdown says in each mode."""
-        splats = dict(self.model.gauss_params.items())
-        kinds = offered_components(self.model.head, splats)
-        return {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(self.model.head, splats)}
-
-    def offer_modes(self) -> None:
-        """Offer what the model's head has to show, after it has become another one."""
-        if self.installed:
-            legends = self._legends()
-            if self.mode.value not in legends:
-                self.mode.value = FULL
-            self.mode.options, self.legends = list(legends), legends
+        field = self.model.field
+        kinds = offered_components(field)
+        return {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(field)}
 
     @property
     def shown(self) -> Shown:

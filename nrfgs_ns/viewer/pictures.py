@@ -22,7 +22,8 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.colormaps import apply_float_colormap
 from torch import Tensor
 
-from nrfgs_ns.appearance.head import AppearanceHead, Component, SplatAppearance
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Component, SplatAppearance
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.rasterizer import composite
 
@@ -73,17 +74,18 @@ class Shown:
     """the training photograph whose exposure and colour the image has; None: the mean look"""
 
 
-def offered_components(head: AppearanceHead, splats: dict[str, Tensor]) -> dict[str, str]:
-    """What the head can show of itself: name -> kind, asked with no splats."""
-    none = torch.zeros(0, dtype=torch.int64, device=splats["means"].device)
+def offered_components(field: Field) -> dict[str, str]:
+    """What a head can show of itself: name -> kind, asked with no splats."""
+    means = field.splats["means"]
+    none = torch.zeros(0, dtype=torch.int64, device=means.device)
     with torch.no_grad():
-        components = head.components(splats, none, splats["means"].new_zeros(3))
+        components = field.head.components(field.splats, none, means.new_zeros(3))
     return {name: component.kind for name, component in components.items()}
 
 
-def modes(head: AppearanceHead, splats: dict[str, Tensor]) -> list[str]:
-    """All modes in which a model with this head can be shown."""
-    return [FULL, BASE, *offered_components(head, splats), VIEW_DEPENDENCE, DEPTH]
+def modes(field: Field) -> list[str]:
+    """All modes in which a field can be shown."""
+    return [FULL, BASE, *offered_components(field), VIEW_DEPENDENCE, DEPTH]
 
 
 @torch.no_grad()
@@ -103,11 +105,12 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
     Raises:
         ValueError: the head does not offer the mode.
     """
-    view = model.look(camera)
-    center = view.center if shown.frozen_center is None else shown.frozen_center.to(view.center)
-    gain = 0.0 if shown.mode == BASE else shown.gain
-    appearance = with_gain(model.head, view.splats, view.visible, center, gain)
-    outputs, _ = model.paint(view, appearance, background, shown.photograph)
+    field = model.field
+    view = model.project(camera, field.splats)
+    if shown.frozen_center is not None:
+        view = view._replace(center=shown.frozen_center.to(view.center))
+    appearance = with_gain(field, view, 0.0 if shown.mode == BASE else shown.gain)
+    outputs, _ = model.composite(view, appearance, background, shown.photograph)
     if shown.mode in (FULL, BASE):
         if shown.stops != 0.0:
             outputs["rgb"] = exposed(outputs["rgb"], shown.stops)
@@ -116,14 +119,14 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
     if shown.mode == DEPTH:
         share = scaled_depth(outputs["depth"], outputs["accumulation"])
     elif shown.mode == VIEW_DEPENDENCE:
-        deviation = view_dependence(model.head, view.splats, view.visible, center)
+        deviation = view_dependence(field, view)
         share = _blend(view, deviation / FULL_DEVIATION, appearance.opacities, outputs["accumulation"])
     else:
-        components = model.head.components(view.splats, view.visible, center)
+        components = field.components_of(view)
         if shown.mode not in components:
             raise ValueError(
                 f"The {model.head.name!r} head does not show {shown.mode!r}; it offers "
-                f"{', '.join(map(repr, modes(model.head, view.splats)))}."
+                f"{', '.join(map(repr, modes(field)))}."
             )
         component = components[shown.mode]
         if component.kind != "weight":
@@ -136,19 +139,17 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
     return outputs
 
 
-def with_gain(
-    head: AppearanceHead, splats: dict[str, Tensor], visible: Tensor, camera_centers: Tensor, gain: float
-) -> SplatAppearance:
+def with_gain(field: Field, view: "View", gain: float) -> SplatAppearance:
     """The appearance of the visible splats with `gain` times what the head adds to their base appearance.
 
     At gain 1 this is the head's own answer, to the bit; at 0 the base appearance.
     """
     if gain == 1.0:
-        return head(splats, visible, camera_centers)
-    base = head.base_appearance(splats, visible)
+        return field.seen_from(view)
+    base = field.base_of(view)
     if gain == 0.0:
         return base
-    trained = head(splats, visible, camera_centers)
+    trained = field.seen_from(view)
     return SplatAppearance(
         colors=(base.colors + gain * (trained.colors - base.colors)).clamp_min(0.0),
         opacities=(base.opacities + gain * (trained.opacities - base.opacities)).clamp(0.0, 1.0),
@@ -167,24 +168,20 @@ def icosahedron() -> Tensor:
     return torch.nn.functional.normalize(torch.tensor(turned), dim=-1)
 
 
-def view_dependence(head: AppearanceHead, splats: dict[str, Tensor], visible: Tensor, camera_center: Tensor) -> Tensor:
+def view_dependence(field: Field, view: "View") -> Tensor:
     """How much the colours of the visible splats vary with the direction from which they are seen.
 
     Each splat is seen from 12 places around it, as far away as the camera is, whatever is in between and whether or
     not the training had a photograph from there.
 
-    Args:
-        splats, visible: as for the head.
-        camera_center: [3].
-
     Returns:
         Standard deviation of the colour over the directions, root mean square over the three channels, in units of
         white. [M, 1]
     """
-    means = splats["means"].index_select(0, visible)
-    distance = (camera_center - means).norm(dim=-1, keepdim=True)
-    directions = icosahedron().to(means)
-    colors = torch.stack([head(splats, visible, means + distance * direction).colors for direction in directions])
+    means = field.splats["means"].index_select(0, view.visible)
+    distance = (view.center - means).norm(dim=-1, keepdim=True)
+    around = [view._replace(center=means + distance * direction) for direction in icosahedron().to(means)]
+    colors = torch.stack([field.seen_from(place).colors for place in around])
     return colors.var(dim=0, correction=0).mean(dim=-1, keepdim=True).sqrt()
 
 

@@ -8,9 +8,9 @@ from torch.testing import assert_close
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.encoding import view_geometry
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import (
-    Field,
     input_columns,
     latent_basis,
     with_constant_distance,

@@ -143,7 +143,7 @@ def _read(case: Case, folder: Path) -> tuple[str, str]:
             kind, said = "large", f"{size / 2**20:.0f} MiB; {said}"
         elif _listing(folder) != before:
             kind = "wrote"
-    return kind, said[: 2 * LONGEST]
+    return kind, said.replace(str(folder), "FOLDER")[: 2 * LONGEST]
 
 
 def _listing(folder: Path) -> dict[str, tuple[int, int]]:

@@ -15,9 +15,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.appearance.reduce import Field, latent_basis, with_diffuse, with_rank
+from nrfgs_ns.appearance.reduce import latent_basis, with_diffuse, with_rank
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode, means_grid
 from nrfgs_ns.compact.format import read_container, write_container

@@ -62,7 +62,7 @@ def test_folders_of_the_data_set_come_first(tmp_path, cache):
     capture.parse(downscale_factor=2)
     assert not cache.exists()
     (capture.folder / "images_2" / "003.png").unlink()
-    with pytest.raises(InputError, match=r"1 of 9 images are missing: .*images_2/003.png"):
+    with pytest.raises(InputError, match=r"1 of 10 images are missing: .*images_2/003.png"):
         capture.parse(downscale_factor=2)
 
 

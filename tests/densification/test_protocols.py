@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Densification protocols: what they delete, copy, move and add, and by which thresholds."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 from densification_cases import PROTOCOLS, REFINES, Table, protocol
@@ -8,6 +10,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import McmcDensification, OriginalDensification, build_densification
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.host import gsplat_version
 from nrfgs_ns.model.model import NrfgsModelConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -146,3 +149,27 @@ def test_options_that_cannot_work_are_refused(options, says):
 )
 def test_options_of_the_protocol_itself_are_not_refused(options):
     assert build_densification(NrfgsModelConfig(**options), 8).name == options["densification"]
+
+
+@pytest.mark.skipif(gsplat_version() >= (1, 5), reason="gsplat 1.5's strategy reads two radii, and resets no opacity")
+def test_statistics_growth_and_resets_are_gsplats():
+    """Splatfacto's rules step by step, and gsplat's own strategy beside them: the same numbers, to the bit."""
+    ours, theirs = Table(30), Table(30)
+    for table in (ours, theirs):
+        table.set_opacity(3, 0.01)
+    rules = protocol("splatfacto", warmup_length=10, refine_every=5, reset_alpha_every=4)
+    strategy = deepcopy(rules.strategy)
+    strategy.seen_opacity, state = None, strategy.initialize_state(scene_scale=1.0)
+    for step in range(60):
+        torch.manual_seed(step)
+        ours.step(rules, step, gradient=0.01 * (step % 3))
+        torch.manual_seed(step)
+        info = theirs.info(0.01 * (step % 3))
+        info["means2d"].absgrad = info["means2d"].grad.clone()
+        strategy.step_post_backward(theirs.splats, theirs.optimizers, state, step, info, packed=True)
+        assert len(ours) == len(theirs)
+    assert len(ours) > 30
+    for name, value in theirs.splats.items():
+        assert torch.equal(ours.splats[name].detach(), value.detach()), name
+    for name in ("grad2d", "count", "radii"):
+        assert torch.equal(rules.state[name], state[name]), name

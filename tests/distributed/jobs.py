@@ -178,7 +178,7 @@ def averaged(scene: Path, folder: Path) -> None:
 
         note(trainer, break_splat)
 
-    options = {**PLAIN, **AVERAGED}
+    options = {**PLAIN, **AVERAGED, "--pipeline.model.photographs": "on"}
     with CONSOLE.capture() as log:
         trainer = train(scene, folder / "averaged", world, 12, watch=watch, **options)
     whole, ended = told(trainer), parameters(trainer)

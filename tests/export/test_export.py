@@ -249,7 +249,7 @@ def test_the_fit_follows_a_random_field_closer_than_its_base_colour(trained):
         camera = cameras[index : index + 1]
         outputs = model.get_outputs_for_camera(camera)
         pictures = {
-            "file": render_splats(model.fit.splats, camera, outputs["background"]),
+            "file": render_splats(model.fit.splats, camera, model.background_color),
             "base": model.get_base_color(camera),
         }
         for name, picture in pictures.items():
@@ -383,7 +383,7 @@ def test_trainings_and_viewers_see_the_stored_tables(mode, tiny_scene, tmp_path,
     """The viewer reads every property of the model several times at its start: nothing may be fitted there."""
     config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path)])
     model = config.pipeline.setup(device="cpu", test_mode=mode).model
-    monkeypatch.setattr("nrfgs_ns.model.exported.fit_harmonics", None)
+    monkeypatch.setattr("nrfgs_ns.model.model.fit_harmonics", None)
     assert model.fit is None and model.shs_rest.shape == (model.num_points, 0, 3)
     for name in ("opacities", "quats", "features_dc"):
         assert getattr(model, name) is model.gauss_params[name]

@@ -23,9 +23,10 @@ from short_trainings import command_line, trained
 
 from nrfgs_lab.pages.browser import CHROMIUM, chromium, different
 from nrfgs_lab.pages.web import main as measure_page
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.appearance.reduce import Field, with_diffuse
+from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container

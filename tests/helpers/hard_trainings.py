@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hard trainings: each must end with finite numbers, and the unit of length must not decide how well.
 
-    python tests/helpers/hard_trainings.py --out docs/results/stability --work FOLDER
+    python tests/helpers/hard_trainings.py --out bench/stability --work FOLDER
 
 trains on small procedural scenes: in millimetres and in kilometres with nerfstudio's scaling on and off, at ten times
 the learning rates, under many opacity resets, on black, white and single images. It writes `trainings.json` (one entry

@@ -9,8 +9,9 @@ import torch
 import tyro
 from torch.testing import assert_close
 
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
-from nrfgs_ns.appearance.reduce import Field, latent_basis, with_diffuse, with_rank
+from nrfgs_ns.appearance.reduce import latent_basis, with_diffuse, with_rank
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.inspect.ablate import changes, row, together
 from nrfgs_ns.inspect.command import Inspect
@@ -81,16 +82,16 @@ def test_the_largest_change_bounds_what_a_pixel_can_change(loud, field, seen):
     model = loud.model
     order = seen.largest.argsort(descending=True)[::37][:8]
     assert seen.largest[order[0]] > 5, "a bound on nothing would hold"
-    views = [model.look(cameras[i : i + 1]) for i in range(len(cameras))]
+    views = [model.project(cameras[i : i + 1]) for i in range(len(cameras))]
     with torch.no_grad():
-        before = [model.paint(v, field.head(field.splats, v.visible, v.center))[0]["rgb"] for v in views]
+        before = [model.composite(v, field.seen_from(v))[0]["rgb"] for v in views]
         tightest = 0.0
         for row in order.tolist():
             lone = seen._replace(largest=torch.full_like(seen.largest, 1e9).index_fill(0, order.new_tensor([row]), 0.0))
             small = dropped(field, lone, 0.5)
             moved = 0.0
             for view, picture in zip(views, before, strict=True):
-                now = model.paint(view, small.head(small.splats, view.visible, view.center))[0]["rgb"]
+                now = model.composite(view, small.seen_from(view))[0]["rgb"]
                 moved = max(moved, float((now - picture).abs().max()) / EIGHT_BIT_STEP)
             # Colours beyond [0, 1] can contrast by more than 1; opacity of a splat in front also dims what is behind.
             assert moved <= 1.5 * float(seen.largest[row]) + 1e-3
@@ -104,8 +105,7 @@ def test_loss_falls_with_the_rank(loud, field, seen):
     model = loud.model
     # The truth is the model's own picture: what is left out is an error, and nothing else is.
     views.views = [
-        (view, model.paint(view, field.head(field.splats, view.visible, view.center))[0]["rgb"].detach(), None)
-        for view, _, _ in views.views
+        (view, model.composite(view, field.seen_from(view))[0]["rgb"].detach(), None) for view, _, _ in views.views
     ]
     basis = latent_basis(field, seen.weight)
     scores = [views.psnr(with_rank(field, basis, rank)) for rank in range(1, 7)]

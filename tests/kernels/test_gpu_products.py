@@ -48,8 +48,7 @@ def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tens
     """The picture of every mode, and one whose view is frozen, on the CPU; what each must be is checked."""
     model, cameras = model_with_something_to_show(device, scene, out)
     camera, elsewhere = cameras[0:1], cameras[4:5].camera_to_worlds[0, :3, 3]
-    splats = dict(model.gauss_params.items())
-    shown = {mode: Shown(mode) for mode in modes(model.head, splats)} | {FROZEN: Shown(frozen_center=elsewhere)}
+    shown = {mode: Shown(mode) for mode in modes(model.field)} | {FROZEN: Shown(frozen_center=elsewhere)}
     pictures = {}
     for name, what in shown.items():
         pictures[name] = picture(model, camera, what)["rgb"]
@@ -66,10 +65,10 @@ def negative_colors(device: str, scene: Path, out: Path) -> None:
     """The compositor takes signed colours as they are: those of the residual's picture are."""
     model, cameras = model_with_something_to_show(device, scene, out)
     with torch.no_grad():
-        view = model.look(cameras[0:1])
-        residual = model.head.components(view.splats, view.visible, view.center)["residual"].values
+        view = model.project(cameras[0:1])
+        residual = model.field.components_of(view)["residual"].values
         assert residual.min() < -0.05 and residual.max() > 0.05
-        opacities = model.head(view.splats, view.visible, view.center).opacities
+        opacities = model.field.seen_from(view).opacities
         render = composite(view.projection, residual, opacities)[0]
         mirrored = composite(view.projection, -residual, opacities)[0]
     assert render.min() < -0.01 and render.max() > 0.01
@@ -81,10 +80,10 @@ def per_splat_centers(device: str, scene: Path, out: Path) -> None:
     """A head that is told each splat's own centre answers as for one camera, if they are all the same."""
     model, cameras = model_with_something_to_show(device, scene, out)
     with torch.no_grad():
-        view = model.look(cameras[0:1])
+        view = model.project(cameras[0:1])
         center = cameras[4:5].camera_to_worlds[0, :3, 3]  # not the camera that looks: a frozen view
-        one = model.head(view.splats, view.visible, center)
-        each = model.head(view.splats, view.visible, center.expand(len(view.visible), 3).contiguous())
+        one = model.field.seen_from(view._replace(center=center))
+        each = model.field.seen_from(view._replace(center=center.expand(len(view.visible), 3).contiguous()))
     for name in ("colors", "opacities"):
         # The same operations on the same numbers; a kernel may take another order of sums for another stride.
         assert_close(getattr(each, name), getattr(one, name), rtol=0, atol=1e-6)

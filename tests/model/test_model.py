@@ -61,10 +61,10 @@ def test_background_shows_where_splats_let_it(build, training):
     """Over a colour: what black gives, and the colour times what is not covered. Three roundings of terms below 1."""
     model = build().model.train(training)
     pose = torch.eye(3, 4)[None] + torch.tensor([0.0, 0.0, 0.0, 1.0])
-    view = model.look(Cameras(pose, fx=40.0, fy=40.0, cx=24.0, cy=18.0, width=48, height=36))
-    appearance = model.head(view.splats, view.visible, view.center)
+    view = model.project(Cameras(pose, fx=40.0, fy=40.0, cx=24.0, cy=18.0, width=48, height=36))
+    appearance = model.field.seen_from(view)
     color = torch.tensor([0.9, 0.5, 0.1])
-    black, over = (model.paint(view, appearance, behind)[0] for behind in (torch.zeros(3), color))
+    black, over = (model.composite(view, appearance, behind)[0] for behind in (torch.zeros(3), color))
     assert 0.01 < over["accumulation"].mean() < 0.99
     expected = (black["rgb"] + (1 - over["accumulation"]) * color).clamp(0, 1)
     assert_close(over["rgb"], expected, rtol=0, atol=3 * 2.0**-23)

@@ -24,8 +24,8 @@ def residual(model, cameras) -> float:
     """Root mean square residual over all cameras."""
     losses = []
     for index in range(len(cameras)):
-        view = model.look(cameras[index : index + 1])
-        losses.append(model.head.neutral_loss(view.splats, view.visible, view.center))
+        view = model.project(cameras[index : index + 1])
+        losses.append(model.head.neutral_loss(model.field.splats, view.visible, view.center))
     return torch.stack(losses).mean().sqrt().item()
 
 

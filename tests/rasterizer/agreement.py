@@ -36,7 +36,7 @@ class Verdict:
 
     values: dict[str, Tensor]
     tolerances: dict[str, Tensor]
-    sigma3: Tensor  # [C, N]
+    reach: Tensor  # [C, N], the longer side
     visible: Tensor  # [C, N]
 
 
@@ -46,6 +46,7 @@ def _run(
     unit: float,
     noise: torch.Generator | None = None,
     orders: list[Tensor] | None = None,
+    bounds: str = "square",
 ) -> tuple[dict[str, Tensor], list[reference.Screen], list[reference.Image]]:
     """The twin, forward and backward; with `noise`, in the order of the run without (equal depths must stay equal)."""
 
@@ -69,6 +70,7 @@ def _run(
         unit=unit,
         perturb=shaken,
         orders=orders,
+        bounds=bounds,
     )
     weight = torch.ones_like(alphas)
     if noise is not None:
@@ -100,13 +102,13 @@ def _largest(t: Tensor) -> Tensor:
     return t.abs().amax() if t.numel() else t.sum()
 
 
-def judge(case: Case, grads: tuple[Tensor, Tensor], unit: float = FLOAT32) -> Verdict:
+def judge(case: Case, grads: tuple[Tensor, Tensor], unit: float = FLOAT32, bounds: str = "square") -> Verdict:
     """Values and tolerances of everything a rasterizer computes for a case in an arithmetic of the given rounding
-    unit.
+    unit; `bounds` as in `reference.project`.
     """
-    values, screens, images = _run(case, grads, unit)
+    values, screens, images = _run(case, grads, unit, bounds=bounds)
     noise = torch.Generator().manual_seed(0)
-    shaken = [_run(case, grads, unit, noise, [image.order for image in images])[0] for _ in range(RUNS)]
+    shaken = [_run(case, grads, unit, noise, [image.order for image in images], bounds)[0] for _ in range(RUNS)]
     tolerances = {}
     for name, value in values.items():
         spread = torch.stack([(other[name] - value).abs() for other in shaken]).amax(0)
@@ -134,7 +136,7 @@ def judge(case: Case, grads: tuple[Tensor, Tensor], unit: float = FLOAT32) -> Ve
     return Verdict(
         values,
         tolerances,
-        torch.stack([s.sigma3 for s in screens]).detach(),
+        torch.stack([s.reach.amax(-1) for s in screens]).detach(),
         torch.stack([s.visible for s in screens]),
     )
 
@@ -145,7 +147,7 @@ def assert_agrees(verdict: Verdict, result: dict[str, Tensor], unit: float = FLO
     assert torch.equal(result["radii"] > 0, visible), "visible splats differ"
     # ceil may land on either side only if three sigma is an integer up to 8 roundings of sqrt and eigenvalue, and the
     # loss of a determinant; 64 units bound both for the aspect ratios that occur.
-    low, high = ((verdict.sigma3 * (1 + s * 64 * unit)).ceil() for s in (-1, 1))
+    low, high = ((verdict.reach * (1 + s * 64 * unit)).ceil() for s in (-1, 1))
     radii = result["radii"].double()
     assert ((radii >= low) & (radii <= high))[visible].all(), "radii differ"
     for name, expected in verdict.values.items():

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -34,8 +35,8 @@ class Screen:
     """(a c / det) of the covariance before the blur: by how much a difference of products amplifies rounding in det.
     [N]
     """
-    sigma3: Tensor
-    """The radius before it is rounded up. [N]"""
+    reach: Tensor
+    """Half the sides of the splat's rectangle before they are rounded up. [N, 2]"""
     visible: Tensor
     """[N], bool"""
 
@@ -74,8 +75,14 @@ def project(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     packed: bool = True,
+    bounds: Literal["square", "rectangle"] = "square",
 ) -> Screen:
-    """Project N splats into one camera: cov2d = J W Sigma W^T J^T + eps2d I. Everything in float64."""
+    """Project N splats into one camera: cov2d = J W Sigma W^T J^T + eps2d I. Everything in float64.
+
+    Args:
+        bounds: what cuts a splat off. square: of three standard deviations along its longest axis, as gsplat 1.4 does
+            it. rectangle: of 3.33 along each axis of the image, as gsplat 1.5.
+    """
     means, quats, scales, viewmat, K = (t.double() for t in (means, quats, scales, viewmat, K))
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     W, t = viewmat[:3, :3], viewmat[:3, 3]
@@ -113,14 +120,15 @@ def project(
 
     condition = (cov2d[:, 0, 0] * cov2d[:, 1, 1] / torch.linalg.det(cov2d).clamp(min=1e-300)).detach()
 
+    variances = torch.diagonal(blurred, dim1=-2, dim2=-1)
     half_trace = 0.5 * (blurred[:, 0, 0] + blurred[:, 1, 1])
     longest = half_trace + (half_trace**2 - torch.linalg.det(blurred)).clamp(min=0.1 if packed else 0.01).sqrt()
-    sigma3 = 3 * longest.sqrt()
-    radius = sigma3.ceil()
+    reach = 3.33 * variances.sqrt() if bounds == "rectangle" else 3 * longest.sqrt()[:, None].expand(-1, 2)
+    sides = reach.ceil()
     size = torch.tensor([width, height])
-    on_image = ((means2d + radius[:, None] > 0) & (means2d - radius[:, None] < size)).all(-1)
-    visible = in_range & on_image & (radius > radius_clip)
-    return Screen(means2d, depths, torch.linalg.inv(blurred), compensations, condition, sigma3, visible)
+    on_image = ((means2d + sides > 0) & (means2d - sides < size)).all(-1)
+    visible = in_range & on_image & (sides.amax(-1) > radius_clip)
+    return Screen(means2d, depths, torch.linalg.inv(blurred), compensations, condition, reach, visible)
 
 
 def _covered(centre: Tensor, radius: Tensor, n_pixels: int, tile_size: int) -> Tensor:
@@ -159,7 +167,7 @@ def composite(
         order = torch.argsort(screen.depths.detach(), stable=True)
         order = order[screen.visible[order]]
     opacity_error = torch.as_tensor(opacity_error).expand_as(screen.depths)[order, None, None]
-    means2d, conics, sigma3 = screen.means2d[order], screen.conics[order], screen.sigma3[order].detach()
+    means2d, conics, sides = screen.means2d[order], screen.conics[order], screen.reach[order].detach()
     opacities, colors = opacities.double()[order, None, None], colors.double()[order]
 
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -171,12 +179,12 @@ def composite(
     sigma = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", d, conics, d)
     raw = opacities * torch.exp(-sigma)
 
-    def reach(radius: Tensor, shift: float = 0.0) -> Tensor:
-        columns = _covered(means2d[:, 0].detach(), radius + shift, width, tile_size)
-        rows = _covered(means2d[:, 1].detach(), radius + shift, height, tile_size)
+    def reach(sides: Tensor, shift: Tensor | float = 0.0) -> Tensor:
+        columns = _covered(means2d[:, 0].detach(), sides[:, 0] + shift, width, tile_size)
+        rows = _covered(means2d[:, 1].detach(), sides[:, 1] + shift, height, tile_size)
         return rows[:, :, None] & columns[:, None, :]
 
-    within = reach(sigma3.ceil())
+    within = reach(sides.ceil())
     counts = within & (raw >= MIN_ALPHA) & (sigma >= 0)
     alpha = torch.where(counts, raw.clamp(max=MAX_ALPHA), 0.0)
     after = torch.cumprod(1 - alpha, dim=0)
@@ -199,8 +207,9 @@ def composite(
         rounding = 2 * (weights * error).sum(0) + 8 * unit
         lost = torch.cumsum(torch.where(counts, alpha / (1 - alpha) * error, 0.0), 0) + 8 * unit  # relative error of T
 
-        fuzz = 8 * unit * (sigma3 * (1 + cancelled[:, 0, 0]) + means2d.abs().amax(-1) + max(width, height))
-        may_reach = reach((sigma3 + fuzz).ceil(), fuzz) != reach((sigma3 - fuzz).ceil(), -fuzz)
+        longest = sides.amax(-1)
+        fuzz = 8 * unit * (longest * (1 + cancelled[:, 0, 0]) + means2d.abs().amax(-1) + max(width, height))
+        may_reach = reach((sides + fuzz[:, None]).ceil(), fuzz) != reach((sides - fuzz[:, None]).ceil(), -fuzz)
         near_min = (raw / MIN_ALPHA - 1).abs() <= error
         reached = torch.cat([torch.ones_like(drawn[:1]), drawn[:-1]])
         maybe_cut = reached & ((within & near_min) | (may_reach & (raw >= MIN_ALPHA * (1 - error))))
@@ -231,7 +240,7 @@ def rasterization(
     unit: float = 2.0**-24,
     perturb: Callable[[Tensor], Tensor] = lambda t: t,
     orders: list[Tensor] | None = None,
-    **limits: float,
+    **limits: Any,
 ) -> tuple[Tensor, Tensor, list[Screen], list[Image]]:
     """The twin of `nrfgs_ns.rasterizer.rasterization`, camera by camera.
 
@@ -240,7 +249,7 @@ def rasterization(
             expected depth is divided by; with noise of a few rounding units it shows what rounding does to the image
             and to its gradients.
         orders: see `composite`; one per camera.
-        limits: near_plane, far_plane, radius_clip, eps2d, packed.
+        limits: near_plane, far_plane, radius_clip, eps2d, packed, bounds.
 
     Returns:
         render [C, H, W, X], alphas [C, H, W, 1], and the screens and images of the C cameras.

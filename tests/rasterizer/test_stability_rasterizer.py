@@ -213,6 +213,9 @@ def test_rows_that_gsplat_lets_through_as_nan_are_projected_away(monkeypatch):
         p = project(*harmless, viewmats, Ks, width, height)
         spoilt = ~torch.isfinite(means[p.gaussian_ids]).all(1)
         conics = p.conics.masked_fill(spoilt[:, None], math.nan)
+        if gsplat_cuda.HAS_BATCHES:
+            sides = p.radii[:, None].expand(-1, 2)
+            return p.camera_ids, p.camera_ids, p.gaussian_ids, sides, p.means2d, p.depths, conics, None
         return p.camera_ids, p.gaussian_ids, p.radii, p.means2d, p.depths, conics, None
 
     monkeypatch.setattr(gsplat_cuda, "fully_fused_projection", kernel)

@@ -13,7 +13,9 @@ from short_trainings import assert_same_training, checkpoint_of, command_line, m
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs
+from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.training.photographs import exif_of, exposure, physical_cameras, verdict
+from nrfgs_ns.training.run import parse
 
 NAN = math.nan
 
@@ -94,7 +96,7 @@ def test_cameras_are_told_apart_by_exif_or_by_their_angle():
 @pytest.fixture(scope="module")
 def exposed_scene(tmp_path_factory):
     """A procedural data set of 24 photographs, 128 x 96, with known stops, and those stops by name."""
-    from nrfgs_lab.exposure import exposed
+    from nrfgs_lab.exposure import exposed as exposed_bytes
     from nrfgs_ns.scenes import SceneConfig, write_scene
 
     config = SceneConfig(views=24, width=128, height=96, points=4000, samples=1)
@@ -106,7 +108,7 @@ def exposed_scene(tmp_path_factory):
         drawn = random.uniform(-1, 1) + 0.1 * random.standard_normal(3)
         with Image.open(path) as image:
             pixels = np.asarray(image.convert("RGB"))
-        Image.fromarray(exposed(pixels, drawn)).save(path)
+        Image.fromarray(exposed_bytes(pixels, drawn)).save(path)
         stops[path.name] = drawn
     return scene, stops
 
@@ -178,3 +180,28 @@ def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished,
     monkeypatch.setenv("NRFGS_LOOK", "nobody.jpg")
     with pytest.raises(InputError, match="nobody.jpg"):
         model.get_outputs_for_camera(camera)
+
+
+def test_what_is_behind_a_cut_out_photograph_is_exposed_with_it(tiny_scene, tmp_path):
+    words = command_line("nrfgs-sh", tiny_scene, tmp_path, 1, QUICK, {"--pipeline.model.photographs": "on"})
+    model = parse(words).pipeline.setup(device="cpu", test_mode="val").model.train()
+    with torch.no_grad():
+        model.photograph.shots[3] = torch.tensor([-1.0, 0.2, 0.1])
+    transparent = {"image": torch.zeros(6, 8, 4, dtype=torch.uint8), "image_idx": 3}
+    grey = torch.full((3,), 0.5)
+    model.config.num_downscales = 0
+    truth = model._truth({"background": grey}, transparent)
+    torch.testing.assert_close(truth, exposed(grey.expand(6, 8, 3), model.photograph.stops()[3]))
+    assert torch.equal(model.eval()._truth({"background": grey}, transparent), grey.expand(6, 8, 3))
+
+
+def test_robust_loss_trims_and_goes_on(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("nrfgs_ns.image.robust.FIRST_STEP", 1)
+    robust = {"--pipeline.model.robust-loss": 0.1}
+    whole = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "whole", 4, QUICK, robust))
+    assert checkpoint_of(whole)["pipeline"]["_model.trimming.histogram"].sum() > 0
+    half = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "half", 2, QUICK, robust))
+    rest = command_line("nrfgs-sh", tiny_scene, tmp_path / "rest", 4, QUICK, robust, {"--load-dir": models_of(half)})
+    assert_same_training(checkpoint_of(whole), checkpoint_of(trained(rest)), rtol=0, atol=0)
+    with pytest.raises(InputError, match="robust_loss is 2.0"):
+        trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 1, QUICK, {"--pipeline.model.robust-loss": 2.0}))

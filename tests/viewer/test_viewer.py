@@ -28,6 +28,7 @@ from viser.transforms import SO3
 
 import nrfgs_ns.training.trainer
 from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.gsnb import GsnbConfig
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -37,6 +38,7 @@ from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.image.photograph import exposed
+from nrfgs_ns.model.renderer import View
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.run import parse
 from nrfgs_ns.viewer.pictures import (
@@ -93,7 +95,7 @@ def test_a_head_offers_what_it_has():
     def offered(config):
         head = config.setup()
         splats = {"means": torch.zeros(4, 3), "opacities": torch.zeros(4, 1), **head.splat_params(torch.zeros(4, 3))}
-        shown = modes(head, splats)
+        shown = modes(Field(head, splats))
         assert (shown[0], shown[1], shown[-2], shown[-1]) == (FULL, BASE, VIEW_DEPENDENCE, DEPTH)
         return shown[2:-2]
 
@@ -112,7 +114,7 @@ def test_every_mode_is_a_picture_of_its_own(build, method):
     pipeline = build(method)
     model, (camera, _) = pipeline.model, two_cameras(pipeline)
     pictures = {}
-    for mode in modes(model.head, dict(model.gauss_params.items())):
+    for mode in modes(model.field):
         outputs = picture(model, camera, Shown(mode))
         assert outputs.keys() == model.get_outputs(camera).keys()
         rgb = outputs["rgb"]
@@ -135,16 +137,16 @@ def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(build):
     assert torch.equal(picture(model, camera, Shown(gain=0.0))["rgb"], model.get_base_color(camera))
     assert torch.equal(picture(model, camera, Shown(BASE, gain=2.0))["rgb"], model.get_base_color(camera))
     assert torch.equal(picture(model, camera, Shown(gain=1.0))["rgb"], model.get_outputs(camera)["rgb"])
-    view = model.look(camera)
+    view = model.project(camera)
     base, trained = (
-        model.head.base_appearance(view.splats, view.visible),
-        model.head(view.splats, view.visible, view.center),
+        model.field.base_of(view),
+        model.field.seen_from(view),
     )
     doubled = SplatAppearance(
         (2 * trained.colors - base.colors).clamp_min(0), (2 * trained.opacities - base.opacities).clamp(0, 1)
     )
     # The same to rounding: 2^-24 in each of at most 300 splats that a pixel adds up.
-    by_hand = model.paint(view, doubled)[0]["rgb"]
+    by_hand = model.composite(view, doubled)[0]["rgb"]
     assert_close(picture(model, camera, Shown(gain=2.0))["rgb"], by_hand, rtol=0, atol=300 * 2**-24)
 
 
@@ -163,9 +165,9 @@ def test_gain_scales_what_it_shows(build, mode):
 def test_frozen_view_is_the_head_seen_from_elsewhere(build):
     pipeline = build()
     model, (here, there) = pipeline.model, two_cameras(pipeline)
-    center = model.look(there).center
-    view = model.look(here)
-    expected = model.paint(view, model.head(view.splats, view.visible, center))[0]["rgb"]
+    center = model.project(there).center
+    view = model.project(here)
+    expected = model.composite(view, model.field.seen_from(view._replace(center=center)))[0]["rgb"]
     frozen = picture(model, here, Shown(frozen_center=center))["rgb"]
     assert torch.equal(frozen, expected)
     unfrozen = picture(model, here, Shown())["rgb"]
@@ -205,12 +207,13 @@ def test_view_dependence_is_the_deviation_over_the_sphere():
     means = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
     splats = {"means": means, "opacities": torch.zeros(5, 1), **head.splat_params(torch.full((5, 3), 0.5))}
     visible, center = torch.tensor([0, 2, 3]), torch.tensor([4.0, 0.0, 1.0])
-    assert view_dependence(head, splats, visible, center).abs().max() == 0
+    field, view = Field(head, splats), View(SimpleNamespace(gaussian_ids=visible), center)
+    assert view_dependence(field, view).abs().max() == 0
     splats["features_rest"][2, :, 1] = torch.tensor([0.3, -0.2, 0.1])
     # sqrt(k . k / (4 pi)) in one channel; a third of its square over three channels.
     expected = torch.tensor([0.0, (0.14 / (12 * torch.pi)) ** 0.5, 0.0])[:, None]
     # 12 colours near 1/2 are rounded at 2^-25 each.
-    assert_close(view_dependence(head, splats, visible, center), expected, rtol=0, atol=12 * 2**-25)
+    assert_close(view_dependence(field, view), expected, rtol=0, atol=12 * 2**-25)
 
 
 def test_depth_is_dark_near_and_bright_far():
@@ -352,7 +355,7 @@ def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
     plain = coarse(Browser.sees(viewer, pose)["rgb"])
     assert panel.count.value == "300"
     panel.mode.value, panel.gain.value = "residual", 1.5
-    panel.frozen_center, panel.freeze.value = model.look(elsewhere).center, True
+    panel.frozen_center, panel.freeze.value = model.project(elsewhere).center, True
     viewer.control_panel.background_color = (255, 0, 0)
     viewer.control_panel.crop_viewport = True
     assert panel.shown.mode == "residual" and panel.shown.gain == 1.5

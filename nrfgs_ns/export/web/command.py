@@ -19,7 +19,7 @@ from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.compact import PLY_BYTES, check_options, chosen_field, measure_loss, write_config
+from nrfgs_ns.export.compact import PLY_BYTES, check_options, chosen_field, measure_file, write_config
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.web.options import WebOptions
 from nrfgs_ns.export.web.page import page
@@ -77,7 +77,7 @@ def export_web(
         file = Path(temporary) / SCENE
         scene_bytes = write_container(file, header, streams)
         scene = file.read_bytes()
-        losses = measure_loss(pipeline, write_config(load_config, file)) if measure else {}
+        losses = measure_file(pipeline, write_config(load_config, file)) if measure else {}
     title = output.stem if web.title is None else web.title
     text = page(about, poster, scene if alone else SCENE, title, web.author)
     written = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
@@ -146,8 +146,8 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
     for i in evenly_spaced(len(cameras), 8):
         camera = cameras[i : i + 1].to(model.device)
         outputs = model.get_outputs_for_camera(camera)
-        truth = model.composite_with_background(model.get_gt_img(images[i]["image"]), outputs["background"])
-        score = psnr(outputs["rgb"], truth, model._mask(images[i]))
+        truth = model.truth_of(images[i], outputs["background"])
+        score = psnr(outputs["rgb"], truth, model.mask_of(images[i]))
         if poster is None or (score is not None and score > best):
             best, start, poster = score if score is not None else best, i, outputs["rgb"]
 

@@ -11,6 +11,7 @@ import torch
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
 
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.training import run
 from nrfgs_ns.training.run import evaluate, train
 from nrfgs_ns.viewer.pictures import modes
@@ -43,7 +44,7 @@ def test_its_colours_are_linear_in_the_direction(my_head):
         assert torch.allclose(head(splats, rows, center).colors[0], expected, atol=1e-6)
     with pytest.raises(ValueError, match="distance_eps"):
         my_head.LinearConfig(distance_eps=0.0).setup()
-    assert modes(head, splats) == ["full", "base colour", "residual", "view dependence", "depth"]
+    assert modes(Field(head, splats)) == ["full", "base colour", "residual", "view dependence", "depth"]
 
 
 def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tmp_path, monkeypatch):

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A study's records in one file, as the folder results/ of the repository keeps them.
+
+    python -m nrfgs_lab.results pack OUT results/NAME.json       # all records and tables of a study's folder
+    python -m nrfgs_lab.results unpack results/NAME.json OUT     # the folder again: `nrfgs bench` reports from it
+
+{"study": NAME, "records": {path without .json: record}, "texts": {path: lines}}, a line for each record. Numbers are
+kept to seven significant digits, as many as float32 has. Figures and the tables of other formats are not kept: the
+commands draw them anew from the records. Nor is what ns-eval says of each image, where `bench/measure.py` says it too.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from nrfgs_ns.files import write_whole
+
+TEXTS = ".md", ".yaml"
+"""Endings of what is kept as text."""
+
+
+def rounded(content: Any) -> Any:
+    """The same with numbers of seven significant digits."""
+    if isinstance(content, dict):
+        return {name: rounded(value) for name, value in content.items()}
+    if isinstance(content, list):
+        return [rounded(value) for value in content]
+    return float(f"{content:.7g}") if isinstance(content, float) else content
+
+
+def slim(record: Any) -> Any:
+    """A record without the values of each image that it has twice."""
+    if not (isinstance(record, dict) and {"eval", "measured"} <= record.keys()):
+        return record
+    return {**record, "eval": {name: value for name, value in record["eval"].items() if name != "per_image"}}
+
+
+def pack(folder: Path, file: Path) -> None:
+    """Write all records and tables of a folder into a file."""
+    records, texts = {}, {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder)
+        if path.suffix == ".json":
+            records[name.with_suffix("").as_posix()] = slim(json.loads(path.read_text(encoding="utf-8")))
+        elif path.suffix in TEXTS:
+            texts[name.as_posix()] = path.read_text(encoding="utf-8").splitlines()
+    write(file, records, texts)
+
+
+def write(file: Path, records: dict[str, Any], texts: dict[str, list[str]] | None = None) -> None:
+    """Write a study's file; its name is the study's."""
+
+    def line(name: str) -> str:
+        return f"  {json.dumps(name)}: {json.dumps(rounded(records[name]), separators=(',', ':'))}"
+
+    parts = [f'"study": {json.dumps(file.stem)}', '"records": {\n' + ",\n".join(map(line, records)) + "\n }"]
+    parts += [f'"texts": {json.dumps(texts, indent=1, ensure_ascii=False)}'] if texts else []
+    write_whole(file, "{" + ",\n ".join(parts) + "}\n")
+
+
+def unpack(file: Path, folder: Path) -> None:
+    """Write the folder that a file was made from."""
+    content = json.loads(file.read_text(encoding="utf-8"))
+    for name, record in content["records"].items():
+        write_whole(folder / f"{name}.json", json.dumps(record, indent=1) + "\n")
+    for name, lines in content.get("texts", {}).items():
+        write_whole(folder / name, "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    {"pack": pack, "unpack": unpack}[sys.argv[1]](*map(Path, sys.argv[2:]))
