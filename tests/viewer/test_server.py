@@ -106,7 +106,7 @@ def test_the_network_is_refused_unless_it_is_asked_for(open_viewer, interface, c
     port = viewer.viser_server.get_port()
     assert reachable("127.0.0.1", port)
     assert not reachable(interface, port)
-    assert "127.0.0.1" in viewer.viewer_info[0] and f"ssh -L {port}:localhost:{port}" in viewer.viewer_info[1]
+    assert "127.0.0.1" in viewer.viewer_info[0] and f"ssh -L {port}:localhost:{port}" in viewer.viewer_info[-1]
 
 
 def test_a_busy_port_is_named_with_the_one_instead(open_viewer):
@@ -124,7 +124,7 @@ def test_the_network_is_served_if_it_is_asked_for(to_all, interface):
     port = to_all.viser_server.get_port()
     status, body = answer(interface, port, "/")
     assert status == 200 and b"<html" in body.lower()
-    assert "Whoever reaches 0.0.0.0" in to_all.viewer_info[1]
+    assert "Whoever reaches 0.0.0.0" in to_all.viewer_info[-1]
 
 
 @pytest.mark.parametrize(
