@@ -25,8 +25,11 @@ from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS
 from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
+from nrfgs_ns.training.start import know_callers_quickly
 from nrfgs_ns.training.trainer import AVERAGED, NrfgsTrainerConfig
 from nrfgs_ns.viewer.server import LocalViewerConfig
+
+know_callers_quickly()  # plugins are loaded right before nerfstudio asks
 
 HALF_A_SPACING = 0.5
 """Noise on where the field is asked from, in distances between neighbouring training cameras (docs/captures.md)."""

@@ -14,11 +14,10 @@ settings.load_profile("nrfgs")
 # nerfbaselines for installed.
 sys.path.insert(0, str(Path(__file__).resolve().parent / "helpers"))
 
-from quick_start import ask_for_callers_quickly, keep_what_is_imported, let_go  # noqa: E402
+from quick_start import keep_what_is_imported, let_go  # noqa: E402
 from without_open3d import hide_open3d, open3d_shown  # noqa: E402
 
 hide_open3d()
-ask_for_callers_quickly()
 
 SCENES = Path(os.environ.get("NRFGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
 

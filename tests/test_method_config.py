@@ -4,10 +4,12 @@
 import subprocess
 import sys
 from dataclasses import fields, is_dataclass
+from types import SimpleNamespace
 
 import pytest
 import torch
 import tyro
+from nerfstudio.configs import external_methods
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods, method_configs
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.scripts.train import entrypoint
@@ -140,6 +142,17 @@ def test_every_option_of_the_head_is_reachable_and_explained(monkeypatch, capsys
             assert f"--pipeline.model.appearance.{field.name.replace('_', '-')}" in plain
     assert "numbers in a splat's latent" in plain
     assert "--pipeline.model.sh-degree" not in plain, "the head's degree, and splatfacto's that does nothing"
+
+
+def test_nerfstudio_still_knows_who_asks_for_an_external_method(capsys):
+    """Listing them asks nothing; naming one on the command line says how to install it."""
+    listed, _ = external_methods.get_external_methods()
+    assert "in2n" in listed
+    assert isinstance(external_methods.inspect, SimpleNamespace), "the slow way is back"
+    named = external_methods.ExternalMethod("[bold]how to install it", [("x", "")])
+    with pytest.raises(SystemExit):
+        external_methods.ExternalMethodDummyTrainerConfig(method_name="x", method=named)
+    assert "how to install it" in capsys.readouterr().out
 
 
 def test_registering_pulls_in_no_gpu_code_and_no_training_tools():

@@ -110,6 +110,23 @@ def exif_of_copy(exif: Image.Exif) -> bytes:
     return copy.tobytes() if {*copy, *copy.get_ifd(ExifTags.IFD.Exif), *copy.get_ifd(ExifTags.IFD.GPSInfo)} else b""
 
 
+def share_of_size(path: Path) -> float:
+    """Width of an image as a share of the one in its EXIF: below 1 where it was made smaller and EXIF was kept as it
+    was; 1 where nothing is known.
+
+    A focal length in millimetres comes with the sensor's resolution, in pixels of the size in EXIF, except where it is
+    also given for 35 mm film (then 1, too)."""
+    try:
+        with open_picture(path) as image:
+            details = exif_of(image).get_ifd(ExifTags.IFD.Exif)
+            sides = [_number(details.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+            if None in sides or ExifTags.Base.FocalLengthIn35mmFilm in details:
+                return 1.0
+            return max(image.size) / max(sides)
+    except InputError:
+        return 1.0
+
+
 def read_position(path: Path) -> tuple[float, float] | None:
     """Latitude and longitude in degrees where a photograph was taken, or None."""
     try:

@@ -90,9 +90,9 @@ def place(
     placed, transform = camera_utils.auto_orient_and_center_poses(
         torch.from_numpy(near.astype(np.float32)), method=orientation, center_method=centering
     )
-    scale = 1.0
-    if auto_scale:
-        scale /= float(torch.max(torch.abs(placed[:, :3, 3])))
+    scale, reach = 1.0, float(torch.max(torch.abs(placed[:, :3, 3])))
+    if auto_scale and reach > 0:
+        scale /= reach
     scale *= factor
     placed[:, :3, 3] *= scale
     if far:

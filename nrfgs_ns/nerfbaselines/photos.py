@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from nerfstudio.cameras import camera_utils
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from torch import Tensor
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanager, NrfgsDatamanagerConfig, NrfgsInputDataset
 from nrfgs_ns.data.dataparser import MIN_POINTS, NrfgsDataParserConfig
+from nrfgs_ns.data.world import place
 from nrfgs_ns.errors import InputError
 
 PINHOLE = 0
@@ -40,19 +40,18 @@ class World(NamedTuple):
             poses: as nerfbaselines has them, [V, 3 or 4, 4].
             options: the parser's orientation_method, center_method, auto_scale_poses and scale_factor.
         """
-        rows = torch.eye(4).repeat(len(poses), 1, 1)
-        rows[:, :3] = _opengl(poses).float()
+        rows = np.tile(np.eye(4), (len(poses), 1, 1))
+        rows[:, :3] = _opengl(poses).numpy()
         method = options.orientation_method
         if len(poses) == 1 and method == "vertical":  # needs two cameras
             method = "up"
-        placed, transform = camera_utils.auto_orient_and_center_poses(rows, method, options.center_method)
+        _, transform, scale = place(rows, method, options.center_method, options.auto_scale_poses, options.scale_factor)
         if not torch.isfinite(transform).all():
             raise InputError(
                 "The data set's poses cannot be oriented (their up directions cancel). Set "
                 "pipeline.datamanager.dataparser.orientation_method to none."
             )
-        reach = float(placed[:, :3, 3].abs().max()) if options.auto_scale_poses else 1.0
-        return cls(transform.double(), options.scale_factor / (reach if reach > 0 else 1.0))
+        return cls(transform.double(), scale)
 
     def points(self, xyz: Tensor) -> Tensor:
         """Points float64 [N, 3] of the data set's world in this one."""

@@ -297,8 +297,9 @@ def _focal_advice(lengths: list[tuple[float, float]]) -> Iterator[str]:
     told, found = max(lengths, key=lambda pair: abs(math.log(pair[1] / pair[0])), default=(1.0, 1.0))
     if abs(math.log(found / told)) > math.log(1 + FOCAL_TOLERANCE):
         yield (
-            f"EXIF tells a focal length of {told:.0f} pixels, {found:.0f} fit best. A walk straight ahead hardly tells "
-            "one from the other, and depths are stretched by as much; photographs to the side would tell."
+            f"EXIF tells a focal length of {told:.0f} pixels, {found:.0f} fit best. After cropping or zooming that is "
+            "as it should be. After a walk straight ahead depths may be stretched by as much: photographs to the side "
+            "would tell."
         )
 
 
@@ -310,4 +311,4 @@ def train_line(out: Path) -> str:
 
     if torch.cuda.is_available():
         return f"Train with: {shlex.join(['ns-train', 'nrfgs', '--data', str(out)])}"
-    return f"No CUDA device: for a good result in ten minutes, train with: {ten_minute_command(out)}"
+    return f"No CUDA device: the CPU trains. A good result in ten minutes: {ten_minute_command(out)}"

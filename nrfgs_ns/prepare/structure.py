@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from nrfgs_ns.data.exif import share_of_size
 from nrfgs_ns.data.pictures import read_header
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.prepare.forecast import looked_at
@@ -92,6 +93,20 @@ def extract_features(
             device=pycolmap.Device.cpu,
         )
         advance(len(part))
+    _scale_focal_lengths(database, photos, names)
+
+
+def _scale_focal_lengths(database: Path, photos: Path, names: list[str]) -> None:
+    """Correct what COLMAP makes of the EXIF of photographs that were made smaller."""
+    with colmap().Database.open(database) as opened:
+        cameras = {opened.read_image_with_name(name).camera_id: name for name in names}
+        for number, name in cameras.items():
+            camera, share = opened.read_camera(number), share_of_size(photos / name)
+            if camera.has_prior_focal_length and share != 1.0:
+                params = camera.params
+                params[camera.focal_length_idxs()] *= share
+                camera.params = params
+                opened.update_camera(camera)
 
 
 def largest_features(database: Path, names: list[str], number: int) -> list[np.ndarray]:

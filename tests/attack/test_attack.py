@@ -4,6 +4,7 @@
 `python tests/attack/table.py` runs more of them and prints the table of docs/stability.md.
 """
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -56,3 +57,11 @@ def test_the_attack_tells_outcomes_apart(tmp_path):
     assert attempt(Case("", lambda folder: 1 / 0)).kind == "broken case"
     good, deadly = case(lambda folder: None, hostile=False), case(lambda folder: os._exit(1))
     assert [outcome.kind for outcome in attempts([good, deadly, good])] == ["read", "hang", "read"]
+
+
+def test_the_page_shows_the_tables():
+    root = Path(__file__).resolve().parents[2]
+    record = json.loads((root / "results" / "attack.json").read_text())
+    page = (root / "docs" / "stability.md").read_text()
+    assert record["before"]["table"] in page and record["after"]["table"] in page
+    assert set(record["after"]["areas"]) <= set(AREAS)

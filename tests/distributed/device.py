@@ -176,9 +176,8 @@ def told(trainer) -> Path:
 
 def main() -> None:
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
-    from quick_start import ask_for_callers_quickly, keep_what_is_imported, let_go
+    from quick_start import keep_what_is_imported, let_go
 
-    ask_for_callers_quickly()
     from nrfgs_ns.distributed.launch import join_group
 
     job, rank, world, meeting, scene, folder, device_type = sys.argv[1:]

@@ -87,7 +87,7 @@ def train(scene, out, steps, *more):
 def test_training_on_is_the_unbroken_training_to_the_bit(tiny_scene, tmp_path, no_cuda):
     whole = checkpoint_of(train(tiny_scene, tmp_path / "whole", 8))
     half = train(tiny_scene, tmp_path / "half", 4)
-    rest = checkpoint_of(train(tiny_scene, tmp_path / "rest", 4, {"--load-dir": models_of(half)}))
+    rest = checkpoint_of(train(tiny_scene, tmp_path / "rest", 8, {"--load-dir": models_of(half)}))
     assert_same_training(whole, rest, rtol=0.0, atol=0.0)
     without = checkpoint_of(train(tiny_scene, tmp_path / "off", 8, {"--pipeline.model.view-noise": 0}))
     latents = "_model.gauss_params.latents"

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 from rich.console import Console
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
@@ -367,6 +368,27 @@ def test_photographs_are_kept_or_made_upright(tmp_path):
         assert image.getexif()[ExifTags.Base.Model] == "Camera", "the lens is a first guess of the focal length"
     with Image.open(stored["d.png"]) as image:
         assert image.mode == "RGB" and image.getpixel((0, 0)) == (255, 255, 255)
+
+
+@pytest.mark.parametrize(("told_width", "focal_length"), [(160, 177.17), (640, 44.29)])
+def test_focal_lengths_follow_photographs_that_were_made_smaller(tmp_path, told_width, focal_length):
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif).update(
+        {
+            ExifTags.Base.FocalLength: IFDRational(9, 2),
+            ExifTags.Base.FocalPlaneXResolution: IFDRational(1000),  # pixels an inch: 4.5 mm are 177.17
+            ExifTags.Base.FocalPlaneYResolution: IFDRational(1000),
+            ExifTags.Base.FocalPlaneResolutionUnit: 2,
+            ExifTags.Base.ExifImageWidth: told_width,
+            ExifTags.Base.ExifImageHeight: told_width * 3 // 4,
+        }
+    )
+    photo(tmp_path / "a.jpg", (160, 120), exif=exif.tobytes())
+    database = tmp_path / "database.db"
+    structure.extract_features(database, tmp_path, ["a.jpg"], "SIMPLE_RADIAL", True, 1600, 100, lambda _: None)
+    with structure.colmap().Database.open(database) as opened:
+        (camera,) = opened.read_all_cameras()
+    assert camera.has_prior_focal_length and camera.mean_focal_length() == pytest.approx(focal_length, abs=0.01)
 
 
 def test_names_stay_different_and_short():
