@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splatfacto with an appearance head: nerfstudio's hooks. `renderer.py` has how a camera is rendered.
 
-Loss, schedules and crop are nerfstudio's, and so is densification unless another protocol is asked for
+Loss, schedules and crop are nerfstudio's, and so is densification unless another strategy is asked for
 (`densification/`). What differs: colours and opacities come from the head, for the splats that the camera sees only;
 nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the parameter objects that the optimisers
 hold, so that an interrupted training can go on.
@@ -32,7 +32,7 @@ from nrfgs_ns.densification import (
     McmcDensification,
     OpacitySeen,
     OriginalDensification,
-    Protocol,
+    Strategy,
     build_densification,
 )
 from nrfgs_ns.errors import InputError
@@ -69,7 +69,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     A head that adds nothing from the start skips them."""
     warmup_lr: float = 1e-3
     """learning rate of the warm-up's Adam"""
-    densification: Protocol = "splatfacto"
+    densification: Strategy = "splatfacto"
     """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
     splat_budget"""
     splat_budget: int = 1_000_000
@@ -83,7 +83,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
     """whether each photograph's exposure and white balance are learnt. auto: where EXIF says that exposure varies, or
-    where photographs disagree about the same points by more than noise; a line in the log says why"""
+    where each photograph disagrees with those taken next to it; a line in the log says why"""
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0
@@ -437,7 +437,7 @@ class NrfgsModel(SplatfactoModel):
         self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """Splatfacto's losses, and in training what the densification protocol adds to them.
+        """Splatfacto's losses, and in training what the densification strategy adds to them.
 
         Terms that are zero in this step are left out. Nothing waits for the GPU.
         """
@@ -451,8 +451,8 @@ class NrfgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params)
-            if self.photograph is not None:
-                losses["photograph"] = self.photograph.penalty(batch["image_idx"])
+            if self.photograph is not None and self.step % 10 == 0:
+                losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")
