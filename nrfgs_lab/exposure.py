@@ -144,7 +144,8 @@ def make_data(scene: Path, out: Path, downscale: int, exposures: dict[str, list[
             pixels = exposed(pixels, exposures[stem])
         Image.fromarray(pixels).save(aside / "images" / f"{stem}.png", compress_level=1)
         frame["file_path"] = f"images/{stem}.png"
-        frame.pop("exif", None)
+        if exposures is not None:
+            frame.pop("exif", None)  # it tells of another photograph
         if "mask_path" in frame:
             with Image.open(scene / frame["mask_path"]) as mask:
                 size = (-(-mask.width // downscale), -(-mask.height // downscale))

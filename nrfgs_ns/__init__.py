@@ -15,6 +15,7 @@ MOVED = {
     "nrfgs_ns.capacity": None,
     "nrfgs_ns.capacity.config": "nrfgs_ns.model.retired",
     "nrfgs_ns.diffuse_splats": "nrfgs_ns.model.retired",
+    "nrfgs_ns.distributed.config": "nrfgs_ns.training.sharding",
     "nrfgs_ns.pipeline": "nrfgs_ns.training.pipeline",
     "nrfgs_ns.trainer": "nrfgs_ns.training.trainer",
 }

@@ -213,7 +213,7 @@ class FactoredHarmonics(DirectionalModel):
 
 
 def bounded(residual: Tensor, bound: float | None) -> Tensor:
-    """bound * tanh(residual), or the residual itself."""
+    """Bound * tanh(residual), or the residual itself."""
     return residual if bound is None else bound * residual.tanh()
 
 

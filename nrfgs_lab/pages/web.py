@@ -12,7 +12,9 @@ import argparse
 import base64
 import http.server
 import json
+import os
 import shlex
+import signal
 import subprocess
 import tempfile
 import threading
@@ -98,13 +100,16 @@ def measured(page: Path, browser: list[str], size: tuple[int, int], count: int, 
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
     ):
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        own = ["--profile", profile] if "firefox" in browser[0] else [f"--user-data-dir={profile}"]
+        firefox = any("firefox" in word for word in browser)
+        own = ["--profile", profile, "--no-remote"] if firefox else [f"--user-data-dir={profile}"]
+        if firefox:  # without a GPU it refuses WebGL
+            Path(profile, "user.js").write_text('user_pref("webgl.force-enabled", true);')
         command = [*browser, *own, f"http://127.0.0.1:{server.server_port}/outer"]
-        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
         try:
             there.wait(patience)
         finally:
-            process.terminate()
+            os.killpg(process.pid, signal.SIGTERM)  # whatever the command has started
             process.wait()
             server.shutdown()
     if not answers or "failed" in answers[0]:

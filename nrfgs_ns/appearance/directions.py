@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def unit_vectors(vectors: Tensor, floor: float) -> Tensor:
-    """v / max(|v|, floor). Values and gradients are finite for any finite v; the gradient is at most 1 / floor.
+    """V / max(|v|, floor). Values and gradients are finite for any finite v; the gradient is at most 1 / floor.
 
     Args:
         vectors: [..., 3].

@@ -25,20 +25,17 @@ On CUDA, two Triton kernels compute all this and its gradients (`hash_grid_trito
 dtypes than float32, PyTorch does. The kernels' gradients cannot be differentiated again.
 """
 
-import logging
 from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.kernels.trial import try_triton
+from nrfgs_ns.kernels.trial import Gate
 
 PRIMES = (1, 2654435761, 805459861)
 """The hash's multipliers for x, y, z."""
 INITIAL_RANGE = 1e-4
 """Features start uniform in +- this, as in the paper: next to nothing, and no two the same."""
-
-logger = logging.getLogger(__name__)
 
 
 class HashGrid(nn.Module):
@@ -129,18 +126,12 @@ def _corners(per_axis: Tensor, combine: Callable[[Tensor, Tensor], Tensor]) -> T
     return combine(xy[..., :, :, None], z[..., None, None, :]).flatten(-3)
 
 
-_RUNS: dict[tuple[torch.device, int], bool] = {}
+_GATE = Gate("The hash grid")
 
 
 def _kernels_run_on(device: torch.device, features: int) -> bool:
     """Whether Triton's kernels run on a CUDA device, for so many features per level; tried once."""
-    key = device, features
-    if key not in _RUNS:
-        why_not = try_triton(lambda: _try_kernels(device, features))
-        if why_not is not None:
-            logger.warning("The hash grid runs in plain PyTorch on %s: %s.", device, why_not)
-        _RUNS[key] = why_not is None
-    return _RUNS[key]
+    return _GATE.opens((device, features), device, lambda: _try_kernels(device, features))
 
 
 def _try_kernels(device: torch.device, features: int) -> None:

@@ -210,8 +210,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             cache_images_device = "gpu"
         images = super()._load_images(split, cache_images_device)
         # What is in memory is a pinhole's, whatever the lens: nerfstudio undistorts, and keeps the camera's type.
-        for dataset in (self.train_dataset, self.eval_dataset):
-            dataset.cameras.camera_type[:] = CameraType.PERSPECTIVE.value
+        dataset = self.train_dataset if split == "train" else self.eval_dataset
+        dataset.cameras.camera_type[:] = CameraType.PERSPECTIVE.value
         return images
 
     def sampling_state(self) -> dict[str, Any]:

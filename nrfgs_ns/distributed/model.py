@@ -12,7 +12,6 @@ from torch.nn import Parameter
 
 from nrfgs_ns.densification import Mcmc
 from nrfgs_ns.distributed import comm
-from nrfgs_ns.distributed.config import ShardingConfig
 from nrfgs_ns.distributed.exchange import scale_gradient, send_to_cameras
 from nrfgs_ns.distributed.shards import cut_model_state, rebalance, rows_of, shard_counts
 from nrfgs_ns.errors import InputError
@@ -20,6 +19,7 @@ from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import View, project_splats, project_view
 from nrfgs_ns.rasterizer import Projection
+from nrfgs_ns.training.sharding import ShardingConfig
 
 
 @dataclass

@@ -27,7 +27,7 @@ import pickle
 
 import torch
 import torch.nn.functional as F
-from nerfstudio.utils.rich_utils import CONSOLE
+from rich import get_console
 from torch import Tensor
 
 from nrfgs_ns.image.color_fit import fit_colors
@@ -194,7 +194,7 @@ def _precise(image: Tensor) -> Tensor:
 
 
 def _errors_inside(pred: Tensor, gt: Tensor, mask: Tensor | None) -> Tensor | None:
-    """pred - gt of the pixels inside, [N, 3], without gradient; None if there are none."""
+    """Pred - gt of the pixels inside, [N, 3], without gradient; None if there are none."""
     _check(pred, gt, mask)
     error = _precise(pred.detach()) - _precise(gt.detach())
     if mask is None:
@@ -235,7 +235,7 @@ _lpips_warned = False
 
 
 def _load_lpips_net() -> torch.nn.Module | None:
-    """torchmetrics' LPIPS network if its AlexNet weights are on disk, else None and (once per process) a warning."""
+    """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else None and (once per process) a warning."""
     # Both imports cost seconds, and only evaluation needs them.
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     from torchvision.models import AlexNet_Weights
@@ -260,7 +260,7 @@ def _warn_lpips(finding: str, url: str) -> None:
     if _lpips_warned:
         return
     _lpips_warned = True
-    CONSOLE.print(
+    get_console().print(
         f"Warning: LPIPS is not reported: {finding}. Training and all other metrics are intact. "
         "To get it, run this on a connected machine, and copy the file here if that is another one:\n"
         f'  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"',

@@ -16,8 +16,6 @@ Conventions: images are [H, W, 3] in [0, 1], of one floating dtype and on one de
 Images with a side shorter than the window go to pytorch_msssim, which warns and leaves that side unblurred.
 """
 
-import logging
-
 import torch
 import torch.nn.functional as F
 from pytorch_msssim import SSIM
@@ -25,7 +23,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nrfgs_ns.image.metrics import SSIM_C1, SSIM_C2, WINDOW_SIGMA, WINDOW_SIZE
-from nrfgs_ns.kernels.trial import try_triton
+from nrfgs_ns.kernels.trial import Gate
 
 REACH = WINDOW_SIZE // 2
 """Pixels from a window's centre to its edge."""
@@ -36,8 +34,6 @@ WEIGHTS = tuple(LIBRARY.win[0].flatten().tolist())
 feels that they do not quite add up to 1."""
 MAX_NUMBERS = 2**31
 """The kernels index slopes with 32 bits: three slopes of an image must have fewer numbers."""
-
-logger = logging.getLogger(__name__)
 
 
 def ssim(prediction: Tensor, truth: Tensor) -> Tensor:
@@ -139,17 +135,12 @@ def _kernels_take(prediction: Tensor, truth: Tensor) -> bool:
     )
 
 
-_RUNS: dict[torch.device, bool] = {}
+_GATE = Gate("SSIM")
 
 
 def _kernels_run_on(device: torch.device) -> bool:
     """Whether Triton's kernels run on a CUDA device; tried once."""
-    if device not in _RUNS:
-        why_not = try_triton(lambda: _try_kernels(device))
-        if why_not is not None:
-            logger.warning("SSIM runs in plain PyTorch on %s: %s.", device, why_not)
-        _RUNS[device] = why_not is None
-    return _RUNS[device]
+    return _GATE.opens(device, device, lambda: _try_kernels(device))
 
 
 def _try_kernels(device: torch.device) -> None:

@@ -27,9 +27,9 @@ class Inspect:
         from nerfstudio.utils.rich_utils import CONSOLE
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        from nrfgs_lab.bench.measure import evenly_spaced
         from nrfgs_ns.appearance.nrf import NeuralResidualField
         from nrfgs_ns.appearance.reduce import latent_basis
+        from nrfgs_ns.data.views import evenly_spaced
         from nrfgs_ns.export.loading import load_model
         from nrfgs_ns.files import write_whole
         from nrfgs_ns.inspect.ablate import changes, row, together

@@ -6,12 +6,15 @@ Nothing here imports Triton: it is missing on machines without CUDA. Trials do, 
 """
 
 import importlib.util
-from collections.abc import Callable
-from typing import TypeVar
+import logging
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar
 
 import torch
 
 Outcome = TypeVar("Outcome")
+
+logger = logging.getLogger(__name__)
 
 
 def try_triton(trial: Callable[[], Outcome]) -> Outcome | str:
@@ -35,3 +38,36 @@ def try_triton(trial: Callable[[], Outcome]) -> Outcome | str:
     except Exception as error:
         first_line = next(iter(str(error).splitlines()), "")
         return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
+
+
+class Gate(dict[Hashable, Any]):
+    """What has been found out about some kernels: each key is tried once, and said once where they do not run.
+
+    Args:
+        what: they compute, the subject of the warning.
+    """
+
+    def __init__(self, what: str):
+        super().__init__()
+        self.what = what
+
+    def find(
+        self, key: Hashable, device: torch.device, trial: Callable[[], Outcome], quiet: bool = False
+    ) -> Outcome | str:
+        """What the trial returned, or why the kernels do not run on a device (`try_triton`).
+
+        Args:
+            key: what the answer holds for.
+            device: for the warning.
+            trial: as for `try_triton`; it may also return a reason.
+            quiet: somebody else says it.
+        """
+        if key not in self:
+            self[key] = try_triton(trial)
+            if isinstance(self[key], str) and not quiet:
+                logger.warning("%s runs in plain PyTorch on %s: %s.", self.what, device, self[key])
+        return self[key]
+
+    def opens(self, key: Hashable, device: torch.device, trial: Callable[[], object]) -> bool:
+        """Whether the kernels run."""
+        return not isinstance(self.find(key, device, trial), str)

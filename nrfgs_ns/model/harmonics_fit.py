@@ -152,7 +152,7 @@ class Moments:
         return full
 
     def solve(self, strength: float) -> Tensor:
-        """delta of the module's docstring, [count, 16, 3]; 0 for what was not seen."""
+        """Delta of the module's docstring, [count, 16, 3]; 0 for what was not seen."""
         views_per_weight = self.weight / self.weight_squared.clamp_min(torch.finfo(torch.float64).tiny)  # n / W
         ridge = strength * torch.eye(BASES, dtype=torch.float64, device=self.gram.device)
         solution = torch.empty_like(self.target)
@@ -164,7 +164,7 @@ class Moments:
         return solution
 
     def squared_error(self, delta: Tensor) -> float:
-        """sum over splats and views of w |residual - Y delta|^2, for delta [count, 16, 3]."""
+        """Sum over splats and views of w |residual - Y delta|^2, for delta [count, 16, 3]."""
         quadratic = (delta * (self.full_gram(slice(None)) @ delta)).sum()
         return (self.power.sum() - 2.0 * (delta * self.target).sum() + quadratic).item()
 

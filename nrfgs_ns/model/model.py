@@ -83,7 +83,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
     """whether each photograph's exposure and white balance are learnt. auto: where EXIF says that exposure varies, or
-    where photographs disagree about the same points by more than noise; a line in the log says why"""
+    where each photograph disagrees with those taken next to it; a line in the log says why"""
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0
@@ -451,8 +451,8 @@ class NrfgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params)
-            if self.photograph is not None:
-                losses["photograph"] = self.photograph.penalty(batch["image_idx"])
+            if self.photograph is not None and self.step % 10 == 0:
+                losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")

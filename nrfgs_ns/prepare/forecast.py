@@ -2,7 +2,7 @@
 """How long the rest will take, from how long the features took on this machine as it is now.
 
 Costs are in units of finding the features of a million pixels. They were taken from `castle` and `caliterra`
-(results/prepare.json), whose forecasts are within a third of what came.
+(results/prepare.json). What else the machine begins or ends with later is not in the forecast.
 """
 
 import numpy as np

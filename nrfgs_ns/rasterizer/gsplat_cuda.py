@@ -77,7 +77,7 @@ def _finite(rows: tuple) -> bool:
 
 
 def _visible_rows(means, quats, scales, viewmats, Ks, width, height, *, packed: bool, **settings) -> tuple:
-    """gsplat's projection as packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, and
+    """Gsplat's projection as packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, and
     extents where it has them."""
     rows = fully_fused_projection(
         means,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether a training learns what happened to each photograph, and from where it starts.
 
-It does if the capture needs it: if EXIF says that exposure varies, or if photographs taken next to each other disagree
-about the same points by more than noise (`image/overlap.py`). What they say is where it starts.
+It does if the capture needs it: if EXIF says that exposure varies, or if each photograph disagrees with those taken
+next to it about the same points (`image/overlap.py`). What they say is where it starts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nrfgs_ns.data.exif import read_exif
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.image.overlap import ENOUGH_PAIRS, Pairs, compare, drawn, estimate, sight, slope, varies
+from nrfgs_ns.image.overlap import ENOUGH_STOPS, Pairs, compare, drawn, estimate, sight, slope, varies
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.pinhole import world_to_camera
 
@@ -69,23 +69,25 @@ def verdict(choice: Choice, pairs: Pairs, known: Tensor) -> tuple[bool, str]:
         pairs: of photographs.
         known: exposures from EXIF in stops, NaN where it says nothing. [V]
     """
-    share = pairs.share_beyond_noise
     count = len(pairs.first)
-    seen = f"{share:.0%} of {count} neighbouring pairs differ beyond noise" if count else "no points to compare them by"
+    exposures, *colors = pairs.beyond_neighbours.tolist()
+    seen = f"each differs from those next to it by {exposures:.2f} stops, in colour by {max(colors):.2f}"
+    seen = f"{seen} ({count} pairs)" if count else "no points to compare them by"
     there = known[torch.isfinite(known)]
+    spread = float(there.std(correction=0)) if len(there) else 0.0
     if len(there) == 0:
         told = "EXIF says nothing"
     elif not varies(known):
-        told = "EXIF says that exposure is the same"
+        told = f"EXIF says that exposure is {'the same' if spread < 0.005 else 'almost the same'}"
     else:
-        told = f"EXIF says that exposure varies by {float(there.max() - there.min()):.1f} stops"
+        told = f"EXIF says that exposure varies by {spread:.2f} stops"
         _, explained = slope(pairs, known)
         if explained is not None:
             told += f", which explains {explained:.0%} of their difference"
-    needed = share >= ENOUGH_PAIRS or varies(known)
-    enough = "" if needed or not count else f" ({ENOUGH_PAIRS:.0%} would be enough)"
+    needed = pairs.vary or varies(known)
+    enough = "" if needed else f"; {ENOUGH_STOPS[0]:g}, and {ENOUGH_STOPS[1]:g} in colour, would be enough"
     asked = "asked for; " if choice == "on" else ""
-    return needed or choice == "on", f"{asked}{seen}{enough}; {told}"
+    return needed or choice == "on", f"{asked}{seen}; {told}{enough}"
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:

@@ -17,13 +17,13 @@ from torchvision.utils import save_image
 
 from nrfgs_ns.compact.decode import model_state
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
-from nrfgs_ns.distributed.config import ShardingConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.metrics import METRIC_NAMES
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.evaluation_table import print_evaluation
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
+from nrfgs_ns.training.sharding import ShardingConfig
 from nrfgs_ns.viewer.panel import ViewerPanel
 
 

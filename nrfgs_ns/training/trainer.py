@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Literal
 
 import torch
@@ -55,6 +56,10 @@ AVERAGED = 200
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
 TIME_STAMP = re.compile(r"\d{4}-\d\d-\d\d_\d{6}")
 """What nerfstudio calls a training's folder if it is not told."""
+
+
+SEVERAL_DEVICES = "nrfgs_ns.distributed"
+"""The package that trains on several devices. It builds on this one, and is looked up by name when it is asked for."""
 
 
 @dataclass
@@ -104,13 +109,11 @@ class NrfgsTrainerConfig(TrainerConfig):
             checkpoint_files.checkpoints_in(self.load_dir)
         if devices == 1:
             return super().setup(**kwargs)
-        from nrfgs_ns.distributed.trainer import ShardedTrainer
-
         # Schedules are not stretched there.
         whole = replace(
             self, max_num_iterations=self.max_num_iterations or STEPS, average_steps=self.average_steps or 0
         )
-        return ShardedTrainer(whole, **kwargs)
+        return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
         """The configuration with what is left open chosen: steps, schedules and mean of a training on one device.
@@ -138,9 +141,7 @@ class NrfgsTrainerConfig(TrainerConfig):
             super().print_to_terminal()
         machine = self.machine
         if machine.num_devices * machine.num_machines > 1:
-            from nrfgs_ns.distributed.launch import prepare
-
-            prepare(self)
+            resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
         data = self.data or self.pipeline.datamanager.data
         lines = [f"{self.method_name} on {data}"]
         if machine.device_type == "cpu" and self.time_budget is None:

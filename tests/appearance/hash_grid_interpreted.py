@@ -11,6 +11,7 @@ from hash_grid_cases import assert_near_twin, grids, positions
 
 from nrfgs_ns.appearance import hash_grid, hash_grid_triton
 from nrfgs_ns.appearance.hash_grid_triton import Interpolation
+from nrfgs_ns.kernels.trial import Gate
 
 
 @pytest.fixture(autouse=True)
@@ -107,7 +108,7 @@ def test_what_is_no_lattice_coordinate():
 
 def test_the_trial_passes_here_and_its_failure_is_told(monkeypatch, caplog):
     device = torch.device("cpu")
-    monkeypatch.setattr(hash_grid, "_RUNS", {})
+    monkeypatch.setattr(hash_grid, "_GATE", Gate("The hash grid"))
     assert hash_grid._kernels_run_on(device, 4) and not caplog.records
 
     def broken(*_, **__):

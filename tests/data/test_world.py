@@ -175,8 +175,15 @@ def test_a_fisheye_is_undistorted(tmp_path, k1):
     capture.save()
     config = NrfgsDataParserConfig(data=capture.folder, load_3D_points=False)
     manager = NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
-    image = manager.cached_train[0]["image"].numpy().astype(float)
-    camera = manager.train_dataset.cameras[0]
+    manager.load_all_images()
+    for images, dataset in (
+        (manager.cached_train, manager.train_dataset),
+        (manager.cached_eval, manager.eval_dataset),
+    ):
+        check_is_what_a_pinhole_sees(images[0]["image"].numpy().astype(float), dataset.cameras[0], side, focal, seen)
+
+
+def check_is_what_a_pinhole_sees(image, camera, side, focal, seen):
     u, v = np.meshgrid(np.arange(image.shape[1]) + 0.5, np.arange(image.shape[0]) + 0.5)
     x, y = (u - camera.cx.item()) / camera.fx.item(), (v - camera.cy.item()) / camera.fy.item()
     error = np.abs(image - seen(x, y))[2:-2, 2:-2]

@@ -24,7 +24,6 @@ from short_trainings import command_line, trained
 from nrfgs_lab.pages.browser import CHROMIUM, chromium, different
 from nrfgs_lab.pages.web import main as measure_page
 from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import decode
@@ -36,7 +35,8 @@ from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.web.page import page as page_of
 from nrfgs_ns.image.metrics import psnr
-from nrfgs_ns.rasterizer import composite, project
+from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
+from nrfgs_ns.model.renderer import Projecting, composite_view, project_view
 from nrfgs_ns.viewer.pictures import AMPLIFICATION, GREY, OPACITY_AXIS, with_gain
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
@@ -164,31 +164,21 @@ def rendered(scene: Path, photograph: dict, mode: str = "full", gain: float = 1.
     head = decoded.config.setup().requires_grad_(False)
     head.load_state_dict(decoded.weights)
     head.scene_unit = decoded.header["head"]["scene_unit"]
-    splats = dict(decoded.splats)
-    pose = torch.tensor(photograph["pose"]).view(3, 4)
-    rotation = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T
-    view = torch.eye(4)
-    view[:3, :3], view[:3, 3] = rotation, -rotation @ pose[:, 3]
+    field = Field(head, dict(decoded.splats))
+    pose = torch.tensor(photograph["pose"]).view(1, 3, 4)
     fx, fy, cx, cy = photograph["lens"]
-    projection = project(
-        splats["means"],
-        splats["quats"],
-        splats["scales"].exp(),
-        view[None],
-        torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]]),
-        *photograph["size"],
-        near_plane=0.01 * head.scene_unit,
-        rasterize_mode=decoded.header["render"]["rasterize_mode"],
-    )
-    seen = projection.gaussian_ids, pose[:, 3]
-    colors, opacities = with_gain(head, splats, *seen, 0.0 if mode == "base" else gain)
-    background = torch.tensor([decoded.header["render"]["background"]])
+    lens = torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]])
+    camera = Pinhole(world_to_camera(pose), lens, *photograph["size"], pose[0, :, 3])
+    view = project_view(field.splats, camera, Projecting(decoded.header["render"]["rasterize_mode"], head.scene_unit))
+    appearance = with_gain(field, view, 0.0 if mode == "base" else gain)
+    background = torch.tensor(decoded.header["render"]["background"])
     if mode.endswith("residual"):
-        component = head.components(splats, *seen).get(mode)
-        change = torch.zeros(len(colors), 1) if component is None else component.values
+        component = field.components_of(view).get(mode)
+        change = torch.zeros(len(appearance.colors), 1) if component is None else component.values
         change = change * torch.tensor(OPACITY_AXIS) if mode == "opacity residual" else change
-        colors, background = GREY + AMPLIFICATION * gain * change, torch.full((1, 3), GREY)
-    return composite(projection, *SplatAppearance(colors, opacities), backgrounds=background)[0][0].clamp(0, 1)
+        appearance = appearance._replace(colors=GREY + AMPLIFICATION * gain * change.expand(-1, 3))
+        background = torch.full((3,), GREY)
+    return composite_view(view, appearance, background)[0]["rgb"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -322,7 +312,8 @@ def test_every_control_changes_the_picture(demo, browser):
     same(home)
     page.set("freeze", "on", "change")
     same(lambda: None)
-    frozen = changed(lambda: page.visit(3))
+    elsewhere = (int(page.page.locator("#photograph").input_value()) + 3) % 8  # of the tiny scene's training views
+    frozen = changed(lambda: page.visit(elsewhere))
     changed(lambda: page.set("freeze", "", "change"), than=frozen)
     same(home)
 

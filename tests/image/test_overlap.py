@@ -56,7 +56,7 @@ def pairs_of(stops, gloss: float = 0.0):
 def test_same_exposure_is_found_to_be_the_same():
     pairs = pairs_of(torch.zeros(8, 3))
     assert len(pairs.first) >= 7
-    assert pairs.share_beyond_noise == 0.0
+    assert not pairs.vary and (pairs.beyond_neighbours < 0.03).all()
     assert estimate(pairs, torch.full((8,), UNKNOWN)).abs().max() < 0.03
 
 
@@ -64,21 +64,39 @@ def test_known_stops_are_found():
     torch.manual_seed(1)
     stops = torch.randn(8, 1) * 0.5 + torch.randn(8, 3) * 0.2
     pairs = pairs_of(stops)
-    assert pairs.share_beyond_noise > 0.6
+    assert pairs.vary and pairs.beyond_neighbours[0] > 0.3
     found = estimate(pairs, torch.full((8,), UNKNOWN))
     assert (found - (stops - stops.mean(0))).abs().max() < 0.05
 
 
 def test_white_balance_alone_is_noticed():
     stops = torch.zeros(8, 3)
-    stops[::2, 0] = 0.4
-    assert pairs_of(stops).share_beyond_noise > 0.2
+    stops[::2, 0] = 0.5
+    pairs = pairs_of(stops)
+    assert pairs.vary
+    assert (pairs.beyond_neighbours >= torch.tensor([0.3, 0.2, 0.2])).tolist() == [False, True, False]
 
 
 def test_gloss_is_noise():
     glossy = pairs_of(torch.zeros(8, 3), gloss=0.5)
     assert glossy.shift[:, 0].abs().max() > 0.02
-    assert glossy.share_beyond_noise < 0.2
+    assert not glossy.vary
+
+
+def test_what_changes_slowly_from_place_to_place_is_the_scenes():
+    slowly = torch.linspace(0.0, 1.2, 12)[:, None].expand(12, 3)
+    pairs = pairs_of(slowly)
+    found = estimate(pairs, torch.full((12,), UNKNOWN))
+    assert found[-1, 1] - found[0, 1] > 0.8  # it is seen
+    assert not pairs.vary
+    shuffled = slowly[torch.randperm(12, generator=torch.Generator().manual_seed(0))]
+    assert pairs_of(shuffled).vary
+
+
+def test_few_pairs_tell_nothing():
+    stops = torch.tensor([0.0, 1.0, -1.0, 0.5])[:, None].expand(4, 3)
+    pairs = pairs_of(stops)
+    assert 0 < len(pairs.first) < 8 and not pairs.vary
 
 
 def test_hidden_points_and_dark_or_bright_pixels_are_left_out():
@@ -110,7 +128,7 @@ def test_exif_is_a_start_as_far_as_photographs_agree_with_it():
 def test_exif_alone():
     nothing = compare([], torch.zeros(0, 3))
     known = torch.tensor([0.0, 1.0, UNKNOWN, 2.0])
-    assert varies(known) and not varies(torch.tensor([0.3, 0.3, UNKNOWN])) and not varies(torch.tensor([UNKNOWN]))
+    assert varies(known) and not varies(torch.tensor([0.3, 0.4, UNKNOWN])) and not varies(torch.tensor([UNKNOWN]))
     assert slope(nothing, known) == (1.0, None)
     assert estimate(nothing, known)[:, 1].tolist() == pytest.approx([-1.0, 0.0, 0.0, 1.0])
 

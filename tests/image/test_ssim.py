@@ -16,6 +16,7 @@ from nrfgs_ns.image import ssim as module
 from nrfgs_ns.image.metrics import SSIM_C2
 from nrfgs_ns.image.ssim import photometric_loss, ssim
 from nrfgs_ns.kernels import trial
+from nrfgs_ns.kernels.trial import Gate
 
 INTERPRETED = Path(__file__).with_name("ssim_interpreted.py")
 DOUBLE_TOLERANCE = TOLERANCE * 2.0**-29
@@ -127,7 +128,7 @@ def test_bad_input():
 
 
 def test_without_triton_a_warning_and_torch(monkeypatch, caplog):
-    monkeypatch.setattr(module, "_RUNS", {})
+    monkeypatch.setattr(module, "_GATE", Gate("SSIM"))
     monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: None)
     assert not module._kernels_run_on(torch.device("cpu"))
     assert not module._kernels_run_on(torch.device("cpu"))

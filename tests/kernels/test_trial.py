@@ -9,7 +9,7 @@ from nrfgs_ns.appearance import hash_grid
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.image import ssim
 from nrfgs_ns.kernels import trial
-from nrfgs_ns.kernels.trial import try_triton
+from nrfgs_ns.kernels.trial import Gate, try_triton
 
 CPU = torch.device("cpu")
 
@@ -69,11 +69,11 @@ def test_gradients_whatever_the_caller_does_without(mode):
 
 @pytest.mark.parametrize("module, key", [(ssim, (CPU,)), (hash_grid, (CPU, 4))])
 def test_memory_that_is_out_is_not_remembered(module, key, monkeypatch, caplog):
-    monkeypatch.setattr(module, "_RUNS", {})
+    monkeypatch.setattr(module, "_GATE", Gate("It"))
     monkeypatch.setattr(module, "_try_kernels", raises(torch.OutOfMemoryError("CUDA out of memory")))
     with pytest.raises(torch.OutOfMemoryError):
         module._kernels_run_on(*key)
-    assert module._RUNS == {} and not caplog.records
+    assert module._GATE == {} and not caplog.records
     monkeypatch.setattr(module, "_try_kernels", lambda *_: None)
     assert module._kernels_run_on(*key)
 

@@ -493,7 +493,7 @@ def test_a_real_capture_is_recovered(captures, tmp_path):
     # degree of view direction against the principal point. Hence 1 % of the camera path, and 1.5 degrees.
     assert errors.max() < 0.01 * np.ptp(truth[:, :3, 3], axis=0).max() and angles.max() < 1.5
     outputs = NrfgsDataParserConfig(data=tmp_path / "scene").setup().get_dataparser_outputs("train")
-    assert len(outputs.image_filenames) == 21 and len(outputs.metadata["points3D_xyz"]) == verdict["points"]
+    assert len(outputs.image_filenames) == 22 and len(outputs.metadata["points3D_xyz"]) == verdict["points"]
 
 
 @pytest.mark.slow

@@ -21,8 +21,8 @@ from nrfgs_ns.compact.format import MAGIC
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.inspect.view import View, view_file
 from nrfgs_ns.training.run import parse
-from nrfgs_ns.viewer.command import View, view_file
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")

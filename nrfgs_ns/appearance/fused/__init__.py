@@ -10,7 +10,6 @@ is missing on machines without CUDA. With TRITON_INTERPRET=1 set before Triton i
 Triton's interpreter on the CPU: slowly, for tests.
 """
 
-import logging
 import math
 import os
 from collections.abc import Mapping
@@ -22,7 +21,7 @@ from torch import Tensor, nn
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.fused.packing import Packing, pack
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.kernels.trial import try_triton
+from nrfgs_ns.kernels.trial import Gate
 
 if TYPE_CHECKING:  # imports Triton
     from nrfgs_ns.appearance.fused.launch import FieldOptions, Launches
@@ -31,8 +30,6 @@ MAX_WIDTH = 64
 """Largest P (packing.py): latents, or features, rounded up to a power of two."""
 MAX_WEIGHTS = 128 * 128
 """Most numbers in the first layer, padded. Their gradients are kept in registers, and the layer in shared memory."""
-
-logger = logging.getLogger(__name__)
 
 
 class FusedField:
@@ -50,7 +47,7 @@ class FusedField:
         self.layers = [layer for branch in branches for layer in branch if isinstance(layer, nn.Linear)]
         self.on_cpu = pack(config.latent_dim, config.num_bands, config.use_distance, low, high)
         # By device, precision, and whether some splats are diffuse.
-        self.ready: dict[tuple[torch.device, str, bool], tuple[Packing, Launches] | str] = {}
+        self.ready = Gate("The field")
 
     def takes(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> bool:
         """Whether the kernels are to compute this call.
@@ -102,14 +99,12 @@ class FusedField:
     def _ready_on(self, device: torch.device, some_diffuse: bool = False) -> "tuple[Packing, Launches] | str":
         """What `_prepare` finds on `device`: found out once, and said once."""
         key = device, self.config.precision, some_diffuse
-        if key not in self.ready:
-            self.ready[key] = self._prepare(device, some_diffuse)
-            if isinstance(self.ready[key], str) and self.config.implementation == "auto":
-                logger.warning("The field runs in plain PyTorch on %s: %s.", device, self.ready[key])
-        return self.ready[key]
+        quiet = self.config.implementation != "auto"
+        return self.ready.find(key, device, lambda: self._prepare(device, some_diffuse), quiet)
 
     def _prepare(self, device: torch.device, some_diffuse: bool) -> "tuple[Packing, Launches] | str":
-        """The index maps on `device` and how the kernels are launched there, or why they cannot run there."""
+        """The index maps on `device` and how the kernels are launched there, or why they cannot be; raise whatever goes
+        wrong."""
         width, hidden = self.on_cpu.width, self.on_cpu.hidden
         if width > MAX_WIDTH or 2 * width * hidden > MAX_WEIGHTS:
             return (
@@ -117,8 +112,7 @@ class FusedField:
                 f"{MAX_WIDTH}) and {2 * width} x {hidden} weights of the first layer (at most {MAX_WEIGHTS})"
             )
         packing = self.on_cpu.to(device)
-        launches = try_triton(lambda: self._launches(packing, some_diffuse))
-        return launches if isinstance(launches, str) else (packing, launches)
+        return packing, self._launches(packing, some_diffuse)
 
     def _launches(self, packing: Packing, some_diffuse: bool) -> "Launches":
         """How the kernels are launched where the index maps are; raise whatever goes wrong."""

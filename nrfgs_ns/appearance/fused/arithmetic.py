@@ -60,7 +60,7 @@ def operand(x, KIND: tl.constexpr):
 
 @triton.jit
 def dot(a, b, accumulator, KIND: tl.constexpr):
-    """accumulator + a b, summed in float32."""
+    """Accumulator + a b, summed in float32."""
     if KIND == "tf32" or KIND == "tf32x3":
         return tl.dot(a, b, accumulator, input_precision=KIND)
     else:

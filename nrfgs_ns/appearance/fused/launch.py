@@ -259,7 +259,7 @@ def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> lis
 
 
 def _contiguous(x: Tensor) -> Tensor:
-    """x without gradient, dense."""
+    """X without gradient, dense."""
     return x.detach().contiguous()
 
 

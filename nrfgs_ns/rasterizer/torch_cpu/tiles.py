@@ -107,7 +107,7 @@ def _inclusive_range(low: Tensor, high: Tensor, edge: int) -> tuple[Tensor, Tens
 
 
 def _square_range(centre: Tensor, radius: Tensor, tile_size: int, n_tiles: int) -> tuple[Tensor, Tensor]:
-    """gsplat's rule: tiles [floor((m - r) / size), ceil((m + r) / size)), in the precision of the input."""
+    """Gsplat's rule: tiles [floor((m - r) / size), ceil((m + r) / size)), in the precision of the input."""
     centre, radius = centre / tile_size, radius / tile_size
     return (centre - radius).floor().clamp(0, n_tiles), (centre + radius).ceil().clamp(0, n_tiles)
 
