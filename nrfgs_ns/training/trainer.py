@@ -145,7 +145,7 @@ class NrfgsTrainerConfig(TrainerConfig):
         data = self.data or self.pipeline.datamanager.data
         lines = [f"{self.method_name} on {data}"]
         if machine.device_type == "cpu" and self.time_budget is None:
-            lines.append(f"No CUDA device: the CPU trains. A good result in ten minutes: {ten_minute_command(data)}")
+            lines.append(f"No CUDA device: the CPU trains. A result in ten minutes: {ten_minute_command(data)}")
         CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
     def save_config(self) -> None:
