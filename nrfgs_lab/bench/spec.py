@@ -162,7 +162,7 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
         where: what error messages call it.
 
     Raises:
-        InputError: naming the key and the mend.
+        InputError: naming the key and the fix.
     """
     known = [one.name for one in fields(Spec)]
     for key in content:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs express`: the verb. Runs the plan, one record for each cell, and makes table and figures from the records."""
+"""`nrfgs express`: runs the plan, one record for each cell, and makes table and figures from the records."""
 
 import json
 import math

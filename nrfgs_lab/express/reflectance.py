@@ -87,8 +87,8 @@ def read_btf(folder: Path, light: Angles) -> Btf:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        mend = "unpack it and give the folder" if folder.is_file() else "give the folder that holds the images"
-        raise InputError(f"{folder} is not a folder. A BTF is a folder of images: {mend}.")
+        fix = "unpack it and give the folder" if folder.is_file() else "give the folder that holds the images"
+        raise InputError(f"{folder} is not a folder. A BTF is a folder of images: {fix}.")
     found: dict[BtfName, Path] = {}
     for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES):
         angles = parse_btf_name(path.stem)

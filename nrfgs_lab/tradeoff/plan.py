@@ -56,7 +56,7 @@ def bench_plan(
         What `nrfgs bench` takes as a file, and the settings, the default first, in the order of its runs.
 
     Raises:
-        InputError: naming the key and the mend.
+        InputError: naming the key and the fix.
     """
     rest = {key: value for key, value in content.items() if key not in (DEFAULT, "knobs")}
     _require("runs" not in rest, f"{where}: runs are made from {DEFAULT} and knobs. Leave runs out.")

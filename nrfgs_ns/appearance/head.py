@@ -65,7 +65,7 @@ class AppearanceHeadConfig:
         return head
 
     def validate(self) -> None:
-        """Raise ValueError, naming the field and the mend, if a value cannot work."""
+        """Raise ValueError, naming the field and the fix, if a value cannot work."""
 
     def require(self, holds: bool, name: str, needed: str) -> None:
         """Raise ValueError naming field `name`, its value and what is `needed`, unless the condition holds."""

@@ -96,14 +96,14 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     try:
         data = path.read_bytes() if path.is_file() else None
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}). Export it again, or mend the path.") from error
+        raise InputError(f"{path} cannot be read ({error.strerror}). Export it again, or fix the path.") from error
     if data is None:
-        raise InputError(f"{path} cannot be read (there is no such file). Export it again, or mend the path.")
-    mend = "Copy it again, or export it again with nrfgs export compact."
+        raise InputError(f"{path} cannot be read (there is no such file). Export it again, or fix the path.")
+    fix = "Copy it again, or export it again with nrfgs export compact."
     if data[: len(MAGIC)] != MAGIC[: len(data)] or not data:
-        raise InputError(f"{path} is not a compact file of nrfgs: it begins with {data[:8]!r}. {mend}")
+        raise InputError(f"{path} is not a compact file of nrfgs: it begins with {data[:8]!r}. {fix}")
     if len(data) < PREAMBLE.size:
-        raise InputError(f"{path} is cut short: {len(data)} bytes. {mend}")
+        raise InputError(f"{path} is cut short: {len(data)} bytes. {fix}")
     _, version, length, total = PREAMBLE.unpack_from(data)
     first = PREAMBLE.size + length + CHECKSUM.size
     # A file of a later version may lie otherwise: what it is comes before whether it is whole.
@@ -113,19 +113,19 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             "Install a newer nrfgs-ns, or copy the file again."
         )
     if len(data) != total or len(data) < first:
-        raise InputError(f"{path} has {len(data)} bytes, and its header says {total}. {mend}")
+        raise InputError(f"{path} has {len(data)} bytes, and its header says {total}. {fix}")
     header_end = first - CHECKSUM.size
     if version < 1 or zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
-        raise InputError(f"{path} is damaged: the header's checksum does not hold. {mend}")
+        raise InputError(f"{path} is damaged: the header's checksum does not hold. {fix}")
     header = _header(path, data[PREAMBLE.size : header_end], max(LARGEST_RATIO * len(data), SMALL))
     streams = {}
     for entry in header["streams"]:
         body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
         if len(body) != entry["bytes"] or zlib.crc32(body) != entry["crc32"]:
-            raise InputError(f"{path} is damaged: the checksum of its stream {entry['name']!r} does not hold. {mend}")
+            raise InputError(f"{path} is damaged: the checksum of its stream {entry['name']!r} does not hold. {fix}")
         streams[entry["name"]] = _unpack(path, entry, body)
     if first != len(data):
-        raise InputError(f"{path} has {len(data) - first} bytes after its last stream. {mend}")
+        raise InputError(f"{path} has {len(data) - first} bytes after its last stream. {fix}")
     return header, streams
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can be wrong with a data set, found before any training time is spent.
 
-Every check raises InputError with the file or field, what was found, and the mend. `source` is the transforms.json that
+Every check raises InputError with the file or field, what was found, and the fix. `source` is the transforms.json that
 the messages name. What only deserves attention goes through `warn`.
 """
 
@@ -129,11 +129,11 @@ def check_options(config: Any) -> None:
         "downscale_factor": (1, LARGEST, "1 or more, or leave it out"),
         "eval_interval": (1, math.inf, "1 or more"),
     }
-    for name, (low, high, mend) in bounds.items():
+    for name, (low, high, fix) in bounds.items():
         value = getattr(config, name)
         good = value is None or (low <= value < high and value > 0)
         if not good:
-            raise InputError(f"--{name.replace('_', '-')} is {value}. Give {mend}.")
+            raise InputError(f"--{name.replace('_', '-')} is {value}. Give {fix}.")
 
 
 def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
@@ -173,9 +173,9 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
     poses = np.stack([_pose(frame, source) for frame in frames])
     names = [frame["file_path"] for frame in frames]
 
-    def reject(bad: np.ndarray, finding: str, mend: str) -> None:
+    def reject(bad: np.ndarray, finding: str, fix: str) -> None:
         if bad.any():
-            raise InputError(f"{source}: transform_matrix of {some(np.array(names)[bad])} {finding}. {mend}")
+            raise InputError(f"{source}: transform_matrix of {some(np.array(names)[bad])} {finding}. {fix}")
 
     remove = "Recompute the pose, or remove the frame."
     reject(~np.isfinite(poses).all((1, 2)), "holds NaN or Inf", remove)
@@ -298,10 +298,10 @@ def check_exist(paths: Sequence[Path], source: Path, what: str) -> None:
         )
 
 
-def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what: str, mend: str) -> list[str]:
+def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what: str, fix: str) -> list[str]:
     """Every file is an image of the size (width, height) that its camera has; only headers are read.
 
-    `what` says what the files are, and `mend` what to do if their size is another.
+    `what` says what the files are, and `fix` what to do if their size is another.
 
     Returns:
         The PIL modes of the files.
@@ -315,7 +315,7 @@ def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what:
     if wrong:
         raise InputError(
             f"{len(wrong)} {what} do not match the size w x h of their cameras (divided by the downscale factor): "
-            f"{some(wrong)}. {mend}"
+            f"{some(wrong)}. {fix}"
         )
     return [mode for _, mode in found]
 

@@ -29,7 +29,7 @@ LARGEST_SCALE = 16.0
 
 
 class NrfgsInputDataset(InputDataset):
-    """nerfstudio's dataset, whose errors name the file and the mend.
+    """nerfstudio's dataset, whose errors name the file and the fix.
 
     Grey, palette, bilevel, CMYK and YCbCr images are converted to RGB, grey or palette with transparency to RGBA;
     nerfstudio takes most of these for something else without a word (a palette's indices for grey, CMYK for RGBA).

@@ -289,7 +289,7 @@ class NrfgsDataParser(DataParser):
     ) -> dict[str, list[Path]]:
         """The same files, found to have the sizes that their cameras have; those that are larger, resized."""
         scale_all = "Use the images that the poses were computed from, or scale w, h, fl_x, fl_y, cx and cy alike."
-        for key, what, mend in (
+        for key, what, fix in (
             ("file_path", "images", scale_all),
             ("mask_path", "masks", "Make them as large as the images."),
         ):
@@ -299,7 +299,7 @@ class NrfgsDataParser(DataParser):
             if not shrink:
                 check_unique(files[key], f"{scene.source}: frames")
             expected = [_size(scene.meta, frame) for frame in frames] if shrink else sizes
-            modes = check_headers(files[key], expected, what, mend)
+            modes = check_headers(files[key], expected, what, fix)
             if key == "mask_path":
                 bad = [path for path, mode in zip(files[key], modes, strict=True) if mode not in MASK_MODES]
                 if bad:

@@ -26,23 +26,23 @@ LONGEST_HEADER = 2**16
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Reads vertices (x, y, z) and their colours (red, green, blue: integers in [0, 255], or floats in
     [0, 1]) of a .ply file."""
-    mend = "Repair or replace it, or remove ply_file_path from transforms.json to start from random points."
+    fix = "Repair or replace it, or remove ply_file_path from transforms.json to start from random points."
     if not (exists(path) and path.is_file()):
-        raise InputError(f"{path}, named by ply_file_path, is missing. {mend}")
+        raise InputError(f"{path}, named by ply_file_path, is missing. {fix}")
     try:
         _check_counts(path)
         vertices = PlyData.read(path)["vertex"].data
         xyz = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     except KeyError as error:
-        raise InputError(f"{path} has no vertex element. {mend}") from error
+        raise InputError(f"{path} has no vertex element. {fix}") from error
     except Exception as error:  # plyfile lets out whatever it meets in a broken file
-        raise InputError(f"{path} cannot be read as vertices with x, y, z ({shown(str(error))}). {mend}") from error
+        raise InputError(f"{path} cannot be read as vertices with x, y, z ({shown(str(error))}). {fix}") from error
     if not {"red", "green", "blue"} <= set(vertices.dtype.names):
         warn(f"{path} has no colours; its points start in mid grey.")
         return _finite(xyz, np.full(xyz.shape, float(GREY)), path)
     rgb = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)
     if rgb.dtype.kind not in "iuf":
-        raise InputError(f"{path}: its colours are not numbers. {mend}")
+        raise InputError(f"{path}: its colours are not numbers. {fix}")
     return _finite(xyz, rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0), path)
 
 

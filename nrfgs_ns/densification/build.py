@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a model's configuration to its protocol of densification."""
+"""From a model's configuration to its strategy of densification."""
 
 from typing import Any
 
 from nrfgs_ns.densification.gradient import GradientDensification, OriginalDensification, PruneBySeenOpacity
 from nrfgs_ns.densification.mcmc import Mcmc
-from nrfgs_ns.densification.protocol import Densification
+from nrfgs_ns.densification.strategy import Densification
 from nrfgs_ns.errors import InputError
 
 LARGEST_BUDGET = 2**24
@@ -20,7 +20,7 @@ SPLATFACTOS_THRESHOLDS = (
     "split_screen_size",
     "stop_screen_size_at",
 )
-"""Options of the model that only the protocol `splatfacto` reads."""
+"""Options of the model that only the strategy `splatfacto` reads."""
 READ_BY = {"original": "original", "mcmc": "mcmc", "splat_budget": "mcmc"}
 """Options of the model that one of the others alone reads -> which."""
 UNREAD = {
@@ -28,11 +28,11 @@ UNREAD = {
     "original": (*SPLATFACTOS_THRESHOLDS, "mcmc", "splat_budget"),
     "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at", "original"),
 }
-"""Options of the model that a protocol does not read, and refuses where they are set."""
+"""Options of the model that a strategy does not read, and refuses where they are set."""
 
 
 def build_densification(config: Any, num_train_images: int, scene_unit: float = 1.0) -> Densification:
-    """The protocol that a model's configuration asks for.
+    """The strategy that a model's configuration asks for.
 
     Args:
         config: an NrfgsModelConfig.
@@ -40,7 +40,7 @@ def build_densification(config: Any, num_train_images: int, scene_unit: float = 
         scene_unit: world units in a scene unit, in which the configuration's sizes are.
 
     Raises:
-        InputError: an option is out of range, or belongs to another protocol.
+        InputError: an option is out of range, or belongs to another strategy.
     """
     makers = {"splatfacto": _splatfacto, "original": _original, "mcmc": _mcmc}
     if config.densification not in makers:
@@ -116,16 +116,16 @@ def _mcmc(config: Any, num_train_images: int, scene_unit: float) -> Densificatio
 
 
 def _refuse_options(config: Any) -> None:
-    """Raise InputError where an option was set that this protocol does not read: it would be ignored silently."""
-    protocol, default = config.densification, type(config)()
-    for name in UNREAD[protocol]:
+    """Raise InputError where an option was set that this strategy does not read: it would be ignored silently."""
+    strategy, default = config.densification, type(config)()
+    for name in UNREAD[strategy]:
         if getattr(config, name) != getattr(default, name):
             reader = READ_BY.get(name)
             raise InputError(
-                f"pipeline.model.{name} has no effect with the densification {protocol!r}. Leave it out, or use "
+                f"pipeline.model.{name} has no effect with the densification {strategy!r}. Leave it out, or use "
                 + (
                     f"--pipeline.model.densification {reader}."
                     if reader
-                    else f"--pipeline.model.{protocol}.... (see ns-train METHOD --help)."
+                    else f"--pipeline.model.{strategy}.... (see ns-train METHOD --help)."
                 )
             )

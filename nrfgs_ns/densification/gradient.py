@@ -10,7 +10,7 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
-from nrfgs_ns.densification.protocol import Densification, OpacitySeen, Protocol
+from nrfgs_ns.densification.strategy import Densification, OpacitySeen, Strategy
 
 EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
@@ -58,8 +58,8 @@ class GradientDensification(Densification):
     """Growth where screen-space gradients are large, pruning and resetting of opacities: splatfacto's, and 3DGS's.
 
     Args:
-        name: of the protocol.
-        strategy: gsplat's, with the protocol's thresholds.
+        name: of the strategy.
+        strategy: gsplat's own, with this one's thresholds.
         opacity_seen: which opacity pruning looks at. A reset always acts on the stored one.
         scene_unit: world units in a scene unit, which sizes are measured in; None: in extents of the cameras.
         reset_at_start: reset opacities at step 0, too, as gsplat 1.4 does; 3DGS counts its steps from 1.
@@ -67,7 +67,7 @@ class GradientDensification(Densification):
 
     def __init__(
         self,
-        name: Protocol,
+        name: Strategy,
         strategy: PruneBySeenOpacity,
         opacity_seen: OpacitySeen,
         scene_unit: float | None,

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from nrfgs_ns.densification.protocol import CHANGE, UNSEEN, Densification, OpacitySeen, seen_with
 from nrfgs_ns.densification.relocation import add_samples, diffuse, relocate
+from nrfgs_ns.densification.strategy import CHANGE, UNSEEN, Densification, OpacitySeen, seen_with
 
 CHANGE_BEFORE = CHANGE + "_before"
 """As `CHANGE`, in the window before: `every` steps until the last relocation, or what would be one."""
@@ -18,7 +18,7 @@ CHANGE_BEFORE = CHANGE + "_before"
 @dataclass
 class McmcDensification:
     """Constants of 3DGS-MCMC, as in gsplat. Its start and rhythm are the model's warmup_length and refine_every; it
-    starts from the same splats as the other protocols."""
+    starts from the same splats as the other strategies."""
 
     min_opacity: float = 0.005
     """splats of this opacity or less are dead and move"""

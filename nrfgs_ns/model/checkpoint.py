@@ -32,12 +32,12 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
         state: the checkpoint's state of the model. Tensors under "gauss_params." may have any number of rows.
 
     Raises:
-        InputError: naming the first tensor that is missing, unknown, of another shape or not finite, and the mend.
+        InputError: naming the first tensor that is missing, unknown, of another shape or not finite, and the fix.
     """
     written_by = state.get("_extra_state", {}).get("head", "another method")
     same = f"Both have the '{written_by}' head, but of another size or with other switches."
     other = f"The checkpoint was written by the '{written_by}' head and this model has the '{model.head.name}' head."
-    mend = (
+    fix = (
         f"{same if written_by == model.head.name else other} Use the config.yml that was saved beside the checkpoint "
         "(--load-config), or the same method and --pipeline.model.appearance options as in that training."
     )
@@ -46,16 +46,16 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
     splats_first = sorted(expected, key=lambda name: not name.startswith("gauss_params."))
     for name in splats_first:
         if name not in given:
-            raise InputError(f"The checkpoint has no '{name}'. {mend}")
+            raise InputError(f"The checkpoint has no '{name}'. {fix}")
         rows = 1 if name.startswith("gauss_params.") else 0
         if given[name].shape[rows:] != expected[name].shape[rows:]:
             raise InputError(
                 f"The checkpoint's '{name}' is of shape {list(given[name].shape)}, this model's of shape "
-                f"{list(expected[name].shape)}. {mend}"
+                f"{list(expected[name].shape)}. {fix}"
             )
     for name in given:
         if name not in expected:
-            raise InputError(f"The checkpoint has '{name}', which this model does not know. {mend}")
+            raise InputError(f"The checkpoint has '{name}', which this model does not know. {fix}")
     for name, value in given.items():
         if value.numel() > 0 and not torch.isfinite(value).all():
             rows = (~torch.isfinite(value)).reshape(len(value), -1).any(dim=1).nonzero().flatten().tolist()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splatfacto with an appearance head: nerfstudio's hooks. `renderer.py` has how a camera is rendered.
 
-Loss, schedules and crop are nerfstudio's, and so is densification unless another protocol is asked for
+Loss, schedules and crop are nerfstudio's, and so is densification unless another strategy is asked for
 (`densification/`). What differs: colours and opacities come from the head, for the splats that the camera sees only;
 nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the parameter objects that the optimisers
 hold, so that an interrupted training can go on.
@@ -32,7 +32,7 @@ from nrfgs_ns.densification import (
     McmcDensification,
     OpacitySeen,
     OriginalDensification,
-    Protocol,
+    Strategy,
     build_densification,
 )
 from nrfgs_ns.errors import InputError
@@ -69,7 +69,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     A head that adds nothing from the start skips them."""
     warmup_lr: float = 1e-3
     """learning rate of the warm-up's Adam"""
-    densification: Protocol = "splatfacto"
+    densification: Strategy = "splatfacto"
     """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
     splat_budget"""
     splat_budget: int = 1_000_000
@@ -437,7 +437,7 @@ class NrfgsModel(SplatfactoModel):
         self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """Splatfacto's losses, and in training what the densification protocol adds to them.
+        """Splatfacto's losses, and in training what the densification strategy adds to them.
 
         Terms that are zero in this step are left out. Nothing waits for the GPU.
         """

@@ -278,7 +278,7 @@ class Run:
         self.screen.print(train_line(self.out), markup=False, highlight=False, soft_wrap=True)
 
     def _advice(self, registered: int, total: int, error: float) -> Iterator[str]:
-        """What is wrong with a reconstruction, and the mend; nothing for a good one."""
+        """What is wrong with a reconstruction, and the fix; nothing for a good one."""
         if registered < GOOD_SHARE * total:
             placed = {path.name for path in (self.out / "images").iterdir()}
             left = [name for name in self.names if name not in placed]

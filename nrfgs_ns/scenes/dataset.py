@@ -168,16 +168,16 @@ def _digest(path: Path) -> str:
 
 def _require_same_scene(out: Path, record: dict) -> None:
     """Pass when `out` is a complete data set of the scene that `record` describes; raise FileExistsError otherwise."""
-    mend = "Choose another folder, or delete this one to have it written again."
+    fix = "Choose another folder, or delete this one to have it written again."
     try:
         found = json.loads((out / "scene.json").read_text(encoding="utf-8"))
         files, config = found.pop("files"), dict(found["config"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise FileExistsError(f"{out} exists and is not a procedural scene (no readable scene.json). {mend}") from error
+        raise FileExistsError(f"{out} exists and is not a procedural scene (no readable scene.json). {fix}") from error
     if found != json.loads(json.dumps(record)):  # through JSON, which turns tuples into lists
         differing = [key for key, value in record["config"].items() if config.get(key) != value]
         what = f"another {', '.join(differing)}" if differing else "another version of the scene"
-        raise FileExistsError(f"{out} holds a procedural scene with {what}. {mend}")
+        raise FileExistsError(f"{out} holds a procedural scene with {what}. {fix}")
     damaged = sorted(name for name, digest in files.items() if _digest(out / name) != digest)
     if damaged:
-        raise FileExistsError(f"{out} holds this scene, but {damaged[0]} is missing or was changed. {mend}")
+        raise FileExistsError(f"{out} holds this scene, but {damaged[0]} is missing or was changed. {fix}")

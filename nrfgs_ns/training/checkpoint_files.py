@@ -182,13 +182,13 @@ def checkpoints_in(folder: Path) -> dict[int, Path]:
     if found:
         return found
     within = next((inner.parent for inner in sorted(folder.glob("*/step-*.ckpt"))), None)
-    mend = (
+    fix = (
         f"They are in {within}."
         if within
         else "Give the folder nerfstudio_models of a training, beside its config.yml."
     )
     what = "holds no checkpoints (step-*.ckpt)" if folder.is_dir() else "is no folder"
-    raise InputError(f"{folder} {what}. {mend}")
+    raise InputError(f"{folder} {what}. {fix}")
 
 
 def seal(pipeline: dict[str, Any], step: int) -> None:

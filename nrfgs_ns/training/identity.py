@@ -77,7 +77,7 @@ def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: objec
         written, here: of `scene_of`.
         data: how the data set is called.
     """
-    mend = "Go on with the data set that it was trained on, or train anew."
+    fix = "Go on with the data set that it was trained on, or train anew."
     gone, new = ([name for name in a if name not in b] for a, b in _pairs(written["images"], here["images"]))
     if gone or new or len(written["images"]) != len(here["images"]):
         what = "; ".join(
@@ -85,13 +85,13 @@ def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: objec
             + [f"it did not have {some(new)}"] * bool(new)
         )
         counts = f"{len(written['images'])} training images, there are {len(here['images'])}"
-        raise InputError(f"{data}: the checkpoint was trained on other images ({what or counts}). {mend}")
+        raise InputError(f"{data}: the checkpoint was trained on other images ({what or counts}). {fix}")
     centers, now = written["centers"].double(), here["centers"].double()
     extent = float((centers.amax(0) - centers.amin(0)).max())
     moved = (centers - now).norm(dim=1) > FAR * max(extent, 1e-12)
     if bool(moved.any()):
         which = some([here["images"][i] for i in moved.nonzero().flatten().tolist()])
-        raise InputError(f"{data}: the checkpoint was trained on other poses ({which} elsewhere). {mend}")
+        raise InputError(f"{data}: the checkpoint was trained on other poses ({which} elsewhere). {fix}")
 
 
 def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> list[str]:

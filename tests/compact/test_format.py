@@ -80,7 +80,7 @@ def test_a_cut_or_longer_file_is_noticed(data, written):
 
 
 def rewritten(path, change) -> None:
-    """Change a file's header and mend its checksum and length: a file that was made wrong, not one that was damaged."""
+    """Change a file's header and fix its checksum and length: a file that was made wrong, not one that was damaged."""
     data = path.read_bytes()
     _, version, length, _ = PREAMBLE.unpack_from(data)
     header = json.loads(data[PREAMBLE.size : PREAMBLE.size + length])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Broken data sets: each must be refused with a message that names the culprit and the mend."""
+"""Broken data sets: each must be refused with a message that names the culprit and the fix."""
 
 from pathlib import Path
 

@@ -84,13 +84,13 @@ def first_step(folder, factor, out, *options):
     return trainer, outputs["rgb"].detach(), sum(losses.values()).item()
 
 
-@pytest.mark.parametrize("protocol", ["splatfacto", "original", "mcmc"])
+@pytest.mark.parametrize("strategy", ["splatfacto", "original", "mcmc"])
 @pytest.mark.parametrize("factor", [2.0**-10, 2.0**10])
-def test_a_step_without_auto_scaling_is_the_same_in_any_unit(protocol, factor, tmp_path):
+def test_a_step_without_auto_scaling_is_the_same_in_any_unit(strategy, factor, tmp_path):
     """Powers of two are exact: what differs is the rounding of log-scales and log distances, 2^-20 of what they scale,
     some ten layers deep."""
-    options = ["--pipeline.model.densification", protocol]
-    if protocol == "mcmc":
+    options = ["--pipeline.model.densification", strategy]
+    if strategy == "mcmc":
         options += ["--pipeline.model.splat-budget", "200"]
     base, base_rgb, base_loss = first_step(tmp_path / "one", 1.0, tmp_path / "out", *options)
     other, rgb, loss = first_step(tmp_path / "other", factor, tmp_path / "out", *options)
@@ -113,7 +113,7 @@ def test_a_step_without_auto_scaling_is_the_same_in_any_unit(protocol, factor, t
         offset = 0.0 if name == "means" else torch.tensor(factor).log()
         assert (step - offset).abs().max() < 1e-5 * max(1.0, theirs[name].abs().max().item()) * length, name
     densifications = [trainer.pipeline.model.densification for trainer in (base, other)]
-    if protocol == "mcmc":
+    if strategy == "mcmc":
         for trainer, densification in zip((base, other), densifications, strict=True):
             torch.manual_seed(3)
             trainer.pipeline.model.gauss_params["opacities"].data.fill_(-12.0)  # what cannot be seen explores

@@ -12,9 +12,9 @@ from nrfgs_ns.densification import build_densification
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.run import parse
 
-PROTOCOLS = ("splatfacto", "original", "mcmc")
+STRATEGIES = ("splatfacto", "original", "mcmc")
 REFINES = 1000
-"""A step at which every protocol refines by default: more than 8 images + 100 steps after the reset at 0."""
+"""A step at which every strategy refines by default: more than 8 images + 100 steps after the reset at 0."""
 
 
 def logit(value: float) -> float:
@@ -68,7 +68,7 @@ class Table:
 
     def step(
         self,
-        protocol,
+        strategy,
         step: int,
         gradient: float = 0.0,
         shown: float | Callable[[torch.Tensor], torch.Tensor] = 0.5,
@@ -81,8 +81,8 @@ class Table:
         logits = self.splats["opacities"]
         stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
         opacities = shown(stored) if callable(shown) else torch.full_like(stored, shown)
-        protocol.pre_backward(step, {**info, "gaussian_ids": rows}, opacities, logits)
-        protocol.post_backward(step, info, self.splats, self.optimizers)
+        strategy.pre_backward(step, {**info, "gaussian_ids": rows}, opacities, logits)
+        strategy.post_backward(step, info, self.splats, self.optimizers)
 
     def check(self) -> None:
         """All tensors and moments have a row per splat, and the optimisers hold the table's parameters."""
@@ -94,7 +94,7 @@ class Table:
         assert torch.isfinite(torch.cat([value.detach().flatten() for value in self.splats.values()])).all()
 
 
-def protocol(name: str, images: int = 8, **options):
+def strategy(name: str, images: int = 8, **options):
     return build_densification(NrfgsModelConfig(densification=name, **options), images)
 
 

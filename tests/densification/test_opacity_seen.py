@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from densification_cases import PROTOCOLS, REFINES, Table, one_step, protocol, trainer_of
+from densification_cases import REFINES, STRATEGIES, Table, one_step, strategy, trainer_of
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.gsnb import GsnbConfig
@@ -11,20 +11,20 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.densification import CHANGE, UNSEEN, build_densification
-from nrfgs_ns.densification.protocol import change_of, seen_with
+from nrfgs_ns.densification.strategy import change_of, seen_with
 from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", STRATEGIES)
 def test_a_splat_visible_through_its_residual_only(name):
     """Base below the threshold, effective opacity above: it dies if the base is seen, and lives if the peak is."""
     left = {}
     for seen in ("base", "peak"):
         table = Table(50)
         table.set_opacity(7, 0.001)
-        rules = protocol(name, opacity_seen_by_densification=seen)
+        rules = strategy(name, opacity_seen_by_densification=seen)
         table.step(rules, REFINES - 2, shown=0.3)
         table.step(rules, REFINES - 1, shown=0.001)
         torch.manual_seed(0)
@@ -33,22 +33,22 @@ def test_a_splat_visible_through_its_residual_only(name):
     assert left == {"base": False, "peak": True}
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", STRATEGIES)
 def test_a_splat_that_its_residual_hides(name):
     """Base above the threshold, invisible in all views: the peak sees it. What no view shows is judged by its base."""
     table = Table(50)
-    rules = protocol(name, opacity_seen_by_densification="peak")
+    rules = strategy(name, opacity_seen_by_densification="peak")
     torch.manual_seed(0)
     table.step(rules, REFINES, shown=0.001, seen=slice(0, 10))
     left = set(table.splats["latents"][:, 0].long().tolist())
     assert left == set(range(10, 50))
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", STRATEGIES)
 def test_the_peak_is_forgotten_at_refinement(name):
     table = Table(50)
     table.set_opacity(7, 0.001)
-    rules = protocol(name, opacity_seen_by_densification="peak")
+    rules = strategy(name, opacity_seen_by_densification="peak")
     table.step(rules, REFINES, shown=0.3)
     assert 7 in table.splats["latents"][:, 0].long()
     torch.manual_seed(0)
@@ -56,13 +56,13 @@ def test_the_peak_is_forgotten_at_refinement(name):
     assert 7 not in table.splats["latents"][:, 0].long()
 
 
-def test_each_protocol_has_its_own_idea_of_a_dead_splat():
+def test_each_strategy_has_its_own_idea_of_a_dead_splat():
     """What was measured to be better (docs/bench.md); asked for, each does the other."""
-    seen = {name: protocol(name).opacity_seen for name in PROTOCOLS}
+    seen = {name: strategy(name).opacity_seen for name in STRATEGIES}
     assert seen == {"splatfacto": "base", "original": "base", "mcmc": "peak"}
-    for name in PROTOCOLS:
+    for name in STRATEGIES:
         for asked in ("base", "peak"):
-            assert protocol(name, opacity_seen_by_densification=asked).opacity_seen == asked
+            assert strategy(name, opacity_seen_by_densification=asked).opacity_seen == asked
 
 
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"])
@@ -84,12 +84,12 @@ def test_heads_of_stored_opacity_change_nothing(config):
     logits = 3 * torch.randn(37, 1)
     splats = {"means": torch.randn(37, 3), "opacities": logits, **head.splat_params(torch.rand(37, 3))}
     rows = torch.randperm(37)[:21]
-    rules = protocol("mcmc")
+    rules = strategy("mcmc")
     rules.pre_backward(0, {"gaussian_ids": rows}, head(splats, rows, torch.zeros(3)).opacities, logits)
     assert (rules.state[CHANGE][rows] == 0.0).all() and (rules.state[CHANGE] == UNSEEN).sum() == 16
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", STRATEGIES)
 def test_a_head_of_stored_opacity_cannot_tell_peak_from_base(name):
     """Bit for bit, over three refinements, with opacities that wander across the thresholds in each step: 3DGS-MCMC and
     the others are then what they are."""
@@ -98,7 +98,7 @@ def test_a_head_of_stored_opacity_cannot_tell_peak_from_base(name):
     for seen in ("base", "peak"):
         torch.manual_seed(0)
         table = Table(203)
-        rules = protocol(name, opacity_seen_by_densification=seen, **budget)
+        rules = strategy(name, opacity_seen_by_densification=seen, **budget)
         table.splats["opacities"].data.uniform_(-7.0, 0.0)
         for step in (998, 999, 1000, 1001, 1050, 1099, 1100, 1101, 1199, 1200, 1201):
             table.step(rules, step, shown=lambda stored: stored, seen=torch.randperm(len(table))[:150])
@@ -129,7 +129,7 @@ def test_what_is_seen_follows_the_stored_opacity():
     """A view's addition stays an amount, what it takes away stays a share; neither leads out of [0, 1]."""
     table = Table(4, opacity=0.3)
     table.set_opacity(2, 0.8)
-    rules = protocol("mcmc")
+    rules = strategy("mcmc")
     for shown, row in ((0.45, 0), (0.35, 0), (0.5, 1), (0.2, 2), (0.4, 2)):
         table.step(rules, 10, shown=shown, seen=slice(row, row + 1))
     expected = [0.45, 0.5, 0.4, 0.3]
@@ -147,7 +147,7 @@ def test_noise_spares_what_views_have_lately_shown():
         table = Table(50)
         for row in range(50):
             table.set_opacity(row, 0.006)
-        rules = protocol("mcmc", opacity_seen_by_densification=seen, splat_budget=60)
+        rules = strategy("mcmc", opacity_seen_by_densification=seen, splat_budget=60)
         torch.manual_seed(0)
         table.step(rules, REFINES, shown=0.4, seen=slice(0, 40))
         assert len(table) > 50
@@ -167,7 +167,7 @@ def test_noise_spares_copies_as_their_source(shown):
     table = Table(50, opacity=0.6)
     for row in range(25, 50):
         table.set_opacity(row, 1e-4)
-    rules = protocol("mcmc", splat_budget=50)
+    rules = strategy("mcmc", splat_budget=50)
     torch.manual_seed(0)
     table.step(rules, REFINES, shown=lambda stored: torch.where(stored > 0.5, shown(stored), 0.0))
     parents = table.splats["latents"][:, 0].long()
@@ -180,7 +180,7 @@ def test_noise_spares_copies_as_their_source(shown):
 def test_what_views_have_shown_is_forgotten_after_the_last_relocation_too():
     """MCMC: noise goes on to the end of the training, and so must the windows of 100 steps that it looks back over."""
     table = Table(50, opacity=0.001)
-    rules = protocol("mcmc", splat_budget=50)
+    rules = strategy("mcmc", splat_budget=50)
     moved = {}
     for step in (25_050, 25_100, 25_101, 25_199, 25_200, 25_201, 25_300, 30_000):
         before = table.splats["means"].detach().clone()
@@ -192,7 +192,7 @@ def test_what_views_have_shown_is_forgotten_after_the_last_relocation_too():
 def test_checkpoints_of_older_versions_start_anew():
     """They hold the largest opacities, not changes, under names of their own."""
     table = Table(50)
-    rules = protocol("mcmc", splat_budget=50)
+    rules = strategy("mcmc", splat_budget=50)
     rules.load_state({"peak": torch.rand(50), "peak_before": torch.rand(50)}, torch.device("cpu"))
     logits = table.splats["opacities"]
     assert torch.equal(rules.seen_opacity(logits), torch.sigmoid(logits.detach().flatten()))
@@ -204,7 +204,7 @@ def test_checkpoints_of_older_versions_start_anew():
 
 def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
     """MCMC: the cameras' mean of (what they show, else the stored opacity) over all splats, and its gradients."""
-    rules = protocol("mcmc")
+    rules = strategy("mcmc")
     stored = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
     logits = torch.logit(stored)[:, None].requires_grad_()
     splats = {"opacities": logits, "scales": torch.zeros(4, 3, dtype=torch.float64)}
@@ -224,7 +224,7 @@ def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
 def test_the_peak_is_forgotten_at_reset():
     """Splatfacto does not refine at a reset: what was seen before it must not keep a splat alive after it."""
     table = Table(50)
-    rules = protocol("splatfacto", opacity_seen_by_densification="peak")
+    rules = strategy("splatfacto", opacity_seen_by_densification="peak")
     table.step(rules, 2999, shown=0.9)
     assert_close(rules.state[CHANGE], torch.full((50,), 0.4))
     table.step(rules, 3000, shown=0.9)

@@ -65,7 +65,7 @@ def test_resumed_training_is_the_unbroken_one(densification, seen, tiny_scene, t
         assert_close(tensors(whole[part]), tensors(rest[part]), rtol=0, atol=0)
 
 
-def test_another_protocols_checkpoint_is_refused(tiny_scene, tmp_path):
+def test_another_strategies_checkpoint_is_refused(tiny_scene, tmp_path):
     config = Path(train(arguments(tiny_scene, tmp_path / "a", "original", steps=1)).config_path)
     more = ["--load-dir", str(config.parent / "nerfstudio_models")]
     trainer = parse([*arguments(tiny_scene, tmp_path / "b", "mcmc"), *more]).setup(local_rank=0, world_size=1)

@@ -69,9 +69,9 @@ def test_schedules_counted_in_images():
     assert adam.param_groups[0]["betas"][0] == 0.0
 
 
-@pytest.mark.parametrize("protocol", ["splatfacto", "original", "mcmc"])
-def test_no_step_number_is_divided_that_the_densification_refuses(protocol):
-    pipeline = replace(nrfgs.config.pipeline, model=replace(nrfgs.config.pipeline.model, densification=protocol))
+@pytest.mark.parametrize("strategy", ["splatfacto", "original", "mcmc"])
+def test_no_step_number_is_divided_that_the_densification_refuses(strategy):
+    pipeline = replace(nrfgs.config.pipeline, model=replace(nrfgs.config.pipeline.model, densification=strategy))
     model = with_fewer_steps(replace(nrfgs.config, pipeline=pipeline), 2).pipeline.model
-    assert build_densification(model, num_train_images=10).name == protocol
-    assert (model.refine_every, model.mcmc.stop_at) == (50, 12_500 if protocol == "mcmc" else 25_000)
+    assert build_densification(model, num_train_images=10).name == strategy
+    assert (model.refine_every, model.mcmc.stop_at) == (50, 12_500 if strategy == "mcmc" else 25_000)

@@ -69,7 +69,7 @@ def browser():
 class Page:
     """A page in a window of its own, and what it complained about."""
 
-    def __init__(self, browser, address: str, size: tuple[int, int] = SIZE):
+    def __init__(self, browser, address: str, size: tuple[int, int] = SIZE, before: str = ""):
         self.page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         self.page.set_default_timeout(120_000)
         self.errors: list[str] = []
@@ -77,6 +77,8 @@ class Page:
         self.page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("request", lambda request: self.requests.append(request.url))
+        if before:
+            self.page.add_init_script(before)
         self.page.goto(address)
 
     def begun(self) -> "Page":
@@ -195,6 +197,26 @@ def test_every_kind_of_field_in_every_mode(kind, browser, tmp_path):
             assert score >= ALIKE, (index, mode, gain, score)
     assert not page.errors
     page.page.close()
+
+
+def test_a_device_that_lacks_memory_or_float_targets(browser, tmp_path):
+    scene, photographs = random_scene(tmp_path, *KINDS["antialiased"])
+    text = page_with(scene.read_bytes(), photographs)
+    kept = "const LARGEST_KEPT = 2 ** 28;"
+    assert kept in text
+    (tmp_path / "small.html").write_text(text.replace(kept, "const LARGEST_KEPT = 0;"))
+    (tmp_path / "page.html").write_text(text)
+    no_floats = (
+        "const ask = WebGL2RenderingContext.prototype.getExtension;"
+        "WebGL2RenderingContext.prototype.getExtension = function (name) {"
+        " return name.startsWith('EXT_color_buffer') ? null : ask.call(this, name); };"
+    )
+    # Of hundreds of splats over each other, each is rounded to 8 bits.
+    for name, before, least in (("small", "", ALIKE), ("page", no_floats, 30.0)):
+        page = Page(browser, (tmp_path / f"{name}.html").as_uri(), before=before).begun()
+        assert psnr(page.picture(), rendered(scene, photographs[0])) >= least
+        assert not page.errors
+        page.page.close()
 
 
 @pytest.fixture(scope="module")

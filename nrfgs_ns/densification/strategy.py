@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of all protocols of densification, and which opacity they take a splat to have."""
+"""The interface of all strategies of densification, and which opacity they take a splat to have."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, MutableMapping
@@ -12,11 +12,11 @@ from torch.optim import Optimizer
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 
-Protocol = Literal["splatfacto", "original", "mcmc"]
+Strategy = Literal["splatfacto", "original", "mcmc"]
 OpacitySeen = Literal["base", "peak"]
 
 CHANGE = "opacity_change"
-"""Name, in a protocol's `state`, of the largest change of each splat's opacity by a view, [N]: see `change_of`."""
+"""Name, in a strategy's `state`, of the largest change of each splat's opacity by a view, [N]: see `change_of`."""
 UNSEEN = -2.0
 """Change of a splat that no view has shown since then: less than any change."""
 
@@ -45,9 +45,9 @@ def seen_with(stored: Tensor, change: Tensor) -> Tensor:
 
 
 class Densification(ABC):
-    """What the model asks of a protocol. `state` is all that a continued training needs, and goes into checkpoints."""
+    """What the model asks of a strategy. `state` is all that a continued training needs, and goes into checkpoints."""
 
-    name: Protocol
+    name: Strategy
     state: dict[str, Any]
     """Numbers, tensors with a row per splat, or None for what the first step has to make."""
 
@@ -59,8 +59,8 @@ class Densification(ABC):
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
         return False
 
-    def see_cameras(self, centers: Tensor) -> None:  # noqa: B027  (only some protocols measure by the cameras)
-        """Tell the protocol where the training cameras are, [V, 3], before the first step."""
+    def see_cameras(self, centers: Tensor) -> None:  # noqa: B027  (only some strategies measure by the cameras)
+        """Tell the strategy where the training cameras are, [V, 3], before the first step."""
 
     def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
         """Look at a training view before the loss goes backward.
@@ -97,7 +97,7 @@ class Densification(ABC):
         """
 
     def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Terms that the protocol adds to the loss, by name."""
+        """Terms that the strategy adds to the loss, by name."""
         return {}
 
     @abstractmethod
@@ -114,7 +114,7 @@ class Densification(ABC):
             value = state.get(name, self.state[name])
             self.state[name] = value.to(device) if isinstance(value, Tensor) else value
         self.state.pop(DIFFUSE, None)
-        if state.get(DIFFUSE) is not None:  # of whichever protocol
+        if state.get(DIFFUSE) is not None:  # of whichever strategy
             self.state[DIFFUSE] = state[DIFFUSE].to(device)
 
     def seen_opacity(self, opacities: Tensor) -> Tensor:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Densification protocols: what they delete, copy, move and add, and by which thresholds."""
+"""Densification strategies: what they delete, copy, move and add, and by which thresholds."""
 
 from copy import deepcopy
 
 import pytest
 import torch
-from densification_cases import PROTOCOLS, REFINES, Table, protocol
+from densification_cases import REFINES, STRATEGIES, Table, strategy
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import McmcDensification, OriginalDensification, build_densification
@@ -19,14 +19,14 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 # What happens to the rows.
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", STRATEGIES)
 def test_every_tensor_of_the_table_goes_along(name):
     """Small splats with large gradients are duplicated, large ones split, faint ones pruned or moved."""
     table = Table(40, scale=0.001)
     table.splats["scales"].data[10:20] = torch.tensor(0.05).log()
     for row in range(30, 40):
         table.set_opacity(row, 0.001)
-    rules = protocol(name, opacity_seen_by_densification="base")
+    rules = strategy(name, opacity_seen_by_densification="base")
     torch.manual_seed(0)
     table.step(rules, REFINES, gradient=1.0)
     table.check()
@@ -46,7 +46,7 @@ def test_every_tensor_of_the_table_goes_along(name):
 @pytest.mark.parametrize("budget", [30, 50, 57])
 def test_mcmc_grows_to_its_budget_and_stays_there(budget):
     table = Table(50)
-    rules = protocol("mcmc", splat_budget=budget)
+    rules = strategy("mcmc", splat_budget=budget)
     counts = []
     for step in range(600, 1300, 100):
         table.step(rules, step, gradient=1.0)
@@ -58,7 +58,7 @@ def test_mcmc_grows_to_its_budget_and_stays_there(budget):
 
 def test_mcmc_rests_before_its_start_and_after_its_end():
     table = Table(50)
-    rules = protocol("mcmc")
+    rules = strategy("mcmc")
     for step in (0, 500, 599, 25_000, 25_100):
         table.step(rules, step)
         assert len(table) == 50
@@ -71,7 +71,7 @@ def test_mcmc_rests_before_its_start_and_after_its_end():
 
 def test_original_measures_by_the_cameras():
     """3DGS: 1.1 times the largest distance of a camera from the mean of all."""
-    rules = protocol("original")
+    rules = strategy("original")
     rules.see_cameras(torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0.0], [2.0, -3.0, 0.0]]))
     assert rules.state["scene_scale"] == pytest.approx(1.1 * 3.0)
     table = Table(4, scale=0.032)  # 0.01 x 3.3 = 0.033: three are duplicated, the last is split
@@ -86,14 +86,14 @@ def test_original_measures_by_the_cameras():
 @pytest.mark.parametrize("gradient, count", [(1.9e-4, 10), (2.1e-4, 20)])
 def test_original_grows_above_its_gradient(gradient, count):
     table = Table(10)
-    table.step(protocol("original"), REFINES, gradient=gradient)
+    table.step(strategy("original"), REFINES, gradient=gradient)
     assert len(table) == count
 
 
 def test_original_keeps_its_calendar():
     """No reset before the first step (gsplat 1.4 has one); a reset to 0.01 at 3000, refinement right away after it."""
     table = Table(10, opacity=0.5)
-    rules = protocol("original", images=500)
+    rules = strategy("original", images=500)
     table.step(rules, 0)
     assert_close(torch.sigmoid(table.splats["opacities"].detach()), torch.full((10, 1), 0.5))
     table.step(rules, 3000)
@@ -108,7 +108,7 @@ def test_original_prunes_large_splats_after_the_first_reset():
     for step, left in ((REFINES, 10), (3100, 9)):
         table = Table(10)
         table.splats["scales"].data[4] = torch.tensor(0.11).log()
-        table.step(protocol("original"), step)
+        table.step(strategy("original"), step)
         assert len(table) == left
 
 
@@ -147,7 +147,7 @@ def test_options_that_cannot_work_are_refused(options, says):
         {"densification": "mcmc", "mcmc": McmcDensification(stop_at=100), "splat_budget": 7},
     ],
 )
-def test_options_of_the_protocol_itself_are_not_refused(options):
+def test_options_of_the_strategy_itself_are_not_refused(options):
     assert build_densification(NrfgsModelConfig(**options), 8).name == options["densification"]
 
 
@@ -157,16 +157,16 @@ def test_statistics_growth_and_resets_are_gsplats():
     ours, theirs = Table(30), Table(30)
     for table in (ours, theirs):
         table.set_opacity(3, 0.01)
-    rules = protocol("splatfacto", warmup_length=10, refine_every=5, reset_alpha_every=4)
-    strategy = deepcopy(rules.strategy)
-    strategy.seen_opacity, state = None, strategy.initialize_state(scene_scale=1.0)
+    rules = strategy("splatfacto", warmup_length=10, refine_every=5, reset_alpha_every=4)
+    gsplats = deepcopy(rules.strategy)
+    gsplats.seen_opacity, state = None, gsplats.initialize_state(scene_scale=1.0)
     for step in range(60):
         torch.manual_seed(step)
         ours.step(rules, step, gradient=0.01 * (step % 3))
         torch.manual_seed(step)
         info = theirs.info(0.01 * (step % 3))
         info["means2d"].absgrad = info["means2d"].grad.clone()
-        strategy.step_post_backward(theirs.splats, theirs.optimizers, state, step, info, packed=True)
+        gsplats.step_post_backward(theirs.splats, theirs.optimizers, state, step, info, packed=True)
         assert len(ours) == len(theirs)
     assert len(ours) > 30
     for name, value in theirs.splats.items():
