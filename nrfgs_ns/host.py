@@ -19,7 +19,14 @@ GSPLAT = ("1.4.0", "1.5.3")
 
 PRIVATE = {
     # The trainer is extended between its own steps, and writes and reads checkpoints in its own way.
-    "nerfstudio.engine.trainer:Trainer": ("_load_checkpoint", "_update_viewer_state"),
+    "nerfstudio.engine.trainer:Trainer": (
+        "_after_train",
+        "_load_checkpoint",
+        "_train_complete_viewer",
+        "_update_viewer_state",
+    ),
+    # Who called it is asked slowly (training/start.py).
+    "nerfstudio.configs.external_methods": ("inspect",),
     # Seeds as ns-train seeds.
     "nerfstudio.scripts.train": ("_set_random_seed",),
     # Images are kept where the training runs; a dataset knows its files.

@@ -44,13 +44,13 @@ class ShardedGuard(Guard):
     def __init__(self, pipeline, request: StopRequest):
         super().__init__(pipeline)
         self.request = request
-        self.all_stop = False
-        """whether any device was asked to stop before the last verdict that was read; the same on all of them"""
+        self.signal = 0
+        """the number of a signal that any device had heard before the last verdict that was read; the same on all"""
 
     def _share(self, verdict: Verdict) -> Verdict:
         sizes = verdict.sizes
         bad = (~(sizes <= MAX_GRADIENT)).any().to(sizes.dtype)
-        here = torch.stack([bad, torch.full_like(bad, float(self.request.signal is not None))])
+        here = torch.stack([bad, torch.full_like(bad, float(self.request.signal or 0))])
         anywhere = here.clone()
         dist.all_reduce(anywhere, dist.ReduceOp.MAX)
         elsewhere = torch.where(anywhere[0] > bad, math.inf, 0.0)
@@ -64,7 +64,7 @@ class ShardedGuard(Guard):
 
     def _read(self, verdict: Verdict) -> list[float]:
         sizes = super()._read(verdict)
-        self.all_stop = self.all_stop or sizes[-1] > 0
+        self.signal = self.signal or int(sizes[-1])
         return sizes
 
     def _out_of_sight(self) -> bool:
@@ -160,7 +160,11 @@ class ShardedTrainer(NrfgsTrainer):
 
     @property
     def _is_asked_to_stop(self) -> bool:
-        return self.guard.all_stop
+        return self.guard.signal > 0
+
+    @property
+    def _exit_status(self) -> int:
+        return 128 + self.guard.signal
 
     def _end(self, line: str, status: int) -> None:
         comms.synchronize()  # until the main device has written

@@ -311,4 +311,4 @@ def train_line(out: Path) -> str:
 
     if torch.cuda.is_available():
         return f"Train with: {shlex.join(['ns-train', 'nrfgs', '--data', str(out)])}"
-    return f"No CUDA device: the CPU trains. A good result in ten minutes: {ten_minute_command(out)}"
+    return f"No CUDA device: the CPU trains. A result in ten minutes: {ten_minute_command(out)}"

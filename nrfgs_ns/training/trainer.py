@@ -145,7 +145,7 @@ class NrfgsTrainerConfig(TrainerConfig):
         data = self.data or self.pipeline.datamanager.data
         lines = [f"{self.method_name} on {data}"]
         if machine.device_type == "cpu" and self.time_budget is None:
-            lines.append(f"No CUDA device: the CPU trains. A good result in ten minutes: {ten_minute_command(data)}")
+            lines.append(f"No CUDA device: the CPU trains. A result in ten minutes: {ten_minute_command(data)}")
         CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
     def save_config(self) -> None:
@@ -221,6 +221,10 @@ class NrfgsTrainer(Trainer):
     @property
     def _is_asked_to_stop(self) -> bool:
         return self.request.signal is not None
+
+    @property
+    def _exit_status(self) -> int:
+        return self.request.exit_status
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
@@ -465,10 +469,10 @@ class NrfgsTrainer(Trainer):
     def _stop_as_asked(self) -> None:
         """Save, say so, and end the process with the status of the signal."""
         if self._made < self._start_step:
-            self._end(NOTHING_TO_SAVE, self.request.exit_status)
+            self._end(NOTHING_TO_SAVE, self._exit_status)
         if self._saved_step != self._made:
             self.save_checkpoint(self._made)
-        self._end(f"Stopped at step {self._made}, {self._where_it_goes_on}", self.request.exit_status)
+        self._end(f"Stopped at step {self._made}, {self._where_it_goes_on}", self._exit_status)
 
     @property
     def _where_it_goes_on(self) -> str:
@@ -478,7 +482,7 @@ class NrfgsTrainer(Trainer):
     def _end(self, line: str, status: int) -> None:
         if comms.is_main_process():
             print(line, flush=True)
-        raise SystemExit(status or 130)  # another device has heard the signal
+        raise SystemExit(status)
 
     def _train_complete_viewer(self) -> None:
         """Nerfstudio's: the viewer goes on showing the model until Ctrl-C."""

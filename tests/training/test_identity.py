@@ -73,7 +73,7 @@ def test_another_method_is_refused():
 def test_options_of_learning_may_change_and_are_named():
     here = changed(optimizers__means__optimizer__lr=1e-5, max_num_iterations=600, pipeline__model__refine_every=50)
     assert sorted(check_options(options_of(nrfgs.config), here)) == [
-        "--max-num-iterations 30000 -> 600",
+        "--max-num-iterations 0 -> 600",
         "--optimizers.means.optimizer.lr 0.00016 -> 1e-05",
         "--pipeline.model.refine-every 100 -> 50",
     ]
