@@ -57,7 +57,7 @@ def test_the_picture_is_the_same(similarity):
     expected = render_splats(original, camera(NOWHERE), background)
     assert expected.std() > 0.1
     moved = similarity.moved(original)
-    found = render_splats(moved, camera(similarity), background, near_plane=0.01 * similarity.scale)
+    found = render_splats(moved, camera(similarity), background, scene_unit=similarity.scale)
     # Forty splats' float32 colours and shapes, each rounded a few times at 1e-7 of numbers of up to 10.
     assert_close(found, expected, rtol=0, atol=2e-4)
     back = similarity.inverse.moved(moved)
