@@ -309,6 +309,10 @@ class NrfgsModel(SplatfactoModel):
         view = self.project(camera, field.splats)
         return self.composite(view, field.base_of(view))[0]["rgb"]
 
+    def learn_photographs(self, photographs: PhotographModel | None) -> None:
+        """Let each photograph's look be learnt; None: all have one look."""
+        self.photograph = None if photographs is None else photographs.to(self.device)
+
     def show_by(self, panel: Any) -> None:
         """Let a viewer's panel (`viewer/panel.py`) say what its browsers see."""
         self.viewer_panel = panel

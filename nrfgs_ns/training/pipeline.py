@@ -69,7 +69,7 @@ class NrfgsPipeline(VanillaPipeline):
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             self.datamanager.load_all_images()
             photographs = photograph_model(config.model, self.datamanager)
-            self.model.photograph = None if photographs is None else photographs.to(device)
+            self.model.learn_photographs(photographs)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
             self.model.fit_on(self.datamanager.train_dataset.cameras)
 
