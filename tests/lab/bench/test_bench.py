@@ -155,7 +155,8 @@ def test_parts_of_a_file_report_all_that_is_there(fake):
     assert all(row[1] != "SH" for row in shown), "a run that nobody asked for and that has left nothing"
     assert len(ran(fake)) == 3
     record = json.loads((fake / "out" / "runs" / "NRF-original-other-1.json").read_text())
-    assert record["identity"]["parser"] == ["nrfgs-data", "--downscale-factor", "2"], "read as the file says"
+    parser = record["identity"]["parser"]
+    assert parser[0] == "nrfgs-data" and parser[-2:] == ["--downscale-factor", "2"], "read as the file says"
 
 
 def summaries(folder: Path) -> list[list]:
