@@ -153,7 +153,7 @@ def write_config(load_config: Path, output: Path) -> Path:
     step = max(config.max_num_iterations, 1) - 1
     torch.save({"step": step, "pipeline": {}}, models / f"step-{step:09d}.ckpt")
     path = config.get_base_dir() / "config.yml"
-    path.write_text(yaml.dump(config), encoding="utf-8")
+    write_whole(path, yaml.dump(config))
     return path
 
 

@@ -279,9 +279,11 @@ class NrfgsModel(SplatfactoModel):
         """Which photograph's look a rendering has: in training, the one that the camera took; None: the mean look."""
         if self.photograph is None:
             return None
-        if self.training:
-            return (camera.metadata or {}).get("cam_idx")
-        name = os.environ.get(LOOK)
+        return (camera.metadata or {}).get("cam_idx") if self.training else self._look_asked_for()
+
+    def _look_asked_for(self) -> int | None:
+        """The photograph that LOOK names, if it names one."""
+        name = os.environ.get(LOOK) if self.photograph is not None else None
         if name and name not in self.photograph.names:
             raise InputError(
                 f"{LOOK} is {name!r}, which is none of the training photographs, such as {self.photograph.names[0]!r}."
@@ -312,6 +314,7 @@ class NrfgsModel(SplatfactoModel):
     def learn_photographs(self, photographs: PhotographModel | None) -> None:
         """Let each photograph's look be learnt; None: all have one look."""
         self.photograph = None if photographs is None else photographs.to(self.device)
+        self._look_asked_for()  # a name that is none is told before the first evaluation
 
     def show_by(self, panel: Any) -> None:
         """Let a viewer's panel (`viewer/panel.py`) say what its browsers see."""

@@ -25,7 +25,7 @@ from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.data.checks import warn
-from nrfgs_ns.errors import DEBUG, InputError
+from nrfgs_ns.errors import DEBUG, ForTheUser, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, tell, tell_why_not
 from nrfgs_ns.training.checkpoint_files import DiskFull
@@ -88,7 +88,18 @@ class NrfgsTrainerConfig(TrainerConfig):
         Raises:
             InputError: an option is out of range, cannot be had on several devices, or there is nothing to go on from.
         """
-        devices = kwargs.get("world_size", 1)
+        with nothing_left_where_refused(self):
+            self._check(kwargs.get("world_size", 1))
+            if kwargs.get("world_size", 1) == 1:
+                return super().setup(**kwargs)
+            # Schedules are not stretched there.
+            whole = replace(
+                self, max_num_iterations=self.max_num_iterations or STEPS, average_steps=self.average_steps or 0
+            )
+            return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
+
+    def _check(self, devices: int) -> None:
+        """Raise InputError where an option makes no sense on so many devices; see `setup`."""
         for name in ("time_budget", "schedule_steps"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
@@ -107,13 +118,6 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"pipeline.model.warmup_steps is {warmup}; it must be zero or positive.")
         if self.load_dir is not None:
             checkpoint_files.checkpoints_in(self.load_dir)
-        if devices == 1:
-            return super().setup(**kwargs)
-        # Schedules are not stretched there.
-        whole = replace(
-            self, max_num_iterations=self.max_num_iterations or STEPS, average_steps=self.average_steps or 0
-        )
-        return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
         """The configuration with what is left open chosen: steps, schedules and mean of a training on one device.
@@ -173,6 +177,28 @@ def _absolute(path: Path | None) -> Path | None:
     return None if path is None else Path(path).absolute()
 
 
+@contextmanager
+def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
+    """Take back the config.yml that ns-train saves before it reads the data, with the folders that this leaves empty,
+    where the training is refused before it has written anything else.
+
+    Args:
+        config: of the training.
+    """
+    try:
+        yield
+    except InputError:
+        folder = config.get_base_dir()
+        if [file.name for file in folder.glob("*")] == ["config.yml"]:
+            with suppress(OSError):  # another device was faster, or other trainings are there
+                (folder / "config.yml").unlink()
+                for empty in (folder, *folder.parents):
+                    empty.rmdir()
+                    if empty == config.output_dir:
+                        break
+        raise
+
+
 def end_earlier_logs() -> None:
     """Forget the logs of trainings that this process has set up before, and what one that was cut off left to write.
 
@@ -229,7 +255,8 @@ class NrfgsTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
         try:
-            super().setup(test_mode)
+            with nothing_left_where_refused(self.config):
+                super().setup(test_mode)
         except KeyboardInterrupt:
             NrfgsTrainer._end(self, NOTHING_TO_SAVE, 130)
         writer.GLOBAL_BUFFER["max_iter"] = self.total_steps
@@ -324,9 +351,12 @@ class NrfgsTrainer(Trainer):
             shown = "; ".join(changed[:5]) + ("; ..." if len(changed) > 5 else "")
             warn(f"Going on with other options than {path.name} was trained with: {shown}.")
         if self.config.time_budget is None and self._start_step >= self.total_steps:
+            # Where the steps are given, schedules are stretched on request alone.
+            stretched = self.config.schedule_steps
+            schedules = "" if stretched is None else f" --schedule-steps {stretched}"
             raise InputError(
                 f"{path} is the end of a training of {self.total_steps:,} steps: there is nothing left to do. "
-                f"--max-num-iterations {2 * self._start_step} makes as many more."
+                f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more."
             )
 
     def _scene(self) -> dict[str, Any]:
@@ -341,9 +371,9 @@ class NrfgsTrainer(Trainer):
         """
         pace = self.pace
         if pace is None and written is not None:
-            raise InputError(
-                "The checkpoint's training had a --time-budget or --schedule-steps. Give the same to go on from it."
-            )
+            same = "a --time-budget" if "seconds" in written else f"--schedule-steps {written['length']}"
+            fix = f"Go on with {same}" if self.world_size == 1 else "Go on with one device"
+            raise InputError(f"The schedules of the checkpoint's training are stretched. {fix}, or train anew.")
         if not isinstance(pace, TimedPace):
             self.config = replace(self.config, max_num_iterations=self.total_steps - self._start_step)
         if pace is None:
@@ -457,9 +487,9 @@ class NrfgsTrainer(Trainer):
     def _after_train(self) -> None:
         """Nerfstudio's, whose step number is one too many when it stopped early; the model is the mean from here on."""
         self.step, self._is_ending = self._made, True
-        if self._is_asked_to_stop:
-            self._stop_as_asked()
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
+        if self._is_asked_to_stop and not timed_out and self._made < self.last_step:
+            self._stop_as_asked()
         if self.mean is not None and self._stop and not timed_out:
             tell_why_not(self.config.average_steps, "the training was stopped before its last step")
         else:
@@ -485,8 +515,10 @@ class NrfgsTrainer(Trainer):
         raise SystemExit(status)
 
     def _train_complete_viewer(self) -> None:
-        """Nerfstudio's: the viewer goes on showing the model until Ctrl-C."""
+        """Nerfstudio's: the viewer goes on showing the model until Ctrl-C, which may have come in the last step."""
         self.request.is_over = True
+        if self.request.signal is not None:
+            return
         with suppress(KeyboardInterrupt):
             super()._train_complete_viewer()
 
@@ -532,7 +564,7 @@ class NrfgsTrainer(Trainer):
         try:
             if self._saved_step != self._made:
                 self.save_checkpoint(self._made)
-        except Exception as error:
+        except (Exception, ForTheUser) as error:  # what has failed first is what is raised
             return f"The state could not be saved ({error}). {kept}"
         return f"Step {self._made} is {self._where_it_goes_on}."
 

@@ -72,11 +72,11 @@ def test_the_chosen_steps_are_made_and_an_interrupted_training_goes_on_to_their_
     kept = trainer.checkpoint_dir
     on = trained(command_line("nrfgs", tiny_scene, tmp_path / "on", 0, SMALL, {"--load-dir": kept}))
     assert checkpoint_of(on)["step"] == 11
-    with pytest.raises(InputError, match="is the end of a training of 12 steps"):
-        trained(command_line("nrfgs", tiny_scene, tmp_path / "rest", 0, SMALL, {"--load-dir": models_of(on)}))
-
-
-def test_no_number_of_steps_is_negative(tiny_scene, tmp_path):
-    config = parse(command_line("nrfgs", tiny_scene, tmp_path, -1, SMALL))
-    with pytest.raises(InputError, match="max_num_iterations is -1"):
-        config.setup(local_rank=0, world_size=1)
+    last = {"--load-dir": models_of(on)}
+    with pytest.raises(InputError, match="end of a training of 12 steps.* --max-num-iterations 24 --schedule-steps 30"):
+        trained(command_line("nrfgs", tiny_scene, tmp_path / "rest", 0, SMALL, last))
+    with pytest.raises(InputError, match="Go on with --schedule-steps 30"):
+        trained(command_line("nrfgs", tiny_scene, tmp_path / "rest", 24, SMALL, last))
+    assert not (tmp_path / "rest").exists()
+    more = trained(command_line("nrfgs", tiny_scene, tmp_path / "more", 14, SMALL, last, {"--schedule-steps": 30}))
+    assert checkpoint_of(more)["step"] == 13

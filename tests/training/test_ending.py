@@ -160,6 +160,33 @@ def test_another_failure_saves_too_and_is_raised(tiny_scene, tmp_path, capsys):
     assert "The training failed in step 4. Step 3 is saved in" in capsys.readouterr().out
 
 
+def test_a_disk_that_is_full_as_well_does_not_hide_what_failed(tiny_scene, tmp_path, monkeypatch, capsys):
+    trainer = ready(tiny_scene, tmp_path)
+
+    def broken():
+        raise BrokenPipeError("the log is gone")
+
+    def full(folder, *_):
+        raise DiskFull(f"The disk of {folder} is full.")
+
+    monkeypatch.setattr(checkpoint_files, "write", full)
+    at_step(trainer, 4, broken)
+    with pytest.raises(BrokenPipeError):
+        trainer.train()
+    assert "failed in step 4. The state could not be saved (The disk of" in capsys.readouterr().out
+
+
+def test_a_signal_in_the_last_step_finds_a_training_that_is_done(whole, tiny_scene, tmp_path, monkeypatch, capsys):
+    """With the mean over the last steps, and without a viewer that would wait for another signal."""
+    trainer = ready(tiny_scene, tmp_path)
+    waited = []
+    monkeypatch.setattr("nerfstudio.engine.trainer.Trainer._train_complete_viewer", lambda _: waited.append(True))
+    at_step(trainer, STEPS - 1, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    trainer.train()
+    assert_same_training(whole, checkpoint_of(trainer.base_dir / "config.yml"), rtol=0, atol=0)
+    assert "go on with" not in capsys.readouterr().out and waited == []
+
+
 def test_a_full_disk_is_survived_until_the_end(tiny_scene, tmp_path, monkeypatch, capsys):
     trainer = ready(tiny_scene, tmp_path, {"--steps-per-save": 3})
     original = checkpoint_files.write
@@ -206,6 +233,19 @@ def test_options_without_sense_are_refused(option, bad, tiny_scene, tmp_path):
     config = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS, {option: bad}))
     with pytest.raises(InputError, match=f"{option[2:].replace('-', '_')} is {bad}"):
         config.setup(local_rank=0, world_size=1)
+
+
+def test_a_training_that_is_refused_leaves_nothing(tiny_scene, tmp_path):
+    """Neither the option nor the data set; what was there before stays."""
+    out = tmp_path / "outputs"
+    for scene, steps in ((tiny_scene, -1), (tmp_path / "nowhere", STEPS)):
+        with pytest.raises(InputError):
+            ready(scene, out, steps=steps)
+        assert not out.exists()
+    (out / "mine").mkdir(parents=True)
+    with pytest.raises(InputError):
+        ready(tmp_path / "nowhere", out)
+    assert [path.name for path in out.rglob("*")] == ["mine"]
 
 
 def test_another_scene_and_other_options_are_refused(whole, tiny_scene, tmp_path):

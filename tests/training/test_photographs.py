@@ -188,6 +188,8 @@ def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished,
     monkeypatch.setenv("NRFGS_LOOK", "nobody.jpg")
     with pytest.raises(InputError, match="nobody.jpg"):
         model.get_outputs_for_camera(camera)
+    with pytest.raises(InputError, match="nobody.jpg"):  # a training says so before its first step
+        model.learn_photographs(model.photograph)
 
 
 def test_what_is_behind_a_cut_out_photograph_is_exposed_with_it(tiny_scene, tmp_path):
