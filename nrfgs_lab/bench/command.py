@@ -51,7 +51,7 @@ class Running:
 
 @dataclass
 class Bench:
-    """Compare methods: train each under each protocol on each scene with each seed, and report. See docs/bench.md."""
+    """Compare methods: train each under each strategy on each scene with each seed, and report. See docs/bench.md."""
 
     spec: Annotated[Path | None, tyro.conf.Positional] = None
     """YAML file with runs, protocols, scenes, seeds, ...; what is given as an option here has precedence"""
@@ -88,7 +88,7 @@ class Bench:
     report_only: bool = False
     """run nothing: report what is there"""
     redo_stale: bool = False
-    """put records that were made with other arguments aside, and make them anew"""
+    """rename records that were made with other arguments to NAME.stale, and make them anew"""
 
     def main(self) -> None:
         asked, whole = self.plans()
@@ -115,7 +115,7 @@ class Bench:
                 name, difference = next(iter(stale.items()))
                 raise InputError(
                     f"{len(stale)} of the records in {self.out / 'runs'} were made with other arguments; {name} had "
-                    f"{difference}. Give --redo-stale to put them aside and run them again, or another --out."
+                    f"{difference}. Give --redo-stale to rename them and run them again, or another --out."
                 )
             for name in stale:
                 with contextlib.suppress(FileNotFoundError):  # another command has done it

@@ -32,7 +32,8 @@ INTRODUCTION = """# Options
 This page is written by `python -m nrfgs_lab.pages.options`, from the configurations themselves. It has what this
 package adds to nerfstudio's options, or explains or presets in its own way; all of nerfstudio's and splatfacto's are
 there too, in `ns-train nrfgs --help`. Underscores and hyphens are the same. A scene unit is what the cameras fill:
-they lie within [-1, 1].
+they lie within [-1, 1]. Defaults are `nrfgs`'s; of the other heads' methods `view-noise` is 0, `max-num-iterations`
+30,000 and `average-steps` 0.
 """
 HOST = "`--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
 

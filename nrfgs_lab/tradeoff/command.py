@@ -43,7 +43,7 @@ class Tradeoff:
     report_only: bool = False
     """run nothing: report what is there"""
     redo_stale: bool = False
-    """put records that were made with other arguments aside, and make them anew"""
+    """rename records that were made with other arguments to NAME.stale, and make them anew"""
 
     def main(self) -> None:
         from nrfgs_lab.bench.spec import make_spec

@@ -32,7 +32,10 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         _check_counts(path)
         vertices = PlyData.read(path)["vertex"].data
-        xyz = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+        xyz = np.stack([vertices[axis] for axis in "xyz"], axis=-1)
+        if xyz.dtype.kind not in "iuf":  # lists: NumPy before 2.2 takes lists of one for numbers
+            raise ValueError("x, y and z are not numbers")
+        xyz = xyz.astype(np.float64)
     except KeyError as error:
         raise InputError(f"{path} has no vertex element. {fix}") from error
     except Exception as error:  # plyfile lets out whatever it meets in a broken file

@@ -124,6 +124,11 @@ def _apply(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
     arguments = loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else [None]
     if suffix in PATHS and all(isinstance(part, str) for part in arguments):
         return Path(*arguments)
+    if suffix == "builtins.getattr":  # how Python 3.11.0 to 3.11.3 write an enum: its class and the member's name
+        kind, name = arguments if len(arguments) == 2 else (None, None)
+        if isinstance(kind, type) and issubclass(kind, Enum) and isinstance(name, str) and name in kind.__members__:
+            return kind[name]
+        raise _refuse(node, suffix)
     kind = _class(node, suffix)
     if not issubclass(kind, Enum) or len(arguments) != 1:
         raise _refuse(node, suffix)

@@ -75,7 +75,12 @@ def test_both_devices_report_what_one_process_would(two_devices):
     """The same splats in the same order, up to float32: 1e-4 of a metric is 100 times what rounding may do to a mean
     over pixels, and less than a thousandth of what one missing shard would."""
     (first, alone), (second,) = (torch.load(two_devices / f"scores-{rank}.pt") for rank in (0, 1))
-    assert first == second
+    # The colour fit sums over all pixels in float64, in an order that depends on where memory begins; in float32,
+    # a colour may differ by one unit, 6e-8, and so may a mean of them.
+    assert {name: value for name, value in first.items() if not name.startswith("cc_")} == {
+        name: value for name, value in second.items() if not name.startswith("cc_")
+    }
+    assert first == pytest.approx(second, rel=1e-6)
     assert first["splats"] == alone["splats"] and first["parameter_bytes"] == alone["parameter_bytes"]
     assert first.keys() == alone.keys() >= {"psnr", "ssim", "l1"}
     for name in ("psnr", "ssim", "l1"):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """config.yml: what a training saved is read back whole, and a file that asks for more is not obeyed."""
 
+import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +33,18 @@ def saved(tmp_path):
 def test_what_is_saved_is_read_back(saved, name):
     config = replace(getattr(method_config, name).config, data=Path("/some where/scène"))
     assert read_config(saved(yaml.dump(config))) == config
+
+
+def test_enums_as_early_versions_of_python_3_11_write_them(saved):
+    event = r"!!python/object/apply:nerfstudio.utils.writer.EventName\n(\s*)- Train Iter \(time\)"
+    text, count = re.subn(
+        event,
+        r"!!python/object/apply:builtins.getattr\n\1- !!python/name:nerfstudio.utils.writer.EventName ''"
+        r"\n\1- ITER_TRAIN_TIME",
+        yaml.dump(method_config.nrfgs.config),
+    )
+    assert count == 1 or sys.version_info < (3, 11, 4)
+    assert read_config(saved(text)) == method_config.nrfgs.config
 
 
 def test_nerfstudios_colmap_parser_is_read_back(saved):
@@ -81,6 +95,11 @@ HOSTILE = {
     "no YAML": "{{]",
     "deep": "[" * 2_000,
     "bytes": "!!binary aGk=",
+    "an attribute": "!!python/object/apply:builtins.getattr [!!python/name:os.path '', sep]",
+    "an attribute of a class": "!!python/object/apply:builtins.getattr "
+    "[!!python/name:nerfstudio.engine.trainer.TrainerConfig '', setup]",
+    "what the enum has beside values": "!!python/object/apply:builtins.getattr "
+    "[!!python/name:nerfstudio.utils.writer.EventName '', __class__]",
     "a value that the enum lacks": "!!python/object/apply:nerfstudio.utils.writer.EventName ['no such']",
 }
 
