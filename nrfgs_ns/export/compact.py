@@ -2,6 +2,7 @@
 """`nrfgs export compact`: choose what is left out, write the file, and a config.yml with which nerfstudio reads it."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -103,7 +104,8 @@ def chosen_field(pipeline, load_config: Path, options: CompactOptions) -> tuple[
         with CONSOLE.status(f"Looking at the splats from {len(cameras)} training views"):
             seen = look_over(model, cameras)
         chosen = evenly_spaced(len(images), options.views)
-        views = FieldViews(model, [(cameras[i : i + 1].to(model.device), images[i]) for i in chosen])
+        pairs = [(cameras[i : i + 1].to(model.device), images[i]) for i in chosen]
+        views = FieldViews(model, pairs, photographs_of(model, data.train_dataset.image_filenames, chosen))
         columns = TextColumn("{task.description:<40}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=CONSOLE, transient=True) as progress:
             task = progress.add_task("Choosing what to leave out", total=None)
@@ -117,6 +119,18 @@ def chosen_field(pipeline, load_config: Path, options: CompactOptions) -> tuple[
                 lambda what: progress.update(task, description=f"Without {what}", advance=1),
             )
     return slimmed.field, slimmed.threshold
+
+
+def photographs_of(model, files: Sequence[Path], chosen: Sequence[int]) -> list[int | None]:
+    """Which photographs of a model the chosen ones of the training images are; None for those that it has not learnt.
+
+    Args:
+        model: an NrfgsModel.
+        files: of the training images, in their order.
+        chosen: rows of `files`.
+    """
+    known = [] if model.photograph is None else model.photograph.names
+    return [i if i < len(known) and known[i] == Path(files[i]).name else None for i in chosen]
 
 
 def stream_bytes(path: Path) -> dict[str, int]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How good a field is on some views, and how small it can be made within a loss."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter, process_time
 from typing import NamedTuple
 
@@ -28,11 +28,14 @@ class FieldViews:
     Args:
         model: an NrfgsModel in evaluation mode.
         views: pairs of a camera and its batch; at least one.
+        photographs: which of the photographs that the model has learnt each view is, so that its look is not counted as
+            an error; None: the mean look.
     """
 
-    def __init__(self, model, views: list):
+    def __init__(self, model, views: list, photographs: Sequence[int | None] | None = None):
         self.model = model
         self.views = []
+        self.photographs = [None] * len(views) if photographs is None else list(photographs)
         for camera, batch in views:
             with torch.no_grad():
                 view = model.project(camera.to(model.device))
@@ -48,8 +51,9 @@ class FieldViews:
     def scores(self, field: Field) -> list[float]:
         """PSNR of each view inside its mask, dB; views whose mask is empty are left out."""
         scores = []
-        for view, truth, mask in self.views:
-            score = psnr(self.model.composite(view, field.seen_from(view))[0]["rgb"], truth, mask)
+        for (view, truth, mask), photograph in zip(self.views, self.photographs, strict=True):
+            outputs, _ = self.model.composite(view, field.seen_from(view), photograph=photograph)
+            score = psnr(outputs["rgb"], truth, mask)
             scores += [] if score is None else [score]
         return scores
 
