@@ -59,14 +59,18 @@ def export_ply(load_config: Path, output: Path, options: "PlyOptions", measure: 
         raise InputError(f"--ply.largest is {options.largest}; it must be positive.")
     # Set up exactly as in ns-export, so that both fit over the same cameras.
     pipeline = load_model(load_config, "inference")
-    fit, splats, comments = pipeline.model.fit, pipeline.model.fit.splats, []
+    fit, splats = pipeline.model.fit, pipeline.model.fit.splats
+    # Brush's mark, which splat-transform reads, too: the splats are dimmed for the blur that a renderer adds to them.
+    comments = ["SplatRenderMode: mip"] if pipeline.model.config.rasterize_mode == "antialiased" else []
+    origin = None
     if options.largest is not None:
         splats = splats._replace(scales=splats.scales.clamp_max(math.log(options.largest)))
     placed = {"viewers": Y_DOWN, "training": NOWHERE}.get(options.world)
     if placed is None:
         frame = CaptureFrame.of(pipeline.datamanager.train_dataparser_outputs)
         placed = to_capture(frame)
-        comments = [f"origin {' '.join(f'{number:.17g}' for number in frame.origin)}"]
+        origin = frame.origin
+        comments.append(f"origin {' '.join(f'{number:.17g}' for number in origin)}")
     written = write_splats(placed.moved(splats), output, comments)
     report = {
         "splats": len(fit.splats.means),
@@ -86,8 +90,8 @@ def export_ply(load_config: Path, output: Path, options: "PlyOptions", measure: 
         markup=False,
         soft_wrap=True,
     )
-    if comments and frame.origin.any():
-        report["origin"] = frame.origin.tolist()
+    if origin is not None and origin.any():
+        report["origin"] = origin.tolist()
         CONSOLE.print(f"Its coordinates are the capture's less {tuple(report['origin'])}, as its header says.")
     if not fit.exact and fit.unseen:
         CONSOLE.print(f"{fit.unseen:,} splats are seen by no training view and have their base colour.")

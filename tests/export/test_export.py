@@ -300,6 +300,19 @@ def test_every_world_holds_the_same_scene(trained, tmp_path, capsys):
     assert reports["viewers"]["world"] == "viewers" and "origin" not in reports["capture"]
 
 
+def test_an_antialiased_model_is_marked_as_such(trained, tmp_path):
+    config, out = trained("nrfgs"), tmp_path / "s.ply"
+    words = ["ply", "--load-config", str(tmp_path / "config.yml"), "--output", str(out), "--no-measure"]
+    for mode, comments in (("antialiased", ["SplatRenderMode: mip"]), ("classic", [])):
+        text, count = re.subn(r"rasterize_mode: \w+", f"rasterize_mode: {mode}", config.read_text())
+        assert count == 1
+        (tmp_path / "config.yml").write_text(text)
+        (tmp_path / "nerfstudio_models").unlink(missing_ok=True)
+        (tmp_path / "nerfstudio_models").symlink_to(config.parent / "nerfstudio_models")
+        tyro.cli(Export, args=words).main()
+        assert PlyData.read(str(out)).comments == comments
+
+
 def test_large_splats_are_cut_down_and_spoken_of(trained, tmp_path, capsys, monkeypatch):
     config, report = trained("nrfgs"), tmp_path / "report.json"
     words = ["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--report", str(report)]
