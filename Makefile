@@ -12,7 +12,7 @@ demo: $(VENV)/.installed  ## make a scene, train NRF and SH on it, compare them
 	$(BIN)/nrfgs demo $(DEMO_ARGS)
 
 test: $(VENV)/.installed  ## the default test suite, a process for each core
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 test-slow: $(VENV)/.installed  ## real training runs
 	$(BIN)/python -m pytest -m slow
