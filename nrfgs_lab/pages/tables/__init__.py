@@ -5,8 +5,8 @@
     python -m nrfgs_lab.pages.tables --write    # writes them anew
 
 Between `<!-- table MODULE.FUNCTION -->` and `<!-- end -->` a page has what the function of that module of this package
-returns: a table on lines of its own, or a number within a sentence. A test holds pages and records together, and asks that a
-number of decibels in the prose of such a page stands in one of its blocks.
+returns: a table on lines of its own, or a number within a sentence. A test holds pages and records together, and asks
+that a number of decibels in the prose of such a page stands in one of its blocks.
 """
 
 import importlib
@@ -22,7 +22,9 @@ from nrfgs_lab.bench.table import COLUMNS, Row, ranks
 ROOT = Path(__file__).resolve().parents[3]
 OPENING = "<!-- table "
 BLOCK = re.compile(r"<!-- table (\w+)\.(\w+) -->(.*?)<!-- end -->", re.DOTALL)
-RUN = re.compile(r"(?:(?P<part>.*)/)?runs/(?P<run>.+)-(?P<protocol>own|original|splatfacto|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)")
+RUN = re.compile(
+    r"(?:(?P<part>.*)/)?runs/(?P<run>.+)-(?P<protocol>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)"
+)
 """How a benchmark names its records. An underscore stands for a space."""
 BY_NAME = {column.name: column for column in COLUMNS}
 
@@ -118,4 +120,3 @@ def loose_decibels(text: str) -> Iterator[str]:
     for number in re.findall(r"(?<![\d.])(\d+(?:\.\d+)?) dB", prose):
         if number not in known:
             yield number
-
