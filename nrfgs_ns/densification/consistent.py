@@ -38,6 +38,8 @@ FEWEST_VIEWS = 4
 VIEWED, FIRST_VIEW, SUPPORTED = "viewed", "first_view", "supported"
 """Names in the strategy's `state`: views looked at since the start; the first view of this deal that shows each splat,
 -1 for none, [N]; whether a second one does, [N]."""
+CONFIRMED, RADII = "confirmed", "radii_before"
+"""Names in `state` during a refinement: whether the views confirm that a splat should grow; its radius, [N]."""
 
 
 @dataclass
@@ -96,12 +98,22 @@ class Consistent(GradientDensification):
         self.views = views
 
     @torch.no_grad()
-    def _refine(self, step: int, splats, optimizers) -> None:
+    def _grow(self, step: int, splats, optimizers) -> tuple[int, int]:
+        """Prune by what the views say, then grow what they confirm. Rows that are made follow those of all state."""
         grow, prune = self._judge(len(splats["means"]), splats["means"].device)
-        self.state["grad2d"] *= grow
+        state = self.state
+        state[CONFIRMED] = grow
         if prune.any() and not prune.all():
-            remove(splats, optimizers, self.state, prune)
-        super()._refine(step, splats, optimizers)
+            remove(splats, optimizers, state, prune)
+        confirmed = state.pop(CONFIRMED)
+        state["grad2d"] = state["grad2d"] * confirmed
+        by_size = "radii" in state
+        if by_size:
+            state[RADII], state["radii"] = state["radii"], state["radii"] * confirmed
+        grown = super()._grow(step, splats, optimizers)
+        if by_size:  # what is too large for the picture goes, confirmed or not
+            state["radii"] = state.pop(RADII)
+        return grown
 
     def _judge(self, count: int, device: torch.device) -> tuple[Tensor, Tensor]:
         """Which of the splats may grow, and which must go: bool [N] each."""

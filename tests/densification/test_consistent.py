@@ -53,6 +53,20 @@ def test_what_grows_is_what_splatfacto_would_grow_and_the_views_confirm(seed, th
     table.check()
 
 
+@pytest.mark.parametrize("stop", [4000, 0])
+def test_splats_that_are_large_in_the_picture_are_split_where_views_confirm_it(stop):
+    """Both are 10 of 100 pixels wide, which splatfacto splits until step 4000."""
+    table = Table(2)
+    chosen = strategy("consistent", stop_screen_size_at=stop, consistent=ConsistentDensification(prune_score=1.0))
+    chosen.see_training_views(Views(torch.tensor([[5.0, 0.0]]).repeat(4, 1)))
+    info = table.info()
+    info["radii"] = torch.full((2,), 10, dtype=torch.int32)
+    chosen.pre_backward(REFINES, info, torch.full((2,), 0.5), table.splats["opacities"])
+    chosen.post_backward(REFINES, info, table.splats, table.optimizers)
+    assert sorted(parents(table)) == ([0, 0, 1] if stop else [0, 1])
+    table.check()
+
+
 # Pruning.
 
 
