@@ -10,7 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.densification import Consistent, Mcmc
+from nrfgs_ns.densification import Mcmc
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import scale_gradient, send_to_cameras
 from nrfgs_ns.distributed.shards import cut_model_state, rebalance, rows_of, shard_counts
@@ -49,11 +49,6 @@ class ShardedModel(NrfgsModel):
         super().populate_modules()
         if self.trimming is not None:
             raise InputError("pipeline.model.robust_loss is for one device. Leave it out, or use one.")
-        if isinstance(self.densification, Consistent):
-            raise InputError(
-                "pipeline.model.densification is 'consistent', which is for one device: no device sees whole pictures "
-                "of its own splats. Use 'splatfacto', 'original' or 'mcmc'."
-            )
         self.view_noise.seed += comm.rank()  # each device has other splats
         self.sizes: list[tuple[int, int]] = []
         if isinstance(self.densification, Mcmc):

@@ -3,14 +3,16 @@
 
 import pytest
 import torch
-from densification_cases import REFINES, Table, Views, strategy, trainer_of
+from densification_cases import REFINES, Table, Views, arguments, strategy, trainer_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import ConsistentDensification
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.robust import Trimming
 from nrfgs_ns.model.training_views import ComparedViews
+from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -234,3 +236,8 @@ def test_looking_changes_nothing(training):
     for name, value in before.items():
         assert torch.equal(model.state_dict()[name], value)
     assert all(value.grad is None for value in model.gauss_params.values())
+
+
+def test_several_devices_are_refused(tiny_scene, tmp_path):
+    with pytest.raises(InputError, match="'consistent', which is for one device"):
+        parse(arguments(tiny_scene, tmp_path, "consistent")).setup(local_rank=0, world_size=2)
