@@ -38,7 +38,7 @@ from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.appearance.spherical_harmonics import num_bases, sh_bases
 from nrfgs_ns.model.renderer import View
-from nrfgs_ns.rasterizer import Projection, composite
+from nrfgs_ns.rasterizer import contributions
 
 DEGREE = 3
 """Degree of the harmonics in a 3DGS file."""
@@ -266,19 +266,4 @@ def look_through(model, field: Field, camera: Cameras) -> tuple[View, SplatAppea
         camera.rescale_output_resolution(0.5**halvings)
     view = model.project(camera, field.splats)
     appearance = field.seen_from(view)
-    return view, appearance, contributions(view.projection, appearance.opacities)
-
-
-def contributions(projection: Projection, opacities: Tensor) -> Tensor:
-    """What each projected splat contributes to the image: alpha T summed over pixels, [M].
-
-    Args:
-        projection: M rows.
-        opacities: [M].
-    """
-    with torch.enable_grad():
-        # The image is linear in its colours: its derivative does not ask which they are.
-        colors = opacities.new_zeros(len(opacities), 1).requires_grad_()
-        render, _, _ = composite(projection, colors, opacities.detach())
-        (weights,) = torch.autograd.grad(render.sum(), colors)
-    return weights[:, 0]
+    return view, appearance, contributions(view.projection, appearance.opacities)[:, 0]

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of the pages are those of the records, and links lead somewhere."""
+
+import re
+
+import pytest
+
+from nrfgs_lab.pages import tables
+from nrfgs_lab.pages.tables import BLOCK, ROOT, loose_decibels, pages, written
+
+PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_numbers_are_those_of_the_records(name):
+    assert PAGES[name] == written(PAGES[name]), "write them again: python -m nrfgs_lab.pages.tables --write"
+
+
+@pytest.mark.parametrize("name", [name for name, text in PAGES.items() if BLOCK.search(text)])
+def test_decibels_in_prose_stand_in_a_block_of_the_page(name):
+    assert list(loose_decibels(PAGES[name])) == []
+
+
+def anchors(text: str) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    titles = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_links_lead_to_files_and_headings_that_are_there(name):
+    page = ROOT / name
+    for link in LINK.findall(re.sub(r"```.*?```", "", PAGES[name], flags=re.DOTALL)):
+        path, _, anchor = link.partition("#")
+        if "://" in link:
+            continue
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        assert target.is_relative_to(ROOT), f"{link} leads out of the repository"
+        if anchor:
+            assert anchor in anchors(target.read_text(encoding="utf-8")), link
+
+
+def test_a_number_that_is_not_the_record_s_is_noticed():
+    text = next(text for text in PAGES.values() if BLOCK.search(text))
+    first = BLOCK.search(text)
+    changed = text[: first.start(3)] + first[3].replace("1", "2") + text[first.end(3) :]
+    assert changed != text and written(changed) == text
+
+
+def test_a_block_is_a_table_on_its_lines_or_a_number_in_a_sentence(monkeypatch):
+    monkeypatch.setattr(tables.importlib, "import_module", lambda name: Blocks)
+    page = "Gains <!-- table x.number --><!-- end --> dB.\n\n<!-- table x.rows -->\n<!-- end -->\n"
+    result = written(page)
+    assert result == (
+        "Gains <!-- table x.number -->1.2<!-- end --> dB.\n\n"
+        "<!-- table x.rows -->\n\n| a |\n| --- |\n| 3.4 |\n\n<!-- end -->\n"
+    )
+    assert written(result) == result
+    assert list(loose_decibels(result + "Or 3.4 dB, `5.6 dB`; not 7.8 dB.")) == ["7.8"]
+    with pytest.raises(ValueError, match="no end"):
+        written("<!-- table x.number -->1.2")
+
+
+class Blocks:
+    """A module of blocks."""
+
+    @staticmethod
+    def number():
+        return "1.2"
+
+    @staticmethod
+    def rows():
+        return tables.grid(["a"], [["3.4"]])
