@@ -142,12 +142,12 @@ class Consistent(GradientDensification):
 
     def _deal(self) -> tuple[list[int], bool]:
         """The views to look at now, and whether all have had their turn then, and are enough to ask for support."""
-        everyone = self.views.indices()
-        deal, place = divmod(self.state[VIEWED], len(everyone))
+        count = len(self.views)
+        deal, place = divmod(self.state[VIEWED], count)
         # Two odd numbers of 64 bits, so that neighbouring deals and seeds have nothing to do with each other.
         key = (self.seed * 0x9E3779B97F4A7C15 + deal * 0xBF58476D1CE4E5B9) % 2**63
-        order = torch.randperm(len(everyone), generator=torch.Generator().manual_seed(key ^ key >> 31)).tolist()
-        rounds = math.ceil(len(everyone) / self.config.views)
-        end = min(place + math.ceil(len(everyone) / rounds), len(everyone))
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(key ^ key >> 31)).tolist()
+        share = math.ceil(count / math.ceil(count / self.config.views))
+        end = min(place + share, count)
         self.state[VIEWED] += end - place
-        return [everyone[i] for i in order[place:end]], end == len(everyone) >= FEWEST_VIEWS
+        return order[place:end], end == count >= FEWEST_VIEWS

@@ -2,7 +2,7 @@
 """The interface of all strategies of densification, and which opacity they take a splat to have."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Mapping, MutableMapping
 from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
@@ -60,8 +60,8 @@ class Seen(NamedTuple):
 class TrainingViews(Protocol):
     """What the strategy may ask of a training."""
 
-    def indices(self) -> Sequence[int]:
-        """The views that are trained on."""
+    def __len__(self) -> int:
+        """How many there are."""
 
     def look(self, index: int, wrong: float) -> Seen:
         """Compare one view with its photograph.

@@ -28,9 +28,8 @@ class ComparedViews:
     def __init__(self, model, datamanager: Any):
         self.model, self.datamanager = model, datamanager
 
-    def indices(self) -> list[int]:
-        aside = set(self.datamanager.held_out_views)
-        return [index for index in range(len(self.datamanager.train_dataset)) if index not in aside]
+    def __len__(self) -> int:
+        return len(self.datamanager.train_dataset)
 
     @torch.no_grad()
     def look(self, index: int, wrong: float) -> Seen:

