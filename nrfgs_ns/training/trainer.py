@@ -42,6 +42,7 @@ from nrfgs_ns.training.pace import (
     resolution_phases,
     steps_for,
 )
+from nrfgs_ns.training.progress import ProgressLine
 from nrfgs_ns.training.stopping import (
     StopRequest,
     command_to_go_on,
@@ -216,6 +217,7 @@ class NrfgsTrainer(Trainer):
 
     Attributes:
         total_steps: steps of the whole training, those before a checkpoint included.
+        line: what the terminal shows while it trains; None: nothing, or nerfstudio's table.
         pace: how fast the training walks through its schedules; None: a step is a step.
         steps_are_chosen: whether the number of training views says how many steps are made.
         mean: of the parameters over the last steps; None if none was asked for.
@@ -260,6 +262,9 @@ class NrfgsTrainer(Trainer):
         except KeyboardInterrupt:
             NrfgsTrainer._end(self, NOTHING_TO_SAVE, 130)
         writer.GLOBAL_BUFFER["max_iter"] = self.total_steps
+        self.line = next((one for one in writer.EVENT_WRITERS if isinstance(one, ProgressLine)), None)
+        if self.line is not None and self.world_size == 1:  # with several, no device can draw alone
+            self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last step that was made"""
         if comms.is_main_process():
@@ -423,6 +428,8 @@ class NrfgsTrainer(Trainer):
                 super().train()
         finally:
             gc.unfreeze()
+            if self.line is not None:
+                self.line.close()
 
     def _update_viewer_state(self, step: int) -> None:
         """Nerfstudio's, and fewer events: it would send each step's duration to the log, which takes the host longer
@@ -434,8 +441,10 @@ class NrfgsTrainer(Trainer):
     @check_eval_enabled
     def eval_iteration(self, step: int) -> None:
         """Nerfstudio's, and a look at the appearance head whenever test images are looked at."""
-        super().eval_iteration(step)
         pictures = step_check(step, self.config.steps_per_eval_all_images)
+        if pictures and self.line is not None:
+            self.line.step_aside()  # the evaluation shows how far it is itself
+        super().eval_iteration(step)
         if pictures or step_check(step, self.config.steps_per_eval_image):
             self.pipeline.eval()
             camera = self.pipeline.datamanager.eval_dataset.cameras[:1].to(self.device)
@@ -494,6 +503,8 @@ class NrfgsTrainer(Trainer):
             tell_why_not(self.config.average_steps, "the training was stopped before its last step")
         else:
             self.take_the_mean()
+        if self.line is not None:
+            self.line.finish(self._made)
         super()._after_train()
 
     def _stop_as_asked(self) -> None:
