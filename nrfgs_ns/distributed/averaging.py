@@ -29,7 +29,6 @@ class ShardedMean(ParameterMean):
 
         Args:
             model: a ShardedModel, whose splats have been counted.
-            optimizers: by group.
 
         Returns:
             "parameter_mean", `state` with the rows of all devices on the main one, None for the splats' rows elsewhere.

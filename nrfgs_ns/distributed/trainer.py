@@ -35,10 +35,6 @@ WITHOUT_VIEWER = {"viewer": "tensorboard", "viewer_legacy": "tensorboard"}
 class ShardedGuard(Guard):
     """The guard of one device. What one device finds stops all of them, at the same step and with one message; so does
     a signal that one of them has heard.
-
-    Args:
-        pipeline: as for `Guard`.
-        request: what signals have asked this device for.
     """
 
     def __init__(self, pipeline, request: StopRequest):
@@ -123,11 +119,6 @@ class ShardedOptimizers(WatchedOptimizers):
 
 class ShardedTrainer(NrfgsTrainer):
     """The trainer of one device.
-
-    Args:
-        config: of the training, as for one device.
-        local_rank: the device's number on its machine.
-        world_size: number of devices W on all machines.
 
     Raises:
         InputError: an option cannot be had on several devices.
