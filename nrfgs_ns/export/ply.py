@@ -23,8 +23,8 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole, write_whole
 
 if TYPE_CHECKING:  # nerfstudio takes seconds to import: `nrfgs --help` answers at once
+    from nrfgs_ns.export.command import PlyOptions
     from nrfgs_ns.export.frames import Similarity
-    from nrfgs_ns.export.ply_options import PlyOptions
     from nrfgs_ns.model.harmonics_fit import PlainSplats
 
 PROPERTIES = (
