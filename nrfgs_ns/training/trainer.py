@@ -121,11 +121,7 @@ class NrfgsTrainerConfig(TrainerConfig):
             checkpoint_files.checkpoints_in(self.load_dir)
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
-        """The configuration with what is left open chosen: steps, schedules and mean of a training on one device.
-
-        Args:
-            views: number of training views.
-        """
+        """The configuration with what is left open chosen: steps, schedules and mean of a training on one device."""
         if self.max_num_iterations > 0:
             return replace(self, average_steps=self.average_steps or 0)
         return replace(
@@ -182,9 +178,6 @@ def _absolute(path: Path | None) -> Path | None:
 def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
     """Take back the config.yml that ns-train saves before it reads the data, with the folders that this leaves empty,
     where the training is refused before it has written anything else.
-
-    Args:
-        config: of the training.
     """
     try:
         yield
@@ -602,9 +595,6 @@ class NrfgsTrainer(Trainer):
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint of finite numbers. Where the disk is full the training goes on, with a warning.
 
-        Args:
-            step: training step that the checkpoint is named after.
-
         Raises:
             TrainingStopped: there is a number that is not finite; what is good has been written.
             DiskFull: at the end of the training.
@@ -633,9 +623,6 @@ class NrfgsTrainer(Trainer):
 
     def _write_checkpoint(self, step: int) -> None:
         """Write a checkpoint (`checkpoint_files`).
-
-        Args:
-            step: training step that the checkpoint is named after.
 
         Raises:
             DiskFull: there is no room.
