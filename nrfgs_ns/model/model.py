@@ -486,7 +486,7 @@ class NrfgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params)
-            if self.photograph is not None and self.step % 10 == 0:
+            if self.photograph is not None and self.photograph.has_penalty and self.step % 10 == 0:
                 losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
