@@ -46,8 +46,7 @@ from nrfgs_ns.data.checks import (
     warn,
 )
 from nrfgs_ns.data.colmap import read_model
-from nrfgs_ns.data.exif import stored_exif
-from nrfgs_ns.data.pictures import read_header, smaller_copies
+from nrfgs_ns.data.pictures import read_header, smaller_copies, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import MARGIN, check_sight, in_reach
 from nrfgs_ns.data.views import interior_test_images
