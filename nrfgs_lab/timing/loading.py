@@ -116,7 +116,7 @@ def child() -> None:
 
     before = own_memory()
     threading.Thread(target=watch, daemon=True).start()
-    start = time.perf_counter()
+    start, own_time = time.perf_counter(), time.process_time()
     if own:
         parser = NrfgsDataParserConfig(data=data, load_3D_points=False)
         manager = NrfgsDatamanagerConfig(dataparser=parser, max_thread_workers=workers, **options)
@@ -130,13 +130,13 @@ def child() -> None:
     count = len(manager.cached_train) + len(manager.cached_eval)
     read = time.perf_counter()
     for step in range(200):
-        manager.next_train(step)[1]["image"].float().mean()
+        manager.next_train(step)[1]["image"][::10].sum()
     over.set()
     numbers = {
         "photographs": count,
         "seconds_to_check": checked - start,
         "seconds_to_read": read - checked,
-        "milliseconds_for_the_next": 5 * (time.perf_counter() - read),
+        "cpu_seconds": time.process_time() - own_time,
         "peak_bytes": max(peak[0], own_memory()) - before,
     }
     print(json.dumps(numbers))
