@@ -98,6 +98,10 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Be what a config.yml says; that of an older version has fewer options."""
+        self.__dict__.update({**vars(type(self)()), **state})
+
 
 class NrfgsModel(SplatfactoModel):
     """Gaussian splatting with an appearance head.
