@@ -501,7 +501,9 @@ class NrfgsModel(SplatfactoModel):
             mask = self._downscale_if_required(batch["mask"]).to(self.device)
             truth, rgb = truth * mask, rgb * mask
         if self.trimming is not None and self.training and self.schedule_step >= robust.FIRST_STEP:
-            kept = self.trimming(rgb, truth, mask if "mask" in batch else None)
+            since = self.schedule_step - robust.FIRST_STEP
+            left = max(1.0 - since / robust.FADE, 0.0) if robust.FADE else 0.0
+            kept = self.trimming(rgb, truth, mask if "mask" in batch else None, left)
             truth, rgb = truth * kept, rgb * kept
         return photometric_loss(rgb, truth, self.config.ssim_lambda)
 
