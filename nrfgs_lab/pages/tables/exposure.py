@@ -52,7 +52,7 @@ def gap(one: str, other: str, metric: str) -> str:
 
 def recovered(case: str) -> str:
     """How near the exposures that were learnt are to those that were put on."""
-    (record,) = of("bonsai", case)
+    (record,) = of("bonsai", f"{case}-on")
     learnt = record["photographs"]
     return (
         f"correlation {learnt['correlation']:.3f}, error {learnt['rms_error_stops']:.2f} of "
