@@ -14,7 +14,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from nrfgs_ns.data.exif import read_exif
+from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import (
     ENOUGH_STOPS,
