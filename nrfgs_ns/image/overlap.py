@@ -45,8 +45,9 @@ ENOUGH_KNOWN_STOPS = 0.3
 """By so much must known exposures vary."""
 FEWEST_PAIRS = 8
 """Of a capture, to be told by."""
-MOST_PHOTOGRAPHS = 2000
-"""Of more, only their mean is taken for the scene's: telling patterns apart takes their number cubed."""
+MOST_PHOTOGRAPHS = 1000
+"""Of more, the first so many say how photographs differ, and of all only the mean is taken for the scene's: telling
+patterns apart takes their number cubed."""
 
 SMALLEST_SPREAD = 0.02
 """Stops; regions that agree by chance do not make a pair certain."""
@@ -234,7 +235,8 @@ class Looks(NamedTuple):
     """for each column, orthonormal patterns over the photographs that are the scene's rather than theirs, the constant
     among them, [V, K]"""
     random: tuple[float, float, float]
-    """by how many stops a photograph differs from what the place explains, a standard deviation"""
+    """by how many stops a photograph differs from what the place explains, a standard deviation; 0 where too few pairs
+    tell it"""
 
 
 def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
@@ -260,15 +262,24 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
     rows = torch.arange(len(pairs.first))
     difference = torch.zeros(len(rows), count, dtype=torch.float64)
     difference[rows, pairs.second], difference[rows, pairs.first] = 1.0, -1.0
-    places = None if len(rows) < FEWEST_PAIRS or count > MOST_PHOTOGRAPHS else _places(centers)
+    usual_stops, places, told = USUAL_STOPS, None, False
+    if count > MOST_PHOTOGRAPHS:
+        first = (pairs.first < MOST_PHOTOGRAPHS) & (pairs.second < MOST_PHOTOGRAPHS)
+        part = Pairs(*(value[first] for value in pairs))
+        of_part = estimate(part, known[:MOST_PHOTOGRAPHS], centers[:MOST_PHOTOGRAPHS])
+        if told := any(of_part.random):
+            usual_stops = of_part.random
+    elif len(rows) >= FEWEST_PAIRS:
+        places = _places(centers)
     stops, held, random = torch.empty_like(expected), [], []
-    for column, usual in enumerate(USUAL_STOPS):
+    for column, usual in enumerate(usual_stops):
         weight = pairs.spread[:, column].double().clamp_min(SMALLEST_SPREAD) ** -2
         missing = pairs.shift[:, column].double() - difference @ expected[:, column]
         precision = difference.T @ (weight[:, None] * difference)
         seen = difference.T @ (weight * missing)
         if places is None:
-            own, patterns, size = usual**2 * torch.eye(count, dtype=torch.float64), _constant(count), usual
+            own, patterns = usual**2 * torch.eye(count, dtype=torch.float64), _constant(count)
+            size = usual if told else 0.0
             total = own
         else:
             own, total, patterns, size = _split(places, precision, seen)

@@ -89,7 +89,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
     """whether each photograph's exposure and white balance are learnt. auto: where EXIF says that exposure varies, or
-    where each photograph disagrees with those taken next to it; a line in the log says why"""
+    where photographs disagree by more than their places explain; a line in the log says why"""
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0

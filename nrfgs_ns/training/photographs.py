@@ -20,7 +20,6 @@ from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import (
     ENOUGH_STOPS,
-    FEWEST_PAIRS,
     Looks,
     Pairs,
     Sighting,
@@ -56,7 +55,7 @@ class Evidence(NamedTuple):
     def learnt_by_itself(self) -> bool:
         """Whether exposure and white balance are learnt unless somebody says otherwise."""
         vary = any(size >= enough for size, enough in zip(self.seen.random, ENOUGH_STOPS, strict=True))
-        return len(self.pairs.first) >= FEWEST_PAIRS and vary or varies(self.known)
+        return vary or varies(self.known)
 
 
 def evidence(datamanager: Any) -> Evidence:
@@ -109,7 +108,7 @@ def verdict(choice: Choice, found: Evidence) -> tuple[bool, str]:
     pairs, known = found.pairs, found.known
     exposures, *colors = found.seen.random
     words = f"each differs from what its place explains by {exposures:.2f} stops, in colour by {max(colors):.2f}"
-    if len(pairs.first) < FEWEST_PAIRS:
+    if not any(found.seen.random):
         words = "too few points in common to compare them"
     words += f" ({len(pairs.first)} pairs)"
     there = known[torch.isfinite(known)]

@@ -6,7 +6,7 @@ import random
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
@@ -23,8 +23,19 @@ from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.evaluation_table import print_evaluation
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
-from nrfgs_ns.training.sharding import ShardingConfig
 from nrfgs_ns.viewer.panel import ViewerPanel
+
+
+@dataclass
+class ShardingConfig:
+    """How the splats are spread over the devices, and what a step counts. Nothing of it is read with one device."""
+
+    rebalance_at: float = 1.1
+    """splats move between devices once one has more than this many times the mean; looked at after each refinement"""
+    schedules: Literal["steps", "images"] = "steps"
+    """what step numbers and learning rates mean. steps: what they say; each step sees one image for each device.
+    images: they are written for one device, and a training sees as many images as it would there, in fewer steps: all
+    step numbers are divided by the number of devices, and Adam takes larger steps (docs/many-gpus.md)"""
 
 
 @dataclass
