@@ -13,7 +13,9 @@ their places explain (`estimate`).
 """
 
 import math
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import torch
@@ -143,6 +145,16 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
     distance = torch.cdist(centers.double(), centers.double())
     distance.fill_diagonal_(torch.inf)
     nearest = distance.argsort(dim=1)[:, :CANDIDATES]
+
+    def shift_of(pair: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
+        return _shift(sightings[pair[0]], sightings[pair[1]])
+
+    # Those that are asked for below unless they tell too little, on all processors.
+    near = sorted(
+        {(min(a, b), max(a, b)) for a, row in enumerate(nearest[:, :NEIGHBOURS].tolist()) for b in row if a != b}
+    )
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        shifts = dict(zip(near, pool.map(shift_of, near), strict=True))
     done: set[tuple[int, int]] = set()
     found: list[tuple[int, int, Tensor, Tensor]] = []
     for one, candidates in enumerate(nearest.tolist()):
@@ -151,7 +163,7 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
             if neighbours == NEIGHBOURS or other == one:
                 break
             pair = min(one, other), max(one, other)
-            shift = None if pair in done else _shift(sightings[pair[0]], sightings[pair[1]])
+            shift = None if pair in done else shifts[pair] if pair in shifts else shift_of(pair)
             neighbours += shift is not None or pair in done
             if shift is not None:
                 done.add(pair)

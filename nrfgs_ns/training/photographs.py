@@ -5,7 +5,9 @@ It does if the capture needs it: if EXIF says that exposure varies, or if photog
 more than their places explain (`image/overlap.py`). What they say is where it starts.
 """
 
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -20,6 +22,7 @@ from nrfgs_ns.image.overlap import (
     ENOUGH_STOPS,
     Looks,
     Pairs,
+    Sighting,
     channels,
     compare,
     drawn,
@@ -176,15 +179,18 @@ def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequenc
     points = drawn(points)
     viewmats = world_to_camera(cameras.camera_to_worlds)
     matrices = cameras.get_intrinsics_matrices()
-    sightings = []
-    for viewmat, K, batch in zip(viewmats, matrices, images, strict=True):
+
+    def seen(viewmat: Tensor, K: Tensor, batch: Mapping[str, Any]) -> Sighting:
         image, mask = batch["image"], None
         if image.shape[-1] == 4:
             mask, image = image[..., 3] >= (128 if image.dtype == torch.uint8 else 0.5), image[..., :3]
         if "mask" in batch:
             inside = batch["mask"][..., 0] >= 0.5
             mask = inside if mask is None else mask & inside.to(mask.device)
-        sightings.append(sight(points, viewmat, K, image, mask))
+        return sight(points, viewmat, K, image, mask)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        sightings = list(pool.map(seen, viewmats, matrices, images))
     return compare(sightings, centers)
 
 
