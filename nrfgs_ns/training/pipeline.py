@@ -34,8 +34,8 @@ class ShardingConfig:
     """splats move between devices once one has more than this many times the mean; looked at after each refinement"""
     schedules: Literal["steps", "images"] = "steps"
     """what step numbers and learning rates mean. steps: what they say; each step sees one image for each device.
-    images: they are written for one device, and a training sees as many images as it would there, in fewer steps: all
-    step numbers are divided by the number of devices, and Adam takes larger steps (docs/many-gpus.md)"""
+    images: they are one device's; a training sees as many images as there, in fewer and larger steps
+    (docs/many-gpus.md)"""
 
 
 @dataclass
