@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 from torch import Tensor
 
 from nrfgs_ns.errors import InputError
@@ -144,15 +144,13 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
     names = [Path(name).name for name in pipeline.datamanager.eval_dataset.image_filenames]
     images = list(zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True))
     per_image, scores = [], {}
-    columns = TextColumn("Measuring the loss"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=CONSOLE, transient=True) as progress:
-        for image, (camera, batch) in progress.track(images):
-            outputs = model.get_outputs_for_camera(camera)
-            truth, mask = model.truth_of(batch, outputs["background"]), model.mask_of(batch)
-            every = {"model": outputs["rgb"], **pictures(camera)}
-            scores = {f"psnr_{name}": psnr(picture, truth, mask) for name, picture in every.items()}
-            if None not in scores.values():  # nothing inside the mask
-                per_image.append({"image": image, **scores})
+    for image, (camera, batch) in track(images, "Measuring the loss", console=CONSOLE, transient=True):
+        outputs = model.get_outputs_for_camera(camera)
+        truth, mask = model.truth_of(batch, outputs["background"]), model.mask_of(batch)
+        every = {"model": outputs["rgb"], **pictures(camera)}
+        scores = {f"psnr_{name}": psnr(picture, truth, mask) for name, picture in every.items()}
+        if None not in scores.values():  # nothing inside the mask
+            per_image.append({"image": image, **scores})
     if not per_image:
         raise InputError("The file is written, but no test image has pixels inside its mask. Use --no-measure.")
     means = {key: sum(one[key] for one in per_image) / len(per_image) for key in scores}
