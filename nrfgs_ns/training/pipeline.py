@@ -19,6 +19,7 @@ from nrfgs_ns.compact.decode import model_state
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.metrics import METRIC_NAMES
+from nrfgs_ns.kernels.trial import tried_meanwhile
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.evaluation_table import print_evaluation
@@ -78,8 +79,9 @@ class NrfgsPipeline(VanillaPipeline):
         super().__init__(config, device, test_mode, **kwargs)
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
-            self.datamanager.load_all_images()
-            photographs = photograph_model(config.model, self.datamanager)
+            with tried_meanwhile(self.model.kernel_trials(), self.model.device):
+                self.datamanager.load_all_images()
+                photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
             self.model.fit_on(self.datamanager.train_dataset.cameras)
