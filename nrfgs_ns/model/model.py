@@ -530,7 +530,7 @@ class NrfgsModel(SplatfactoModel):
             mask = self._downscale_if_required(batch["mask"]).to(self.device)
             truth, rgb = truth * mask, rgb * mask
         if self.trimming is not None and self.training and self.schedule_step >= robust.FIRST_STEP:
-            kept = self.trimming(rgb, truth, mask if "mask" in batch else None)
+            kept = self.trimming(rgb, truth, self.schedule_step, mask if "mask" in batch else None)
             truth, rgb = truth * kept, rgb * kept
         return photometric_loss(rgb, truth, self.config.ssim_lambda)
 
