@@ -95,8 +95,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0
-    """share of the pixels, those with the largest residuals, that the loss leaves out: passers-by, moving shadows.
-    0: none"""
+    """share of the pixels that the loss leaves out at most, those with the largest residuals: passers-by, moving
+    shadows. 0: none; 0.1 is a start"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
