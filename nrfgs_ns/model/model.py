@@ -95,8 +95,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0
-    """share of the pixels, those with the largest residuals, that the loss leaves out: passers-by, moving shadows.
-    0: none"""
+    """share of the pixels that the loss leaves out at most, those with the largest residuals: passers-by, moving
+    shadows. 0: none; 0.1 is a start"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -530,7 +530,7 @@ class NrfgsModel(SplatfactoModel):
             mask = self._downscale_if_required(batch["mask"]).to(self.device)
             truth, rgb = truth * mask, rgb * mask
         if self.trimming is not None and self.training and self.schedule_step >= robust.FIRST_STEP:
-            kept = self.trimming(rgb, truth, mask if "mask" in batch else None)
+            kept = self.trimming(rgb, truth, self.schedule_step, mask if "mask" in batch else None)
             truth, rgb = truth * kept, rgb * kept
         return photometric_loss(rgb, truth, self.config.ssim_lambda)
 
