@@ -95,8 +95,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0
-    """share of the pixels, those with the largest residuals, that the loss leaves out: passers-by, moving shadows.
-    0: none"""
+    """share of the pixels that the loss leaves out at most, those with the largest residuals: passers-by, moving
+    shadows. 0: none; 0.1 is a start"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -204,7 +204,7 @@ class NrfgsModel(SplatfactoModel):
     @property
     def num_diffuse(self) -> int:
         """How many splats have no residual."""
-        diffuse = self.densification.state.get(DIFFUSE)
+        diffuse = self.densification.diffuse
         return 0 if diffuse is None else int(diffuse.sum())
 
     # Rendering.
@@ -213,7 +213,7 @@ class NrfgsModel(SplatfactoModel):
     def field(self) -> Field:
         """What is rendered: the head with all splats, or those in the crop box, and which of them are diffuse."""
         splats: dict[str, Tensor] = dict(self.gauss_params.items())
-        if (diffuse := self.densification.state.get(DIFFUSE)) is not None:
+        if (diffuse := self.densification.diffuse) is not None:
             splats[DIFFUSE] = diffuse
         if self.crop_box is not None and not self.training:
             inside = self.crop_box.within(splats["means"]).reshape(-1)
