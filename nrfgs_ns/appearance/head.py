@@ -90,8 +90,6 @@ class AppearanceHead(nn.Module, ABC):
     scene_unit: float = 1.0
     """World units in a scene unit: the lengths in a head's configuration, and what it makes of distances, are in scene
     units, so that a scene looks the same whatever it is measured in."""
-    knows_diffuse: bool = False
-    """Whether a table may have "diffuse" among its entries (`diffuse.py`)."""
     residual_params: tuple[str, ...] = ()
     """Those of `splat_params` that only the residual reads: a diffuse splat need not store them."""
     is_harmonics: bool = False
@@ -143,6 +141,9 @@ class AppearanceHead(nn.Module, ABC):
 
     def set_step(self, step: int) -> None:  # noqa: B027  (most heads have no schedule)
         """Tell the head which training step it is, for heads that grow with training."""
+
+    def try_kernels(self, device: torch.device) -> None:  # noqa: B027  (most heads have none)
+        """Find out whether the head's own kernels run on a CUDA device, which compiles them: the first step would."""
 
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor | None:
         """How far the head is from adding nothing to the base appearance, as a scalar to minimise in the warm-up.

@@ -108,7 +108,6 @@ class NeuralResidualField(AppearanceHead):
     """The field, as in the module's docstring."""
 
     name = "nrf"
-    knows_diffuse = True
     residual_params = ("latents",)
 
     def __init__(self, config: NrfConfig):
@@ -129,6 +128,9 @@ class NeuralResidualField(AppearanceHead):
                 nn.init.zeros_(branch[-1].weight)
                 nn.init.zeros_(branch[-1].bias)
         self.fused = FusedField(config, self.low, self.high)
+
+    def try_kernels(self, device: torch.device) -> None:
+        self.fused.try_on(device)
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Base colours and latents: "features_dc" [N, 3], "latents" [N, D] ~ N(0, latent_std^2)."""

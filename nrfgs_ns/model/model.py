@@ -9,8 +9,9 @@ hold, so that an interrupted training can go on.
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -21,6 +22,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
 from nerfstudio.utils.colors import get_color
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -38,7 +40,7 @@ from nrfgs_ns.densification import (
     build_densification,
 )
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.image import robust
+from nrfgs_ns.image import robust, ssim
 from nrfgs_ns.image.metrics import ImageMetrics
 from nrfgs_ns.image.photograph import Part, PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
@@ -49,6 +51,7 @@ from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_vi
 from nrfgs_ns.model.training_views import ComparedViews
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
+from nrfgs_ns.rasterizer import load_kernels
 
 LOOK = "NRFGS_LOOK"
 """Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
@@ -88,15 +91,19 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
     """whether each photograph's exposure and white balance are learnt. auto: where EXIF says that exposure varies, or
-    where each photograph disagrees with those taken next to it; a line in the log says why"""
+    where photographs disagree by more than their places explain; a line in the log says why"""
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0
-    """share of the pixels, those with the largest residuals, that the loss leaves out: passers-by, moving shadows.
-    0: none"""
+    """share of the pixels that the loss leaves out at most, those with the largest residuals: passers-by, moving
+    shadows. 0: none; 0.1 is a start"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Be what a config.yml says; that of an older version has fewer options."""
+        self.__dict__.update({**vars(type(self)()), **state})
 
 
 class NrfgsModel(SplatfactoModel):
@@ -163,8 +170,9 @@ class NrfgsModel(SplatfactoModel):
             rgb = torch.rand(len(means), 3)
         neighbours = min(3, len(means) - 1)
         if neighbours > 0:
-            distances, _ = self.k_nearest_sklearn(means, neighbours)
-            width = torch.from_numpy(distances).mean(dim=-1, keepdim=True)
+            # The distances of splatfacto's scikit-learn to the last bit, without a second to import it.
+            distances, _ = cKDTree(means.cpu().numpy()).query(means.cpu().numpy(), k=neighbours + 1, workers=-1)
+            width = torch.from_numpy(distances[:, 1:]).float().mean(dim=-1, keepdim=True)
         else:
             width = torch.full((len(means), 1), self.config.densify_size_thresh * self.scene_unit)
         return {
@@ -179,6 +187,12 @@ class NrfgsModel(SplatfactoModel):
             }.items()
         }
 
+    def kernel_trials(self) -> list[Callable[[], object]]:
+        """What loads or compiles the kernels that a first step would wait for (`kernels.trial`); none on a CPU."""
+        if self.device.type != "cuda":
+            return []
+        return [partial(trial, self.device) for trial in (load_kernels, self.head.try_kernels, ssim.try_kernels)]
+
     @property
     def parameter_bytes(self) -> int:
         """Bytes of all that a renderer needs: the head and the splats' parameters, of diffuse ones the base alone."""
@@ -190,7 +204,7 @@ class NrfgsModel(SplatfactoModel):
     @property
     def num_diffuse(self) -> int:
         """How many splats have no residual."""
-        diffuse = self.densification.state.get(DIFFUSE)
+        diffuse = self.densification.diffuse
         return 0 if diffuse is None else int(diffuse.sum())
 
     # Rendering.
@@ -199,7 +213,7 @@ class NrfgsModel(SplatfactoModel):
     def field(self) -> Field:
         """What is rendered: the head with all splats, or those in the crop box, and which of them are diffuse."""
         splats: dict[str, Tensor] = dict(self.gauss_params.items())
-        if (diffuse := self.densification.state.get(DIFFUSE)) is not None:
+        if (diffuse := self.densification.diffuse) is not None:
             splats[DIFFUSE] = diffuse
         if self.crop_box is not None and not self.training:
             inside = self.crop_box.within(splats["means"]).reshape(-1)
@@ -275,14 +289,29 @@ class NrfgsModel(SplatfactoModel):
             and "depth" [H, W, 1], which is left out of training unless `output_depth_during_training`.
         """
         field = self.field
+        outputs, appearance = self.render(field, camera, self._as_learnt(field))
+        if self.training:
+            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
+        return outputs
+
+    def render(self, field: Field, camera: Cameras, asked: Field) -> tuple[dict[str, Tensor], SplatAppearance]:
+        """Render a field, which need not be the model's own, as `get_outputs` renders that.
+
+        Args:
+            field: what is drawn.
+            camera: a batch of one camera, [1].
+            asked: the same field as its head is asked about it, with or without noise.
+
+        Returns:
+            what `get_outputs` does, and what the visible splats look like.
+        """
         view = self.project(camera, field.splats)
-        appearance = self._as_learnt(field).seen_from(view)
+        appearance = asked.seen_from(view)
         background = self._get_background_color()
         outputs, self.info = self.composite(view, appearance, background, self._photograph_of(camera))
         if self.training:
-            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._finish_for_training(outputs, camera, background)
-        return outputs
+        return outputs, appearance
 
     def against_photograph(
         self, camera: Cameras, batch: Mapping[str, Any], view: View, appearance: SplatAppearance
@@ -476,7 +505,7 @@ class NrfgsModel(SplatfactoModel):
 
         Terms that are zero in this step are left out. Nothing waits for the GPU.
         """
-        losses = {"main_loss": self._photometric_loss(outputs, batch)}
+        losses = {"main_loss": self.photometric_loss(outputs, batch)}
         if self.config.use_scale_regularization and self.step % 10 == 0:
             scales = self.scales.exp()
             ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
@@ -493,7 +522,7 @@ class NrfgsModel(SplatfactoModel):
             self.watched_image = batch.get("image_idx")
         return losses
 
-    def _photometric_loss(self, outputs, batch) -> Tensor:
+    def photometric_loss(self, outputs, batch) -> Tensor:
         """Splatfacto's loss of an image against its photograph, a scalar."""
         truth = self.truth_of(batch, outputs["background"])
         rgb = outputs["rgb"]
@@ -501,7 +530,7 @@ class NrfgsModel(SplatfactoModel):
             mask = self._downscale_if_required(batch["mask"]).to(self.device)
             truth, rgb = truth * mask, rgb * mask
         if self.trimming is not None and self.training and self.schedule_step >= robust.FIRST_STEP:
-            kept = self.trimming(rgb, truth, mask if "mask" in batch else None)
+            kept = self.trimming(rgb, truth, self.schedule_step, mask if "mask" in batch else None)
             truth, rgb = truth * kept, rgb * kept
         return photometric_loss(rgb, truth, self.config.ssim_lambda)
 
