@@ -173,6 +173,15 @@ def test_shares_of_the_wrong_pixels(training):
     assert len(compared(training)) == len(training.pipeline.datamanager.train_dataset)
 
 
+def test_pixels_are_those_of_the_photograph_at_any_resolution(training, monkeypatch):
+    model = training.pipeline.model
+    whole = compared(training).look(3, 0.1)
+    monkeypatch.setattr(model.config, "num_downscales", 1)
+    half = compared(training).look(3, 0.1)
+    assert_close(half.pixels.sum(), whole.pixels.sum(), rtol=0.1, atol=0)
+    assert 0 < half.wrong.sum() < half.pixels.sum()
+
+
 def test_wrong_pixels_are_between_the_smallest_and_the_largest_error_that_count():
     error = torch.tensor([[0.1, 0.2, 0.31], [0.6, 0.9, 0.0]])[..., None]
     counted = torch.tensor([[True, True, True], [True, False, False]])[..., None]
