@@ -13,6 +13,7 @@ from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, ras
 from torch import Tensor
 
 from nrfgs_ns.host import GSPLAT, gsplat_version
+from nrfgs_ns.kernels.trial import Gate
 
 from .contract import Projection
 
@@ -21,6 +22,7 @@ if HAS_BATCHES and gsplat_version() < (1, 5, 3):
     raise ImportError(f"gsplat {'.'.join(map(str, gsplat_version()))} is not known here; use {' or '.join(GSPLAT)}.")
 
 CHANNEL_CHUNK = 32  # more channels at once slow the kernels down
+MOST_TILES = 2**15  # those beyond have no 16-bit number, as `tile_lists.py` wants
 
 
 def project(
@@ -114,25 +116,7 @@ def composite(
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, dict]:
     """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`."""
-    tile_width, tile_height = -(-projection.width // tile_size), -(-projection.height // tile_size)
-    if HAS_BATCHES:
-        extents = projection.extents  # a square where another device has projected them
-        bounds = projection.radii[:, None].expand(-1, 2) if extents is None else extents
-        images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
-    else:
-        bounds, images = projection.radii, {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
-    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
-        projection.means2d,
-        bounds,
-        projection.depths,
-        tile_size,
-        tile_width,
-        tile_height,
-        packed=True,
-        gaussian_ids=projection.gaussian_ids,
-        **images,
-    )
-    isect_offsets = isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height)
+    isect_offsets, flatten_ids = _lists(projection, opacities, tile_size)
 
     def blend(colors: Tensor, backgrounds: Tensor | None) -> tuple[Tensor, Tensor]:
         behind = backgrounds
@@ -163,10 +147,56 @@ def composite(
         behind = [None] * len(chunks) if backgrounds is None else backgrounds.split(CHANNEL_CHUNK, dim=-1)
         parts = [blend(*part) for part in zip(chunks, behind, strict=True)]
         render, alphas = torch.cat([part for part, _ in parts], dim=-1), parts[0][1]
-    lists = {
-        "tiles_per_gauss": tiles_per_gauss,
-        "isect_ids": isect_ids,
-        "flatten_ids": flatten_ids,
-        "isect_offsets": isect_offsets,
-    }
-    return render, alphas, lists
+    return render, alphas, {"flatten_ids": flatten_ids, "isect_offsets": isect_offsets}
+
+
+def _lists(projection: Projection, opacities: Tensor, tile_size: int) -> tuple[Tensor, Tensor]:
+    """Which splats each tile draws, as gsplat's kernels take it: offsets into a list of rows, and the list."""
+    tile_width, tile_height = -(-projection.width // tile_size), -(-projection.height // tile_size)
+    bounds = projection.radii
+    if HAS_BATCHES:
+        extents = projection.extents  # a square where another device has projected them
+        bounds = projection.radii[:, None].expand(-1, 2) if extents is None else extents
+    means2d, depths, conics = projection.means2d, projection.depths, projection.conics
+    if projection.n_cameras == 1 and _kernels_take(tile_width * (tile_height + 1), means2d, depths, conics, opacities):
+        from .tile_lists import tile_lists
+
+        tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
+        return tile_lists(*tables, tile_width, tile_height, tile_size)
+    images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
+    if HAS_BATCHES:
+        images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
+    _, isect_ids, flatten_ids = isect_tiles(
+        means2d,
+        bounds,
+        depths,
+        tile_size,
+        tile_width,
+        tile_height,
+        packed=True,
+        gaussian_ids=projection.gaussian_ids,
+        **images,
+    )
+    return isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height), flatten_ids
+
+
+_GATE = Gate("The list of each tile's splats")
+
+
+def _kernels_take(tiles: int, *tables: Tensor) -> bool:
+    """Whether the kernels of `tile_lists.py` make the lists of so many tiles from these tables."""
+    device = tables[0].device
+    return (
+        tiles <= MOST_TILES
+        and all(table.dtype == torch.float32 for table in tables)
+        and _GATE.opens(device, device, lambda: _try_kernels(device))
+    )
+
+
+def _try_kernels(device: torch.device) -> None:
+    """Compile and run both kernels on one splat; raise whatever goes wrong."""
+    from .tile_lists import tile_lists
+
+    ones = torch.ones(1, 3, device=device)
+    radii = torch.ones(1, 2, dtype=torch.int32, device=device) if HAS_BATCHES else ones[0, :1].int()
+    tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, 16)

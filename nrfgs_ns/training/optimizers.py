@@ -2,9 +2,9 @@
 """Nerfstudio's optimisers, with less work for the host.
 
 A training step on a GPU is bound by what Python does between kernels. Nerfstudio keeps one Adam for each tensor, and
-each `Optimizer.step` costs the host more than its kernel costs the GPU. Here Adam runs fused, one kernel for each
-group, and after its first step that kernel is called directly. Numbers and state are torch's own, so densification
-and checkpoints find what they expect.
+each `Optimizer.step` costs the host more than its kernel costs the GPU. Here Adam runs fused, and after its first step
+one kernel does all groups (`adam_triton.py`). State is torch's own, so densification and checkpoints find what they
+expect.
 """
 
 from collections.abc import Iterable
@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
+from nrfgs_ns.kernels.trial import Gate
 from nrfgs_ns.training.pace import Pace
 
 
@@ -106,49 +107,89 @@ class LeanOptimizers(Optimizers):
 
 
 def fused_adam_step(optimizers: Iterable[Optimizer]) -> None:
-    """One step of several fused Adams whose state exists; the operator is that of `Adam(fused=True).step`.
+    """One step of several fused Adams whose state exists: in one Triton kernel, or where that cannot be by the operator
+    of `Adam(fused=True).step`.
 
     An optimiser's `found_inf` (a tensor on the device, 1.0 for "skip this step") is heeded as torch heeds it.
     """
-    counters: list[Tensor] = []
-    skips: list[Tensor] = []
     work = []
     for optimizer in optimizers:
-        found_inf = getattr(optimizer, "found_inf", None)
         for group in optimizer.param_groups:
             parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
-            if not parameters:
-                continue
-            states = [optimizer.state[parameter] for parameter in parameters]
-            steps = [state["step"] for state in states]
-            counters += steps
-            skips += [found_inf] * len(steps) if found_inf is not None else []
-            work.append((group, parameters, states, steps, found_inf))
+            if parameters:
+                states = [optimizer.state[parameter] for parameter in parameters]
+                work.append((group, parameters, states, getattr(optimizer, "found_inf", None)))
     if not work:
         return
+    counters = [state["step"] for _, _, states, _ in work for state in states]
+    skips = [found_inf for _, _, states, found_inf in work for _ in states if found_inf is not None]
     torch._foreach_add_(counters, 1)
     with torch.no_grad():
-        for group, parameters, states, steps, found_inf in work:
-            beta1, beta2 = group["betas"]
-            torch._fused_adam_(
-                parameters,
-                [parameter.grad for parameter in parameters],
-                [state["exp_avg"] for state in states],
-                [state["exp_avg_sq"] for state in states],
-                [],
-                steps,
-                lr=group["lr"],
-                beta1=beta1,
-                beta2=beta2,
-                weight_decay=group["weight_decay"],
-                eps=group["eps"],
-                amsgrad=False,
-                maximize=False,
-                grad_scale=None,
-                found_inf=found_inf,
-            )
+        if not _step_at_once(work):
+            for group, parameters, states, found_inf in work:
+                _step_group(group, parameters, states, found_inf)
     if skips:
         torch._foreach_sub_(counters, skips)
+
+
+def _step_group(group: dict[str, Any], parameters: list[Tensor], states: list[dict], found_inf: Tensor | None) -> None:
+    """One step of a group of parameters, whose counters have counted it."""
+    beta1, beta2 = group["betas"]
+    torch._fused_adam_(
+        parameters,
+        [parameter.grad for parameter in parameters],
+        [state["exp_avg"] for state in states],
+        [state["exp_avg_sq"] for state in states],
+        [],
+        [state["step"] for state in states],
+        lr=group["lr"],
+        beta1=beta1,
+        beta2=beta2,
+        weight_decay=group["weight_decay"],
+        eps=group["eps"],
+        amsgrad=False,
+        maximize=False,
+        grad_scale=None,
+        found_inf=found_inf,
+    )
+
+
+_GATE = Gate("Adam")
+_TABLES: dict[torch.device, Any] = {}
+
+
+def _step_at_once(work: list[tuple]) -> bool:
+    """Make the step of all groups in one kernel, if it can be."""
+    device = work[0][1][0].device
+    if device.type != "cuda" or not _GATE.opens(device, device, lambda: _try_kernel(device)):
+        return False
+    found_inf = work[0][3]
+    if any(skip is not found_inf for *_, skip in work):
+        return False
+    from nrfgs_ns.training.adam_triton import COLUMNS, AdamTable, AdamTensor, is_taken
+
+    tensors = [
+        AdamTensor(parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"], state["step"], group)
+        for group, parameters, states, _ in work
+        for parameter, state in zip(parameters, states, strict=True)
+        if parameter.numel() > 0
+    ]
+    if not all(is_taken(tensor, device) for tensor in tensors):
+        return False
+    if device not in _TABLES:
+        _TABLES[device] = AdamTable(device)
+    for begin in range(0, len(tensors), COLUMNS):
+        _TABLES[device].step(tensors[begin : begin + COLUMNS], found_inf)
+    return True
+
+
+def _try_kernel(device: torch.device) -> None:
+    """Compile and run the kernel on one number; raise whatever goes wrong."""
+    from nrfgs_ns.training.adam_triton import AdamTable, AdamTensor
+
+    numbers = [torch.ones(1, device=device) for _ in range(5)]
+    group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
+    AdamTable(device).step([AdamTensor(*numbers, group)], None)
 
 
 def in_world_units(group: dict[str, Any], scene_unit: float) -> dict[str, Any]:
