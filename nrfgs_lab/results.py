@@ -6,7 +6,8 @@
 
 {"study": NAME, "records": {path without .json: record}, "texts": {path: lines}}, a line for each record. Numbers are
 kept to seven significant digits, as many as float32 has. Figures and the tables of other formats are not kept: the
-commands draw them anew from the records. Nor is what ns-eval says of each image, where `bench/measure.py` says it too.
+commands draw them anew from the records. Nor is what ns-eval says of each image, where `bench/measure.py` says it too;
+numbers of splats are kept each 500 steps.
 """
 
 import json
@@ -30,10 +31,16 @@ def rounded(content: Any) -> Any:
 
 
 def slim(record: Any) -> Any:
-    """A record without the values of each image that it has twice."""
-    if not (isinstance(record, dict) and {"eval", "measured"} <= record.keys()):
+    """A run's record without the values of each image that it has twice, and with every fifth number of splats."""
+    if not (isinstance(record, dict) and isinstance(record.get("train"), dict)):
         return record
-    return {**record, "eval": {name: value for name, value in record["eval"].items() if name != "per_image"}}
+    train, record = record["train"], dict(record)
+    if len(splats := train.get("splats") or []) > 1:
+        kept = [pair for pair in splats[:-1] if pair[0] % 500 == 0]
+        record["train"] = {**train, "splats": [*kept, splats[-1]]}
+    if {"eval", "measured"} <= record.keys():
+        record["eval"] = {name: value for name, value in record["eval"].items() if name != "per_image"}
+    return record
 
 
 def pack(folder: Path, file: Path) -> None:

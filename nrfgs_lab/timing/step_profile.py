@@ -180,9 +180,9 @@ def kernels(watch: profile, steps: int) -> dict[str, Any]:
         "gpu_ms": sum(time for _, time in device.values()) / steps / 1e3,
         "launches": sum(count for count, _ in device.values()) / steps,
         "waits": waits,
-        "kernels": [[name[:120], count / steps, time / steps / 1e3] for name, (count, time) in busiest[:30]],
+        "kernels": [[name[:120], count / steps, time / steps / 1e3] for name, (count, time) in busiest[:10]],
         "operations": [
-            [event.key[:120], event.count / steps, event.self_cpu_time_total / steps / 1e3] for event in operations[:30]
+            [event.key[:120], event.count / steps, event.self_cpu_time_total / steps / 1e3] for event in operations[:10]
         ],
     }
 

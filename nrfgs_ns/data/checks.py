@@ -43,7 +43,7 @@ SMALLEST, LARGEST = 4, 2**16
 """Pixels that an image has along each side."""
 LONGEST_JSON = 2**26
 """Bytes of a transforms.json: 64 MB, a hundred thousand frames."""
-LONGEST_NAME, LONGEST_PATH = 255, 4096
+LONGEST_NAME, LONGEST_PATH = 255, 4095
 """Bytes of a name, and of a path, that file systems take."""
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".dng")
 """Endings of what a camera writes."""
@@ -163,9 +163,8 @@ def could_exist(name: str) -> bool:
         encoded = name.encode()
     except UnicodeEncodeError:
         return False
-    return (
-        b"\0" not in encoded and all(len(part) <= LONGEST_NAME for part in encoded.split(b"/")) and len(encoded) < 4096
-    )
+    parts = encoded.split(b"/")
+    return b"\0" not in encoded and len(encoded) <= LONGEST_PATH and all(len(part) <= LONGEST_NAME for part in parts)
 
 
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> None:

@@ -21,7 +21,7 @@ from torch import Tensor
 from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, checked
 from nrfgs_ns.data.pictures import read_picture
-from nrfgs_ns.data.scene_unit import scene_unit
+from nrfgs_ns.data.views import scene_unit
 from nrfgs_ns.errors import InputError
 
 LARGEST_SCALE = 16.0
@@ -149,38 +149,10 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         indices = [self._next_index() for _ in range(count)]
         return [self._view(index) for index in indices], self._image(indices[own])
 
-    def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """One training camera and its image, as `next_train` gives them, out of turn; it may be one held out."""
-        return self._view(index), self._image(index)
-
-    @cached_property
-    def held_out_views(self) -> list[int]:
-        """Training views whose turn does not come; none unless `hold_out` says so."""
-        return []
-
-    def hold_out(self, indices: list[int]) -> None:
-        """Keep some training views, but not all, from being trained on until they are given back (`data/views.py` says
-        which). What they say of a model is no test, and may decide a setting."""
-        self.held_out_views = sorted(indices)
-        self.train_unseen_cameras = [i for i in self.train_unseen_cameras if i not in self.held_out_views]
-        if not self.train_unseen_cameras:
-            self.train_unseen_cameras = self._next_round()
-
-    def give_back_views(self) -> None:
-        """Train on all views again, from the next round on."""
-        self.held_out_views = []
-
-    def _next_round(self) -> list[int]:
-        """Training cameras in the order of their turns."""
-        order: list[int] = []
-        while not order:  # the strategy fps takes some views only, and may take none but those held out
-            order = [index for index in self.sample_train_cameras() if index not in self.held_out_views]
-        return order
-
     def _next_index(self) -> int:
         index = self.train_unseen_cameras.pop(0)
         if len(self.train_unseen_cameras) == 0:
-            self.train_unseen_cameras = self._next_round()
+            self.train_unseen_cameras = self.sample_train_cameras()
         return index
 
     def _image(self, index: int) -> dict[str, Any]:
@@ -223,7 +195,6 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             "strategy": self.config.train_cameras_sampling_strategy,
             "num_images": len(self.train_dataset),
             "unseen_cameras": list(self.train_unseen_cameras),
-            "views_aside": list(self.held_out_views),
         }
         if state["strategy"] == "random":
             return {**state, "generator": self.random_generator.getstate()}
@@ -252,7 +223,6 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
                 f"{state['strategy']}. Set it back, or train anew."
             )
         self.train_unseen_cameras = list(state["unseen_cameras"])
-        self.held_out_views = list(state.get("views_aside", []))  # older checkpoints have none
         if state["strategy"] == "random":
             version, words, gauss = state["generator"]
             self.random_generator = random.Random()

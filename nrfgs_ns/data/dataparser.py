@@ -50,7 +50,7 @@ from nrfgs_ns.data.exif import stored_exif
 from nrfgs_ns.data.pictures import read_header, smaller_copies
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import MARGIN, check_sight, in_reach
-from nrfgs_ns.data.split import interior_test_images
+from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
 

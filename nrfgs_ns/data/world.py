@@ -50,10 +50,6 @@ class CaptureFrame:
         """Points [N, 3] of the training's world in the capture's, float64 [N, 3]."""
         return (np.asarray(points, dtype=np.float64) / self.scale - self.translation) @ self.rotation
 
-    def to_training(self, points: np.ndarray) -> np.ndarray:
-        """Points [N, 3] of the capture's world in the training's, float64 [N, 3]."""
-        return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
-
 
 class PlacedOutputs(DataparserOutputs):
     """Nerfstudio's outputs, whose way back may be in float64."""

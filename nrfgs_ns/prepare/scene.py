@@ -19,7 +19,7 @@ from plyfile import PlyData, PlyElement
 
 from nrfgs_ns.data.exif import exif_of, exif_of_copy, known
 from nrfgs_ns.data.pictures import open_picture
-from nrfgs_ns.data.split import interior_test_images
+from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare.structure import colmap
 

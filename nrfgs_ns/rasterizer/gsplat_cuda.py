@@ -81,6 +81,11 @@ def _finite(rows: tuple) -> bool:
 def _visible_rows(means, quats, scales, viewmats, Ks, width, height, *, packed: bool, **settings) -> tuple:
     """Gsplat's projection as packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, and
     extents where it has them."""
+    if len(means) == 0:  # gsplat 1.5.3 divides by the number of splats, which ends the process
+        ids = torch.empty(0, dtype=torch.int64, device=means.device)
+        compensations = means[:, 2] if settings["calc_compensations"] else None
+        sides = ids.new_empty((0, 2), dtype=torch.int32) if HAS_BATCHES else None
+        return ids, ids, ids.int(), means[:, :2], means[:, 2], scales, compensations, sides
     rows = fully_fused_projection(
         means,
         None,

@@ -30,7 +30,6 @@ from torch import Tensor
 from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.errors import ForTheUser
 from nrfgs_ns.training.guard_report import Finding, report
-from nrfgs_ns.training.in_sight import PATIENCE, InSight
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 from nrfgs_ns.training.pace import Pace
 
@@ -39,7 +38,8 @@ MAX_GRADIENT = 2.0**63
 there on the second moment would be infinite and the parameter would never move again, in silence."""
 PARAMETERS_EVERY = 100
 """Steps between two looks at the parameters."""
-
+PATIENCE = 100
+"""Steps in a row, each with another view's turn, without a visible splat after which there will be none."""
 
 Origin = Literal["rendering", "gradient", "parameter", "elsewhere", "nothing visible", "memory"]
 """What stops a training: a number in the image or a loss, in a gradient or a parameter, or on another device; that
@@ -87,7 +87,7 @@ class Guard:
     def __init__(self, pipeline):
         self.pipeline = pipeline
         self.step = 0
-        self.in_sight = InSight()
+        self.blind_steps = 0
         self._verdict: Verdict | None = None
         # Pinned memory and events are dear to make; one of each will do, for a verdict is read before the next is made.
         self._in_host_memory: Tensor | None = None
@@ -149,8 +149,10 @@ class Guard:
             self.settle()
 
     def _out_of_sight(self) -> bool:
-        """Whether nothing has been visible for long."""
-        return not self.in_sight.see(getattr(self.model, "info", {}))
+        """Whether nothing has been visible in the last `PATIENCE` steps. The host knows how many rows there were."""
+        rows = getattr(self.model, "info", {}).get("gaussian_ids")
+        self.blind_steps = self.blind_steps + 1 if rows is not None and len(rows) == 0 else 0
+        return self.blind_steps >= PATIENCE
 
     def _share(self, verdict: Verdict) -> Verdict:
         """Here joins in what other devices have found, where there are any (`distributed`)."""

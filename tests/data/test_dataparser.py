@@ -13,7 +13,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from PIL import Image
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, nrfgs_dataparser
-from nrfgs_ns.data.split import interior_test_images
+from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.errors import InputError
 
 

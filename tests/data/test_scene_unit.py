@@ -10,7 +10,7 @@ from nerfstudio.scripts.train import _set_random_seed
 
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.data.scene_unit import scene_unit
+from nrfgs_ns.data.views import scene_unit
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.optimizers import in_world_units
 from nrfgs_ns.training.run import parse

@@ -11,6 +11,7 @@ def test_a_folder_comes_back(tmp_path):
     (folder / "runs").mkdir(parents=True)
     image = [{"image": "a.png", "psnr": 30.123456789}]
     run = {"eval": {"psnr": 1 / 3, "per_image": image}, "measured": {"test": {"per_image": image}}, "splats": 123456789}
+    run["train"] = {"splats": [[step, 10 * step] for step in range(0, 1101, 100)] + [[1149, 7]]}
     (folder / "runs" / "one.json").write_text(json.dumps(run))
     (folder / "table.md").write_text("| a |\n|---|\n")
     (folder / "splats.png").write_bytes(b"no text")
@@ -20,5 +21,6 @@ def test_a_folder_comes_back(tmp_path):
     assert {path.name for path in (tmp_path / "again").rglob("*.*")} == {"one.json", "table.md"}
     assert (tmp_path / "again" / "table.md").read_text() == "| a |\n|---|\n"
     found = json.loads((tmp_path / "again" / "runs" / "one.json").read_text())
+    assert found["train"]["splats"] == [[0, 0], [500, 5000], [1000, 10000], [1149, 7]]
     assert found["eval"] == {"psnr": 0.3333333} and found["splats"] == 123456789
     assert found["measured"]["test"]["per_image"] == [{"image": "a.png", "psnr": 30.12346}]

@@ -233,6 +233,41 @@ def test_rows_that_gsplat_lets_through_as_nan_are_projected_away(monkeypatch):
     assert calls == [6, 5, 6, 6]
 
 
+@modes
+@pytest.mark.parametrize("bad", [None, math.nan])
+def test_gsplats_projection_never_sees_an_empty_table(monkeypatch, mode, bad):
+    """1.5.3 divides by the number of splats: the process would end without a word."""
+    from nrfgs_ns.rasterizer import gsplat_cuda
+
+    def kernel(means, covars, quats, scales, viewmats, Ks, width, height, **settings):
+        assert len(means) > 0
+        ids = torch.arange(len(means))
+        sides = torch.ones(len(means), 2, dtype=torch.int32)
+        rows = (ids * 0, ids, sides if gsplat_cuda.HAS_BATCHES else sides[:, 0], means[:, :2], means[:, 2], scales)
+        return *(rows[:1] if gsplat_cuda.HAS_BATCHES else ()), *rows, means[:, 2]
+
+    monkeypatch.setattr(gsplat_cuda, "fully_fused_projection", kernel)
+    count = 0 if bad is None else 2
+    splats = {name: value.detach()[:count].requires_grad_() for name, value in cloud().items()}
+    if bad is not None:
+        splats["means"] = torch.full((2, 3), bad, requires_grad=True)
+    p = gsplat_cuda.project(
+        *(splats[name] for name in NAMES[:3]),
+        *camera(),
+        near_plane=0.01,
+        far_plane=1e10,
+        radius_clip=0.0,
+        eps2d=0.3,
+        rasterize_mode=mode,
+        packed=True,
+        assume_finite=False,
+    )
+    assert p.gaussian_ids.shape == (0,) and p.means2d.shape == (0, 2) and p.conics.shape == (0, 3)
+    assert p.radii.shape == (0,) and p.radii.dtype == torch.int32
+    assert (p.compensations is None) == (mode == "classic")
+    (p.means2d.sum() + p.depths.sum() + p.conics.sum()).backward()  # nothing to find, nothing in the way
+
+
 @devices
 @modes
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1)])

@@ -2,6 +2,7 @@
 """The guard: what stops a training, what is said, and what is left on disk."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,8 +10,7 @@ from short_trainings import command_line
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.checkpoint_files import seal, write
-from nrfgs_ns.training.guard import MAX_GRADIENT, PARAMETERS_EVERY, TrainingStopped
-from nrfgs_ns.training.in_sight import PATIENCE, InSight
+from nrfgs_ns.training.guard import MAX_GRADIENT, PARAMETERS_EVERY, PATIENCE, Guard, TrainingStopped
 from nrfgs_ns.training.run import _set_random_seed, parse
 
 
@@ -303,6 +303,12 @@ def test_a_training_in_which_nothing_is_visible_stops(start):
 
 
 def test_now_and_then_a_view_may_see_nothing():
-    sight, nothing, something = InSight(), {"gaussian_ids": torch.empty(0)}, {"gaussian_ids": torch.arange(3)}
-    assert all(sight.see(nothing) for _ in range(PATIENCE - 1)) and sight.see(something) and sight.see({})
-    assert all(sight.see(nothing) for _ in range(PATIENCE - 1)) and not sight.see(nothing)
+    nothing, something = {"gaussian_ids": torch.empty(0)}, {"gaussian_ids": torch.arange(3)}
+    guard = Guard(SimpleNamespace(model=SimpleNamespace(info=nothing)))
+
+    def blind(info, steps=1):
+        guard.model.info = info
+        return [guard._out_of_sight() for _ in range(steps)]
+
+    assert not any(blind(nothing, PATIENCE - 1) + blind(something) + blind({}))
+    assert not any(blind(nothing, PATIENCE - 1)) and blind(nothing) == [True]
