@@ -22,6 +22,7 @@ if HAS_BATCHES and gsplat_version() < (1, 5, 3):
     raise ImportError(f"gsplat {'.'.join(map(str, gsplat_version()))} is not known here; use {' or '.join(GSPLAT)}.")
 
 CHANNEL_CHUNK = 32  # more channels at once slow the kernels down
+MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` look through
 MOST_TILES = 2**15  # those beyond have no 16-bit number, as `tile_lists.py` wants
 
 
@@ -119,9 +120,14 @@ def composite(
     backgrounds: Tensor | None,
     tile_size: int,
     absgrad: bool,
+    leave_out: bool = False,
 ) -> tuple[Tensor, Tensor, dict]:
-    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`."""
-    isect_offsets, flatten_ids = _lists(projection, opacities, tile_size)
+    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`.
+
+    Args:
+        leave_out: rows that are not finite, if `leaves_out` says that this can be.
+    """
+    isect_offsets, flatten_ids = _lists(projection, opacities, tile_size, colors if leave_out else None)
 
     def blend(colors: Tensor, backgrounds: Tensor | None) -> tuple[Tensor, Tensor]:
         behind = backgrounds
@@ -155,19 +161,30 @@ def composite(
     return render, alphas, {"flatten_ids": flatten_ids, "isect_offsets": isect_offsets}
 
 
-def _lists(projection: Projection, opacities: Tensor, tile_size: int) -> tuple[Tensor, Tensor]:
-    """Which splats each tile draws, as gsplat's kernels take it: offsets into a list of rows, and the list."""
+def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor, tile_size: int) -> bool:
+    """Whether `composite` can leave out rows that are not finite. Their gradients would not all be 0."""
+    few = colors.shape[-1] <= MOST_CHECKED
+    return few and not torch.is_grad_enabled() and _kernels_take(projection, opacities, tile_size)
+
+
+def _lists(projection: Projection, opacities: Tensor, tile_size: int, finite: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Which splats each tile draws, as gsplat's kernels take it: offsets into a list of rows, and the list.
+
+    Args:
+        finite: leave out the rows of which one of these, [M, D], or another number is not finite.
+    """
     tile_width, tile_height = -(-projection.width // tile_size), -(-projection.height // tile_size)
     bounds = projection.radii
     if HAS_BATCHES:
         extents = projection.extents  # a square where another device has projected them
         bounds = projection.radii[:, None].expand(-1, 2) if extents is None else extents
     means2d, depths, conics = projection.means2d, projection.depths, projection.conics
-    if projection.n_cameras == 1 and _kernels_take(tile_width * (tile_height + 1), means2d, depths, conics, opacities):
+    if _kernels_take(projection, opacities, tile_size):
         from .tile_lists import tile_lists
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
-        return tile_lists(*tables, tile_width, tile_height, tile_size)
+        colors = None if finite is None else finite.detach().contiguous()
+        return tile_lists(*tables, tile_width, tile_height, tile_size, colors)
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
@@ -188,12 +205,14 @@ def _lists(projection: Projection, opacities: Tensor, tile_size: int) -> tuple[T
 _GATE = Gate("The list of each tile's splats")
 
 
-def _kernels_take(tiles: int, *tables: Tensor) -> bool:
-    """Whether the kernels of `tile_lists.py` make the lists of so many tiles from these tables."""
-    device = tables[0].device
+def _kernels_take(projection: Projection, opacities: Tensor, tile_size: int) -> bool:
+    """Whether the kernels of `tile_lists.py` make the lists."""
+    tiles = -(-projection.width // tile_size) * (-(-projection.height // tile_size) + 1)
+    device = opacities.device
     return (
-        tiles <= MOST_TILES
-        and all(table.dtype == torch.float32 for table in tables)
+        projection.n_cameras == 1
+        and tiles <= MOST_TILES
+        and opacities.dtype == projection.means2d.dtype == torch.float32
         and _GATE.opens(device, device, lambda: _try_kernels(device))
     )
 

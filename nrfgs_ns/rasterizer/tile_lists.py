@@ -96,22 +96,29 @@ def _columns(row, x, y, a, b, c, bound, det, left, right, SIDE: tl.constexpr):
 
 @triton.jit(do_not_specialize=["count", "width", "height"])
 def count_kernel(
-    means2d, conics, opacities, radii, order, counts, count, width, height,
-    SPLATS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr,
+    means2d, conics, opacities, radii, order, counts, colors, count, width, height,
+    SPLATS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr, CHANNELS: tl.constexpr,
 ):  # fmt: skip
-    """How many tiles each splat is listed in, by its place in `order`."""
+    """How many tiles each splat is listed in, by its place in `order`. If there are CHANNELS, none where a number is
+    not finite."""
     at = tl.program_id(0) * SPLATS + tl.arange(0, SPLATS)
     valid = at < count
     rows = tl.load(order + at, mask=valid, other=0)
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
     left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
-    bottom = tl.where(valid & (bound > 0.0), bottom, top)
-    total = tl.zeros((SPLATS,), tl.int32)
+    drawn = valid & (bound > 0.0)
+    if CHANNELS > 0:
+        total = x + y + a + b + c + bound
+        for channel in tl.static_range(CHANNELS):
+            total += tl.load(colors + rows * CHANNELS + channel, mask=valid, other=0.0)
+        drawn = drawn & (tl.abs(total) < float("inf"))
+    bottom = tl.where(drawn, bottom, top)
+    tiles = tl.zeros((SPLATS,), tl.int32)
     for step in range(tl.max(bottom - top, axis=0)):
         row = top + step
         first, end = _columns(row, x, y, a, b, c, bound, det, left, right, SIDE)
-        total += tl.where(row < bottom, end - first, 0)
-    tl.store(counts + at, total, mask=valid)
+        tiles += tl.where(row < bottom, end - first, 0)
+    tl.store(counts + at, tiles, mask=valid)
 
 
 @triton.jit(do_not_specialize=["count", "pairs", "width", "height"])
@@ -160,6 +167,7 @@ def tile_lists(
     width: int,
     height: int,
     side: int,
+    colors: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Lists of one camera's tiles. All tensors are dense, of M splats that are all visible.
 
@@ -169,6 +177,7 @@ def tile_lists(
         opacities: that the splats are drawn with, [M].
         width, height: of the image, in tiles; with the row below it has at most 2^15.
         side: of a tile, in pixels.
+        colors: leave out the splats of which one of these, [M, D], or another number is not finite.
 
     Returns:
         Where each tile's splats begin, int32 [1, height + 1, width], the last row for tiles below the image; rows of
@@ -180,8 +189,9 @@ def tile_lists(
     splats = means2d, conics, opacities, radii, order
     if count > 0:
         launch_count(
-            (-(-count // SPLATS), 1, 1), *splats, counts, count, width, height,
-            SPLATS=SPLATS, SIDE=side, RADII=axes, num_warps=max(SPLATS // 32, 1),
+            (-(-count // SPLATS), 1, 1), *splats, counts, conics if colors is None else colors, count, width, height,
+            SPLATS=SPLATS, SIDE=side, RADII=axes, CHANNELS=0 if colors is None else colors.shape[1],
+            num_warps=max(SPLATS // 32, 1),
         )  # fmt: skip
     ends = counts.cumsum(0)
     pairs = int(ends[-1]) if count > 0 else 0
