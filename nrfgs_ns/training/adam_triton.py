@@ -169,3 +169,6 @@ class AdamTable:
             self.copied.record()
         skip = self.never if skip is None else skip
         launch((int(programs.sum()), 1, 1), base, self.device, skip, BLOCK=BLOCK, COLUMNS=COLUMNS, num_warps=WARPS)
+        for tensor in tensors:  # which PyTorch cannot know
+            for written in (tensor.parameter, tensor.mean, tensor.square):
+                torch.autograd.graph.increment_version(written)

@@ -1,16 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lean optimisers step as torch's own."""
 
+import importlib.util
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
+from interpreted import passes_in_the_interpreter
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from torch.amp import GradScaler
 from torch.testing import assert_close
 
 from nrfgs_ns.training.optimizers import LeanOptimizers, fused_adam_step
+
+INTERPRETED = Path(__file__).with_name("adam_interpreted.py")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
+def test_the_kernel_in_the_interpreter():
+    passes_in_the_interpreter(INTERPRETED)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_all_tensors_in_one_kernel_step_as_torchs(monkeypatch):
+    """Forty tensors, more than a launch takes, small and large; and a step that is skipped on the device."""
+    from nrfgs_ns.training import optimizers as module
+
+    shapes = [(1000, 3), (300_000, 7), *[(size,) for size in range(1, 39)]]
+    sides = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        parameters = [torch.nn.Parameter(torch.randn(shape, device="cuda")) for shape in shapes]
+        made = [torch.optim.Adam([p], lr=10.0 ** -(1 + i % 4), eps=1e-15, fused=True) for i, p in enumerate(parameters)]
+        sides.append((parameters, made))
+    for step in range(5):
+        set_gradients(sides, step)
+        verdict = torch.tensor(float(step == 3), device="cuda")
+        for (_, optimizers), mine in zip(sides, (True, False), strict=True):
+            for optimizer in optimizers:
+                optimizer.found_inf = verdict
+                if step == 0 or not mine:
+                    optimizer.step()
+            if step > 0 and mine:
+                with monkeypatch.context() as only:
+                    only.setattr(module, "_step_group", None)
+                    fused_adam_step(optimizers)
+    for mine, theirs in zip(*(side[0] for side in sides), strict=True):
+        assert_close(mine, theirs, rtol=1e-6, atol=1e-7)
+    for mine, theirs in zip(*(side[1] for side in sides), strict=True):
+        assert next(iter(mine.state.values()))["step"] == next(iter(theirs.state.values()))["step"] == 4
 
 
 def twins(**options):
