@@ -231,7 +231,6 @@ def contact_sheet(views: dict[str, list[SeenView]], path: Path, count: int = 3) 
 
     Args:
         views: method -> its test views.
-        path: where the PNG goes.
     """
     nrf, sh = views["nrfgs"], views["nrfgs-sh"]
     chosen = range(0, len(nrf), max(len(nrf) // count, 1))[:count]

@@ -31,12 +31,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def only_one(lock: Path, waiting: str) -> Iterator[None]:
-    """Hold a lock file; waits while another process holds it, and lets go however this one ends.
-
-    Args:
-        lock: the file. It stays.
-        waiting: what is printed before a wait.
-    """
+    """Hold a lock file; waits while another process holds it, and lets go however this one ends."""
     lock.parent.mkdir(parents=True, exist_ok=True)
     with lock.open("w") as file:
         try:

@@ -25,6 +25,7 @@ from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS
 from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
+from nrfgs_ns.training.progress import ProgressLineConfig
 from nrfgs_ns.training.start import know_callers_quickly
 from nrfgs_ns.training.trainer import AVERAGED, NrfgsTrainerConfig
 from nrfgs_ns.viewer.server import LocalViewerConfig
@@ -59,7 +60,8 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
             steps_per_save=2000,
             steps_per_eval_all_images=1000,
             mixed_precision=False,
-            logging=LoggingConfig(profiler="none"),  # its table of durations would end every command
+            # The profiler's table of durations would end every command.
+            logging=LoggingConfig(profiler="none", local_writer=ProgressLineConfig()),
             machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
             pipeline=NrfgsPipelineConfig(model=NrfgsModelConfig(appearance=appearance)),
             optimizers={

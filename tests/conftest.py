@@ -10,9 +10,12 @@ from hypothesis import settings
 settings.register_profile("nrfgs", deadline=None)
 settings.load_profile("nrfgs")
 
-# Modules that tests of several folders share. tests/ itself would let its folders pass for packages of their names, and
+# Modules that several test files share. tests/ itself would let its folders pass for packages of their names, and
 # nerfbaselines for installed.
-sys.path.insert(0, str(Path(__file__).resolve().parent / "helpers"))
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [
+    str(HERE / name) for name in ("helpers", "fixtures", "appearance", "densification", "image", "rasterizer")
+]
 
 from quick_start import keep_what_is_imported, let_go  # noqa: E402
 from without_open3d import hide_open3d, open3d_shown  # noqa: E402

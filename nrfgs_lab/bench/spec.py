@@ -84,7 +84,7 @@ class Spec:
     scenes: list[Scene]
     """data sets"""
     protocols: list[str] = field(default_factory=lambda: [OWN])
-    """densification: splatfacto, original, mcmc, mcmc@BUDGET, or own for no option at all"""
+    """densification: splatfacto, original, consistent, mcmc, mcmc@BUDGET, or own for no option at all"""
     seeds: list[int] = field(default_factory=lambda: [42])
     """--machine.seed of each repetition"""
     steps: int = 30_000
@@ -252,8 +252,9 @@ def protocol_options(protocol: str) -> list[str]:
     name, at, budget = protocol.partition("@")
     if protocol == OWN:
         return []
-    good = name in ("splatfacto", "original", "mcmc") and (not at or (name == "mcmc" and budget.isdigit()))
-    _require(good, f"protocol {protocol!r} is unknown; use splatfacto, original, mcmc, mcmc@BUDGET or own.")
+    known = ("splatfacto", "original", "consistent", "mcmc")
+    good = name in known and (not at or (name == "mcmc" and budget.isdigit()))
+    _require(good, f"protocol {protocol!r} is unknown; use {', '.join(known)}, mcmc@BUDGET or own.")
     return [DENSIFICATION, name, *(["--pipeline.model.splat-budget", budget] if at else [])]
 
 

@@ -63,7 +63,7 @@ class NrfConfig(AppearanceHeadConfig):
     be quieted by the warm-up."""
     opacity_bound: OpacityBound = "straight-through"
     """how base + residual is brought back into [0, 1]. clamp: no gradient beyond the ends. straight-through: the
-    gradient ignores the clamp, so that a splat can come back (measured in docs/stability.md). logit: the residual
+    gradient ignores the clamp, so that a splat can come back (measured in docs/opacity.md). logit: the residual
     is added to the logit. smooth: a clamp with round corners."""
     geometry_gradient: bool = True
     """let direction and distance send gradients to the means and the camera."""

@@ -136,7 +136,10 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         Returns:
             camera [1] on the device, with "cam_idx" in its metadata, and "image" [H, W, 3 or 4], "image_idx", "mask".
         """
-        index = self._next_index()
+        return self.train_view(self._next_index())
+
+    def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
+        """One training camera and its image, as `next_train` gives them, out of turn."""
         return self._view(index), self._image(index)
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:

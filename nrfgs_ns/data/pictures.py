@@ -84,9 +84,7 @@ def smaller_copies(
     filtered (Lanczos; JPEG stays JPEG, of quality 95, the rest is kept without loss), masks are sampled.
 
     Args:
-        paths: the originals.
         sizes: (width, height) of the copies.
-        kind: what the pictures are.
     """
     copies = [_copy_of(path, size, kind) for path, size in zip(paths, sizes, strict=True)]
     missing = [job for job in zip(paths, sizes, copies, strict=True) if not job[2].is_file()]

@@ -60,8 +60,6 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
     Args:
         xyz: points in the world of the cameras, [N, 3].
         cameras: of the training views, [V].
-        names: of their images.
-        source: what the messages begin with.
     """
     points = xyz[:: max(len(xyz) // MOST_POINTS, 1)].float()
     seen = torch.zeros(len(points), dtype=torch.bool)

@@ -71,7 +71,6 @@ def place(
         orientation: nerfstudio's orientation_method.
         centering: nerfstudio's center_method.
         auto_scale: whether the largest coordinate of a camera becomes 1.
-        factor: a further scale.
 
     Returns:
         The poses, float32 [V, 3, 4]; the transform [3, 4] that they were moved by, float64 if they were far from the

@@ -3,6 +3,9 @@
 
 from typing import Any
 
+import torch
+
+from nrfgs_ns.densification.consistent import Consistent
 from nrfgs_ns.densification.gradient import GradientDensification, OriginalDensification, PruneBySeenOpacity
 from nrfgs_ns.densification.mcmc import Mcmc
 from nrfgs_ns.densification.strategy import Densification
@@ -20,13 +23,14 @@ SPLATFACTOS_THRESHOLDS = (
     "split_screen_size",
     "stop_screen_size_at",
 )
-"""Options of the model that only the strategy `splatfacto` reads."""
-READ_BY = {"original": "original", "mcmc": "mcmc", "splat_budget": "mcmc"}
+"""Options of the model that only the strategies `splatfacto` and `consistent` read."""
+READ_BY = {"original": "original", "consistent": "consistent", "mcmc": "mcmc", "splat_budget": "mcmc"}
 """Options of the model that one of the others alone reads -> which."""
 UNREAD = {
-    "splatfacto": ("original", "mcmc", "splat_budget"),
-    "original": (*SPLATFACTOS_THRESHOLDS, "mcmc", "splat_budget"),
-    "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at", "original"),
+    "splatfacto": ("original", "consistent", "mcmc", "splat_budget"),
+    "original": (*SPLATFACTOS_THRESHOLDS, "consistent", "mcmc", "splat_budget"),
+    "consistent": ("original", "mcmc", "splat_budget"),
+    "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at", "original", "consistent"),
 }
 """Options of the model that a strategy does not read, and refuses where they are set."""
 
@@ -42,7 +46,7 @@ def build_densification(config: Any, num_train_images: int, scene_unit: float = 
     Raises:
         InputError: an option is out of range, or belongs to another strategy.
     """
-    makers = {"splatfacto": _splatfacto, "original": _original, "mcmc": _mcmc}
+    makers = {"splatfacto": _splatfacto, "original": _original, "consistent": _consistent, "mcmc": _mcmc}
     if config.densification not in makers:
         raise InputError(
             f"pipeline.model.densification is {config.densification!r}; use one of {', '.join(map(repr, makers))}."
@@ -57,7 +61,28 @@ def build_densification(config: Any, num_train_images: int, scene_unit: float = 
 
 
 def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densification:
-    strategy = PruneBySeenOpacity(
+    return GradientDensification(
+        "splatfacto",
+        _splatfactos_rules(config, num_train_images),
+        config.opacity_seen_by_densification or "base",
+        scene_unit,
+        reset_at_start=True,
+    )
+
+
+def _consistent(config: Any, num_train_images: int, scene_unit: float) -> Densification:
+    config.consistent.check()
+    return Consistent(
+        config.consistent,
+        _splatfactos_rules(config, num_train_images),
+        config.opacity_seen_by_densification or "base",
+        scene_unit,
+        seed=torch.initial_seed(),
+    )
+
+
+def _splatfactos_rules(config: Any, num_train_images: int) -> PruneBySeenOpacity:
+    return PruneBySeenOpacity(
         prune_opa=config.cull_alpha_thresh,
         grow_grad2d=config.densify_grad_thresh,
         grow_scale3d=config.densify_size_thresh,
@@ -73,9 +98,6 @@ def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densif
         absgrad=config.use_absgrad,
         revised_opacity=False,
         verbose=True,
-    )
-    return GradientDensification(
-        "splatfacto", strategy, config.opacity_seen_by_densification or "base", scene_unit, reset_at_start=True
     )
 
 

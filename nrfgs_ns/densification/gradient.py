@@ -127,7 +127,7 @@ class GradientDensification(Densification):
     def _refine(self, step: int, splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
         strategy, state = self.strategy, self.state
-        duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
+        duplicated, split = self._grow(step, splats, optimizers)
         grown = len(splats["means"])
         pruned = strategy._prune_gs(splats, optimizers, state, step)
         if strategy.verbose:
@@ -137,6 +137,10 @@ class GradientDensification(Densification):
             if name in state:
                 state[name].zero_()
         torch.cuda.empty_cache()
+
+    def _grow(self, step: int, splats, optimizers) -> tuple[int, int]:
+        """Grow by gsplat's rules; how many were duplicated, and how many split."""
+        return self.strategy._grow_gs(splats, optimizers, self.state, step)
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         for name, step in self.bounds.items():

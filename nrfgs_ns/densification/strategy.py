@@ -3,7 +3,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, MutableMapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 
-Strategy = Literal["splatfacto", "original", "mcmc"]
+Strategy = Literal["splatfacto", "original", "consistent", "mcmc"]
 OpacitySeen = Literal["base", "peak"]
 
 CHANGE = "opacity_change"
@@ -44,6 +44,34 @@ def seen_with(stored: Tensor, change: Tensor) -> Tensor:
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
 
 
+class Seen(NamedTuple):
+    """What one training view says of the M splats that it sees."""
+
+    rows: Tensor
+    """of the table, int64 [M]"""
+    pixels: Tensor
+    """how much of the picture each is, alpha T summed over pixels, [M]"""
+    wrong: Tensor
+    """the same over wrong pixels alone, [M]"""
+    loss: Tensor
+    """the view's photometric loss, a scalar"""
+
+
+class TrainingViews(Protocol):
+    """What the strategy may ask of a training."""
+
+    def __len__(self) -> int:
+        """How many there are."""
+
+    def look(self, index: int, wrong: float) -> Seen:
+        """Compare one view with its photograph.
+
+        Args:
+            index: of the view.
+            wrong: error above which a pixel is wrong, as a share of the way from the view's smallest to its largest.
+        """
+
+
 class Densification(ABC):
     """What the model asks of a strategy. `state` is all that a continued training needs, and goes into checkpoints."""
 
@@ -61,6 +89,9 @@ class Densification(ABC):
 
     def see_cameras(self, centers: Tensor) -> None:  # noqa: B027  (only some strategies measure by the cameras)
         """Tell the strategy where the training cameras are, [V, 3], before the first step."""
+
+    def see_training_views(self, views: TrainingViews) -> None:  # noqa: B027  (only some strategies look at them)
+        """Give the strategy what it may ask of the training views while it refines, before the first step."""
 
     def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
         """Look at a training view before the loss goes backward.

@@ -59,7 +59,6 @@ def send_to_cameras(
 
     Args:
         projection: this device's splats in all W cameras, camera i being that of device i; M rows.
-        appearance: what the head says about each row.
         width, height: size of this device's own camera, pixels.
         absgrad: let the backward pass leave `projection.means2d.absgrad`, [M, 2].
 

@@ -76,12 +76,7 @@ def check_devices(config: TrainerConfig) -> None:
 
 
 def explain(error: Exception, config: TrainerConfig) -> str:
-    """What happened to a process, and how to go on.
-
-    Args:
-        error: a ProcessExitedException or ProcessRaisedException of torch.multiprocessing.
-        config: of the training.
-    """
+    """What happened to a process, and how to go on."""
     machine = config.machine
     device = machine.machine_rank * machine.num_devices + error.error_index
     if isinstance(error, ProcessExitedException):
@@ -115,7 +110,6 @@ def launch(config: TrainerConfig, timeout: timedelta = TIMEOUT) -> None:
 
     Args:
         config: of the training, whose config.yml has been saved.
-        timeout: longest that a device waits for another.
 
     Raises:
         InputError: this machine has fewer GPUs, or several machines have no address to meet at.
@@ -167,11 +161,7 @@ def join_group(
     """Meet the other processes: NCCL on GPUs, gloo on CPUs.
 
     Args:
-        rank: this process's number among all.
-        world: number of processes W.
-        url: where they meet, as torch.distributed reads it.
         device_type: "cuda" or "cpu".
-        timeout: longest that a device waits for another.
         per_machine: processes on each machine; None: there is one machine.
     """
     per_machine = per_machine or world

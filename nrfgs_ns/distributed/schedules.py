@@ -41,7 +41,6 @@ def with_fewer_steps(config: Any, devices: int) -> Any:
 
     Args:
         config: an NrfgsTrainerConfig, for one device; stays what it is.
-        devices: W.
     """
     model = config.pipeline.model
     head = model.appearance

@@ -33,9 +33,7 @@ def rows_of(rank: int, total: int, devices: int, written: list[int] | None = Non
     training goes on as if it had not been interrupted.
 
     Args:
-        rank: of the device.
         total: rows N of the table.
-        devices: W.
         written: rows of each device that wrote the table, if it is known.
     """
     if written is not None and len(written) == devices and sum(written) == total:
@@ -57,7 +55,6 @@ def cut_model_state(state: Mapping[str, Any], rows: slice) -> dict[str, Any]:
 
     Args:
         state: of a whole model, as `NrfgsModel.state_dict` gives it.
-        rows: of the device.
     """
     total = len(state[f"{PREFIX}means"])
     cut = {name: value[rows] if name.startswith(PREFIX) else value for name, value in state.items()}
@@ -80,7 +77,6 @@ def gather_model_state(state: MutableMapping[str, Any], counts: list[int], prefi
 
     Args:
         state: of the pipeline; changes.
-        counts: every device's splats.
         prefix: of the model's entries in it.
     """
     for name in [name for name in state if name.startswith(prefix + PREFIX)]:
@@ -132,9 +128,7 @@ def rebalance(
 
     Args:
         splats: this device's table; entries are replaced.
-        optimizers: of each entry, by its name.
         state: densification's; entries with a row per splat are replaced.
-        counts: every device's splats.
 
     Returns:
         Every device's splats now.

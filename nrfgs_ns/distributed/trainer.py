@@ -4,6 +4,7 @@ main one writes checkpoints of the whole."""
 
 import math
 import random
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -14,13 +15,14 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
+from torch.optim import Optimizer
 
 from nrfgs_ns.distributed import comm
-from nrfgs_ns.distributed.averaging import ShardedMean
 from nrfgs_ns.distributed.pipeline import ShardedPipeline
 from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import cut_optimizer_state, gather_model_state, gather_optimizer_state
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, WatchedOptimizers
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 from nrfgs_ns.training.stopping import StopRequest
@@ -32,13 +34,52 @@ WITHOUT_VIEWER = {"viewer": "tensorboard", "viewer_legacy": "tensorboard"}
 """What `--vis` becomes: the viewer renders when it likes, and a rendering takes all devices."""
 
 
+class ShardedMean(ParameterMean):
+    """`ParameterMean` of one device's splats and of the shared weights. All but `install` and `state` must be called on
+    all devices, and all begin anew where one must: shared weights stay the same, and a checkpoint has one mean."""
+
+    def _is_of(self, parameters: Mapping[str, Tensor]) -> bool:
+        """Whether on all devices these very objects are those that it is the mean of. The host waits for the answer."""
+        here = super()._is_of(parameters)
+        return all(comm.gather_counts(int(here), next(iter(parameters.values())).device))
+
+    def whole_state(self, model, optimizers: Mapping[str, Optimizer]) -> dict[str, Any]:
+        """What a checkpoint of the whole must hold.
+
+        Args:
+            model: a ShardedModel, whose splats have been counted.
+
+        Returns:
+            "parameter_mean", `state` with the rows of all devices on the main one, None for the splats' rows elsewhere.
+            Nothing where any device has other splats than those that it is the mean of: the guard has taken some out.
+        """
+        if not self.is_current(model, optimizers):
+            return {}
+        state = self.state()
+        for name, mean in state["means"].items():
+            if _is_per_splat(name, model):
+                state["means"][name] = comm.gather_rows(mean, model.counts)
+        return {"parameter_mean": state}
+
+    def load_state(self, state: Mapping[str, Any], model, optimizers: Mapping[str, Optimizer]) -> None:
+        """Go on from this device's rows of a whole checkpoint's `state`; see `ParameterMean.load_state`."""
+        means, total = dict(state["means"]), sum(model.counts)
+        for name, mean in means.items():
+            if _is_per_splat(name, model):
+                if len(mean) != total:  # its rows could fit one device and not another
+                    return
+                means[name] = mean[model.loaded].contiguous()
+        super().load_state({**state, "means": means}, model, optimizers)
+
+
+def _is_per_splat(name: str, model) -> bool:
+    """Whether a parameter, by its group and its place in it, has a row for each splat."""
+    return name.rpartition(".")[0] in model.gauss_params
+
+
 class ShardedGuard(Guard):
     """The guard of one device. What one device finds stops all of them, at the same step and with one message; so does
     a signal that one of them has heard.
-
-    Args:
-        pipeline: as for `Guard`.
-        request: what signals have asked this device for.
     """
 
     def __init__(self, pipeline, request: StopRequest):
@@ -123,11 +164,6 @@ class ShardedOptimizers(WatchedOptimizers):
 
 class ShardedTrainer(NrfgsTrainer):
     """The trainer of one device.
-
-    Args:
-        config: of the training, as for one device.
-        local_rank: the device's number on its machine.
-        world_size: number of devices W on all machines.
 
     Raises:
         InputError: an option cannot be had on several devices.

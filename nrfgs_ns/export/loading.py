@@ -28,7 +28,6 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     """A finished training, set up as by nerfstudio's `eval_setup`; but its config.yml runs no code.
 
     Args:
-        path: its config.yml.
         mode: "test" reads the test images; "inference" none, and fits harmonics to the head.
 
     Raises:

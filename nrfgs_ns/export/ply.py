@@ -23,8 +23,8 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole, write_whole
 
 if TYPE_CHECKING:  # nerfstudio takes seconds to import: `nrfgs --help` answers at once
+    from nrfgs_ns.export.command import PlyOptions
     from nrfgs_ns.export.frames import Similarity
-    from nrfgs_ns.export.ply_options import PlyOptions
     from nrfgs_ns.model.harmonics_fit import PlainSplats
 
 PROPERTIES = (
@@ -122,11 +122,6 @@ def write_splats(splats: "PlainSplats", path: Path, comments: Sequence[str] = ()
 
     Splats that are not finite or too faint to be drawn are left out.
 
-    Args:
-        splats: the splats, in the file's world.
-        path: the file.
-        comments: lines for its header.
-
     Returns:
         How many were written.
 
@@ -203,10 +198,8 @@ def render_splats(
 
     Args:
         splats: on one device, which picks the rasterizer's back end.
-        camera: nerfstudio's, a batch of one.
         background: a colour [3].
         rasterize_mode: as the model was trained.
-        scene_unit: as in `Projecting`.
 
     Returns:
         [H, W, 3] in [0, 1].
@@ -228,7 +221,6 @@ def on_screen(means: Tensor, camera) -> Tensor:
 
     Args:
         means: [N, 3].
-        camera: nerfstudio's, a batch of one.
 
     Returns:
         bool [N].

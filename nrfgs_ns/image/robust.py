@@ -52,6 +52,12 @@ class Trimming(nn.Module):
         error = (prediction - truth).abs().mean(dim=-1)
         counted = error if mask is None else torch.where(mask[..., 0] >= 0.5, error, -1.0)  # beyond the bins
         self.histogram.mul_(MEMORY).add_(torch.histc(counted, BINS, 0.0, 1.0))
+        return self.kept(prediction, truth)
+
+    @torch.no_grad()
+    def kept(self, prediction: Tensor, truth: Tensor) -> Tensor:
+        """As `forward`, by the residuals remembered, without remembering these."""
+        error = (prediction - truth).abs().mean(dim=-1)
         reached = self.histogram.cumsum(0) >= (1.0 - self.share) * self.histogram.sum()
         threshold = (BINS - reached.sum() + 1) / BINS
         kept = (error <= threshold).to(prediction.dtype)

@@ -49,10 +49,6 @@ class View:
 def view_file(path: Path, config):
     """Nerfstudio's viewer for a compact file alone: no photographs, no training.
 
-    Args:
-        path: the file.
-        config: a LocalViewerConfig.
-
     Returns:
         the viewer.
     """

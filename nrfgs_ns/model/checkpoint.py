@@ -28,7 +28,6 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
     """Refuse a checkpoint that this model cannot hold.
 
     Args:
-        model: an NrfgsModel.
         state: the checkpoint's state of the model. Tensors under "gauss_params." may have any number of rows.
 
     Raises:

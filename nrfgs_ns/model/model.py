@@ -29,6 +29,7 @@ from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import (
+    ConsistentDensification,
     McmcDensification,
     OpacitySeen,
     OriginalDensification,
@@ -44,6 +45,7 @@ from nrfgs_ns.model.checkpoint import check_compatible, reduced_config
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.pinhole import FixedPinholes, Pinhole, pinhole
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
+from nrfgs_ns.model.training_views import ComparedViews
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 
@@ -70,8 +72,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     warmup_lr: float = 1e-3
     """learning rate of the warm-up's Adam"""
     densification: Strategy = "splatfacto"
-    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
-    splat_budget"""
+    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. consistent: splatfacto's, where
+    several training views agree. mcmc: 3DGS-MCMC, up to splat_budget"""
     splat_budget: int = 1_000_000
     """mcmc: the number of splats that it grows to and keeps"""
     opacity_seen_by_densification: OpacitySeen | None = None
@@ -79,6 +81,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     since the last refinement would show. None: peak for mcmc, base for the others"""
     original: OriginalDensification = field(default_factory=OriginalDensification)
     """thresholds of the densification 'original'"""
+    consistent: ConsistentDensification = field(default_factory=ConsistentDensification)
+    """what the densification 'consistent' adds to splatfacto's rules"""
     mcmc: McmcDensification = field(default_factory=McmcDensification)
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
@@ -277,6 +281,23 @@ class NrfgsModel(SplatfactoModel):
             self._finish_for_training(outputs, camera, background)
         return outputs
 
+    def against_photograph(
+        self, camera: Cameras, batch: Mapping[str, Any], view: View, appearance: SplatAppearance
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """A training view as `get_outputs` renders it, on a background that does not change, and its photograph.
+
+        Args:
+            camera, batch: as the datamanager gives them.
+            view, appearance: what the camera sees, and as what.
+
+        Returns:
+            Outputs, with "rgb" [H, W, 3], and the photograph [H, W, 3] at that size.
+        """
+        background = self.background_color.to(self.device)
+        outputs, _ = self.composite(view, appearance, background, self._photograph_of(camera))
+        self._finish_for_training(outputs, camera, background)
+        return outputs, self.truth_of(batch, background)
+
     def _photograph_of(self, camera: Cameras) -> int | None:
         """Which photograph's look a rendering has: in training, the one that the camera took; None: the mean look."""
         if self.photograph is None:
@@ -416,6 +437,7 @@ class NrfgsModel(SplatfactoModel):
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
         self.densification.see_cameras(centers)
+        self.densification.see_training_views(ComparedViews(self, attributes.pipeline.datamanager))
         self.camera_spacing = camera_spacing(centers)
         self.view_noise.sigma = self.config.view_noise * self.camera_spacing / math.sqrt(3.0)
 

@@ -84,7 +84,6 @@ class ViewNoise:
 
         Args:
             splats: the table; itself is returned if there is no noise.
-            step: training step.
         """
         if self.sigma == 0.0:
             return splats

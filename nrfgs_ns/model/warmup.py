@@ -18,7 +18,6 @@ def warm_up(model, cameras: Cameras, steps: int, lr: float) -> None:
         model: an NrfgsModel in training mode.
         cameras: the training cameras, [V]; step i looks through camera i mod V.
         steps: how many steps, >= 0.
-        lr: learning rate.
     """
     weights = list(model.head.parameters())
     if steps <= 0 or not weights:

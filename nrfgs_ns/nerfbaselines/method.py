@@ -41,7 +41,6 @@ class Nrfgs:
     """`ns-train nrfgs`.
 
     Args:
-        checkpoint: a folder that `save` wrote, to render or to go on from.
         train_dataset: nerfbaselines' data set with its images; only rendering can do without.
         config_overrides: options of `ns-train`, with their dots: {"pipeline.model.appearance.latent_dim": 16}. Not
             read with a checkpoint, which has its own.
@@ -163,7 +162,6 @@ class Nrfgs:
         """Render one camera of the data set's world.
 
         Args:
-            camera: nerfbaselines' pinhole camera, one.
             options: "outputs" names what is wanted; all, if it is not there.
 
         Returns:
@@ -213,40 +211,12 @@ class Nrfgs:
             self.folder.cleanup()
 
 
-class NrfgsFast(Nrfgs):
-    """`ns-train nrfgs-fast`."""
-
-    method = "nrfgs-fast"
+def _method(name: str) -> type[Nrfgs]:
+    return type(f"Nrfgs{name.title()}", (Nrfgs,), {"method": f"nrfgs-{name}", "__doc__": f"`ns-train nrfgs-{name}`."})
 
 
-class NrfgsBest(Nrfgs):
-    """`ns-train nrfgs-best`."""
-
-    method = "nrfgs-best"
-
-
-class NrfgsSh(Nrfgs):
-    """`ns-train nrfgs-sh`."""
-
-    method = "nrfgs-sh"
-
-
-class NrfgsVdgs(Nrfgs):
-    """`ns-train nrfgs-vdgs`."""
-
-    method = "nrfgs-vdgs"
-
-
-class NrfgsGsnb(Nrfgs):
-    """`ns-train nrfgs-gsnb`."""
-
-    method = "nrfgs-gsnb"
-
-
-class NrfgsSg(Nrfgs):
-    """`ns-train nrfgs-sg`."""
-
-    method = "nrfgs-sg"
+NrfgsFast, NrfgsBest, NrfgsSh = map(_method, ("fast", "best", "sh"))
+NrfgsVdgs, NrfgsGsnb, NrfgsSg = map(_method, ("vdgs", "gsnb", "sg"))
 
 
 def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) -> NrfgsTrainerConfig:

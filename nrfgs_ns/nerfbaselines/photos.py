@@ -110,8 +110,6 @@ def hold_in_memory(config: NrfgsDatamanagerConfig, dataset: dict[str, Any], worl
 
     Args:
         config: changed in place: its classes are replaced.
-        dataset: nerfbaselines' data set, with its images.
-        world: where to put its cameras and points.
 
     Raises:
         InputError: a camera is not a pinhole, or an option asks for what nerfbaselines has done already.

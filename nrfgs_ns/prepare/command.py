@@ -209,11 +209,7 @@ class Run:
         """One stage, with a progress bar.
 
         Args:
-            slot: its name in state.json, one of STAGES.
-            name: what is shown.
             made: what the stage writes; removed where it belongs to another input or other options.
-            total: steps of the bar.
-            depends_on: the options that matter to this stage.
 
         Yields:
             What advances the bar by a number of steps, or None if the stage is done already.

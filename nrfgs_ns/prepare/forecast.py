@@ -30,7 +30,6 @@ def still_to_do(sizes: Sizes, features: list[int], pairs: Pairs) -> float:
     """The cost of all that comes after the choice of pairs.
 
     Args:
-        sizes: of the photographs.
         features: how many each has.
         pairs: which will be matched.
     """

@@ -139,7 +139,6 @@ def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path,
     """Match and verify pairs of photographs.
 
     Args:
-        folder: for the list of pairs that COLMAP reads.
         advance: called with the number of pairs that were done.
 
     Returns:

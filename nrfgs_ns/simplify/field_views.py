@@ -154,7 +154,6 @@ def slim(
     Args:
         lowest_psnr: on the views, dB.
         threshold, rank: not to be looked for.
-        on_trial: told what is tried next.
     """
     if threshold is None:
         spare = views.psnr(field) - lowest_psnr

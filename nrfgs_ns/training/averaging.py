@@ -41,12 +41,7 @@ class ParameterMean:
 
     @torch.no_grad()
     def add(self, model, optimizers: Mapping[str, Optimizer]) -> None:
-        """Take the parameters as they are now into the mean.
-
-        Args:
-            model: an NrfgsModel in training.
-            optimizers: by group.
-        """
+        """Take the parameters as they are now into the mean."""
         parameters = _parameters(optimizers)
         if not self._is_of(parameters):
             self.began_anew = self.began_anew or self.count > 0
@@ -67,12 +62,7 @@ class ParameterMean:
         return {"count": self.count, "began_anew": self.began_anew, "means": dict(self._means)}
 
     def load_state(self, state: Mapping[str, Any], model, optimizers: Mapping[str, Optimizer]) -> None:
-        """Go on from a checkpoint's `state`, whose parameters have been loaded. A mean of others is left.
-
-        Args:
-            state: of the checkpoint.
-            model, optimizers: as for `add`.
-        """
+        """Go on from a checkpoint's `state`, whose parameters have been loaded. A mean of others is left."""
         parameters = _parameters(optimizers)
         shapes = {name: parameter.shape for name, parameter in parameters.items()}
         if {name: mean.shape for name, mean in state["means"].items()} != shapes:
@@ -95,8 +85,6 @@ def tell(count: int, window: int, began_anew: bool) -> None:
     """Say what a trained model is the mean of.
 
     Args:
-        count: steps that are in the mean.
-        window: steps that were asked for.
         began_anew: whether it is so few because splats or the field have changed.
     """
     steps = "the last step" if count == 1 else f"the last {count} steps"
@@ -105,12 +93,7 @@ def tell(count: int, window: int, began_anew: bool) -> None:
 
 
 def tell_why_not(window: int, why: str) -> None:
-    """Say that a trained model is the last step's, though a mean was asked for.
-
-    Args:
-        window: steps that were asked for.
-        why: the reason.
-    """
+    """Say that a trained model is the last step's, though a mean was asked for."""
     CONSOLE.print(
         f"[bold yellow]average_steps is {window}, but nothing was averaged: {why}. The model is the last step's.",
         soft_wrap=True,

@@ -64,9 +64,6 @@ def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = 
 
     Args:
         folder: of the checkpoints; made if it is not there.
-        step: that the file is named after.
-        content: numbers, strings, tensors, and lists, tuples and dictionaries of them.
-        only_latest: remove all but the last `KEPT`.
 
     Raises:
         DiskFull: there was no room.
@@ -146,10 +143,6 @@ def read_or_refuse(path: Path) -> dict[str, Any]:
 
 def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, Any]]:
     """Read a folder's last checkpoint; where that is damaged the one before, with a warning.
-
-    Args:
-        folder: of the checkpoints.
-        step: read this one and no other.
 
     Raises:
         InputError: there is none, or none that can be read.

@@ -35,9 +35,6 @@ PATHS = {
 def read_config(path: Path) -> TrainerConfig:
     """The configuration of a training.
 
-    Args:
-        path: the config.yml that the training saved.
-
     Raises:
         InputError: there is no such file, it is no configuration, or it names what is none.
     """

@@ -41,9 +41,6 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
 def far_below(images: Sequence[Mapping[str, Any]]) -> list[tuple[str, float, float]]:
     """Views whose PSNR is far below that of the rest, the worst first.
 
-    Args:
-        images: "image" and "psnr" of each view.
-
     Returns:
         name, PSNR and the median of all, for each.
     """

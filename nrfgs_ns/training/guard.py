@@ -50,9 +50,6 @@ class TrainingStopped(ForTheUser, RuntimeError):
     """A training cannot go on: it met a number that is not finite, sees nothing, or its memory has run out.
 
     Args:
-        message: what was met, where, and the likely cause.
-        step: the condemned step.
-        origin: where it was met first.
         savable: whether the state that is left is good.
     """
 
@@ -78,11 +75,7 @@ class Verdict:
 
 
 class Guard:
-    """Watches one training.
-
-    Args:
-        pipeline: nerfstudio's pipeline around an NrfgsModel.
-    """
+    """Watches one training."""
 
     def __init__(self, pipeline):
         self.pipeline = pipeline
@@ -120,7 +113,6 @@ class Guard:
         """Look at image, losses and gradients, and condemn the step if one is not finite.
 
         Args:
-            optimizers: those about to step.
             gradients_are_scaled: a GradScaler is at work, which meets infinite gradients as a matter of course and
                 skips such steps itself: only the image and the losses are looked at.
 
@@ -241,14 +233,7 @@ class Guard:
 
 
 class WatchedOptimizers(LeanOptimizers):
-    """The optimisers; each step is shown to the guard first.
-
-    Args:
-        config: optimiser configurations by group, as nerfstudio passes them.
-        param_groups: parameters by group.
-        guard: whom to ask.
-        steps_per_log, pace: as for `LeanOptimizers`.
-    """
+    """The optimisers; each step is shown to the guard first."""
 
     def __init__(
         self,
@@ -277,7 +262,6 @@ def remove_splats(model, optimizers: Mapping[str, torch.optim.Optimizer], bad: T
     """Take splats out of the parameters, out of their optimisers' moments and out of densification's statistics.
 
     Args:
-        model: an NrfgsModel.
         optimizers: by group; those of `gauss_params` among them.
         bad: bool [N].
     """

@@ -31,13 +31,7 @@ class Finding:
 
 
 def report(pipeline, step: int, findings: list[Finding], limit: float) -> str:
-    """The whole message.
-
-    Args:
-        pipeline: nerfstudio's pipeline around an NrfgsModel.
-        findings: at least one.
-        limit: largest absolute value that is let through.
-    """
+    """The whole message."""
     model = pipeline.model
     first = findings[0]
     others = ", ".join(finding.name for finding in findings[1:4]) + (", ..." if len(findings) > 4 else "")

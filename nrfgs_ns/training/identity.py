@@ -48,11 +48,7 @@ FAR = 0.01
 
 
 def options_of(config: Any) -> dict[str, str]:
-    """Every option of a training that its numbers may depend on.
-
-    Args:
-        config: an NrfgsTrainerConfig.
-    """
+    """Every option of a training that its numbers may depend on."""
     parts = {"pipeline": config.pipeline, "optimizers": config.optimizers}
     steps = ("schedule_steps", "time_budget", "average_steps", "max_num_iterations", "gradient_accumulation_steps")
     parts |= {name: getattr(config, name) for name in steps}
@@ -64,19 +60,13 @@ def scene_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
     """What tells a data set from others.
 
     Args:
-        names: of the training images' files, without folders.
         cameras: theirs, [V].
     """
     return {"images": names, "centers": cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()}
 
 
 def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: object) -> None:
-    """Raise InputError where a checkpoint was trained on another data set.
-
-    Args:
-        written, here: of `scene_of`.
-        data: how the data set is called.
-    """
+    """Raise InputError where a checkpoint was trained on another data set."""
     fix = "Go on with the data set that it was trained on, or train anew."
     gone, new = ([name for name in a if name not in b] for a, b in _pairs(written["images"], here["images"]))
     if gone or new or len(written["images"]) != len(here["images"]):
@@ -96,9 +86,6 @@ def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: objec
 
 def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
     """Compare a checkpoint's options with this training's. Options that one of the versions lacks are let be.
-
-    Args:
-        written, here: of `options_of`.
 
     Returns:
         Those that changed and may, as "name: old -> new".

@@ -41,11 +41,7 @@ steps."""
 
 
 def steps_for(views: int) -> int:
-    """How many steps suit a capture: few views are learnt by heart in many.
-
-    Args:
-        views: number of training views.
-    """
+    """How many steps suit a capture: few views are learnt by heart in many."""
     return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), STEPS)
 
 
@@ -53,7 +49,6 @@ class Pace:
     """A constant rate.
 
     Args:
-        length: L, steps of the training that the schedules are laid out for.
         rate: positions for each step, positive.
     """
 
@@ -77,7 +72,6 @@ class Pace:
         """The step of this training at which a position is reached, as things look now.
 
         Args:
-            position: on the schedules.
             now: the step whose position is `self.position`.
 
         Returns:
@@ -99,7 +93,6 @@ class TimedPace(Pace):
     """A rate that lets the schedules end when the time does.
 
     Args:
-        length: L, as above.
         seconds: the budget, positive, from the start of training to the end of its last step: warm-up, evaluations
             and checkpoints in between and time in which the viewer pauses it are part of it.
         phases: pairs (position at which the phase ends, cost of a step in it), in order; the last one has no end
@@ -192,7 +185,6 @@ def resolution_phases(num_downscales: int, resolution_schedule: int) -> list[tup
 
     Args:
         num_downscales: how many times the resolution doubles.
-        resolution_schedule: positions between two doublings.
     """
     rising = [
         (float((done + 1) * resolution_schedule), COST_OF_HALF_RESOLUTION ** (num_downscales - done))

@@ -111,7 +111,6 @@ class NrfgsPipeline(VanillaPipeline):
 
         Args:
             step: unused; nerfstudio passes it.
-            output_path: folder for the pictures, truth and rendering side by side, if they are wanted.
             get_std: also report deviations, nulls and each image's values (what `ns-eval` writes); without it only
                 numbers, which a tensorboard can show.
 

@@ -62,7 +62,6 @@ def train(
     """Run `ns-train ARGS` in this process.
 
     Args:
-        args: the command line after `ns-train`.
         on_step: called after each step with its number, for progress bars.
         on_save: called before each checkpoint is written, with the record of the training until then.
         earlier: the record until the checkpoint that `args` continue from; the result is that of the whole training.

@@ -29,9 +29,6 @@ TO_LOAD = ("--load-dir", "--load-checkpoint", "--load-step")
 class StopRequest:
     """What signals have asked for.
 
-    Args:
-        quiet: say nothing on the terminal: another process does.
-
     Attributes:
         signal: the first that was heard; None: the training goes on.
         is_over: whether the training has ended, so that signals end the process as usual.
@@ -94,7 +91,6 @@ def rows_agree(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]
     """Whether a state that was interrupted anywhere is one: each splat has a row in every tensor.
 
     Args:
-        splats: the table.
         optimizers: by group; those of `splats` among them.
         counted: densification's statistics; tensors with a row for each splat, or others.
     """
@@ -112,12 +108,7 @@ def rows_agree(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]
 
 
 def command_to_go_on(folder: Path, method: str) -> str:
-    """The command that goes on from a folder's last checkpoint: this process's own, if it is `ns-train`'s.
-
-    Args:
-        folder: of the checkpoints.
-        method: the registered method's name.
-    """
+    """The command that goes on from a folder's last checkpoint: this process's own, if it is `ns-train`'s."""
     words, load = sys.argv[1:], ["--load-dir", str(folder)]
     program = "ns-train" if Path(sys.argv[0]).name != "launch.py" else "python -m nrfgs_ns.distributed.launch"
     if words[:1] != [method]:  # a program of another kind

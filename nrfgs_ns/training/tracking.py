@@ -48,7 +48,6 @@ def track(model: NrfgsModel, camera: Cameras, step: int, pictures: bool) -> None
     Args:
         model: in evaluation mode.
         camera: a batch of one camera, [1].
-        step: training step, on the logs' horizontal axis.
         pictures: whether to render the base colours and each component, too.
     """
     field = model.field

@@ -42,6 +42,7 @@ from nrfgs_ns.training.pace import (
     resolution_phases,
     steps_for,
 )
+from nrfgs_ns.training.progress import ProgressLine
 from nrfgs_ns.training.stopping import (
     StopRequest,
     command_to_go_on,
@@ -110,6 +111,12 @@ class NrfgsTrainerConfig(TrainerConfig):
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise InputError(f"{name} is {value}; it must be zero or positive.")
+        if devices > 1 and self.pipeline.model.densification == "consistent":
+            raise InputError(
+                "pipeline.model.densification is 'consistent', which is for one device: it compares whole pictures "
+                "with their photographs, and here each device has a part of the splats. Use 'splatfacto', 'original' "
+                "or 'mcmc', or --machine.num-devices 1."
+            )
         scale = self.pipeline.datamanager.camera_res_scale_factor
         if not 0 < scale < math.inf:
             raise InputError(f"pipeline.datamanager.camera_res_scale_factor is {scale}; it must be positive.")
@@ -120,11 +127,7 @@ class NrfgsTrainerConfig(TrainerConfig):
             checkpoint_files.checkpoints_in(self.load_dir)
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
-        """The configuration with what is left open chosen: steps, schedules and mean of a training on one device.
-
-        Args:
-            views: number of training views.
-        """
+        """The configuration with what is left open chosen: steps, schedules and mean of a training on one device."""
         if self.max_num_iterations > 0:
             return replace(self, average_steps=self.average_steps or 0)
         return replace(
@@ -181,9 +184,6 @@ def _absolute(path: Path | None) -> Path | None:
 def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
     """Take back the config.yml that ns-train saves before it reads the data, with the folders that this leaves empty,
     where the training is refused before it has written anything else.
-
-    Args:
-        config: of the training.
     """
     try:
         yield
@@ -216,6 +216,7 @@ class NrfgsTrainer(Trainer):
 
     Attributes:
         total_steps: steps of the whole training, those before a checkpoint included.
+        line: what the terminal shows while it trains; None: nothing, or nerfstudio's table.
         pace: how fast the training walks through its schedules; None: a step is a step.
         steps_are_chosen: whether the number of training views says how many steps are made.
         mean: of the parameters over the last steps; None if none was asked for.
@@ -260,6 +261,9 @@ class NrfgsTrainer(Trainer):
         except KeyboardInterrupt:
             NrfgsTrainer._end(self, NOTHING_TO_SAVE, 130)
         writer.GLOBAL_BUFFER["max_iter"] = self.total_steps
+        self.line = next((one for one in writer.EVENT_WRITERS if isinstance(one, ProgressLine)), None)
+        if self.line is not None and self.world_size == 1:  # with several, no device can draw alone
+            self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last step that was made"""
         if comms.is_main_process():
@@ -423,6 +427,8 @@ class NrfgsTrainer(Trainer):
                 super().train()
         finally:
             gc.unfreeze()
+            if self.line is not None:
+                self.line.close()
 
     def _update_viewer_state(self, step: int) -> None:
         """Nerfstudio's, and fewer events: it would send each step's duration to the log, which takes the host longer
@@ -434,8 +440,10 @@ class NrfgsTrainer(Trainer):
     @check_eval_enabled
     def eval_iteration(self, step: int) -> None:
         """Nerfstudio's, and a look at the appearance head whenever test images are looked at."""
-        super().eval_iteration(step)
         pictures = step_check(step, self.config.steps_per_eval_all_images)
+        if pictures and self.line is not None:
+            self.line.step_aside()  # the evaluation shows how far it is itself
+        super().eval_iteration(step)
         if pictures or step_check(step, self.config.steps_per_eval_image):
             self.pipeline.eval()
             camera = self.pipeline.datamanager.eval_dataset.cameras[:1].to(self.device)
@@ -494,6 +502,8 @@ class NrfgsTrainer(Trainer):
             tell_why_not(self.config.average_steps, "the training was stopped before its last step")
         else:
             self.take_the_mean()
+        if self.line is not None:
+            self.line.finish(self._made)
         super()._after_train()
 
     def _stop_as_asked(self) -> None:
@@ -591,9 +601,6 @@ class NrfgsTrainer(Trainer):
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint of finite numbers. Where the disk is full the training goes on, with a warning.
 
-        Args:
-            step: training step that the checkpoint is named after.
-
         Raises:
             TrainingStopped: there is a number that is not finite; what is good has been written.
             DiskFull: at the end of the training.
@@ -622,9 +629,6 @@ class NrfgsTrainer(Trainer):
 
     def _write_checkpoint(self, step: int) -> None:
         """Write a checkpoint (`checkpoint_files`).
-
-        Args:
-            step: training step that the checkpoint is named after.
 
         Raises:
             DiskFull: there is no room.

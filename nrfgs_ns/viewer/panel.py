@@ -103,9 +103,6 @@ class ViewerPanel(ViewerControl):
     def _welcome(self, client) -> None:
         """Let a browser begin where the first of the training photographs was taken: nerfstudio's own first view may
         see nothing at all. A little in front of it, so that the photograph, which hangs there, hides nothing.
-
-        Args:
-            client: who has come.
         """
         taken = list(getattr(self.viewer, "camera_handles", {}).values())
         if not taken:  # the scene is not there yet: the first picture that is asked for is early enough
@@ -144,7 +141,6 @@ class ViewerPanel(ViewerControl):
 
         Args:
             camera: a batch of one camera, [1].
-            obb_box: the viewer's crop.
 
         Returns:
             As `picture`.

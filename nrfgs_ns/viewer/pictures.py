@@ -95,7 +95,6 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
     Args:
         model: in evaluation mode.
         camera: a batch of one camera, [1].
-        shown: what to show.
         background: a colour [3] behind the splats instead of the configuration's.
 
     Returns:

@@ -145,12 +145,7 @@ class GuardedServer(infra.WebsockServer):
         super()._background_worker(ready_sem)
 
     def refusal(self, path: str, headers) -> tuple[HTTPStatus, dict, bytes] | None:
-        """The answer to a request that is not served, None for the others.
-
-        Args:
-            path: as it stands in the request's first line.
-            headers: the request's.
-        """
+        """The answer to a request that is not served, None for the others."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._known(hosts[0]):
             sentence = "Not served under this name. Open the viewer as http://localhost:PORT or by the address."

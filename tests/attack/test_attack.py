@@ -59,9 +59,7 @@ def test_the_attack_tells_outcomes_apart(tmp_path):
     assert [outcome.kind for outcome in attempts([good, deadly, good])] == ["read", "hang", "read"]
 
 
-def test_the_page_shows_the_tables():
-    root = Path(__file__).resolve().parents[2]
-    record = json.loads((root / "results" / "attack.json").read_text())
-    page = (root / "docs" / "stability.md").read_text()
-    assert record["before"]["table"] in page and record["after"]["table"] in page
-    assert set(record["after"]["areas"]) <= set(AREAS)
+def test_the_record_is_of_these_areas_and_nothing_got_through():
+    record = json.loads((Path(__file__).resolve().parents[2] / "results" / "attack.json").read_text())["after"]
+    assert set(record["areas"]) <= set(AREAS)
+    assert all(not area["did not hold"] for area in record["areas"].values())

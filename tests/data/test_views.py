@@ -1,9 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Some views of many."""
+"""Some views of many; and a scene must train alike whatever it is measured in."""
+
+from dataclasses import dataclass, replace
 
 import pytest
+import torch
+from hard_trainings import rescale
+from nerfstudio.scripts.train import _set_random_seed
 
-from nrfgs_ns.data.views import evenly_spaced
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.vdgs import VdgsConfig
+from nrfgs_ns.data.views import evenly_spaced, scene_unit
+from nrfgs_ns.scenes import SceneConfig, write_scene
+from nrfgs_ns.training.optimizers import in_world_units
+from nrfgs_ns.training.run import parse
 
 
 @pytest.mark.parametrize(
@@ -11,3 +21,115 @@ from nrfgs_ns.data.views import evenly_spaced
 )
 def test_evenly_spaced(total, wanted, expected):
     assert evenly_spaced(total, wanted) == expected
+
+
+@pytest.mark.parametrize("reach", [1e-9, 1e-3, 0.3, 3.0, 1e3, 1e9])
+def test_the_unit_is_the_power_of_two_next_to_the_reach_of_the_cameras(reach):
+    positions = torch.randn(50, 3)
+    positions -= positions.mean(0)
+    positions *= reach / positions.abs().max()
+    unit = scene_unit(positions + 1e6 * reach)  # wherever they are
+    assert 2**-0.51 <= unit / reach <= 2**0.51 and torch.tensor(unit).log2() % 1 == 0
+
+
+def test_scaled_cameras_are_left_alone():
+    positions = torch.rand(50, 3) * 0.1
+    positions[0, 0] = 1.0  # nerfstudio's scaling after centring on a focus: their mean is elsewhere
+    assert scene_unit(positions) == 1.0
+    for nothing in (positions[:0], positions[1:2] * 100, torch.ones(3, 3) * 7):
+        assert scene_unit(nothing) == 1.0
+
+
+@pytest.mark.parametrize("config", [NrfConfig(output_init="default"), VdgsConfig()], ids=["nrf", "vdgs"])
+@pytest.mark.parametrize("unit", [2.0**-10, 2.0**10])
+def test_a_head_sees_the_same_in_any_unit(config, unit):
+    """Floor of the distance included: the first splat sits on the camera."""
+    torch.manual_seed(0)
+    head = config.setup()
+    head.set_step(10**6)
+    splats = {"means": torch.randn(20, 3), "opacities": torch.randn(20, 1), **head.splat_params(torch.rand(20, 3))}
+    center = splats["means"][0].clone()
+    rows = torch.arange(20)
+    expected = head(splats, rows, center)
+    head.scene_unit = unit
+    found = head({**splats, "means": splats["means"] * unit}, rows, center * unit)
+    # The power of two is exact but for log(r unit) - log(unit): two roundings of numbers up to 12, seen by a network.
+    for ours, theirs in zip(found, expected, strict=True):
+        assert (ours - theirs).abs().max() < 1e-5
+
+
+def test_learning_rates_are_lengths():
+    @dataclass
+    class Config:
+        lr: float = 1.0
+        lr_final: float | None = 0.1
+        other: float = 3.0
+
+    group = {"optimizer": Config(), "scheduler": Config()}
+    assert in_world_units(group, 1.0) is group
+    scaled = in_world_units(group, 4.0)
+    assert (scaled["optimizer"].lr, scaled["scheduler"].lr_final, scaled["scheduler"].other) == (4.0, 0.4, 3.0)
+    assert in_world_units({"optimizer": Config(), "scheduler": replace(Config(), lr_final=None)}, 4.0)["scheduler"]
+    assert in_world_units({"optimizer": Config(), "scheduler": None}, 4.0)["scheduler"] is None
+
+
+def first_step(folder, factor, out, *options):
+    """A trainer after backward of step 0 on one small scene, every length times `factor`, auto-scaling off."""
+    write_scene(SceneConfig(views=8, width=32, height=24, points=150, samples=1), folder)
+    rescale(folder, factor)
+    args = ["nrfgs", "--output-dir", str(out), "--vis", "tensorboard", "--pipeline.model.num-downscales", "0"]
+    args += ["--pipeline.model.background-color", "black", "--pipeline.model.appearance.output-init", "default"]
+    args += [*options, "nrfgs-data", "--data", str(folder), "--auto-scale-poses", "False"]
+    config = parse(args)
+    _set_random_seed(42)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    model = trainer.pipeline.model
+    model.step_cb(trainer.optimizers, 0)
+    outputs, losses, _ = trainer.pipeline.get_train_loss_dict(0)
+    sum(losses.values()).backward()
+    return trainer, outputs["rgb"].detach(), sum(losses.values()).item()
+
+
+@pytest.mark.parametrize("strategy", ["splatfacto", "original", "mcmc"])
+@pytest.mark.parametrize("factor", [2.0**-10, 2.0**10])
+def test_a_step_without_auto_scaling_is_the_same_in_any_unit(strategy, factor, tmp_path):
+    """Powers of two are exact: what differs is the rounding of log-scales and log distances, 2^-20 of what they scale,
+    some ten layers deep."""
+    options = ["--pipeline.model.densification", strategy]
+    if strategy == "mcmc":
+        options += ["--pipeline.model.splat-budget", "200"]
+    base, base_rgb, base_loss = first_step(tmp_path / "one", 1.0, tmp_path / "out", *options)
+    other, rgb, loss = first_step(tmp_path / "other", factor, tmp_path / "out", *options)
+    assert base_rgb.std() > 0.01
+    # A contribution at the cut-off of 1/255 may come or go with the rounding.
+    assert ((rgb - base_rgb).abs() > 1e-4).float().mean() < 0.01
+    assert loss == pytest.approx(base_loss, rel=1e-3)
+    ours, theirs = other.pipeline.model.gauss_params, base.pipeline.model.gauss_params
+    for name, length in (("means", factor), ("scales", 1.0), ("opacities", 1.0), ("latents", 1.0)):
+        gradient, expected = ours[name].grad * length, theirs[name].grad
+        assert (gradient - expected).norm() < 1e-2 * expected.norm(), name
+
+    # What moves the means, and what decides whether splats come or go.
+    for trainer in (base, other):
+        for parameter in trainer.pipeline.model.gauss_params.values():
+            parameter.grad.copy_(torch.ones_like(parameter.grad))  # Adam's first step is its learning rate
+        trainer.optimizers.optimizer_step_all()
+    for name, length in (("means", factor), ("scales", 1.0)):
+        step = ours[name].detach() - theirs[name].detach() * length
+        offset = 0.0 if name == "means" else torch.tensor(factor).log()
+        assert (step - offset).abs().max() < 1e-5 * max(1.0, theirs[name].abs().max().item()) * length, name
+    densifications = [trainer.pipeline.model.densification for trainer in (base, other)]
+    if strategy == "mcmc":
+        for trainer, densification in zip((base, other), densifications, strict=True):
+            torch.manual_seed(3)
+            trainer.pipeline.model.gauss_params["opacities"].data.fill_(-12.0)  # what cannot be seen explores
+            densification.post_backward(1, {}, trainer.pipeline.model.gauss_params, trainer.optimizers.optimizers)
+        assert (ours["means"] - theirs["means"] * factor).abs().max() < 1e-5 * factor * theirs["means"].abs().max()
+        penalties = [
+            d.regularisation(t.pipeline.model.gauss_params) for d, t in zip(densifications, (base, other), strict=True)
+        ]
+        assert penalties[1]["mcmc_scale_reg"].item() == pytest.approx(penalties[0]["mcmc_scale_reg"].item(), rel=1e-4)
+    else:
+        scales = [densification.state["scene_scale"] for densification in densifications]
+        assert scales[1] == pytest.approx(factor * scales[0], rel=1e-5)

@@ -8,7 +8,12 @@ import torch
 from densification_cases import REFINES, STRATEGIES, Table, strategy
 from torch.testing import assert_close
 
-from nrfgs_ns.densification import McmcDensification, OriginalDensification, build_densification
+from nrfgs_ns.densification import (
+    ConsistentDensification,
+    McmcDensification,
+    OriginalDensification,
+    build_densification,
+)
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.host import gsplat_version
 from nrfgs_ns.model.model import NrfgsModelConfig
@@ -133,6 +138,11 @@ def test_constants_are_those_of_the_papers():
         ({"original": OriginalDensification(prune_opacity=0.01)}, "original has no effect"),
         ({"densification": "mcmc", "original": OriginalDensification(prune_opacity=0.01)}, "original has no effect"),
         ({"densification": "original", "mcmc": McmcDensification(stop_at=100)}, "mcmc has no effect"),
+        ({"consistent": ConsistentDensification(views=3)}, "consistent has no effect with the densification 'splatf"),
+        ({"densification": "consistent", "consistent": ConsistentDensification(views=0)}, "consistent.views is 0"),
+        ({"densification": "consistent", "consistent": ConsistentDensification(wrong=1.0)}, "consistent.wrong is 1.0"),
+        ({"densification": "consistent", "consistent": ConsistentDensification(grow_pixels=-1)}, "grow_pixels is -1"),
+        ({"densification": "consistent", "consistent": ConsistentDensification(prune_score=2)}, "prune_score is 2"),
     ],
 )
 def test_options_that_cannot_work_are_refused(options, says):
@@ -145,6 +155,7 @@ def test_options_that_cannot_work_are_refused(options, says):
     [
         {"densification": "original", "original": OriginalDensification(prune_opacity=0.01)},
         {"densification": "mcmc", "mcmc": McmcDensification(stop_at=100), "splat_budget": 7},
+        {"densification": "consistent", "consistent": ConsistentDensification(views=3), "cull_alpha_thresh": 0.05},
     ],
 )
 def test_options_of_the_strategy_itself_are_not_refused(options):

@@ -2,13 +2,16 @@
 """Trainings on two devices: shards stay equal, checkpoints are whole, all stop together."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE
-from nrfgs_ns.training.checkpoint_files import read_latest
+from nrfgs_ns.distributed.trainer import ShardedMean
+from nrfgs_ns.training.averaging import ParameterMean
+from nrfgs_ns.training.checkpoint_files import read, read_latest
 
 
 def checkpoint(folder: str | Path) -> dict:
@@ -106,3 +109,98 @@ def test_a_resumed_training_is_the_unbroken_one(run_together):
     for name, value in whole["pipeline"].items():
         if isinstance(value, torch.Tensor):
             assert_close(rest["pipeline"][name], value, rtol=1e-5, atol=1e-7, msg=lambda text, name=name: name + text)
+
+
+SPLATS = "gauss_params."
+
+
+@pytest.fixture(scope="module")
+def devices(two_devices) -> tuple[dict, dict]:
+    return tuple(torch.load(two_devices / f"averaged-{rank}.pt") for rank in (0, 1))
+
+
+def saved(folder: str | Path, step: int, part: str = "pipeline") -> dict:
+    return read(Path(folder) / f"step-{step:09d}.ckpt")[part]
+
+
+def whole_after(devices: tuple[dict, dict], step: int) -> dict[str, torch.Tensor]:
+    """All parameters after a step, as one device would hold them, in float64."""
+    one, other = (device["after"][step] for device in devices)
+    rows = {name: torch.cat([value, other[name]]) if name.startswith(SPLATS) else value for name, value in one.items()}
+    return {name: value.double() for name, value in rows.items()}
+
+
+def test_all_begin_anew_where_one_does(devices):
+    splats = [[len(after[f"{SPLATS}means"]) for after in device["after"]] for device in devices]
+    assert set(splats[0]) == {150} and set(splats[1][:4]) == {150} and set(splats[1][4:]) != {150}
+    assert devices[0]["counts"] == devices[1]["counts"] == [0, 0, 1, 2, 1, 2, 3, 4, 5, 6, 7, 8]
+    assert "over the last 8 steps, not 10" in devices[0]["said"] and devices[1]["said"] == ""
+
+
+def test_the_trained_model_is_the_mean_of_the_whole(devices):
+    """Parameters are up to 10; eight float32 roundings of that, 8 * 10 * 6e-8."""
+    expected = [whole_after(devices, step) for step in range(4, 12)]
+    content = saved(devices[0]["saved"][0], 11)
+    for name, last in expected[-1].items():
+        mean = torch.stack([state[name] for state in expected]).mean(dim=0)
+        assert mean.abs().max() <= 10
+        assert_close(
+            content[f"_model.{name}"].double(), mean, rtol=0, atol=5e-6, msg=lambda text, name=name: name + text
+        )
+        assert (mean - last).abs().max() > 1e-4, name
+    assert "parameter_mean" not in saved(devices[0]["saved"][0], 11, "training")
+
+
+def test_shared_weights_are_the_same_on_all(devices):
+    first, second = (device["ended"] for device in devices)
+    shared = [name for name in first if not name.startswith(SPLATS)]
+    assert shared and all(torch.equal(first[name], second[name]) for name in shared)
+
+
+def test_a_checkpoint_in_between_has_the_mean_of_the_whole(devices):
+    """As one device would have written it, and as one reads it. Four roundings of numbers up to 10."""
+    state = saved(devices[0]["saved"][0], 7, "training")["parameter_mean"]
+    assert (state["count"], state["began_anew"]) == (4, True)
+    means = [whole_after(devices, step) for step in range(4, 8)]
+    for name in ("means", "latents"):
+        expected = torch.stack([one[SPLATS + name] for one in means]).mean(dim=0)
+        assert_close(state["means"][f"{name}.0"].double(), expected, rtol=0, atol=2.4e-6)
+    alone = devices[0]["alone"]
+    assert alone["count"] == 4 and alone["means"].keys() == state["means"].keys()
+    assert all(torch.equal(alone["means"][name], mean) for name, mean in state["means"].items())
+
+
+def test_a_mean_continues_to_the_bit(devices):
+    one, other = (saved(path, 11) for path in devices[0]["saved"])
+    for name, value in one.items():
+        if isinstance(value, torch.Tensor):
+            assert_close(other[name], value, rtol=0, atol=0, msg=lambda text, name=name: name + text)
+
+
+def test_a_mean_of_splats_that_one_device_took_out_is_not_written(devices, two_devices):
+    """The second device has lost a row since the last step; the first has not. Both know."""
+    assert devices[0]["stopped"] and devices[1]["stopped"]
+    (folder,) = (two_devices / "averaged-nan").rglob("nerfstudio_models")
+    content = saved(folder, 9)
+    before = len(saved(devices[0]["saved"][0], 11)[f"_model.{SPLATS}means"])
+    assert len(content[f"_model.{SPLATS}means"]) == before - 1
+    assert "parameter_mean" not in saved(folder, 9, "training")
+
+
+@pytest.mark.parametrize("written, count", [(5, 3), (6, 0)])
+def test_each_device_takes_its_rows_of_a_mean_or_none_does(written, count):
+    """Of 5 splats dealt out to two devices the second has 2, as it would have of 6 were they 4; a mean over 6 is of
+    splats that are gone."""
+    for rows in (slice(0, 5, 2), slice(1, 5, 2)):
+        splats, weight = torch.nn.Parameter(torch.arange(5.0)[rows]), torch.nn.Parameter(torch.zeros(2))
+        optimizers = {"means": torch.optim.Adam([splats]), "field": torch.optim.Adam([weight])}
+        model = SimpleNamespace(
+            gauss_params={"means": splats}, counts=[3, 2], loaded=rows, densification=SimpleNamespace(state={})
+        )
+        means = {"means.0": 10.0 + torch.arange(float(written)), "field.0": torch.ones(2)}
+        mean = ShardedMean()
+        mean.load_state({"count": 3, "began_anew": True, "means": means}, model, optimizers)
+        assert mean.count == count
+        ParameterMean.install(mean)
+        assert_close(splats.detach(), torch.arange(5.0)[rows] + (10.0 if count else 0.0), rtol=0, atol=0)
+        assert weight.tolist() == ([1.0, 1.0] if count else [0.0, 0.0])

@@ -2,7 +2,6 @@
 """Every quantity from a splat's numbers to Adam's state: its range, what happens at both ends, and what holds it there.
 
     python tests/helpers/stability_catalogue.py                    # run every check, print the table
-    python tests/helpers/stability_catalogue.py --markdown-only    # the table of docs/stability.md
 
 Float32, CPU, a second or two. The named tests are where each row is pinned down; the check here shows it.
 """
@@ -341,28 +340,12 @@ CATALOGUE = [
 ]
 
 
-def markdown() -> str:
-    """The catalogue as a Markdown table."""
-    lines = ["| quantity | range | lower end | upper end | held by |", "|---|---|---|---|---|"]
-    for q in CATALOGUE:
-        tests = ", ".join(f"`{test.split('::')[1].removeprefix('test_')}`" for test in q.tests)
-        cells = (cell.replace("|", r"\|") for cell in (q.name, q.range, q.low, q.high))
-        lines.append(f"| {' | '.join(cells)} | {tests} |")
-    return "\n".join(lines) + "\n"
-
-
-def main(markdown_only: bool = False) -> None:
+def main() -> None:
     """Run every check and print the catalogue.
-
-    Args:
-        markdown_only: print the table of docs/stability.md instead, without running anything.
 
     Raises:
         SystemExit: a check failed; its rows are marked.
     """
-    if markdown_only:
-        print(markdown(), end="")
-        return
     table = Table("quantity", "range", "lower end", "upper end", "check", title="Numbers at their extremes")
     results = [q.check() for q in CATALOGUE]
     for q, holds in zip(CATALOGUE, results, strict=True):

@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a record says of the version it was made with."""
+"""What a record says of its version; the command for a CPU; an evaluation as a table."""
 
+import json
 from pathlib import Path
 
+import pytest
+
+from nrfgs_ns.training.cpu_command import scale_for, ten_minute_command
+from nrfgs_ns.training.evaluation_table import far_below, print_evaluation
 from nrfgs_ns.training.run import digest_of, machine, source_digest
 
 
@@ -32,3 +37,52 @@ def test_a_record_names_the_source_it_was_made_with():
     import nrfgs_ns
 
     assert machine()["source"] == source_digest() == digest_of(Path(nrfgs_ns.__file__).parent)
+
+
+@pytest.mark.parametrize(
+    ("content", "scale"),
+    [
+        ({"w": 4032, "h": 3024, "frames": [{}]}, 0.06),
+        ({"frames": [{"w": 540, "h": 960}]}, 0.25),
+        ({"w": 48, "h": 36, "frames": [{}]}, 1.0),
+        ({"w": 0, "h": 0, "frames": [{}]}, 0.25),
+        ({"frames": []}, 0.25),
+        ([], 0.25),
+    ],
+)
+def test_the_scale_fits_the_photographs(content, scale, tmp_path):
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert scale_for(tmp_path) == scale_for(tmp_path / "transforms.json") == scale
+    assert ten_minute_command(tmp_path).endswith(
+        f"--data {tmp_path} --time-budget 10 --pipeline.datamanager.camera-res-scale-factor {scale:g}"
+    )
+
+
+def test_a_folder_without_transforms_has_a_command_too(tmp_path):
+    assert "--time-budget 10" in ten_minute_command(tmp_path / "nowhere")
+
+
+def views(*psnrs: float | None) -> list[dict]:
+    return [
+        {"image": f"{index}.png", **({} if value is None else {"psnr": value})} for index, value in enumerate(psnrs)
+    ]
+
+
+def test_views_far_below_the_rest_are_named_the_worst_first():
+    found = far_below(views(25.0, 26.0, 12.0, 25.5, 26.5, 8.0, 25.2, 25.8, None))
+    assert [name for name, *_ in found] == ["5.png", "2.png"]
+
+
+def test_views_that_differ_as_views_do_are_not():
+    assert far_below(views(20.0, 22.0, 24.0, 26.0, 28.0, 30.0)) == []  # spread widely
+    assert far_below(views(25.0, 25.1, 25.0, 25.1, 25.0, 23.0)) == []  # spread little: 2 dB are not far
+    assert far_below(views(25.0, 25.0, 25.0, 5.0)) == []  # too few
+    assert far_below([]) == []
+
+
+def test_the_table_has_what_was_measured(capsys):
+    result = {"psnr": 25.25, "ssim": 0.8125, "lpips": None, "splats": 12345, "per_image": views(*[25.0] * 6, 9.0)}
+    print_evaluation(result)
+    said = capsys.readouterr().out
+    assert "Means over 7 test views" in said and "25.25" in said and "12,345" in said and "lpips" not in said
+    assert "6.png: 9.0 dB, 16.0 below the median view." in said

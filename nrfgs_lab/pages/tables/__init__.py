@@ -5,8 +5,9 @@
     python -m nrfgs_lab.pages.tables --write    # writes them anew
 
 Between `<!-- table MODULE.FUNCTION -->` and `<!-- end -->` a page has what the function of that module of this package
-returns: a table on lines of its own, or a number within a sentence. A test holds pages and records together, and asks
-that a number of decibels in the prose of such a page stands in one of its blocks.
+returns: a table on lines of its own, or a number within a sentence. `MODULE.FUNCTION(bonsai, NRF-GS)` hands it words. A
+test holds pages and records together, and asks that a number of decibels in the prose of such a page stands in one of
+its blocks.
 """
 
 import importlib
@@ -21,7 +22,7 @@ from nrfgs_lab.bench.table import COLUMNS, Row, ranks
 
 ROOT = Path(__file__).resolve().parents[3]
 OPENING = "<!-- table "
-BLOCK = re.compile(r"<!-- table (\w+)\.(\w+) -->(.*?)<!-- end -->", re.DOTALL)
+BLOCK = re.compile(r"<!-- table (\w+)\.(\w+)(\([^\n]*?\))? -->(.*?)<!-- end -->", re.DOTALL)
 RUN = re.compile(
     r"(?:(?P<part>.*)/)?runs/(?P<run>.+)-(?P<protocol>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)"
 )
@@ -42,10 +43,11 @@ def written(text: str) -> str:
 
 
 def _block(match: re.Match) -> str:
-    module, function, old = match.groups()
-    new = getattr(importlib.import_module(f"{__name__}.{module}"), function)()
+    module, function, words, old = match.groups(default="")
+    arguments = words[1:-1].split(", ") if words else []
+    new = getattr(importlib.import_module(f"{__name__}.{module}"), function)(*arguments)
     new = f"\n\n{new.strip()}\n\n" if old.startswith("\n") else new
-    return f"{OPENING}{module}.{function} -->{new}<!-- end -->"
+    return f"{OPENING}{module}.{function}{words} -->{new}<!-- end -->"
 
 
 @cache
@@ -100,6 +102,12 @@ def bold(text: str, condition: bool = True) -> str:
     return f"**{text}**" if condition else text
 
 
+def signed(difference: float, digits: int = 1) -> str:
+    """A difference with its sign; without one if it rounds to nothing."""
+    text = f"{difference:+.{digits}f}"
+    return text if float(text) else text[1:]
+
+
 def mean_of(row: Row, column: str) -> float:
     """A row's mean over seeds.
 
@@ -114,7 +122,7 @@ def mean_of(row: Row, column: str) -> float:
 
 def loose_decibels(text: str) -> Iterator[str]:
     """Numbers of decibels in a page's prose that stand in none of its blocks."""
-    blocks = " ".join(match[2] for match in BLOCK.findall(text))
+    blocks = " ".join(match[3] for match in BLOCK.findall(text))
     known = set(re.findall(r"\d+(?:\.\d+)?", blocks))
     prose = re.sub(r"```.*?```|`[^`\n]*`", "", BLOCK.sub("", text), flags=re.DOTALL)
     for number in re.findall(r"(?<![\d.])(\d+(?:\.\d+)?) dB", prose):

@@ -45,16 +45,16 @@ def test_links_lead_to_files_and_headings_that_are_there(name):
 def test_a_number_that_is_not_the_record_s_is_noticed():
     text = next(text for text in PAGES.values() if BLOCK.search(text))
     first = BLOCK.search(text)
-    changed = text[: first.start(3)] + first[3].replace("1", "2") + text[first.end(3) :]
+    changed = text[: first.start(4)] + re.sub(r"\d", "7", first[4]) + text[first.end(4) :]
     assert changed != text and written(changed) == text
 
 
 def test_a_block_is_a_table_on_its_lines_or_a_number_in_a_sentence(monkeypatch):
     monkeypatch.setattr(tables.importlib, "import_module", lambda name: Blocks)
-    page = "Gains <!-- table x.number --><!-- end --> dB.\n\n<!-- table x.rows -->\n<!-- end -->\n"
+    page = "Gains <!-- table x.number(1, .2) --><!-- end --> dB.\n\n<!-- table x.rows -->\n<!-- end -->\n"
     result = written(page)
     assert result == (
-        "Gains <!-- table x.number -->1.2<!-- end --> dB.\n\n"
+        "Gains <!-- table x.number(1, .2) -->1.2<!-- end --> dB.\n\n"
         "<!-- table x.rows -->\n\n| a |\n| --- |\n| 3.4 |\n\n<!-- end -->\n"
     )
     assert written(result) == result
@@ -67,9 +67,15 @@ class Blocks:
     """A module of blocks."""
 
     @staticmethod
-    def number():
-        return "1.2"
+    def number(whole, part):
+        return whole + part
 
     @staticmethod
     def rows():
         return tables.grid(["a"], [["3.4"]])
+
+
+def test_every_record_is_named_in_the_index():
+    index = PAGES["docs/measurements.md"]
+    named = {word for line in re.findall(r"^\| ([\w, -]+) \|", index, re.MULTILINE) for word in line.split(", ")}
+    assert {path.stem for path in (ROOT / "results").glob("*.json")} <= named

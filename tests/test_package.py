@@ -1,12 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file is whole or not there, whoever else writes it; a lock is held by one."""
+"""What is at the top of the package: messages for the user, files written whole; and that open3d is hidden here."""
 
+import os
+import subprocess
+import sys
 import threading
 import time
 
 import pytest
+import without_open3d
 
 from nrfgs_ns.files import only_one, whole, write_whole
+
+RAISE = "from nrfgs_ns.errors import InputError\nraise InputError('x.json is missing. Make one.')"
+
+
+@pytest.mark.parametrize("debug", ["0", "1"])
+def test_it_is_the_last_line_and_the_status_1(debug):
+    environment = {**os.environ, "NRFGS_DEBUG": debug}
+    run = subprocess.run([sys.executable, "-c", RAISE], capture_output=True, text=True, env=environment)
+    assert run.returncode == 1
+    assert run.stderr.splitlines()[-1].endswith("x.json is missing. Make one.")
+    assert ("Traceback" in run.stderr) == (debug == "1")
+    if debug == "0":
+        assert run.stderr == "x.json is missing. Make one.\n"
 
 
 def test_writers_do_not_meet(tmp_path):
@@ -65,3 +82,24 @@ def test_a_lock_is_held_by_one(tmp_path):
         events.append("second in")
     thread.join()
     assert events == ["first in", "first out", "second in"]
+
+
+def test_open3d_is_hidden_here_and_in_processes_that_tests_start():
+    with pytest.raises(ImportError, match="hidden from the tests"):
+        import open3d  # noqa: F401
+    run = subprocess.run([sys.executable, "-c", "import open3d"], capture_output=True, text=True)
+    assert run.returncode == 1 and "hidden from the tests" in run.stderr
+
+
+def test_what_was_shown_is_hidden_again(monkeypatch, tmp_path):
+    """With a package in open3d's place, since the true one does not import everywhere."""
+    (tmp_path / "open3d.py").write_text("")
+    behind = sys.path.index(without_open3d.HIDDEN) + 1
+    monkeypatch.setattr(sys, "path", [*sys.path[:behind], str(tmp_path), *sys.path[behind:]])
+    monkeypatch.setattr(without_open3d, "shown", {})
+    with without_open3d.open3d_shown():
+        import open3d
+
+        assert open3d.__file__ == str(tmp_path / "open3d.py")
+    with pytest.raises(ImportError, match="hidden from the tests"):
+        import open3d

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of docs/deviations.md."""
+
+from nrfgs_lab.pages.tables import bench_rows, mean_of, records
+
+
+def start(run: str) -> str:
+    """PSNR of the small fox with one of the starts."""
+    return f"{mean_of(bench_rows('warm-up')['fox', 'original', run], 'PSNR'):.2f}"
+
+
+def bonsai(run: str) -> str:
+    """PSNR of a whole training of bonsai under splatfacto's rules."""
+    return f"{records('bonsai')[f'30k-fused/{run}-bonsai-42']['eval']['psnr']:.2f}"
+
+
+def rules() -> str:
+    """Field and splats under splatfacto's rules and 3DGS's, on bonsai."""
+    own = bench_rows("presets")["bonsai", "own", "default"]
+    original = bench_rows("comparison")["bonsai", "original", "NRF-GS"]
+    texts = [f"{mean_of(row, 'PSNR'):.2f} dB with {mean_of(row, 'splats') / 1000:.0f}k" for row in (own, original)]
+    return f"{texts[0]} (splatfacto's), {texts[1]} (3DGS's)"

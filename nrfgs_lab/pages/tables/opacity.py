@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of docs/opacity.md."""
+
+from nrfgs_lab.pages.tables import grid, records
+
+SEEN = {
+    "base": ("the field", "stored"),
+    "peak": ("the field", "shown"),
+    "logit": ("residual on the logit", "stored"),
+    "SH": ("3DGS", "stored"),
+}
+MCMC = {"SH": "3DGS", "stored": "stored", "shown_base": "shown, in the loss alone", "shown_peak": "shown, in all rules"}
+BOUNDS = "straight-through", "clamp", "smooth", "logit"
+SCENES = "bonsai", "goldcape", "fox"
+
+
+def pruning() -> str:
+    """What 3DGS's rules make of the field, by the opacity that they go by."""
+    study = records("opacity-seen")
+    body = []
+    for part, scene, seeds in (("30k/", "bonsai", [42]), ("", "fox", [42, 43])):
+        found = {one["run"]: one for one in study[f"{part}opacity"]}
+        for run, (label, seen) in SEEN.items():
+            rows = [found[name] for name in (f"{run}-original-{scene}-{seed}" for seed in seeds) if name in found]
+            cells = [" / ".join(form.format(row[key]) for row in rows) for key, form in FORMS.items()]
+            body.append([scene if scene == "bonsai" else "fox, small", label, seen, *cells])
+    return grid(["", "", "pruned by", "splats", "PSNR", "SSIM", "PSNR right after a reset"], body)
+
+
+FORMS = {"splats": "{:,}", "psnr": "{:.2f}", "ssim": "{:.4f}", "psnr_after_reset": "{:.2f}"}
+
+
+def mcmc() -> str:
+    """The field under MCMC's rules, by the opacity that they go by."""
+    body = []
+    for run, label in MCMC.items():
+        test = records("mcmc-opacity")[f"bonsai/{run}-mcmc@150000-bonsai-42"]["measured"]["test"]
+        head = "3DGS" if run == "SH" else "the field"
+        body.append([head, "-" if run == "SH" else label, f"{test['psnr']:.2f}", f"{test['ssim']:.4f}"])
+    return grid(["", "rules go by the opacity", "PSNR", "SSIM"], body)
+
+
+def bounds() -> str:
+    """Four ways to keep an opacity in [0, 1]."""
+    found = {one["run"]: one for one in records("opacity")["30k/opacity"]}
+
+    def cell(bound: str, key: str, form: str, unit: float = 1.0) -> str:
+        return ", ".join(form.format(found[f"{bound}-own-{scene}-42"][key] / unit) for scene in SCENES)
+
+    body = [
+        [
+            bound,
+            cell(bound, "psnr", "{:.2f}"),
+            cell(bound, "ssim", "{:.4f}"),
+            cell(bound, "splats", "{:.0f}k", 1000),
+            cell(bound, "dead_share", "{:.0f} %", 0.01),
+            cell(bound, "opacity_change", "{:.1f}", 0.001),
+        ]
+        for bound in BOUNDS
+    ]
+    return grid([f"{', '.join(SCENES)}:", "PSNR", "SSIM", "splats", "dead gradients", "flicker (1e-3)"], body)

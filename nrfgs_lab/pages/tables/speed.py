@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of docs/speed.md."""
+
+from statistics import fmean
+
+from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, mean_of, records
+
+TRAININGS = {
+    "nerfstudio_splatfacto": "splatfacto (nerfstudio's own)",
+    "harmonics_nrfgs-sh": "`nrfgs-sh`",
+    "default": "`nrfgs`",
+    "preset_nrfgs-fast": "`nrfgs-fast`, another day",
+}
+VARIANTS = {
+    "fused bf16": "the field (bf16, the default)",
+    "fused tf32": "the field (tf32)",
+    "fused fp32": "the field (fp32)",
+    "torch": "the field in PyTorch",
+    "sh head": "spherical harmonics (gsplat's kernel)",
+    "sg head": "SG (PyTorch)",
+    "vdgs head": "VDGS (PyTorch, hash grid in Triton)",
+    "gsnb head": "GSNB (PyTorch)",
+}
+
+
+def trainings() -> str:
+    """What whole trainings of bonsai cost."""
+    rows = {run: row for (scene, _, run), row in bench_rows("presets").items() if scene == "bonsai"}
+    base = mean_of(rows["nerfstudio_splatfacto"], "time s")
+    body = []
+    for run, label in TRAININGS.items():
+        row = rows[run]
+        seconds = mean_of(row, "time s")
+        cells = [row.text(BY_NAME[name]) for name in ("PSNR", "splats", "FPS", "FPS 1080p", "MB", "peak MB")]
+        body.append([label, f"{seconds:.0f}", f"{seconds / base:.2f}", *cells])
+    head = ["bonsai", "train s", "of splatfacto's", "PSNR", "splats", "FPS, 799 x 532", "FPS, 1080p", "MB", "peak MB"]
+    return grid(head, body)
+
+
+def ratio(what: str, run: str, base: str) -> str:
+    """A quantity of one training of bonsai over another's."""
+    rows = {run: row for (scene, _, run), row in bench_rows("presets").items() if scene == "bonsai"}
+    return f"{mean_of(rows[run], what) / mean_of(rows[base], what):.2f}"
+
+
+def under_the_papers_rules() -> str:
+    """Seconds and frames of whole trainings of bonsai under 3DGS's rules."""
+    body = []
+    for (_, _, run), row in bench_rows("comparison", "timed").items():
+        cells = [row.text(BY_NAME[name]) for name in ("splats", "time s", "FPS", "FPS 1080p", "peak MB")]
+        body.append([run, *cells])
+    return grid(["bonsai, 3DGS's rules", "splats", "train s", "FPS, 799 x 532", "FPS, 1080p", "peak MB"], body)
+
+
+def heads() -> str:
+    """Milliseconds of the GPU for each head, forward and backward."""
+    times = records("head_gpu")["head_gpu_all"]["times"]
+    sizes = sorted({one["visible"] for one in times})
+    found = {(one["variant"], one["visible"]): one for one in times if one["share"] == "all"}
+    body = []
+    for variant, label in VARIANTS.items():
+        cells = [f"{found[variant, size]['gpu_ms']:.2f}" for size in sizes]
+        body.append([label, *cells, f"{found[variant, 1_000_000]['peak_mib']:.0f}"])
+    return grid(["visible splats", *(f"{size / 1e6:g} M" for size in sizes), "peak MiB at 1 M"], body)
+
+
+def head_share() -> str:
+    """The field's time at a million visible splats, of the harmonics'."""
+    times = records("head_gpu")["head_gpu_all"]["times"]
+    found = {one["variant"]: one for one in times if one["share"] == "all" and one["visible"] == 1_000_000}
+    return f"{found['fused bf16']['gpu_ms'] / found['sh head']['gpu_ms']:.2f}"
+
+
+def steps() -> str:
+    """A step of 300,000 random splats, in parts."""
+    runs = records("step_profile")["step_profile_300k"]["runs"]
+    body = []
+    for method in ("nrfgs-sh", "nrfgs"):
+        mine = [one for one in runs if one["method"] == method]
+        parts = ("forward", "loss", "backward", "optimizers", "callbacks")
+        host = [f"{fmean(one['host_ms'][part] for one in mine):.2f}" for part in parts]
+        step, gpu = (fmean(one[key] for one in mine) for key in ("step_ms", "gpu_ms"))
+        body.append(
+            [f"`{method}`", f"{step:.2f}", f"{gpu:.2f}", f"{fmean(one['launches'] for one in mine):.0f}", *host]
+        )
+    head = ["", "step", "of it GPU", "launches", "host: forward", "loss", "backward", "optimisers", "callbacks"]
+    return grid(head, body)
+
+
+def errors() -> str:
+    """Relative errors of the kernels against float64."""
+    body = [
+        [one["variant"], *(f"{one[key]:.0e}" for key in ("colors", "opacities", "d means", "d latents", "d weights"))]
+        for one in records("head_gpu")["head_gpu_all"]["errors"]
+    ]
+    return grid(["", "colours", "opacities", "gradients: means", "latents", "weights"], body)
+
+
+def cpu_rasterizer() -> str:
+    """The CPU's rasterizer beside a loop of autograd over tiles."""
+    results = records("rasterizer_cpu")["rasterizer_cpu_two_threads"]["results"]
+    body = [
+        [
+            name,
+            f"{one['ours']['forward_ms']:.0f} + {one['ours']['backward_ms']:.0f}",
+            f"{one['times_faster']:.1f}",
+            f"{one['peak_memory_mib']:.0f}",
+        ]
+        for name, one in results.items()
+    ]
+    return grid(["splats, image", "forward + backward (ms)", "times faster than the loop", "peak MiB"], body)

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the pages say holds: the worked example of docs/contributing.md, the options' tables, the first scene."""
+
+import contextlib
+import dataclasses
+import importlib.util
+import io
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.plugins.registry import discover_methods
+from nerfstudio.utils import eval_utils
+
+from nrfgs_lab.pages.options import PAGE, command_options, methods, own_options, page
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.cli import commands
+from nrfgs_ns.training import run
+from nrfgs_ns.training.run import evaluate, parse, train
+from nrfgs_ns.viewer.pictures import modes
+
+CONTRIBUTING = Path(__file__).resolve().parents[3] / "docs" / "contributing.md"
+
+
+@pytest.fixture
+def my_head(tmp_path, monkeypatch):
+    """The page's module, on the path under its own name."""
+    (code,) = re.findall(r"```python\n(# my_head\.py\n.*?)```", CONTRIBUTING.read_text(), re.DOTALL)
+    (tmp_path / "my_head.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    spec = importlib.util.spec_from_file_location("my_head", tmp_path / "my_head.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "my_head", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_its_colours_are_linear_in_the_direction(my_head):
+    torch.manual_seed(0)
+    head = my_head.LinearConfig().setup()
+    splats = {"means": torch.zeros(1, 3), "opacities": torch.zeros(1, 1), **head.splat_params(torch.full((1, 3), 0.5))}
+    splats["slopes"] += 0.1 * torch.randn(1, 3, 3)
+    one, two = torch.tensor([0.0, 0.0, 2.0]), torch.tensor([0.0, 3.0, 0.0])
+    rows = torch.zeros(1, dtype=torch.int64)
+    for center in (one, two):
+        expected = 0.5 - splats["slopes"][0] @ (center / center.norm())
+        assert torch.allclose(head(splats, rows, center).colors[0], expected, atol=1e-6)
+    with pytest.raises(ValueError, match="distance_eps"):
+        my_head.LinearConfig(distance_eps=0.0).setup()
+    assert modes(Field(head, splats)) == ["full", "base colour", "residual", "view dependence", "depth"]
+
+
+def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", "linear=my_head:linear")
+    configs, descriptions = discover_methods()
+    assert descriptions["linear"] == "Colours that are linear in the view direction."
+    # nerfstudio looks for methods when it is first imported; here it was imported long ago.
+    monkeypatch.setitem(eval_utils.all_methods, "linear", configs["linear"])
+    monkeypatch.setattr(run, "AnnotatedBaseConfigUnion", run.tyro.extras.subcommand_type_from_defaults(configs))
+    args = ["linear", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "25"]
+    args += ["--vis", "tensorboard", "--pipeline.model.warmup-length", "5", "--pipeline.model.refine-every", "10"]
+    args += ["--steps-per-eval-image", "1000", "--steps-per-eval-all-images", "1000"]
+    record = train([*args, "--pipeline.model.num-downscales", "0"])
+    state = torch.load(next(tmp_path.rglob("*.ckpt")), weights_only=True)["pipeline"]
+    assert state["_model.gauss_params.slopes"].abs().max() > 0
+    assert evaluate(record.config_path, tmp_path / "eval.json")["psnr"] > 10
+
+
+def test_the_page_is_current():
+    assert PAGE.read_text(encoding="utf-8") == page(), "write it again: python -m nrfgs_lab.pages.options"
+
+
+def test_every_option_is_explained():
+    options = [option for method in methods() for option in own_options(method.config)]
+    options += [option for one in commands().values() for option in command_options(one.load())]
+    assert len(options) > 100
+    assert [option.flag for option in options if not option.text] == []
+    flags = {option.flag for option in own_options(methods()[0].config)}
+    fields = {field.name.replace("_", "-") for field in dataclasses.fields(NrfConfig) if field.name[0] != "_"}
+    assert {f"pipeline.model.appearance.{name}" for name in fields} <= flags
+    assert "time-budget" in flags and "pipeline.model.densification" in flags
+    assert not any("sh-degree" in flag or "num-downscales" in flag for flag in flags)  # suppressed; splatfacto's
+
+
+def test_a_switch_that_is_on_is_named_as_the_default_and_the_text_mean_it():
+    """`--no-measure`, True, "render and tell" would say the opposite of what the switch does."""
+    measure = next(option for option in command_options(commands()["export"].load()) if "measure" in option.flag)
+    assert (measure.flag, measure.default) == ("--measure, --no-measure", True)
+    assert (
+        next(option for option in command_options(commands()["demo"].load()) if "quick" in option.flag).flag
+        == "--quick"
+    )
+
+
+@pytest.mark.parametrize("words", [["nrfgs"], ["nrfgs", "nrfgs-data"]])
+def test_the_command_line_has_them(words):
+    screen = io.StringIO()
+    with contextlib.redirect_stdout(screen), pytest.raises(SystemExit):
+        parse([*words, "--help"])
+    known = set(re.findall(r"--([\w.-]+)", screen.getvalue()))
+    for option in own_options(methods()[0].config):
+        inner = option.flag.split(".dataparser.")
+        if len(inner) == len(words):  # the data set's options come after its word
+            assert inner[-1].lower() in {flag.lower() for flag in known}, option.flag
+
+
+ROOT = Path(__file__).resolve().parents[3]
+DOCS = ROOT / "docs"
+
+
+def test_the_page_has_the_commands_that_were_run():
+    page = (DOCS / "first-scene.md").read_text(encoding="utf-8")
+    shown = " ".join(re.sub(r" +#.*", "", page).replace("\\\n", " ").split())
+    record = json.loads((ROOT / "results" / "newcomer.json").read_text(encoding="utf-8"))["records"]["newcomer"]
+    assert [step["step"] for step in record["commands"]] == ["prepare", "train", "look", "eval", "export"]
+    for step in record["commands"]:
+        assert re.sub(r"\d{4}-\d\d-\d\d_\d{6}", "DATE", step["command"]) in shown
+    assert f"{record['eval']['psnr']:.2f}" in page and f"{record['export']['loss_db']:.2f}" in page
+    pictures = re.findall(r"\]\((images/\S+)\)", page)
+    assert len(pictures) == 3 and all((DOCS / picture).is_file() for picture in pictures)
