@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What growth by gradients remembers: the kernel (statistics_interpreted.py, in a process of its own) and its choice."""
+"""What growth by gradients remembers: the kernel (statistics_interpreted.py, in its own process) and its choice."""
 
 import importlib.util
 from pathlib import Path
