@@ -8,6 +8,8 @@ names images, not cameras; and in the packed layout takes no backgrounds of seve
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
 from torch import Tensor
@@ -16,6 +18,9 @@ from nrfgs_ns.host import GSPLAT, gsplat_version
 from nrfgs_ns.kernels.trial import Gate
 
 from .contract import Projection
+
+if TYPE_CHECKING:  # imports Triton
+    from .tile_lists import Room
 
 HAS_BATCHES = gsplat_version() >= (1, 5)
 if HAS_BATCHES and gsplat_version() < (1, 5, 3):
@@ -127,7 +132,29 @@ def composite(
     Args:
         leave_out: rows that are not finite, if `leaves_out` says that this can be.
     """
-    isect_offsets, flatten_ids = _lists(projection, opacities, tile_size, colors if leave_out else None)
+    room = None
+    if len(opacities) > 0 and _kernels_take(projection, opacities, tile_size):
+        from .tile_lists import room_on
+
+        room = room_on(opacities.device)
+    while True:
+        lists = _lists(projection, opacities, tile_size, room, colors if leave_out else None)
+        render, alphas = _blend_all(projection, colors, opacities, backgrounds, tile_size, absgrad, lists)
+        if room is None or room.was_enough():
+            return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1]}
+
+
+def _blend_all(
+    projection: Projection,
+    colors: Tensor,
+    opacities: Tensor,
+    backgrounds: Tensor | None,
+    tile_size: int,
+    absgrad: bool,
+    lists: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Render and alphas from the tiles' lists, as for `composite`."""
+    isect_offsets, flatten_ids = lists
 
     def blend(colors: Tensor, backgrounds: Tensor | None) -> tuple[Tensor, Tensor]:
         behind = backgrounds
@@ -152,13 +179,11 @@ def composite(
         return render, alphas
 
     if colors.shape[-1] <= CHANNEL_CHUNK:  # nothing to cut, and nothing to put together
-        render, alphas = blend(colors, backgrounds)
-    else:
-        chunks = colors.split(CHANNEL_CHUNK, dim=-1)
-        behind = [None] * len(chunks) if backgrounds is None else backgrounds.split(CHANNEL_CHUNK, dim=-1)
-        parts = [blend(*part) for part in zip(chunks, behind, strict=True)]
-        render, alphas = torch.cat([part for part, _ in parts], dim=-1), parts[0][1]
-    return render, alphas, {"flatten_ids": flatten_ids, "isect_offsets": isect_offsets}
+        return blend(colors, backgrounds)
+    chunks = colors.split(CHANNEL_CHUNK, dim=-1)
+    behind = [None] * len(chunks) if backgrounds is None else backgrounds.split(CHANNEL_CHUNK, dim=-1)
+    parts = [blend(*part) for part in zip(chunks, behind, strict=True)]
+    return torch.cat([part for part, _ in parts], dim=-1), parts[0][1]
 
 
 def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor, tile_size: int) -> bool:
@@ -167,10 +192,13 @@ def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor, tile_s
     return few and not torch.is_grad_enabled() and _kernels_take(projection, opacities, tile_size)
 
 
-def _lists(projection: Projection, opacities: Tensor, tile_size: int, finite: Tensor | None) -> tuple[Tensor, Tensor]:
+def _lists(
+    projection: Projection, opacities: Tensor, tile_size: int, room: Room | None, finite: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Which splats each tile draws, as gsplat's kernels take it: offsets into a list of rows, and the list.
 
     Args:
+        room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
         finite: leave out the rows of which one of these, [M, D], or another number is not finite.
     """
     tile_width, tile_height = -(-projection.width // tile_size), -(-projection.height // tile_size)
@@ -179,12 +207,12 @@ def _lists(projection: Projection, opacities: Tensor, tile_size: int, finite: Te
         extents = projection.extents  # a square where another device has projected them
         bounds = projection.radii[:, None].expand(-1, 2) if extents is None else extents
     means2d, depths, conics = projection.means2d, projection.depths, projection.conics
-    if _kernels_take(projection, opacities, tile_size):
+    if room is not None:
         from .tile_lists import tile_lists
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
         colors = None if finite is None else finite.detach().contiguous()
-        return tile_lists(*tables, tile_width, tile_height, tile_size, colors)
+        return tile_lists(*tables, tile_width, tile_height, tile_size, colors, room)
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}

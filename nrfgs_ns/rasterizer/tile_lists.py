@@ -19,6 +19,9 @@ gsplat's to the last tie: 16-bit tile numbers take a quarter of the passes that 
 
 from __future__ import annotations
 
+import threading
+from typing import ClassVar
+
 import torch
 import triton
 import triton.language as tl
@@ -126,10 +129,11 @@ def list_kernel(
     means2d, conics, opacities, radii, order, ends, tiles, splats, count, pairs, width, height,
     PAIRS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr,
 ):  # fmt: skip
-    """The tile and the splat of each pair, splats in `order`. A pair that rounding has left without a tile gets the one
-    behind the last."""
+    """The tile and the splat of each pair, splats in `order`. Pairs beyond the last, and those that rounding has left
+    without a tile, get the tile behind the last."""
     at = tl.program_id(0) * PAIRS + tl.arange(0, PAIRS)
     valid = at < pairs
+    real = at < tl.load(ends + (count - 1))
     # The splat of a pair: how many splats end at or before it.
     low = tl.zeros((PAIRS,), tl.int32)
     high = tl.zeros((PAIRS,), tl.int32) + (count - 1)
@@ -142,7 +146,7 @@ def list_kernel(
     rows = tl.load(order + low)
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
     left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
-    left_over = tl.where(valid, at - begin, -1).to(tl.int32)  # tiles of the splat before the pair's, in rows to come
+    left_over = tl.where(real, at - begin, -1).to(tl.int32)  # tiles of the splat before the pair's, in rows to come
     tile = tl.zeros((PAIRS,), tl.int32) + width * height
     row = top
     while tl.max(tl.where(row < bottom, left_over, -1), axis=0) >= 0:
@@ -158,6 +162,53 @@ def list_kernel(
 launch_count, launch_list = Launcher(count_kernel), Launcher(list_kernel)
 
 
+class Room:
+    """How many pairs of splats and tiles there is room for on a GPU.
+
+    How many there are the GPU alone knows. To ask it, the host would wait while there is nothing for the GPU to do. So
+    the host makes room for a little more than there were lately, goes on, and looks whether that was enough when the
+    image is on its way.
+    """
+
+    MORE: ClassVar[float] = 1.25
+    """Room for each pair that there was."""
+    KEPT: ClassVar[float] = 0.99
+    """Share of the room that is there for the next image, if it needs as little."""
+
+    def __init__(self):
+        self.pairs = 0
+        with torch.inference_mode(False):  # it outlives a rendering that records nothing
+            self._counted = torch.empty(1, dtype=torch.int64, pin_memory=True)
+        self._arrived = torch.cuda.Event()
+
+    def send(self, total: Tensor) -> None:
+        """Send the number of pairs [1] home."""
+        self._counted.copy_(total, non_blocking=True)
+        self._arrived.record()
+
+    def needed(self) -> int:
+        """The number that was sent, for which the host waits."""
+        self._arrived.synchronize()
+        return int(self._counted[0])
+
+    def was_enough(self) -> bool:
+        """Whether there was room for all pairs; then, and next time, there is."""
+        pairs, room = self.needed(), self.pairs
+        self.pairs = max(int(self.MORE * pairs), int(self.KEPT * room))
+        return pairs <= room
+
+
+_ROOMS = threading.local()
+
+
+def room_on(device: torch.device) -> Room:
+    """The room on a GPU for the images of this thread: a viewer's are other images than a training's."""
+    rooms = _ROOMS.__dict__
+    if device not in rooms:
+        rooms[device] = Room()
+    return rooms[device]
+
+
 def tile_lists(
     means2d: Tensor,
     radii: Tensor,
@@ -168,6 +219,7 @@ def tile_lists(
     height: int,
     side: int,
     colors: Tensor | None = None,
+    room: Room | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Lists of one camera's tiles. All tensors are dense, of M splats that are all visible.
 
@@ -179,9 +231,11 @@ def tile_lists(
         side: of a tile, in pixels.
         colors: leave out the splats of which one of these, [M, D], or another number is not finite.
 
+        room: make room for so many pairs, and send home how many there are; None: wait for their number.
+
     Returns:
         Where each tile's splats begin, int32 [1, height + 1, width], the last row for tiles below the image; rows of
-        the splats, tile by tile, int32.
+        the splats, tile by tile, int32; without room for all pairs, some are missing.
     """
     count, device, axes = len(depths), depths.device, 1 if radii.dim() == 1 else 2
     order = torch.sort(depths, stable=True).indices
@@ -194,7 +248,13 @@ def tile_lists(
             num_warps=max(SPLATS // 32, 1),
         )  # fmt: skip
     ends = counts.cumsum(0)
-    pairs = int(ends[-1]) if count > 0 else 0
+    if count == 0:
+        pairs = 0
+    elif room is None:
+        pairs = int(ends[-1])
+    else:
+        room.send(ends[-1:])
+        pairs = room.pairs
     tiles = torch.empty(pairs, dtype=torch.int16, device=device)
     rows = torch.empty(pairs, dtype=torch.int32, device=device)
     if pairs > 0:
