@@ -5,9 +5,9 @@
 
 Each method trains for a few hundred steps at full resolution from the same number of random splats, densification
 off, or with as many splats of a scene (`grown`), as `ns-train` would run it. Wall-clock is taken over steps that
-nothing watches; then the same steps are timed section by section on the host (no waiting added, so a section that waits for the
-GPU shows its wait), and a last few are traced with torch's profiler for kernels. Methods take turns within a round, so
-that a drifting machine hurts all alike.
+nothing watches; then the same steps are timed section by section on the host (no waiting added, so a section that waits
+for the GPU shows its wait), and a last few are traced with torch's profiler for kernels. Methods take turns within a
+round, so that a drifting machine hurts all alike.
 """
 
 import contextlib
