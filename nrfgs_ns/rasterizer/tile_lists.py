@@ -20,6 +20,7 @@ gsplat's to the last tie: 16-bit tile numbers take a quarter of the passes that 
 from __future__ import annotations
 
 import threading
+from functools import lru_cache
 from typing import ClassVar
 
 import torch
@@ -263,6 +264,13 @@ def tile_lists(
             PAIRS=PAIRS, SIDE=side, RADII=axes, num_warps=4,
         )  # fmt: skip
     tiles, by_tile = torch.sort(tiles, stable=True)
-    numbers = torch.arange(width * (height + 1), dtype=torch.int16, device=device)
+    numbers = _numbers(width * (height + 1), device)
     begins = torch.searchsorted(tiles, numbers, out_int32=True)
     return begins.view(1, height + 1, width), rows.index_select(0, by_tile)
+
+
+@lru_cache(maxsize=16)
+def _numbers(count: int, device: torch.device) -> Tensor:
+    """0 to count - 1; made once for each size of image."""
+    with torch.inference_mode(False):  # they outlive a rendering that records nothing
+        return torch.arange(count, dtype=torch.int16, device=device)
