@@ -10,8 +10,6 @@ The equations are torch's (Kingma and Ba 2015, with bias correction), in float32
 1 - beta2, in float64.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,35 +18,22 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nrfgs_ns.kernels.launch import Launcher
+from nrfgs_ns.kernels.launch import ALIGNMENT, Launcher
 
-BLOCK = 2048
+BLOCK = 512
 """Numbers that a program takes; a power of two."""
 WARPS = 4
 """Warps of a program."""
-COLUMNS = 32
-"""Most tensors of a launch; a power of two."""
-END, SIZE, PARAMETER, GRADIENT, MEAN, SQUARE, STEP, RATE, BETA1, BETA2, EPSILON, DECAY = map(tl.constexpr, range(12))
+COLUMNS = 64
+"""Most tensors of a step; a power of two."""
+END, SIZE, PARAMETER, MEAN, SQUARE, STEP, GRADIENT, RATE, BETA1, BETA2, EPSILON, DECAY = map(tl.constexpr, range(12))
 """Rows of the table: the last program's number + 1, how many numbers there are, where they lie, and the constants."""
 ROWS = 12
-ADDRESSES = slice(PARAMETER.value, STEP.value + 1)
-NUMBERS = slice(RATE.value, DECAY.value + 1)
+FIXED = slice(PARAMETER.value, STEP.value + 1)
+CONSTANTS = slice(RATE.value, DECAY.value + 1)
 
-
-@dataclass
-class AdamTensor:
-    """One tensor of a step. All of its tensors are float32, dense and on one device; `step` has one number."""
-
-    parameter: Tensor
-    gradient: Tensor
-    mean: Tensor
-    """exp_avg"""
-    square: Tensor
-    """exp_avg_sq"""
-    step: Tensor
-    """of this step, from 1"""
-    group: dict[str, Any]
-    """torch's options: lr, betas, eps, weight_decay"""
+Group = tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]
+"""torch's options of some parameters (lr, betas, eps, weight_decay), the parameters, and their states."""
 
 
 @triton.jit
@@ -71,14 +56,18 @@ def _place(base, table, row, column, COLUMNS: tl.constexpr):
 
 @triton.jit
 def adam_kernel(base, table, skip, BLOCK: tl.constexpr, COLUMNS: tl.constexpr):
-    """One step of all tensors of `table`, unless `skip` is not 0."""
-    if tl.load(skip) == 0.0:
-        program = tl.program_id(0)
-        ends = tl.load(table + END * COLUMNS + tl.arange(0, COLUMNS))
-        column = tl.sum((ends <= program).to(tl.int32), axis=0)
-        first = tl.max(tl.where(ends <= program, ends, 0), axis=0)
-
-        steps = tl.load(base + _entry(table, STEP, column, COLUMNS)).to(tl.float64)
+    """One step of all tensors of `table`, which their counters have counted; if `skip` is not 0, they uncount it."""
+    program = tl.program_id(0)
+    ends = tl.load(table + END * COLUMNS + tl.arange(0, COLUMNS))
+    column = tl.sum((ends <= program).to(tl.int32), axis=0)
+    first = tl.max(tl.where(ends <= program, ends, 0), axis=0)
+    counter = base + _entry(table, STEP, column, COLUMNS)
+    steps = tl.load(counter)
+    if tl.load(skip) != 0.0:
+        if program == first:
+            tl.store(counter, steps - 1.0)
+    else:
+        steps = steps.to(tl.float64)
         beta1 = _number(table, BETA1, column, COLUMNS)
         beta2 = _number(table, BETA2, column, COLUMNS)
         correction1 = 1.0 - tl.exp(steps * tl.log(beta1))
@@ -113,17 +102,8 @@ def adam_kernel(base, table, skip, BLOCK: tl.constexpr, COLUMNS: tl.constexpr):
 launch = Launcher(adam_kernel)
 
 
-def is_taken(tensor: AdamTensor, device: torch.device) -> bool:
-    """Whether the kernel can step it: float32, dense, on a device, and aligned, for four numbers are read at once."""
-    parts = tensor.parameter, tensor.gradient, tensor.mean, tensor.square
-    return all(
-        part.dtype == torch.float32 and part.device == device and part.is_contiguous() and part.data_ptr() % 16 == 0
-        for part in parts
-    )
-
-
 class AdamTable:
-    """The table on one device, and its copy in host memory."""
+    """The table on one device, and its copy in host memory. Only what has changed since the last step is written."""
 
     def __init__(self, device: torch.device):
         on_cuda = device.type == "cuda"
@@ -133,42 +113,75 @@ class AdamTable:
         self.numbers = self.rows.view(np.float64)
         self.copied = torch.cuda.Event() if on_cuda else None
         self.never = torch.zeros((), device=device)
+        self.fixed: list[int] = []
+        self.constants: list[tuple] = []
+        self.programs = 0
 
-    def step(self, tensors: Sequence[AdamTensor], skip: Tensor | None) -> None:
-        """One step of at most `COLUMNS` tensors, in place.
+    def step(self, work: list[Group], skip: Tensor | None) -> bool:
+        """One step, in place, of parameters with gradients whose counters have counted it.
 
         Args:
-            tensors: none of them empty.
-            skip: a number on the device, not 0 to leave everything as it is.
+            work: all groups.
+            skip: a number on the device, not 0 to leave everything as it was before; None: do not skip.
+
+        Returns:
+            Whether the kernel could make it: of at most `COLUMNS` tensors, all float32, dense, aligned and on the
+            table's device. If not, nothing has been done.
         """
+        fixed: list[int] = []
+        gradients: list[int] = []
+        constants: list[tuple] = []
+        aligned = True
+        for group, parameters, states in work:
+            constant = (group["lr"], *group["betas"], group["eps"], group["weight_decay"])
+            for parameter, state in zip(parameters, states, strict=True):
+                mean, square, gradient = state["exp_avg"], state["exp_avg_sq"], parameter.grad
+                fixed += (parameter.data_ptr(), mean.data_ptr(), square.data_ptr(), state["step"].data_ptr())
+                fixed.append(parameter.numel())
+                gradients.append(gradient.data_ptr())
+                aligned = aligned and gradient.is_contiguous() and gradients[-1] % ALIGNMENT == 0
+                constants.append(constant)
         if self.copied is not None:
             self.copied.synchronize()  # the copy of the step before, which has long been made
-        base, count = tensors[0].parameter, len(tensors)
-        origin = base.data_ptr()
-        sizes = [tensor.parameter.numel() for tensor in tensors]
-        addresses = [
-            [getattr(tensor, name).data_ptr() - origin for tensor in tensors]
-            for name in ("parameter", "gradient", "mean", "square", "step")
-        ]
-        groups = [tensor.group for tensor in tensors]
-        programs = -(-np.array(sizes) // BLOCK)
-        rows = self.rows
-        rows[END, :count] = np.cumsum(programs)
-        rows[END, count:] = np.iinfo(np.int64).max
-        rows[SIZE, :count] = sizes
-        rows[ADDRESSES, :count] = np.array(addresses) >> 2
-        self.numbers[NUMBERS, :count] = [
-            [group["lr"] for group in groups],
-            [group["betas"][0] for group in groups],
-            [group["betas"][1] for group in groups],
-            [group["eps"] for group in groups],
-            [group["weight_decay"] for group in groups],
-        ]
+        if not aligned or (fixed != self.fixed and not self._write_fixed(work, fixed)):
+            return False
+        count, base = len(gradients), work[0][1][0]
+        if constants != self.constants:
+            self.numbers[CONSTANTS, :count] = np.array(constants).T
+            self.constants = constants
+        self.rows[GRADIENT, :count] = (np.array(gradients) - base.data_ptr()) >> 2
         self.device.copy_(self.host, non_blocking=True)
         if self.copied is not None:
             self.copied.record()
         skip = self.never if skip is None else skip
-        launch((int(programs.sum()), 1, 1), base, self.device, skip, BLOCK=BLOCK, COLUMNS=COLUMNS, num_warps=WARPS)
-        for tensor in tensors:  # which PyTorch cannot know
-            for written in (tensor.parameter, tensor.mean, tensor.square):
-                torch.autograd.graph.increment_version(written)
+        launch((self.programs, 1, 1), base, self.device, skip, BLOCK=BLOCK, COLUMNS=COLUMNS, num_warps=WARPS)
+        for _, parameters, _ in work:  # of which PyTorch cannot know that they have been written to
+            for parameter in parameters:
+                torch.autograd.graph.increment_version(parameter)
+        return True
+
+    def _write_fixed(self, work: list[Group], fixed: list[int]) -> bool:
+        """Write where the tensors lie, as far as that stays from step to step, if the kernel can step them."""
+        self.fixed = []
+        parts = [
+            tensor
+            for _, parameters, states in work
+            for parameter, state in zip(parameters, states, strict=True)
+            for tensor in (parameter, state["exp_avg"], state["exp_avg_sq"])
+        ]
+        if len(fixed) > 5 * COLUMNS or not all(
+            part.dtype == torch.float32
+            and part.device == self.device.device
+            and part.is_contiguous()
+            and part.data_ptr() % ALIGNMENT == 0
+            for part in parts
+        ):
+            return False
+        each = np.array(fixed).reshape(-1, 5).T
+        count, programs = each.shape[1], -(-each[4] // BLOCK)
+        self.rows[END, :count] = np.cumsum(programs)
+        self.rows[END, count:] = np.iinfo(np.int64).max
+        self.rows[SIZE, :count] = each[4]
+        self.rows[FIXED, :count] = (each[:4] - each[0, 0]) >> 2
+        self.fixed, self.constants, self.programs = fixed, [], int(programs.sum())
+        return True

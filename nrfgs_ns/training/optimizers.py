@@ -112,24 +112,25 @@ def fused_adam_step(optimizers: Iterable[Optimizer]) -> None:
 
     An optimiser's `found_inf` (a tensor on the device, 1.0 for "skip this step") is heeded as torch heeds it.
     """
-    work = []
+    work: list[tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]] = []
+    skips: list[Tensor | None] = []
     for optimizer in optimizers:
         for group in optimizer.param_groups:
             parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
             if parameters:
-                states = [optimizer.state[parameter] for parameter in parameters]
-                work.append((group, parameters, states, getattr(optimizer, "found_inf", None)))
+                work.append((group, parameters, [optimizer.state[parameter] for parameter in parameters]))
+                skips.append(getattr(optimizer, "found_inf", None))
     if not work:
         return
-    counters = [state["step"] for _, _, states, _ in work for state in states]
-    skips = [found_inf for _, _, states, found_inf in work for _ in states if found_inf is not None]
+    counters = [state["step"] for _, _, states in work for state in states]
     torch._foreach_add_(counters, 1)
     with torch.no_grad():
-        if not _step_at_once(work):
-            for group, parameters, states, found_inf in work:
-                _step_group(group, parameters, states, found_inf)
-    if skips:
-        torch._foreach_sub_(counters, skips)
+        if _step_at_once(work, skips):
+            return
+        for (group, parameters, states), found_inf in zip(work, skips, strict=True):
+            _step_group(group, parameters, states, found_inf)
+            if found_inf is not None:
+                torch._foreach_sub_([state["step"] for state in states], [found_inf] * len(states))
 
 
 def _step_group(group: dict[str, Any], parameters: list[Tensor], states: list[dict], found_inf: Tensor | None) -> None:
@@ -158,38 +159,30 @@ _GATE = Gate("Adam")
 _TABLES: dict[torch.device, Any] = {}
 
 
-def _step_at_once(work: list[tuple]) -> bool:
-    """Make the step of all groups in one kernel, if it can be."""
+def _step_at_once(work: list[tuple], skips: list[Tensor | None]) -> bool:
+    """Make the step of all groups in one kernel, if it can be, uncounted if it is skipped."""
     device = work[0][1][0].device
-    if device.type != "cuda" or not _GATE.opens(device, device, lambda: _try_kernel(device)):
+    if device.type != "cuda" or any(skip is not skips[0] for skip in skips):
         return False
-    found_inf = work[0][3]
-    if any(skip is not found_inf for *_, skip in work):
+    if not _GATE.opens(device, device, lambda: _try_kernel(device)):
         return False
-    from nrfgs_ns.training.adam_triton import COLUMNS, AdamTable, AdamTensor, is_taken
+    from nrfgs_ns.training.adam_triton import AdamTable
 
-    tensors = [
-        AdamTensor(parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"], state["step"], group)
-        for group, parameters, states, _ in work
-        for parameter, state in zip(parameters, states, strict=True)
-        if parameter.numel() > 0
-    ]
-    if not all(is_taken(tensor, device) for tensor in tensors):
-        return False
     if device not in _TABLES:
         _TABLES[device] = AdamTable(device)
-    for begin in range(0, len(tensors), COLUMNS):
-        _TABLES[device].step(tensors[begin : begin + COLUMNS], found_inf)
-    return True
+    return _TABLES[device].step(work, skips[0])
 
 
 def _try_kernel(device: torch.device) -> None:
     """Compile and run the kernel on one number; raise whatever goes wrong."""
-    from nrfgs_ns.training.adam_triton import AdamTable, AdamTensor
+    from nrfgs_ns.training.adam_triton import AdamTable
 
-    numbers = [torch.ones(1, device=device) for _ in range(5)]
+    one = torch.nn.Parameter(torch.ones(1, device=device))
+    one.grad = torch.ones_like(one)
+    state = {name: torch.ones(1, device=device) for name in ("exp_avg", "exp_avg_sq", "step")}
     group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
-    AdamTable(device).step([AdamTensor(*numbers, group)], None)
+    with torch.no_grad():
+        AdamTable(device).step([(group, [one], [state])], None)
 
 
 def in_world_units(group: dict[str, Any], scene_unit: float) -> dict[str, Any]:
