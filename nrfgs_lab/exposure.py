@@ -1,12 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What learning each photograph's exposure is worth, on a capture as it is and with known exposures put on it.
+"""What photographs as people take them cost, and what learning each one's exposure, or the robust loss, is worth.
 
     python -m nrfgs_lab.exposure SCENES/bonsai OUT --cases as-is-off varied-off varied-on
 
-trains on the capture as it is and on one whose training photographs were given random exposures and white balances (in
-light: decoded by sRGB's curve, multiplied, clipped, encoded, rounded to 8 bits), and evaluates on the same test
-photographs, which stay as they are. `on`, `off` and `auto` are values of --pipeline.model.photographs. Each case leaves
-OUT/CASE-SEED.json; where exposures were learnt, it says how far they are from those that were put on.
+trains on a capture as it is, or on one whose training photographs were changed, and evaluates on the same test
+photographs, which stay as they are:
+
+    varied      random exposures and white balances (in light: decoded by sRGB's curve, multiplied, clipped, encoded,
+                rounded to 8 bits), of mean zero, so that the mean look stays that of the test photographs
+    told        the same, and EXIF tells the exposures
+    occluded    in a quarter of the photographs, people-like shapes with what another photograph shows upside down
+    unmasked    masks, where the capture has them, are left out of the training, and count in the test
+
+`on`, `off` and `auto` are values of --pipeline.model.photographs. Each case leaves OUT/CASE-SEED.json; where exposures
+were learnt, it says how far they are from those that were put on.
 
 Several commands at once may share an OUT, each with cases of its own.
 """
@@ -15,8 +22,10 @@ import json
 import math
 import os
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -26,12 +35,44 @@ from PIL import Image
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import only_one, write_whole
 
-Case = Literal["as-is-off", "as-is-on", "as-is-auto", "varied-off", "varied-on", "varied-auto"]
+Case = Literal[
+    "as-is-off", "as-is-on", "as-is-auto", "varied-off", "varied-on", "varied-auto", "told-on", "told-auto",
+    "occluded-off", "unmasked-off",
+]  # fmt: skip
 TEST_EVERY = 8
+OCCLUDED = 0.25
+"""Share of the training photographs that something walks through."""
+MOST_OCCLUDERS = 3
+"""In such a photograph."""
+HEIGHTS, WIDTHS = (0.3, 0.6), (0.3, 0.45)
+"""Of an occluder, in heights of the photograph, and in heights of itself."""
 QUIET = (
     "--vis tensorboard --steps-per-eval-image 1000000 --steps-per-eval-all-images 1000000 "
     "--logging.local-writer.enable False --logging.profiler none"
 ).split()
+
+
+@dataclass(frozen=True)
+class Occluder:
+    """A head and a body in front of a photograph."""
+
+    texture: str
+    """stem of the photograph whose colours it has"""
+    center: tuple[float, float]
+    """x and y, in widths and heights of the photograph"""
+    height: float
+    """in heights of the photograph"""
+    width: float
+    """in heights of the photograph"""
+
+    def inside(self, height: int, width: int) -> np.ndarray:
+        """Which pixels it covers, bool [H, W]."""
+        y, x = np.mgrid[:height, :width].astype(np.float64)
+        up = ((y + 0.5) / height - self.center[1]) / self.height  # -0.5 to 0.5
+        across = ((x + 0.5) - self.center[0] * width) / height / self.width
+        head = ((up + 0.38) / 0.12) ** 2 + (across / 0.3) ** 2 <= 1.0
+        body = ((up - 0.12) / 0.38) ** 4 + (across / 0.5) ** 4 <= 1.0
+        return head | body
 
 
 @dataclass
@@ -49,7 +90,7 @@ class Study:
     white_balance: float = 0.2
     """standard deviation of red's and blue's stops against green's"""
     draw: int = 0
-    """seed of the exposures"""
+    """seed of the exposures, or of what walks through"""
     downscale: int = 1
     """photographs are averaged down by this factor"""
     method: str = "nrfgs-fast"
@@ -77,7 +118,11 @@ class Study:
         data = self.out / f"data-{varied}"
         with only_one(self.out / f"{data.name}.lock", f"Another process makes {data}; waiting for it."):
             if not (data / "transforms.json").exists():
-                make_data(self.scene, data, self.downscale, self.exposures() if varied == "varied" else None)
+                exposures = self.exposures() if varied in ("varied", "told") else None
+                occluders = self.occluders() if varied == "occluded" else {}
+                make_data(
+                    self.scene, data, self.downscale, exposures, varied == "told", occluders, varied != "unmasked"
+                )
         work = self.out / "work" / f"{case}-{self.seed}"
         shutil.rmtree(work, ignore_errors=True)
         args = [self.method, "--output-dir", str(work), "--experiment-name", "x", *QUIET, *self.options.split()]
@@ -105,6 +150,25 @@ class Study:
         stops -= stops.mean(axis=0)
         return dict(zip(names, stops.tolist(), strict=True))
 
+    def occluders(self) -> dict[str, list[Occluder]]:
+        """What walks through some of the training photographs."""
+        random = np.random.default_rng(self.draw)
+        names = [Path(frame["file_path"]).stem for frame in split(read(self.scene))[0]]
+        chosen = random.choice(len(names), max(round(OCCLUDED * len(names)), 1), replace=False)
+        found = {}
+        for index in sorted(chosen.tolist()):
+            others = [name for name in names if name != names[index]]
+            found[names[index]] = [
+                Occluder(
+                    others[random.integers(len(others))],
+                    tuple(random.uniform(0.1, 0.9, 2).tolist()),
+                    height := float(random.uniform(*HEIGHTS)),
+                    height * float(random.uniform(*WIDTHS)),
+                )
+                for _ in range(random.integers(1, MOST_OCCLUDERS + 1))
+            ]
+        return found
+
 
 def read(scene: Path) -> dict[str, Any]:
     file = scene / "transforms.json"
@@ -122,35 +186,60 @@ def split(meta: dict[str, Any]) -> tuple[list[dict[str, Any]], list[dict[str, An
     return [one for one in frames if one["file_path"] in train], [one for one in frames if one["file_path"] in test]
 
 
-def make_data(scene: Path, out: Path, downscale: int, exposures: dict[str, list[float]] | None) -> None:
-    """Copy a data set with smaller photographs, those for training exposed anew.
+def make_data(
+    scene: Path,
+    out: Path,
+    downscale: int,
+    exposures: dict[str, list[float]] | None = None,
+    told: bool = False,
+    occluders: Mapping[str, Sequence[Occluder]] = MappingProxyType({}),
+    masked: bool = True,
+) -> None:
+    """Copy a data set with smaller photographs, those for training changed.
 
     Args:
         scene: with a transforms.json, of which the first split is kept.
         out: the copy.
         downscale: an integer factor.
         exposures: stops [3] by photograph's stem; None: as they are.
+        told: EXIF tells the exposures.
+        occluders: by photograph's stem.
+        masked: whether masks hold for the training.
     """
     meta = read(scene)
     train, test = split(meta)
     aside = out.with_name(out.name + ".writing")
     shutil.rmtree(aside, ignore_errors=True)
     (aside / "images").mkdir(parents=True)
+    files = {Path(frame["file_path"]).stem: scene / frame["file_path"] for frame in (*train, *test)}
+
+    def pixels_of(stem: str) -> np.ndarray:
+        with Image.open(files[stem]) as image:
+            return np.asarray(image.convert("RGB").reduce(downscale))
+
+    training = {Path(frame["file_path"]).stem for frame in train}
     for frame in (*train, *test):
         stem = Path(frame["file_path"]).stem
-        with Image.open(scene / frame["file_path"]) as image:
-            pixels = np.asarray(image.convert("RGB").reduce(downscale))
+        pixels = pixels_of(stem)
+        for occluder in occluders.get(stem, ()):
+            texture = Image.fromarray(pixels_of(occluder.texture)[::-1]).resize(pixels.shape[1::-1])
+            pixels = np.where(occluder.inside(*pixels.shape[:2])[..., None], np.asarray(texture), pixels)
         if exposures is not None and stem in exposures:
             pixels = exposed(pixels, exposures[stem])
         Image.fromarray(pixels).save(aside / "images" / f"{stem}.png", compress_level=1)
         frame["file_path"] = f"images/{stem}.png"
         if exposures is not None:
             frame.pop("exif", None)  # it tells of another photograph
+            if told and stem in exposures:
+                frame["exif"] = {"exposure_time": 0.01 * 2.0 ** float(np.mean(exposures[stem])), "iso": 100}
         if "mask_path" in frame:
             with Image.open(scene / frame["mask_path"]) as mask:
                 size = (-(-mask.width // downscale), -(-mask.height // downscale))
                 (aside / "masks").mkdir(exist_ok=True)
-                mask.resize(size, Image.Resampling.NEAREST).save(aside / "masks" / f"{stem}.png")
+                smaller = mask.resize(size, Image.Resampling.NEAREST)
+                if not masked and stem in training:
+                    smaller = smaller.point(lambda value: 255)
+                smaller.save(aside / "masks" / f"{stem}.png")
             frame["mask_path"] = f"masks/{stem}.png"
     for place in (meta, *meta["frames"]):
         for key in ("fl_x", "fl_y", "cx", "cy"):

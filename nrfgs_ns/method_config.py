@@ -27,7 +27,7 @@ from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS
 from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
 from nrfgs_ns.training.progress import ProgressLineConfig
 from nrfgs_ns.training.start import know_callers_quickly
-from nrfgs_ns.training.trainer import AVERAGED, NrfgsTrainerConfig
+from nrfgs_ns.training.trainer_config import AVERAGED, NrfgsTrainerConfig
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 know_callers_quickly()  # plugins are loaded right before nerfstudio asks
@@ -110,7 +110,7 @@ nrfgs = preset(
 nrfgs_fast = preset(
     "nrfgs-fast",
     nrfgs,
-    "nrfgs in 10,000 steps, however many views there are: where they are many, a third of the time for 1 dB.",
+    "nrfgs in 10,000 steps, however many views there are, for a first result (docs/trade-off.md).",
     model={},
     max_num_iterations=FEWEST_STEPS,
     schedule_steps=STEPS,
@@ -120,8 +120,7 @@ nrfgs_fast = preset(
 nrfgs_best = preset(
     "nrfgs-best",
     nrfgs,
-    "nrfgs in 30,000 steps with the densification of 3DGS: 1.7 times as many splats, 0.7 and 1.5 dB more on two "
-    "captures.",
+    "nrfgs in 30,000 steps with the densification of 3DGS: more splats, more time, more detail (docs/trade-off.md).",
     model={"densification": "original"},
     max_num_iterations=STEPS,
     average_steps=AVERAGED,

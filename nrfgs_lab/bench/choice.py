@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a command asks for of a benchmark's file, and what else of the file its report shows.
 
-A file may be worked off in parts, by several commands, some of them at once: `--runs`, `--data`, `--protocols` and
+A file may be worked off in parts, by several commands, some of them at once: `--runs`, `--data`, `--strategies` and
 `--seeds` choose. All of them report in the same folder, so a report has what its command asked for and whatever else of
 the file has left records there.
 """
@@ -72,7 +72,7 @@ def chosen_scenes(names: tuple[str, ...], scenes: Any) -> list[Any]:
 
 
 def united(file: dict[str, Any], asked: dict[str, Any]) -> dict[str, Any]:
-    """What is asked for, among all runs, scenes, protocols and seeds of the file.
+    """What is asked for, among all runs, scenes, strategies and seeds of the file.
 
     Args:
         file: content of a file; empty if there is none.
@@ -83,7 +83,7 @@ def united(file: dict[str, Any], asked: dict[str, Any]) -> dict[str, Any]:
     runs = {str(name): run for name, run in {**(file.get("runs") or {}), **asked["runs"]}.items()}
     scenes = {scene_name(scene): scene for key in (file, asked) for scene in as_list(key.get("scenes") or [])}
     together = {**asked, "runs": runs, "scenes": list(scenes.values())}
-    for key, default in (("protocols", [OWN]), ("seeds", [42])):
+    for key, default in (("strategies", [OWN]), ("seeds", [42])):
         if key in asked:
             of_file = as_list(file.get(key, default))
             together[key] = of_file + [one for one in as_list(asked[key]) if one not in of_file]
@@ -103,6 +103,8 @@ def with_records(whole: Spec, asked: Spec, is_there: Callable[[str], bool]) -> S
         whole,
         runs=[run for run in whole.runs if run in asked.runs or any(cell.run == run for cell in there)],
         scenes=[one for one in whole.scenes if one in asked.scenes or any(cell.scene == one for cell in there)],
-        protocols=[one for one in whole.protocols if one in asked.protocols or any(c.protocol == one for c in there)],
+        strategies=[
+            one for one in whole.strategies if one in asked.strategies or any(c.strategy == one for c in there)
+        ],
         seeds=[seed for seed in whole.seeds if seed in asked.seeds or any(cell.seed == seed for cell in there)],
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs bench`: methods x protocols x scenes x seeds, one table, one figure, one sheet of crops for each scene.
+"""`nrfgs bench`: methods x strategies x scenes x seeds, one table, one figure, one sheet of crops for each scene.
 
 Each training is a process of its own (`bench_run.py`) that leaves OUT/runs/NAME.json when it is finished. What is there
 is not repeated, what was cut off goes on from its checkpoint, what failed is tried again at the next call and listed
@@ -54,7 +54,7 @@ class Bench:
     """Compare methods: train each under each strategy on each scene with each seed, and report. See docs/bench.md."""
 
     spec: Annotated[Path | None, tyro.conf.Positional] = None
-    """YAML file with runs, protocols, scenes, seeds, ...; what is given as an option here has precedence"""
+    """YAML file with runs, strategies, scenes, seeds, ...; what is given as an option here has precedence"""
     scenes: Path = Path(".")
     """folder in which the data sets lie"""
     out: Path = Path("bench")
@@ -65,7 +65,7 @@ class Bench:
     """data sets: folders below --scenes, read as the file says if it has them"""
     runs: tuple[str, ...] = ()
     """runs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
-    protocols: tuple[str, ...] = ()
+    strategies: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--protocols"])] = ()
     """densification: splatfacto, original, consistent, mcmc, mcmc@BUDGET, own"""
     seeds: tuple[int, ...] = ()
     """--machine.seed of each repetition"""
@@ -161,7 +161,7 @@ class Bench:
 
         where = str(self.spec or "nrfgs bench")
         file = load_spec(self.spec) if self.spec else {}
-        given = {"protocols": self.protocols, "seeds": self.seeds, "steps": self.steps, "options": self.options}
+        given = {"strategies": self.strategies, "seeds": self.seeds, "steps": self.steps, "options": self.options}
         given |= {"train_views": self.train_views, "jobs": self.jobs, "gpus": self.gpus}
         asked = {**file, **{key: value for key, value in given.items() if value not in (None, ())}}
         if self.runs:

@@ -61,22 +61,22 @@ def pictures_of(spec: Spec, scene: Scene, runs: Path, work: Path, stale: dict[st
     The labels name the seeds if the runs have not all the same one.
     """
     found = []
-    for protocol, run in rows_of(spec):
+    for strategy, run in rows_of(spec):
         for seed in spec.seeds:
-            name = Cell(run, protocol, scene, seed).name
+            name = Cell(run, strategy, scene, seed).name
             folder = work / name / "pictures"
             if name not in stale and (runs / f"{name}.json").exists() and numbered(folder):
-                found.append((label(run.name, protocol), seed, folder))
+                found.append((label(run.name, strategy), seed, folder))
                 break
     several = len({seed for _, seed, _ in found}) > 1
     return {f"{text}, seed {seed}" if several else text: folder for text, seed, folder in found}
 
 
 def rows_from_records(spec: Spec, runs: Path, stale: dict[str, str]) -> list[Row]:
-    """One row for each scene, protocol and run, whether or not it has records."""
+    """One row for each scene, strategy and run, whether or not it has records."""
     by_place: dict[tuple[str, str, str], Row] = {}
     for cell in cells_of(spec):
-        place = (cell.scene.name, cell.run.name, cell.protocol)
+        place = (cell.scene.name, cell.run.name, cell.strategy)
         row = by_place.setdefault(place, Row(*place))
         file = runs / f"{cell.name}.json"
         if cell.name in stale:
@@ -94,16 +94,16 @@ def summary(row: Row) -> dict[str, Any]:
     return {
         "scene": row.scene,
         "run": row.run,
-        "protocol": row.protocol,
+        "strategy": row.strategy,
         "seeds": sorted(row.records),
         "absent": {str(seed): why for seed, why in row.absent.items()},
         **values,
     }
 
 
-def label(run: str, protocol: str) -> str:
-    """What a run under a protocol is called in pictures."""
-    return run if protocol == "own" else f"{run} {protocol}"
+def label(run: str, strategy: str) -> str:
+    """What a run under a strategy is called in pictures."""
+    return run if strategy == "own" else f"{run} {strategy}"
 
 
 def plain_label(text: str) -> str:
@@ -112,7 +112,7 @@ def plain_label(text: str) -> str:
 
 
 def draw_splats(rows: list[Row], out: Path) -> None:
-    """Number of splats over training steps: OUT/splats.png and .svg, one panel for each scene and protocol.
+    """Number of splats over training steps: OUT/splats.png and .svg, one panel for each scene and strategy.
 
     A line is the mean over seeds, on a band from the smallest to the largest.
     """
@@ -122,10 +122,10 @@ def draw_splats(rows: list[Row], out: Path) -> None:
     from matplotlib import pyplot
 
     scenes = list(dict.fromkeys(row.scene for row in rows if row.records))
-    protocols = list(dict.fromkeys(row.protocol for row in rows if row.records))
+    strategies = list(dict.fromkeys(row.strategy for row in rows if row.records))
     runs = list(dict.fromkeys(row.run for row in rows if row.records))
-    places = [(scene, protocol) for scene in scenes for protocol in protocols]
-    across = min(3, len(scenes)) if len(protocols) == 1 else len(protocols)
+    places = [(scene, strategy) for scene in scenes for strategy in strategies]
+    across = min(3, len(scenes)) if len(strategies) == 1 else len(strategies)
     down = -(-len(places) // across)
     # Text as text keeps the SVG small; a fixed salt gives the same file for the same numbers.
     with pyplot.rc_context({"svg.fonttype": "none", "svg.hashsalt": "nrfgs", "font.size": 8}):
@@ -133,11 +133,11 @@ def draw_splats(rows: list[Row], out: Path) -> None:
         figure, panels = pyplot.subplots(down, across, figsize=size, squeeze=False, layout="constrained")
         for panel in panels.flat[len(places) :]:
             panel.set_visible(False)
-        for panel, (scene, protocol) in zip(panels.flat, places, strict=False):
+        for panel, (scene, strategy) in zip(panels.flat, places, strict=False):
             for row in rows:
-                if (row.scene, row.protocol) == (scene, protocol) and row.records:
+                if (row.scene, row.strategy) == (scene, strategy) and row.records:
                     draw_counts(panel, row, runs.index(row.run))
-            panel.set(title=plain_label(label(scene, protocol)), xlabel="step", ylabel="splats", ylim=(0, None))
+            panel.set(title=plain_label(label(scene, strategy)), xlabel="step", ylabel="splats", ylim=(0, None))
             panel.yaxis.set_major_formatter("{x:,.0f}")
         lines = {line.get_label(): line for panel in panels.flat for line in panel.get_lines()}
         ordered = [plain_label(run) for run in runs if plain_label(run) in lines]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a benchmark consists of: runs x protocols x scenes x seeds, from a YAML file, and the command of each.
+"""What a benchmark consists of: runs x strategies x scenes x seeds, from a YAML file, and the command of each.
 
     runs:                                   # name -> method of ns-train, or method and options
       SH: nrfgs-sh
       NRF-16: {method: nrfgs, options: --pipeline.model.appearance.latent-dim 16}
-      splatfacto: {method: splatfacto, protocols: [own]}
-    protocols: [original, mcmc@200000]      # densification, and the budget of mcmc; `own`: the method's, no option
+      splatfacto: {method: splatfacto, strategies: [own]}
+    strategies: [original, mcmc@200000]      # densification, and the budget of mcmc; `own`: the method's, no option
     scenes: [bonsai, {path: garden, downscale: 4}]
     seeds: [42, 43]
     steps: 30000
@@ -30,9 +30,9 @@ QUIET = (
 ).split()
 """Options that keep evaluation, the viewer and the terminal table out of the timing."""
 OWN = "own"
-"""The protocol of a method that is run as it is."""
+"""The strategy of a method that is run as it is."""
 DENSIFICATION = "--pipeline.model.densification"
-"""The option by which a protocol is told."""
+"""The option by which a strategy is told."""
 AVERAGE = "average"
 """What stands for the scene in the rows of averages over scenes."""
 PRESET_STEPS = {"nrfgs-fast": 10_000}
@@ -53,7 +53,7 @@ class Method:
     name: str
     method: str
     options: tuple[str, ...] = ()
-    protocols: tuple[str, ...] | None = None
+    strategies: tuple[str, ...] | None = None
     """instead of the benchmark's; a method that is not of this project has `own` only, unless it says otherwise"""
     steps: int | None = None
     """instead of the benchmark's, or of the preset's"""
@@ -83,7 +83,7 @@ class Spec:
     """methods with options, each under a name"""
     scenes: list[Scene]
     """data sets"""
-    protocols: list[str] = field(default_factory=lambda: [OWN])
+    strategies: list[str] = field(default_factory=lambda: [OWN])
     """densification: splatfacto, original, consistent, mcmc, mcmc@BUDGET, or own for no option at all"""
     seeds: list[int] = field(default_factory=lambda: [42])
     """--machine.seed of each repetition"""
@@ -108,14 +108,14 @@ class Cell:
     """One training of a benchmark."""
 
     run: Method
-    protocol: str
+    strategy: str
     scene: Scene
     seed: int
 
     @property
     def name(self) -> str:
         """Name of its files."""
-        text = f"{self.run.name}-{self.protocol}-{self.scene.name}-{self.seed}"
+        text = f"{self.run.name}-{self.strategy}-{self.scene.name}-{self.seed}"
         return re.sub(r"[^A-Za-z0-9_.@-]", "_", text)
 
 
@@ -151,7 +151,20 @@ def load_spec(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
     if not isinstance(content, dict):
         raise InputError(f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md for an example.")
-    return content
+    return _today(content)
+
+
+RENAMED = {"protocols": "strategies", "protocol": "strategy"}
+"""Keys of version 0.1.0 -> what they are called now."""
+
+
+def _today(content: Any) -> Any:
+    """The same with today's keys."""
+    if isinstance(content, list):
+        return [_today(value) for value in content]
+    if not isinstance(content, dict):
+        return content
+    return {key if RENAMED.get(key, key) in content else RENAMED.get(key, key): _today(content[key]) for key in content}
 
 
 def make_spec(content: dict[str, Any], where: str) -> Spec:
@@ -175,14 +188,14 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
             **content,
             "runs": [_method(name, value, where) for name, value in content["runs"].items()],
             "scenes": [_scene(value, where) for value in as_list(content["scenes"])],
-            "protocols": [str(value) for value in as_list(content.get("protocols", [OWN]))],
+            "strategies": [str(value) for value in as_list(content.get("strategies", [OWN]))],
             "seeds": as_list(content.get("seeds", [42])),
             "options": _words(content.get("options", ()), f"{where}: options"),
         }
     )
     for key, least in (("steps", 1), ("jobs", 1), ("gpus", 1), ("train_views", 0), ("checkpoint_every", 1)):
         _whole(getattr(spec, key), least, f"{where}: {key}")
-    for key in ("protocols", "seeds"):
+    for key in ("strategies", "seeds"):
         _require(bool(getattr(spec, key)), f"{where}: {key} is empty. Name at least one, or leave it out.")
     views = isinstance(spec.crops, dict) and all(
         isinstance(chosen, list) and all(isinstance(view, int) for view in chosen) for chosen in spec.crops.values()
@@ -193,18 +206,18 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     _require_free(spec.options, f"{where}: options")
     for run in spec.runs:
         _require_free(run.options, f"{where}: runs: {run.name}: options")
-        for protocol in run.protocols or spec.protocols:
-            options = protocol_options(protocol)
+        for strategy in run.strategies or spec.strategies:
+            options = strategy_options(strategy)
             own = {option_name(word) for word in (*spec.options, *run.options) if word.startswith("--")}
             twice = ", ".join(sorted(own.intersection(options)))
             _require(
                 not twice,
-                f"{where}: runs: {run.name}: {twice} is what protocol {protocol} gives; leave it out, or use protocol "
+                f"{where}: runs: {run.name}: {twice} is what strategy {strategy} gives; leave it out, or use strategy "
                 "own.",
             )
             _require(
-                not (run.protocols and options) or run.method.startswith("nrfgs"),
-                f"{where}: runs: {run.name}: {run.method} knows no protocol {protocol!r}; only this project's methods "
+                not (run.strategies and options) or run.method.startswith("nrfgs"),
+                f"{where}: runs: {run.name}: {run.method} knows no strategy {strategy!r}; only this project's methods "
                 "do. Use own, and the method's options.",
             )
     cells = cells_of(spec)
@@ -213,7 +226,7 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     _require(
         not twice,
         f"{where}: {', '.join(twice[:3])} would be trained twice. Give runs and scenes distinct names, and each "
-        "protocol and seed once.",
+        "strategy and seed once.",
     )
     return spec
 
@@ -221,21 +234,21 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
 def cells_of(spec: Spec) -> list[Cell]:
     """All trainings, the first seed of everything before the second."""
     return [
-        Cell(run, protocol, scene, seed)
+        Cell(run, strategy, scene, seed)
         for seed in spec.seeds
         for scene in spec.scenes
-        for protocol, run in rows_of(spec)
+        for strategy, run in rows_of(spec)
     ]
 
 
 def rows_of(spec: Spec) -> list[tuple[str, Method]]:
-    """Pairs (protocol, run): the rows of the table for each scene, protocol by protocol."""
+    """Pairs (strategy, run): the rows of the table for each scene, strategy by strategy."""
 
-    def protocols(run: Method) -> list[str]:
-        return list(run.protocols or (spec.protocols if run.method.startswith("nrfgs") else [OWN]))
+    def strategies(run: Method) -> list[str]:
+        return list(run.strategies or (spec.strategies if run.method.startswith("nrfgs") else [OWN]))
 
-    order = list(dict.fromkeys([*spec.protocols, *(name for run in spec.runs for name in protocols(run))]))
-    return [(protocol, run) for protocol in order for run in spec.runs if protocol in protocols(run)]
+    order = list(dict.fromkeys([*spec.strategies, *(name for run in spec.runs for name in strategies(run))]))
+    return [(strategy, run) for strategy in order for run in spec.runs if strategy in strategies(run)]
 
 
 def steps_of(spec: Spec, run: Method) -> int:
@@ -243,18 +256,18 @@ def steps_of(spec: Spec, run: Method) -> int:
     return PRESET_STEPS.get(run.method, spec.steps) if run.steps is None else run.steps
 
 
-def protocol_options(protocol: str) -> list[str]:
-    """Options of ns-train for a protocol of densification.
+def strategy_options(strategy: str) -> list[str]:
+    """Options of ns-train for a strategy of densification.
 
     Raises:
-        InputError: there is no such protocol.
+        InputError: there is no such strategy.
     """
-    name, at, budget = protocol.partition("@")
-    if protocol == OWN:
+    name, at, budget = strategy.partition("@")
+    if strategy == OWN:
         return []
     known = ("splatfacto", "original", "consistent", "mcmc")
     good = name in known and (not at or (name == "mcmc" and budget.isdigit()))
-    _require(good, f"protocol {protocol!r} is unknown; use {', '.join(known)}, mcmc@BUDGET or own.")
+    _require(good, f"strategy {strategy!r} is unknown; use {', '.join(known)}, mcmc@BUDGET or own.")
     return [DENSIFICATION, name, *(["--pipeline.model.splat-budget", budget] if at else [])]
 
 
@@ -275,7 +288,7 @@ def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
         *("--machine.seed", str(cell.seed)),
         *QUIET,
         *spec.options,
-        *protocol_options(cell.protocol),
+        *strategy_options(cell.strategy),
         *cell.run.options,
         *parser,
     ]
@@ -344,14 +357,14 @@ def _method(name: str, value: Any, where: str) -> Method:
     _require(isinstance(value, dict) and isinstance(value.get("method"), str), f"{where} names no method.")
     one = len(value["method"].split()) == 1
     _require(one, f"{where}: {value['method']!r} is no single word; use {{method: METHOD, options: OPTIONS}}.")
-    unknown = sorted(set(value) - {"method", "options", "protocols", "steps"})
-    _require(not unknown, f"{where}: unknown key {unknown}. Known are method, options, protocols, steps.")
+    unknown = sorted(set(value) - {"method", "options", "strategies", "steps"})
+    _require(not unknown, f"{where}: unknown key {unknown}. Known are method, options, strategies, steps.")
     if value.get("steps") is not None:
         _whole(value["steps"], 1, f"{where}: steps")
-    protocols = tuple(str(one) for one in as_list(value["protocols"])) if "protocols" in value else None
-    _require(protocols != (), f"{where}: protocols is empty. Name at least one, or leave it out.")
+    strategies = tuple(str(one) for one in as_list(value["strategies"])) if "strategies" in value else None
+    _require(strategies != (), f"{where}: strategies is empty. Name at least one, or leave it out.")
     options = _words(value.get("options", ()), f"{where}: options")
-    return Method(str(name), value["method"], options, protocols, value.get("steps"))
+    return Method(str(name), value["method"], options, strategies, value.get("steps"))
 
 
 def _scene(value: Any, where: str) -> Scene:

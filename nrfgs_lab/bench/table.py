@@ -83,11 +83,11 @@ ABSENCES = (MISSING, STALE, FAILED)
 
 @dataclass
 class Row:
-    """One run under one protocol on one scene, or on the average of all."""
+    """One run under one strategy on one scene, or on the average of all."""
 
     scene: str
     run: str
-    protocol: str
+    strategy: str
     records: dict[int, Record] = field(default_factory=dict)
     """seed -> record"""
     absent: dict[int, str] = field(default_factory=dict)
@@ -135,7 +135,7 @@ class Row:
 
 def average(rows: list[Row]) -> Row:
     """The row of means over scenes: seed by seed, of the seeds and columns that every scene has."""
-    result = Row(AVERAGE, rows[0].run, rows[0].protocol)
+    result = Row(AVERAGE, rows[0].run, rows[0].strategy)
     seeds = [seed for seed in rows[0].records if all(seed in row.records for row in rows)]
     result.records = {seed: {} for seed in seeds}
     for row in rows:
@@ -151,18 +151,18 @@ def average(rows: list[Row]) -> Row:
 
 
 def with_averages(rows: list[Row]) -> list[Row]:
-    """The rows, and behind them one average for each run and protocol if there is more than one scene."""
-    kinds = list(dict.fromkeys((row.protocol, row.run) for row in rows))
+    """The rows, and behind them one average for each run and strategy if there is more than one scene."""
+    kinds = list(dict.fromkeys((row.strategy, row.run) for row in rows))
     if len({row.scene for row in rows}) < 2:
         return rows
-    return rows + [average([row for row in rows if (row.protocol, row.run) == kind]) for kind in kinds]
+    return rows + [average([row for row in rows if (row.strategy, row.run) == kind]) for kind in kinds]
 
 
 def ranks(rows: list[Row], column: Column) -> dict[int, int]:
     """Row number -> 1 (best) or 2 (second) among rows that can be compared; equal as written is equal.
 
     Args:
-        rows: those of one scene and protocol. Times are ranked only if all are of one machine.
+        rows: those of one scene and strategy. Times are ranked only if all are of one machine.
     """
     if column.better == 0:
         return {}
@@ -184,17 +184,17 @@ def has_run(row: Row) -> bool:
 
 
 def cells(rows: list[Row], best: Callable[[str], str], second: Callable[[str], str]) -> list[list[str]]:
-    """The body of the table that is read; best and second of each scene and protocol are marked.
+    """The body of the table that is read; best and second of each scene and strategy are marked.
 
     Rows of which nothing was run are left out; `not_run` names them.
     """
     body: list[list[str]] = []
     shown = [row for row in rows if has_run(row)]
-    for place in dict.fromkeys((row.scene, row.protocol) for row in shown):
-        group = [row for row in shown if (row.scene, row.protocol) == place]
+    for place in dict.fromkeys((row.scene, row.strategy) for row in shown):
+        group = [row for row in shown if (row.scene, row.strategy) == place]
         ranked = {column.name: ranks(group, column) for column in SHOWN}
         for number, row in enumerate(group):
-            line = [row.scene, row.run, row.protocol, row.seeds]
+            line = [row.scene, row.run, row.strategy, row.seeds]
             for column in SHOWN:
                 mark = {1: best, 2: second}.get(ranked[column.name].get(number), str)
                 line.append(mark(row.text(column)))
@@ -202,7 +202,7 @@ def cells(rows: list[Row], best: Callable[[str], str], second: Callable[[str], s
     return body
 
 
-HEAD = ["scene", "run", "protocol", "seeds"]
+HEAD = ["scene", "run", "strategy", "seeds"]
 
 
 def notes(rows: list[Row]) -> list[str]:
@@ -239,8 +239,8 @@ def not_run(rows: list[Row]) -> list[str]:
     places: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row.scene != AVERAGE and not has_run(row):
-            places.setdefault((row.scene, row.protocol), []).append(row.run)
-    listed = "; ".join(f"{scene}, {protocol}: {', '.join(runs)}" for (scene, protocol), runs in places.items())
+            places.setdefault((row.scene, row.strategy), []).append(row.run)
+    listed = "; ".join(f"{scene}, {strategy}: {', '.join(runs)}" for (scene, strategy), runs in places.items())
     return [f"Not run yet, and in no row: {listed}."] if listed else []
 
 
@@ -260,7 +260,7 @@ def plain_markdown(text: str) -> str:
 
 
 def latex(rows: list[Row]) -> str:
-    """The table as a LaTeX tabular: best bold, second underlined, a line between scenes and protocols; notes below."""
+    """The table as a LaTeX tabular: best bold, second underlined, a line between scenes and strategies; notes below."""
     body = cells(rows, lambda text: f"\\textbf{{{text}}}", lambda text: f"\\underline{{{text}}}")
     lines = [f"\\begin{{tabular}}{{{'l' * len(HEAD)}{'r' * len(SHOWN)}}}", "\\hline"]
     lines.append(" & ".join([*HEAD, *(column.name for column in SHOWN)]) + r" \\")
@@ -300,7 +300,7 @@ def as_csv(rows: list[Row]) -> str:
     for row in rows:
         counts = [len(row.records), *(list(row.absent.values()).count(why) for why in ABSENCES)]
         numbers = [number for column in COLUMNS for number in (row.mean(column), row.deviation(column))]
-        writer.writerow([row.scene, row.run, row.protocol, *counts, *("" if n is None else n for n in numbers)])
+        writer.writerow([row.scene, row.run, row.strategy, *counts, *("" if n is None else n for n in numbers)])
     return file.getvalue()
 
 
@@ -320,6 +320,6 @@ def views_as_csv(rows: list[Row]) -> str:
         for seed, record in sorted(row.records.items()):
             for view in (record["measured"].get("test") or {}).get("per_image", ()):
                 numbers = (view.get(key) for key in PER_VIEW.values())
-                place = (row.scene, row.run, row.protocol, seed, view["image"])
+                place = (row.scene, row.run, row.strategy, seed, view["image"])
                 writer.writerow([*place, *("" if n is None else f"{n:.6g}" for n in numbers)])
     return file.getvalue()

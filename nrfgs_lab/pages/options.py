@@ -10,6 +10,7 @@ nerfstudio's own are in `ns-train METHOD --help`, with these.
 import ast
 import dataclasses
 import inspect
+import re
 import textwrap
 from collections.abc import Iterator
 from functools import cache
@@ -29,12 +30,13 @@ APPEARANCE = "pipeline.model.appearance."
 
 INTRODUCTION = """# Options
 
-This page is written by `python -m nrfgs_lab.pages.options`, from the configurations themselves. It has what this
-package adds to nerfstudio's options, or explains or presets in its own way; all of nerfstudio's and splatfacto's are
-there too, in `ns-train nrfgs --help`. Underscores and hyphens are the same. A scene unit is what the cameras fill:
-they lie within [-1, 1]. Defaults are `nrfgs`'s; of the other heads' methods `view-noise` is 0, `max-num-iterations`
-30,000 and `average-steps` 0.
+Written by `python -m nrfgs_lab.pages.options`, from the configurations themselves: what this package adds to
+nerfstudio's options, or presets in its own way. All of nerfstudio's and splatfacto's are there too, in `ns-train nrfgs
+--help`. Underscores and hyphens are the same. A scene unit is what the cameras fill: they lie within [-1, 1]. Defaults
+are `nrfgs`'s; of the other heads' methods `view-noise` is 0, `max-num-iterations` 30,000 and `average-steps` 0.
 """
+UNSAID = "none", "required", "False"
+"""Defaults that a list of options does not tell."""
 HOST = "`--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
 
 
@@ -89,9 +91,14 @@ def table(options: list[Option], prefix: str = "") -> str:
     """A Markdown table, the flags without the prefix that they share."""
     lines = [f"| `--{prefix}` | default | |" if prefix else "| | default | |", "|---|---|---|"]
     for option in options:
-        text = option.text.replace("|", "\\|")
+        text = linked(option.text.replace("|", "\\|"))
         lines.append(f"| `{option.flag.removeprefix(prefix)}` | {_shown(option.default)} | {text} |")
     return "\n".join(lines) + "\n"
+
+
+def linked(text: str) -> str:
+    """A text whose pages of this folder are links."""
+    return re.sub(r"docs/([\w-]+\.md)", r"[\1](\1)", text)
 
 
 def _shown(default: Any) -> str:
@@ -151,19 +158,31 @@ def page() -> str:
         table(data),
     ]
     presets = [method for method in others if is_preset(method, first)]
-    parts += ["## Presets\n", *(f"`ns-train {one.config.method_name}`: {one.description}\n" for one in presets)]
-    for method in others:
-        if method in presets:
-            continue
-        own = list(own_options(method.config.pipeline.model.appearance, APPEARANCE))
-        parts += [f"## `ns-train {method.config.method_name}`: the head\n", f"{method.description}\n"]
-        parts.append(table(own, APPEARANCE))
-    parts += ["## Learning rates\n", rates(first)]
-    for name, entry_point in commands().items():
-        command = entry_point.load()
-        summary = inspect.getdoc(command).split("\n")[0]
-        parts += [f"## `nrfgs {name}`\n", f"{summary}\n", table(list(command_options(command)))]
-    return "\n".join(parts)
+    parts += ["## Presets\n", *(f"`ns-train {one.config.method_name}`: {linked(one.description)}\n" for one in presets)]
+    parts += ["## The other heads\n\nTheir `--pipeline.model.appearance.` options; `--help` explains each.\n"]
+    rows = [
+        (one.config.method_name, own_options(one.config.pipeline.model.appearance), one.description)
+        for one in others
+        if one not in presets
+    ]
+    parts += [_listed("method", rows), "## Learning rates\n", rates(first)]
+    parts += ["## Commands\n\n`nrfgs COMMAND --help` explains their options.\n"]
+    loaded = {name: entry_point.load() for name, entry_point in commands().items()}
+    rows = [
+        (f"nrfgs {name}", command_options(command), inspect.getdoc(command).split("\n")[0])
+        for name, command in loaded.items()
+    ]
+    return "\n".join([*parts, _listed("command", rows)])
+
+
+def _listed(title: str, rows: list[tuple[str, Iterator[Option], str]]) -> str:
+    """A table of methods or commands by name, with their options and defaults in one cell."""
+    lines = [f"| {title} | | options |", "|---|---|---|"]
+    for name, options, text in rows:
+        shown = [(option.flag, _shown(option.default)) for option in options]
+        cell = ", ".join(f"`{flag}`" + ("" if value in UNSAID else f" {value}") for flag, value in shown)
+        lines.append(f"| `{name}` | {linked(text)} | {cell} |")
+    return "\n".join(lines) + "\n"
 
 
 def is_preset(method: MethodSpecification, of: MethodSpecification) -> bool:

@@ -5,10 +5,10 @@
     knobs:
       D: {option: --pipeline.model.appearance.latent-dim, values: [4, 8, 16]}
       steps: {steps: [7000, 15000]}
-      splat budget: {protocols: [mcmc@200000, mcmc@1000000]}
+      splat budget: {strategies: [mcmc@200000, mcmc@1000000]}
       precision: {option: --pipeline.model.appearance.precision, values: [fp32, fp16], cuda: true}
       head:
-        settings:                               # whatever else: name -> method, options, protocol, steps
+        settings:                               # whatever else: name -> method, options, strategy, steps
           SH 0: {method: nrfgs-sh, options: --pipeline.model.appearance.degree 0}
           one branch: {options: --pipeline.model.appearance.split-bands False}
 
@@ -24,8 +24,8 @@ from nrfgs_ns.errors import InputError
 
 DEFAULT = "default"
 """Name of the run that all others are compared with."""
-KINDS = ("option", "steps", "protocols", "settings")
-SETTING_KEYS = ("method", "options", "protocol", "steps")
+KINDS = ("option", "steps", "strategies", "settings")
+SETTING_KEYS = ("method", "options", "strategy", "steps")
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,10 @@ def bench_plan(
     """
     rest = {key: value for key, value in content.items() if key not in (DEFAULT, "knobs")}
     _require("runs" not in rest, f"{where}: runs are made from {DEFAULT} and knobs. Leave runs out.")
-    protocols = rest.get("protocols", [])
+    strategies = rest.get("strategies", [])
     _require(
-        isinstance(protocols, str) or len(protocols) <= 1,
-        f"{where}: protocols names several; a trade compares with one. Make the others values of a knob.",
+        isinstance(strategies, str) or len(strategies) <= 1,
+        f"{where}: strategies names several; a trade compares with one. Make the others values of a knob.",
     )
     default = content.get(DEFAULT, "nrfgs")
     default = {"method": default} if isinstance(default, str) else default
@@ -116,7 +116,7 @@ def _values(knob: str, description: Any, where: str) -> dict[str, dict[str, Any]
         return {str(value): {"options": [option, str(value)]} for value in values}
     values = description[kinds[0]]
     _require(isinstance(values, list) and bool(values), f"{where}: {kinds[0]} must be a list.")
-    one = {"steps": "steps", "protocols": "protocol"}[kinds[0]]
+    one = {"steps": "steps", "strategies": "strategy"}[kinds[0]]
     return {str(value): {one: value} for value in values}
 
 
@@ -126,8 +126,8 @@ def _run(default: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     options = [*_words(run.get("options", ())), *_words(changes.get("options", ()))]
     if options:
         run["options"] = options
-    if "protocol" in changes:
-        run["protocols"] = [str(changes["protocol"])]
+    if "strategy" in changes:
+        run["strategies"] = [str(changes["strategy"])]
     if "steps" in changes:
         run["steps"] = changes["steps"]
     return run

@@ -48,11 +48,11 @@ def report(spec: Spec, settings: list[Setting], out: Path, stale: dict[str, str]
     """
     rows = with_averages(rows_from_records(spec, out / "runs", stale))
     scenes = list(dict.fromkeys(row.scene for row in rows))
-    default_protocol = next(protocol for protocol, run in rows_of(spec) if run.name == DEFAULT)
+    default_strategy = next(strategy for strategy, run in rows_of(spec) if run.name == DEFAULT)
     results, texts, legend = [], [], list(LEGEND)
     for scene in scenes:
         of_scene = ordered([row for row in rows if row.scene == scene], settings)
-        default = next(row for row in of_scene if row.run == DEFAULT and row.protocol == default_protocol)
+        default = next(row for row in of_scene if row.run == DEFAULT and row.strategy == default_strategy)
         result = compare(of_scene, default, settings)
         results.append({"scene": scene, **result})
         texts.append(f"### {plain_markdown(scene)}\n\n{table(of_scene, default, result)}")
@@ -107,7 +107,7 @@ def compare(rows: list[Row], default: Row, settings: list[Setting]) -> dict[str,
                 "knob": knobs[row.run].knob,
                 "value": knobs[row.run].value,
                 "run": row.run,
-                "protocol": row.protocol,
+                "strategy": row.strategy,
                 "seeds": sorted(row.records),
                 "absent": {str(seed): why for seed, why in row.absent.items()},
                 "values": {name: [row.mean(BY_NAME[name]), row.deviation(BY_NAME[name])] for name in names},

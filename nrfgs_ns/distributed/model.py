@@ -2,7 +2,7 @@
 """The model on one of several devices: a shard of the splats, seen from the cameras of all."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -10,14 +10,16 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.densification import Mcmc
+from nrfgs_ns.densification import Densification, GradientDensification, build_densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import scale_gradient, send_to_cameras
+from nrfgs_ns.distributed.schedules import fewer
 from nrfgs_ns.distributed.shards import cut_model_state, rebalance, rows_of, shard_counts
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import View, project_splats, project_view
+from nrfgs_ns.model.view_noise import ViewNoise
 from nrfgs_ns.rasterizer import Projection
 from nrfgs_ns.training.sharding import ShardingConfig
 
@@ -41,21 +43,28 @@ class ShardedModel(NrfgsModel):
 
     counts: list[int]
     """every device's splats, [W]"""
-    sharding: ShardingConfig
     loaded: slice | None = None
     """which rows of the checkpoint are this device's, once one has been loaded"""
 
     def populate_modules(self):
+        self.sharding: ShardingConfig = self.kwargs["sharding"]
+        self.images_per_step = comm.world() if self.sharding.schedules == "images" else 1
+        """how many images a step counts for"""
         super().populate_modules()
         if self.trimming is not None:
             raise InputError("pipeline.model.robust_loss is for one device. Leave it out, or use one.")
-        self.view_noise.seed += comm.rank()  # each device has other splats
+        self.view_noise = ViewNoise(0.0, self.view_noise.seed + comm.rank())  # each device has other splats
         self.sizes: list[tuple[int, int]] = []
-        if isinstance(self.densification, Mcmc):
-            budget, rank = self.densification.budget, comm.rank()
-            self.densification.budget = shard_counts(budget, comm.world())[rank]
-        elif comm.rank() > 0:
-            self.densification.strategy.verbose = False
+
+    def _strategy(self) -> Densification:
+        """Of this device's share of the budget; after a reset it waits for as many images as on one device."""
+        config, rank = self.config, comm.rank()
+        if config.densification == "mcmc":
+            config = replace(config, splat_budget=shard_counts(config.splat_budget, comm.world())[rank])
+        found = build_densification(config, fewer(self.num_train_data, self.images_per_step), self.scene_unit)
+        if isinstance(found, GradientDensification):
+            found.strategy.verbose = rank == 0
+        return found
 
     def _initial_splats(self) -> dict[str, Parameter]:
         whole = super()._initial_splats()

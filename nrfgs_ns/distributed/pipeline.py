@@ -2,6 +2,7 @@
 """The pipeline on one of several devices."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ from nerfstudio.utils import profiler
 
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.model import ShardedModel
-from nrfgs_ns.distributed.schedules import fewer
 from nrfgs_ns.training.pipeline import NrfgsPipeline, NrfgsPipelineConfig
 
 
@@ -26,14 +26,10 @@ class ShardedPipeline(NrfgsPipeline):
     model: ShardedModel
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", world_size: int = 1, **kwargs):
-        config = replace(config, model=replace(config.model, _target=ShardedModel))
+        sharded = partial(ShardedModel, sharding=config.sharding)
+        config = replace(config, model=replace(config.model, _target=sharded))
         super().__init__(config, device, test_mode, world_size=1, **kwargs)
-        self.world_size = world_size
-        self.images_per_step = world_size if config.sharding.schedules == "images" else 1
-        self.model.sharding = config.sharding
-        if self.images_per_step > 1 and self.model.densification.name == "splatfacto":
-            images = fewer(len(self.datamanager.train_dataset), world_size)
-            self.model.densification.strategy.pause_refine_after_reset = images + config.model.refine_every
+        self.world_size, self.images_per_step = world_size, self.model.images_per_step
         torch.manual_seed(torch.initial_seed() + 1 + comm.rank())
 
     @profiler.time_function

@@ -26,7 +26,8 @@ from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, WatchedOptimizers
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 from nrfgs_ns.training.stopping import StopRequest
-from nrfgs_ns.training.trainer import NrfgsTrainer, NrfgsTrainerConfig
+from nrfgs_ns.training.trainer import NrfgsTrainer
+from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig
 
 ELSEWHERE = "a number on another device"
 ASKED = "a signal"

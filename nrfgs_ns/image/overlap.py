@@ -8,10 +8,11 @@ most points in common, and see them under almost the same angle. Their light dif
 - If surfaces shine, points are occluded or the sun has moved, by other shifts in other parts of the picture.
 
 So a picture is divided into regions. The shift of a pair of photographs is the median over the regions' medians, and
-its noise is how far the regions disagree. What counts is not that photographs differ, but that one differs from those
-around it: brightness that changes slowly with the place is what view dependence can learn, and test views need.
+its noise is how far the regions disagree. What counts is not that photographs differ, but that they differ by more than
+their places explain (`estimate`).
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -35,16 +36,26 @@ FEWEST_POINTS, FEWEST_REGIONS = 12, 4
 NEIGHBOURS, CANDIDATES = 4, 12
 """Other photographs that each is compared with, and how many of the nearest are tried."""
 
-ENOUGH_STOPS = 0.3, 0.2, 0.2
-"""By so much must photographs differ from those next to them for their exposure, log2(R/G) or log2(B/G) to be learnt.
-Captures for which learning it only costs have up to 0.23 stops of exposure and 0.12 of colour; one it helps, 0.39."""
-FEWEST_PAIRS, FEWEST_NEIGHBOURS = 8, 3
-"""Of a capture, and of a photograph in it, to be told by."""
+ENOUGH_STOPS = 0.12, 0.06, 0.06
+"""By so much must photographs differ from what their places explain for exposure, log2(R/G) or log2(B/G) to be learnt.
+Captures that do not need it have up to 0.05 stops of exposure and 0.02 of colour; one that does, 0.26."""
+ENOUGH_KNOWN_STOPS = 0.3
+"""By so much must known exposures vary."""
+FEWEST_PAIRS = 8
+"""Of a capture, to be told by."""
+MOST_PHOTOGRAPHS = 2000
+"""Of more, only their mean is taken for the scene's: telling patterns apart takes their number cubed."""
 
 SMALLEST_SPREAD = 0.02
 """Stops; regions that agree by chance do not make a pair certain."""
 USUAL_STOPS = 0.3, 0.1, 0.1
-"""How far exposure, log2(R/G) and log2(B/G) of a photograph are from the mean's before anything is known."""
+"""How far exposure, log2(R/G) and log2(B/G) of a photograph are from the mean's where too few pairs tell it."""
+SIZES = tuple(0.01 * 1.5**step for step in range(12))
+"""Stops that are tried for what differs between photographs and between places: 0.01 to 0.86."""
+SCALES = 2.0, 4.0, 8.0, 16.0, 32.0
+"""Distances in which brightness changes with the place that are tried, in spacings of the cameras."""
+MOST_PATTERNS = 128
+"""Of a column that are held."""
 
 
 class Pairs(NamedTuple):
@@ -58,28 +69,6 @@ class Pairs(NamedTuple):
     """stops by which the second is above the first, [E, 3]"""
     spread: Tensor
     """by how many stops the picture's regions disagree, [E, 3]"""
-
-    @property
-    def beyond_neighbours(self) -> Tensor:
-        """By how many stops a photograph differs from the mean of those next to it, root mean square over the
-        photographs, [3]; 0 for so few pairs that they tell nothing.
-
-        What changes slowly from place to place is small in it: light and gloss that a scene has to learn anyway.
-        """
-        if len(self.first) < FEWEST_PAIRS:
-            return torch.zeros(3)
-        count = int(torch.cat([self.first, self.second]).max()) + 1
-        total, number = torch.zeros(count, 3), torch.zeros(count, 1)
-        for own, sign in ((self.second, 1.0), (self.first, -1.0)):
-            total.index_add_(0, own, sign * self.shift)
-            number.index_add_(0, own, torch.ones(len(own), 1))
-        compared = number[:, 0] >= min(FEWEST_NEIGHBOURS, int(number.max()))
-        return (total[compared] / number[compared]).square().mean(dim=0).sqrt()
-
-    @property
-    def vary(self) -> bool:
-        """Whether exposure or white balance changes from one photograph to the next."""
-        return bool((self.beyond_neighbours >= torch.tensor(ENOUGH_STOPS)).any())
 
 
 class Sighting(NamedTuple):
@@ -200,7 +189,7 @@ def _shift(first: Sighting, second: Sighting) -> tuple[Tensor, Tensor] | None:
 def varies(known: Tensor) -> bool:
     """Whether known exposures (stops, NaN where unknown, [V]) differ enough to be learnt: their standard deviation."""
     there = known[torch.isfinite(known)]
-    return len(there) > 1 and float(there.std(correction=0)) >= ENOUGH_STOPS[0]
+    return len(there) > 1 and float(there.std(correction=0)) >= ENOUGH_KNOWN_STOPS
 
 
 def slope(pairs: Pairs, known: Tensor) -> tuple[float, float | None]:
@@ -224,18 +213,31 @@ def slope(pairs: Pairs, known: Tensor) -> tuple[float, float | None]:
     return factor, max(1.0 - float((seen - factor * expected).square().sum() / seen.square().sum()), 0.0)
 
 
-def estimate(pairs: Pairs, known: Tensor) -> Tensor:
-    """The likeliest stops of each photograph in red, green and blue, with mean 0; a start, not the last word.
+class Looks(NamedTuple):
+    """What photographs say of their exposure before a training. Columns: exposure, log2(R/G), log2(B/G)."""
 
-    Shifts are trusted as far as the regions agree, and a photograph is near its known exposure. That keeps small what
-    only adds up over many pairs: gloss that wanders with the camera.
+    stops: Tensor
+    """the likeliest of each photograph, mean 0, [V, 3]"""
+    held: tuple[Tensor, Tensor, Tensor]
+    """for each column, orthonormal patterns over the photographs that are the scene's rather than theirs, the constant
+    among them, [V, K]"""
+    random: tuple[float, float, float]
+    """by how many stops a photograph differs from what the place explains, a standard deviation"""
+
+
+def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
+    """Tell photographs' exposure from brightness that changes with the place.
+
+    A photograph's brightness is d = s + g: its exposure s, another for each photograph (variance a), and what changes
+    slowly with the place (a Gaussian process over the cameras, covariance b exp(-distance / scale)): light, gloss, and
+    exposure that follows the scene. a, b and the scale are those under which the pairs' shifts are likeliest, and b is
+    0 if that is hardly less likely (Schwarz's criterion). Patterns in which g is likelier than s belong to the scene:
+    view dependence learns them, and test views have them, too.
 
     Args:
         pairs: of the photographs.
         known: exposure of each in stops, NaN where it is not known. [V]
-
-    Returns:
-        [V, 3].
+        centers: where they were taken. [V, 3]
     """
     count = len(known)
     expected = torch.zeros(count, 3, dtype=torch.float64)
@@ -243,17 +245,85 @@ def estimate(pairs: Pairs, known: Tensor) -> Tensor:
     if there.any():
         factor, _ = slope(pairs, known)
         expected[there, 0] = factor * (known[there] - known[there].mean()).double()
-    stops = torch.empty_like(expected)
     rows = torch.arange(len(pairs.first))
     difference = torch.zeros(len(rows), count, dtype=torch.float64)
     difference[rows, pairs.second], difference[rows, pairs.first] = 1.0, -1.0
+    places = None if len(rows) < FEWEST_PAIRS or count > MOST_PHOTOGRAPHS else _places(centers)
+    stops, held, random = torch.empty_like(expected), [], []
     for column, usual in enumerate(USUAL_STOPS):
         weight = pairs.spread[:, column].double().clamp_min(SMALLEST_SPREAD) ** -2
         missing = pairs.shift[:, column].double() - difference @ expected[:, column]
-        normal = difference.T @ (weight[:, None] * difference) + torch.eye(count, dtype=torch.float64) / usual**2
-        correction = torch.linalg.solve(normal, difference.T @ (weight * missing))
+        precision = difference.T @ (weight[:, None] * difference)
+        seen = difference.T @ (weight * missing)
+        if places is None:
+            own, patterns, size = usual**2 * torch.eye(count, dtype=torch.float64), _constant(count), usual
+            total = own
+        else:
+            own, total, patterns, size = _split(places, precision, seen)
+        # mean of s given the pairs: cov(s, d) (cov(d) + precision^-1)^-1, written without inverting the precision
+        eye = torch.eye(count, dtype=torch.float64)
+        correction = own @ torch.linalg.solve(eye + precision @ total, seen)
         stops[:, column] = expected[:, column] + correction
+        held.append(patterns.float())
+        random.append(size)
     stops -= stops.mean(dim=0)
-    exposure, red, blue = stops.unbind(dim=-1)  # log2(R/G), log2(B/G)
+    return Looks(stops.float(), tuple(held), tuple(random))
+
+
+def _constant(count: int) -> Tensor:
+    return torch.full((count, 1), count**-0.5, dtype=torch.float64)
+
+
+def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """For each of some scales, the covariance of what changes slowly with the place, of variance 1 and with mean 0 over
+    the photographs, as eigenvalues [V], falling, and eigenvectors [V, V]."""
+    distance = torch.cdist(centers.double(), centers.double())
+    spacing = distance.sort(dim=1).values[:, 1 : 1 + NEIGHBOURS].mean().clamp_min(1e-12)
+    found = []
+    for scale in SCALES:
+        covariance = torch.exp(-distance / (scale * spacing))
+        covariance = covariance - covariance.mean(dim=0) - covariance.mean(dim=1, keepdim=True) + covariance.mean()
+        values, vectors = torch.linalg.eigh(covariance)
+        found.append((values.flip(0).clamp_min(0.0), vectors.flip(1)))
+    return found
+
+
+def _split(
+    places: list[tuple[Tensor, Tensor]], precision: Tensor, seen: Tensor
+) -> tuple[Tensor, Tensor, Tensor, float]:
+    """How brightness divides: covariance of the photographs' own part, and of all; patterns that are the place's; and
+    the standard deviation of the own part.
+
+    Args:
+        places: of `_places`.
+        precision, seen: of the brightness by the pairs: the likeliest solves precision @ d = seen. [V, V], [V]
+    """
+    count = len(seen)
+    eye = torch.eye(count, dtype=torch.float64)
+    values, vectors = torch.linalg.eigh(precision)
+    told = values > values.max() * 1e-9
+    brightness = vectors[:, told] @ ((vectors[:, told].T @ seen) / values[told])
+    noise = float((1.0 / values[told]).median())
+    best = None
+    for shares, basis in places:
+        squares = (basis.T @ brightness).square()
+        for own in SIZES:
+            for place in (0.0, *SIZES):
+                variance = place**2 * shares + own**2 + noise
+                likelihood = -float((variance.log() + squares / variance)[:-1].sum())
+                likelihood -= 2 * math.log(count) * (place > 0.0)
+                if best is None or likelihood > best[0]:
+                    best = likelihood, own, place, shares, basis
+    _, own, place, shares, basis = best
+    slow = (place**2 * shares > own**2).nonzero()[:MOST_PATTERNS, 0]
+    patterns = torch.cat([_constant(count), basis[:, slow]], dim=1)
+    patterns = torch.linalg.qr(patterns).Q
+    total = own**2 * eye + place**2 * (basis * shares) @ basis.T
+    return own**2 * eye, total, patterns, own
+
+
+def channels(stops: Tensor) -> Tensor:
+    """Stops of red, green and blue [V, 3] from exposure, log2(R/G) and log2(B/G) [V, 3]."""
+    exposure, red, blue = stops.unbind(dim=-1)
     rgb = exposure + (2 * red - blue) / 3, exposure - (red + blue) / 3, exposure + (2 * blue - red) / 3
-    return torch.stack(rgb, dim=-1).float()
+    return torch.stack(rgb, dim=-1)

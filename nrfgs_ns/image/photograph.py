@@ -19,26 +19,26 @@ its own and the mean of all is the scene's.
 
 What all photographs have in common belongs to the scene: exposure and white balance have mean zero over the
 photographs (`center_`, after each step), so that the scene, and what is exported of it, has the photographs' mean look.
-All parameters are zero where nothing happens.
+So do patterns over the photographs that are likelier the scene's than theirs, brightness that changes slowly with the
+place (`overlap.estimate`): they stay what they were at the start. All parameters are zero where nothing happens.
 
 The parts are those of PPISP (Deutsch et al., arXiv 2601.18336), in the pixels' own space instead of a linear one.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.nn import Parameter
+
+from nrfgs_ns.kernels.trial import Gate
 
 Part = Literal["exposure", "white-balance", "vignetting", "response"]
 PARTS: tuple[Part, ...] = get_args(Part)
 
 GAMMA = 2.4
 """sRGB's exponent."""
-LOG_2 = math.log(2.0)
 TOE = 0.055
 """sRGB's offset."""
 LARGEST_TOE, LARGEST_SHOULDER = 0.3, 0.9
@@ -49,10 +49,12 @@ BASIS = {
     "white-balance": ((2 / 3, -1 / 3, -1 / 3), (-1 / 3, -1 / 3, 2 / 3)),
 }
 """Stops of red, green and blue for one stop of each number of a photograph."""
+COLUMNS = "exposure", "white-balance", "white-balance"
+"""The parts whose numbers they are: exposure, log2(R/G), log2(B/G)."""
 TOE_STEP = 0.05
 """The toe's unit where it is learnt."""
 PENALTY = 0.01
-"""Weight of the squared stops in the loss."""
+"""Weight of the squared numbers of a camera in the loss."""
 
 
 class PhotographModel(nn.Module):
@@ -64,6 +66,8 @@ class PhotographModel(nn.Module):
         lenses: of each camera: principal point x and y, and focal length x and y, as shares of width and height. [C, 4]
         parts: which of PARTS there are.
         start: stops in red, green and blue to start from; 0 if left out. [P, 3]
+        held: for exposure, log2(R/G) and log2(B/G), orthonormal patterns over the photographs that stay as they start,
+            the constant among them; the constants alone if left out. [P, K] each
 
     Raises:
         ValueError: a part is unknown, or shapes do not fit.
@@ -76,6 +80,7 @@ class PhotographModel(nn.Module):
         lenses: Tensor,
         parts: Sequence[Part] = ("exposure", "white-balance"),
         start: Tensor | None = None,
+        held: Sequence[Tensor] | None = None,
     ):
         super().__init__()
         if unknown := set(parts) - set(PARTS):
@@ -94,12 +99,26 @@ class PhotographModel(nn.Module):
         if rows := [row for part in self.parts for row in BASIS.get(part, ())]:
             basis = torch.tensor(rows)
             self.register_buffer("basis", basis, persistent=False)
-            self.register_buffer("exponents", basis.T / GAMMA, persistent=False)
-            self.register_buffer("offset", torch.full((3,), -TOE), persistent=False)
+            self.register_buffer("exponents", (basis.T / GAMMA).contiguous(), persistent=False)
             stops = torch.zeros(len(names), 3) if start is None else start.float()
-            self.shots = Parameter(stops @ torch.linalg.pinv(basis))
-            self.center_()
+            self.shots = Parameter((stops - stops.mean(dim=0)) @ torch.linalg.pinv(basis))
+            columns = [column for column, part in enumerate(COLUMNS) if part in parts]
+            constant = torch.full((len(names), 1), max(len(names), 1) ** -0.5)
+            self._hold([constant if held is None else held[column].float() for column in columns])
         self._radii: dict[tuple[int, int, int], Tensor] = {}
+
+    def _hold(self, patterns: Sequence[Tensor]) -> None:
+        """Keep patterns over the photographs [P, K], of each column of the exposures, as they are now."""
+        width = len(patterns)
+        rows = torch.zeros(sum(pattern.shape[1] for pattern in patterns), *self.shots.shape)
+        first = 0
+        for column, pattern in enumerate(patterns):
+            rows[first : first + pattern.shape[1], :, column] = pattern.T
+            first += pattern.shape[1]
+        held = rows.flatten(1)
+        assert held.shape[1] == width * len(self.names)
+        self.register_buffer("held", held)
+        self.register_buffer("kept", held @ self.shots.detach().flatten())
 
     # What a picture becomes.
 
@@ -112,18 +131,25 @@ class PhotographModel(nn.Module):
             index: of the photograph.
 
         Returns:
-            [H, W, 3], not clamped.
+            [H, W, 3] in [0, 1].
         """
         camera = self.camera_of[index]
         if self.falloff is None and self.curves is None:
-            return image if self.shots is None else _Gain.apply(image, self.shots, index, self.exponents, self.offset)
+            if self.shots is None:
+                return image.clamp(0.0, 1.0)
+            if _kernels_take(image, self.shots):
+                from nrfgs_ns.image.photograph_triton import Exposed
+
+                return Exposed.apply(image, self.shots, index, self.exponents)
+            return with_gain(image, (self.exponents @ self.shots[index]).exp2()).clamp(0.0, 1.0)
         stops = image.new_zeros(3) if self.shots is None else self.shots[index] @ self.basis
         return self._taken(image, stops, camera)
 
     def by_camera(self, image: Tensor, camera: int) -> Tensor:
-        """A picture [H, W, 3] of the mean look as a camera would have taken it: its vignetting and response alone."""
+        """A picture [H, W, 3] of the mean look as a camera would have taken it: its vignetting and response alone; in
+        [0, 1]."""
         if self.falloff is None and self.curves is None:
-            return image
+            return image.clamp(0.0, 1.0)
         return self._taken(image, image.new_zeros(3), camera)
 
     def _taken(self, image: Tensor, stops: Tensor, camera: int) -> Tensor:
@@ -132,13 +158,13 @@ class PhotographModel(nn.Module):
             stops = stops - squared * (self.falloff[camera, 0] + self.falloff[camera, 1] * squared)
         gain = torch.exp2(stops / GAMMA)
         if self.curves is None:
-            return with_gain(image, gain)
+            return with_gain(image, gain).clamp(0.0, 1.0)
         curves = self.curves * self.curves.new_tensor([TOE_STEP, 1.0]) + self.curves.new_tensor([TOE, 0.0])
         mean_toe, mean_shoulder = (self.share * curves).sum(0)
         toe, shoulder = curves[camera]
         above = image * (gain + toe * mean_shoulder) + (gain * mean_toe - toe)
         below = 1.0 + shoulder * gain * mean_toe + image * (shoulder * gain - mean_shoulder)
-        return above / below.clamp_min(SMALLEST_DENOMINATOR)
+        return (above / below.clamp_min(SMALLEST_DENOMINATOR)).clamp(0.0, 1.0)
 
     def _squared_radius(self, height: int, width: int, camera: int) -> Tensor:
         """Squared distance from the principal point in half diagonals, [H, W, 1]."""
@@ -155,22 +181,26 @@ class PhotographModel(nn.Module):
     # What is learnt.
 
     def penalty(self, index: int) -> Tensor:
-        """What a photograph's numbers, and its camera's, cost in the loss, a scalar: nothing for what does nothing.
+        """What the numbers of a photograph's camera cost in the loss, a scalar: nothing for what does nothing.
 
-        The photometric loss grows with the error and this with the square, so that it holds back what the pictures say
-        little about, and little else.
+        Exposure and white balance cost nothing: pictures say what is not held.
         """
         camera = self.camera_of[index]
-        numbers = [] if self.shots is None else [self.shots[index]]
-        numbers += [table[camera] for table in (self.falloff, self.curves) if table is not None]
+        numbers = [table[camera] for table in (self.falloff, self.curves) if table is not None]
         own = numbers[0] if len(numbers) == 1 else torch.cat(numbers)
         return PENALTY * torch.dot(own, own)
 
+    @property
+    def has_penalty(self) -> bool:
+        """Whether there is anything that costs."""
+        return self.falloff is not None or self.curves is not None
+
     @torch.no_grad()
     def center_(self) -> None:
-        """After a step: take out of exposures and white balances what all have in common, and keep within bounds."""
+        """After a step: take out of exposures and white balances what is the scene's, and keep within bounds."""
         if self.shots is not None:
-            self.shots.sub_(self.shots.mean(dim=0))
+            flat = self.shots.view(-1)
+            flat.addmv_(self.held.T, torch.addmv(self.kept, self.held, flat, alpha=-1.0))
         if self.falloff is not None:
             self.falloff.clamp_(min=0.0)
         if self.curves is not None:
@@ -204,6 +234,14 @@ class PhotographModel(nn.Module):
         model.load_state_dict(state)
         return model
 
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        for name in ("held", "kept"):  # as many patterns as the checkpoint's; the constants alone if it knows of none
+            if self.shots is not None:
+                buffer = getattr(self, name)
+                written = state_dict.setdefault(prefix + name, buffer)
+                setattr(self, name, torch.empty_like(written, device=buffer.device))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
 
 def with_gain(image: Tensor, gain: Tensor) -> Tensor:
     """A picture [H, W, 3] whose light is multiplied by gain^GAMMA under sRGB's curve; gain [3] or [H, W, 3]."""
@@ -216,24 +254,25 @@ def exposed(image: Tensor, stops: float | Tensor) -> Tensor:
     return with_gain(image, gain).clamp(0.0, 1.0)
 
 
-class _Gain(torch.autograd.Function):
-    """`with_gain` of one photograph's stops. By hand, because a step on a GPU waits for the host: half the calls."""
+MAX_NUMBERS = 2**31
+"""The kernels index an image with 32 bits."""
+_GATE = Gate("The photographs' exposure")
 
-    @staticmethod
-    def forward(ctx, image: Tensor, shots: Tensor, index: int, exponents: Tensor, offset: Tensor) -> Tensor:
-        gain = torch.mv(exponents, shots[index]).exp2_()
-        ctx.save_for_backward(image, gain, exponents)
-        ctx.row = shots.shape, index
-        return torch.addcmul(torch.add(offset, gain, alpha=TOE), image, gain)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, d_taken: Tensor):
-        image, gain, exponents = ctx.saved_tensors
-        shape, index = ctx.row
-        d_shots = None
-        if ctx.needs_input_grad[1]:
-            d_gain = (image + TOE).mul_(d_taken).sum(dim=(0, 1))
-            d_shots = d_taken.new_zeros(shape)
-            torch.mv(exponents.T, d_gain.mul_(gain).mul_(LOG_2), out=d_shots[index])
-        return d_taken * gain, d_shots, None, None, None
+def _kernels_take(image: Tensor, shots: Tensor) -> bool:
+    """Whether the kernels compute this."""
+    return (
+        image.is_cuda
+        and shots.is_cuda
+        and image.dtype == shots.dtype == torch.float32
+        and 0 < image.numel() < MAX_NUMBERS
+        and _GATE.opens(image.device, image.device, lambda: _try_kernels(image.device))
+    )
+
+
+def _try_kernels(device: torch.device) -> None:
+    """Compile and run the kernels on one pixel; raise whatever goes wrong."""
+    from nrfgs_ns.image.photograph_triton import Exposed
+
+    shots, pixel = (torch.zeros(size, device=device, requires_grad=True) for size in ((1, 3), (1, 1, 3)))
+    Exposed.apply(pixel, shots, 0, torch.eye(3, device=device)).sum().backward()

@@ -30,6 +30,7 @@ from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import (
     ConsistentDensification,
+    Densification,
     McmcDensification,
     OpacitySeen,
     OriginalDensification,
@@ -145,10 +146,14 @@ class NrfgsModel(SplatfactoModel):
             if self.config.background_color == "random"
             else get_color(self.config.background_color)
         )
-        self.densification = build_densification(self.config, self.num_train_data, self.scene_unit)
+        self.densification = self._strategy()
         if not self.config.view_noise >= 0.0:
             raise InputError(f"pipeline.model.view_noise is {self.config.view_noise}; it must be zero or positive.")
         self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
+
+    def _strategy(self) -> Densification:
+        """What makes splats come and go."""
+        return build_densification(self.config, self.num_train_data, self.scene_unit)
 
     def _initial_splats(self) -> dict[str, Parameter]:
         """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
@@ -439,7 +444,8 @@ class NrfgsModel(SplatfactoModel):
         self.densification.see_cameras(centers)
         self.densification.see_training_views(ComparedViews(self, attributes.pipeline.datamanager))
         self.camera_spacing = camera_spacing(centers)
-        self.view_noise.sigma = self.config.view_noise * self.camera_spacing / math.sqrt(3.0)
+        sigma = self.config.view_noise * self.camera_spacing / math.sqrt(3.0)
+        self.view_noise = ViewNoise(sigma, self.view_noise.seed)
 
         def before_first_step(step: int) -> None:
             steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
@@ -486,7 +492,7 @@ class NrfgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params)
-            if self.photograph is not None and self.step % 10 == 0:
+            if self.photograph is not None and self.photograph.has_penalty and self.step % 10 == 0:
                 losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard

@@ -91,7 +91,7 @@ def composite_view(
         with_depth: whether depth is wanted, too.
         absgrad: as in `rasterizer.composite`.
         assume_finite: colours and opacities that are not finite need not be looked for.
-        look: what a photograph makes of the picture [H, W, 3] before it is cut off at 0 and 1.
+        look: what a photograph makes of the picture [H, W, 3], whose colours are not cut off; in [0, 1].
 
     Returns:
         "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1] if wanted;
@@ -109,7 +109,7 @@ def composite_view(
     render, alpha = render.squeeze(0), alpha.squeeze(0)  # a view; what [0] sends back is a copy among zeros
     rgb = render[..., :3] if with_depth else render
     outputs = {
-        "rgb": torch.clamp(rgb if look is None else look(rgb), 0.0, 1.0),
+        "rgb": torch.clamp(rgb, 0.0, 1.0) if look is None else look(rgb),
         "accumulation": alpha,
         "background": background.expand(*alpha.shape[:2], 3),
     }

@@ -23,7 +23,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from nrfgs_ns.data.exif import read_position
+from nrfgs_ns.data.pictures import read_position
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare import forecast, pairs, structure

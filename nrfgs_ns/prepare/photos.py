@@ -10,8 +10,7 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, ImageOps
 
-from nrfgs_ns.data.exif import exif_of, exif_of_copy, known
-from nrfgs_ns.data.pictures import open_picture, read_header
+from nrfgs_ns.data.pictures import exif_of, exif_of_copy, known, open_picture, read_header
 from nrfgs_ns.errors import InputError
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")

@@ -17,8 +17,7 @@ import numpy as np
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-from nrfgs_ns.data.exif import exif_of, exif_of_copy, known
-from nrfgs_ns.data.pictures import open_picture
+from nrfgs_ns.data.pictures import exif_of, exif_of_copy, known, open_picture
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare.structure import colmap
@@ -66,7 +65,7 @@ def transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float |
     """The content of transforms.json for images sorted by name. Intrinsics that all share stand at the top.
 
     Args:
-        taken: for each name, how the photograph was taken, which its frame repeats under "exif": see `data.exif`.
+        taken: for each name, how the photograph was taken, which its frame repeats under "exif": see `data.pictures`.
     """
     cameras = [_intrinsics(model.cameras[image.camera_id]) for image in images]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}

@@ -14,8 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nrfgs_ns.data.exif import share_of_size
-from nrfgs_ns.data.pictures import read_header
+from nrfgs_ns.data.pictures import read_header, share_of_size
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.prepare.forecast import looked_at
 from nrfgs_ns.prepare.pairs import Pairs

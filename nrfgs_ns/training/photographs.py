@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether a training learns what happened to each photograph, and from where it starts.
 
-It does if the capture needs it: if EXIF says that exposure varies, or if each photograph disagrees with those taken
-next to it about the same points (`image/overlap.py`). What they say is where it starts.
+It does if the capture needs it: if EXIF says that exposure varies, or if photographs disagree about the same points by
+more than their places explain (`image/overlap.py`). What they say is where it starts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,9 +14,21 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from nrfgs_ns.data.exif import read_exif
+from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.image.overlap import ENOUGH_STOPS, Pairs, compare, drawn, estimate, sight, slope, varies
+from nrfgs_ns.image.overlap import (
+    ENOUGH_STOPS,
+    FEWEST_PAIRS,
+    Looks,
+    Pairs,
+    channels,
+    compare,
+    drawn,
+    estimate,
+    sight,
+    slope,
+    varies,
+)
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.pinhole import world_to_camera
 
@@ -51,28 +63,33 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
     exif = exif_of(paths, told.get("exif"))
     known = torch.tensor([exposure(of_one) for of_one in exif])
     pairs = compare_photographs(told.get("points3D_xyz"), cameras, datamanager.cached_train)
-    wanted, why = verdict(config.photographs, pairs, known)
+    centers = cameras.camera_to_worlds[:, :3, 3].cpu()
+    seen = estimate(pairs, torch.full_like(known, torch.nan), centers)
+    wanted, why = verdict(config.photographs, pairs, seen, known)
     what = " and ".join(part.replace("-", " ") for part in config.photograph_parts)
     CONSOLE.print(f"Photographs: {what} {'learnt' if wanted else 'not learnt'}: {why}.", soft_wrap=True, markup=False)
     if not wanted:
         return None
     camera_of, lenses = physical_cameras(cameras, exif)
-    start = estimate(pairs, known)
-    return PhotographModel([path.name for path in paths], camera_of, lenses, config.photograph_parts, start)
+    looks = estimate(pairs, known, centers) if torch.isfinite(known).any() else seen
+    names = [path.name for path in paths]
+    return PhotographModel(names, camera_of, lenses, config.photograph_parts, channels(looks.stops), looks.held)
 
 
-def verdict(choice: Choice, pairs: Pairs, known: Tensor) -> tuple[bool, str]:
+def verdict(choice: Choice, pairs: Pairs, seen: Looks, known: Tensor) -> tuple[bool, str]:
     """Whether photographs differ enough, and the evidence in words.
 
     Args:
         choice: of the user.
         pairs: of photographs.
+        seen: what they say by themselves.
         known: exposures from EXIF in stops, NaN where it says nothing. [V]
     """
     count = len(pairs.first)
-    exposures, *colors = pairs.beyond_neighbours.tolist()
-    seen = f"each differs from those next to it by {exposures:.2f} stops, in colour by {max(colors):.2f}"
-    seen = f"{seen} ({count} pairs)" if count else "no points to compare them by"
+    exposures, *colors = seen.random
+    told_by_pairs = count >= FEWEST_PAIRS
+    words = f"each differs from what its place explains by {exposures:.2f} stops, in colour by {max(colors):.2f}"
+    words = f"{words} ({count} pairs)" if told_by_pairs else f"too few points in common to compare them ({count} pairs)"
     there = known[torch.isfinite(known)]
     spread = float(there.std(correction=0)) if len(there) else 0.0
     if len(there) == 0:
@@ -84,10 +101,11 @@ def verdict(choice: Choice, pairs: Pairs, known: Tensor) -> tuple[bool, str]:
         _, explained = slope(pairs, known)
         if explained is not None:
             told += f", which explains {explained:.0%} of their difference"
-    needed = pairs.vary or varies(known)
+    vary = any(size >= enough for size, enough in zip(seen.random, ENOUGH_STOPS, strict=True))
+    needed = told_by_pairs and vary or varies(known)
     enough = "" if needed else f"; {ENOUGH_STOPS[0]:g}, and {ENOUGH_STOPS[1]:g} in colour, would be enough"
     asked = "asked for; " if choice == "on" else ""
-    return needed or choice == "on", f"{asked}{seen}; {told}{enough}"
+    return needed or choice == "on", f"{asked}{words}; {told}{enough}"
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:

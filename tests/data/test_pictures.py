@@ -12,8 +12,7 @@ from small_colmap import Model
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.data.exif import exif_of_copy, read_exif
-from nrfgs_ns.data.pictures import smaller_copies
+from nrfgs_ns.data.pictures import exif_of_copy, read_exif, smaller_copies
 from nrfgs_ns.errors import InputError
 
 

@@ -191,6 +191,7 @@ def averaged(scene: Path, folder: Path) -> None:
     except TrainingStopped:
         stopped = True
     result = {"after": after, "counts": counts, "ended": ended, "said": log.get(), "stopped": stopped}
+    result["exposures"] = trainer.pipeline.model.photograph.shots.detach().clone()
     if main:
         alone = trainer_of(scene, folder / "averaged-alone", 1, **from_between, **{"--load-dir": whole})
         mean = alone.mean

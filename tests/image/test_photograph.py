@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The model of a photograph: known answers, gradients, gauge, identity, checkpoints."""
 
+import importlib.util
+from pathlib import Path
+
 import pytest
 import torch
+from interpreted import passes_in_the_interpreter
 
 from nrfgs_ns.image.photograph import GAMMA, PARTS, PENALTY, TOE, TOE_STEP, PhotographModel, exposed
 
@@ -32,7 +36,7 @@ def test_starts_as_the_identity_to_the_bit(parts):
     image = torch.rand(6, 7, 3) * 1.2
     model = model_of(parts)
     for index in range(5):
-        assert torch.equal(model(image, index), image)
+        assert torch.equal(model(image, index), image.clamp(0.0, 1.0))
 
 
 def test_a_stop_is_a_stop_of_light_under_srgb():
@@ -85,19 +89,19 @@ def test_response_undoes_itself():
     with torch.no_grad():
         model.curves[:] = torch.tensor([(0.12 - TOE) / TOE_STEP, 0.4])
         model.shots[:, 0] = torch.tensor([0.8, -0.8])
-    image = torch.rand(4, 5, 3, dtype=torch.float64)
+    image = 0.1 + 0.5 * torch.rand(4, 5, 3, dtype=torch.float64)  # what is cut off is lost
     torch.testing.assert_close(model(model(image, 0), 1), image)
 
 
 @pytest.mark.parametrize("parts", CHOICES)
 def test_gradients_against_finite_differences(parts):
     model = model_of(parts, seed=1).double()
-    image = torch.rand(4, 5, 3, dtype=torch.float64, requires_grad=True)
+    image = (0.1 + 0.7 * torch.rand(4, 5, 3, dtype=torch.float64)).requires_grad_()  # nothing is at a bound
     names, values = zip(*model.named_parameters(), strict=True)
 
     def taken(image, *values):
         with torch.nn.utils.stateless._reparametrize_module(model, dict(zip(names, values, strict=True))):
-            return model(image, 3), model.penalty(3)
+            return model(image, 3), model.penalty(3) if model.has_penalty else image
 
     inputs = (image, *(value.detach().requires_grad_(True) for value in values))
     assert torch.autograd.gradcheck(taken, inputs)
@@ -138,13 +142,53 @@ def test_bounds_hold_after_a_step():
     assert torch.isfinite(model(torch.rand(3, 3, 3) * 4, 0)).all()
 
 
-def test_penalty_is_the_squared_stops_and_nothing_at_the_start():
-    model = model_of(("exposure", "white-balance"))
-    assert model.penalty(2) == 0.0 and model_of(PARTS).penalty(0) == 0.0
+def test_penalty_is_of_the_cameras_numbers_and_nothing_at_the_start():
+    assert not model_of(("exposure", "white-balance")).has_penalty
+    model = model_of(PARTS)
+    assert model.has_penalty and model.penalty(0) == 0.0
     with torch.no_grad():
-        model.shots[2] = torch.tensor([1.0, 0.5, -0.5])
-    assert model.penalty(2).item() == pytest.approx(PENALTY * 1.5)
+        model.shots[2] = 1.0
+        model.curves[0] = torch.tensor([1.0, 0.5])
+    assert model.penalty(2).item() == pytest.approx(PENALTY * 1.25)
     assert model.penalty(1) == 0.0
+
+
+def test_patterns_that_are_the_scenes_stay_as_they_started():
+    torch.manual_seed(0)
+    ramp = torch.linspace(-1.0, 1.0, 6)[:, None]
+    constant = torch.full((6, 1), 6**-0.5)
+    held = [torch.cat([constant, ramp / ramp.norm()], dim=1), constant, constant]
+    start = torch.randn(6, 3)
+    model = PhotographModel([str(index) for index in range(6)], [0] * 6, LENSES[:1], start=start, held=held)
+    slow = (ramp.T @ model.shots[:, 0]).item()
+    torch.testing.assert_close(model.stops(), start - start.mean(dim=0))
+    with torch.no_grad():
+        model.shots.add_(torch.randn(6, 3))
+    own = model.shots.detach().clone()
+    model.center_()
+    assert model.shots.mean(dim=0).abs().max() < 1e-6
+    assert (ramp.T @ model.shots[:, 0]).item() == pytest.approx(slow, abs=1e-5)
+    torch.testing.assert_close(model.shots[:, 1:], own[:, 1:] - own[:, 1:].mean(dim=0))  # not held for colours
+
+
+def test_a_checkpoint_without_patterns_holds_the_constants():
+    model = model_of(("exposure", "white-balance"), seed=5)
+    state = {name: value for name, value in model.state_dict().items() if name not in ("held", "kept")}
+    again = PhotographModel.from_state(state)
+    assert again.held.shape == (3, 15) and torch.equal(again.shots, model.shots)
+
+
+def test_a_checkpoint_brings_its_own_patterns():
+    eye = torch.eye(5)
+    many = PhotographModel([f"{i}.jpg" for i in range(5)], [0] * 5, LENSES, held=[eye, eye, eye])
+    few = PhotographModel([f"{i}.jpg" for i in range(5)], [0] * 5, LENSES)
+    few.load_state_dict(many.state_dict())
+    assert torch.equal(few.held, many.held) and few.kept.shape == (15,)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
+def test_kernels_in_the_interpreter():
+    passes_in_the_interpreter(Path(__file__).with_name("photograph_interpreted.py"))
 
 
 def test_recovers_known_exposures_from_the_photographs_alone():
@@ -159,7 +203,7 @@ def test_recovers_known_exposures_from_the_photographs_alone():
         optimizer.zero_grad()
         index = step % 6
         error = (model(guess, index).clamp(0.0, 1.0) - photographs[index]).abs().mean()
-        (error + model.penalty(index)).backward()
+        error.backward()
         optimizer.step()
         model.center_()
     assert (model.stops() - truth).abs().max() < 0.1

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from nrfgs_ns.data.exif import read_position
+from nrfgs_ns.data.pictures import read_position
 from nrfgs_ns.prepare import forecast, pairs
 
 

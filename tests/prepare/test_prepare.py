@@ -15,7 +15,7 @@ from PIL.TiffImagePlugin import IFDRational
 from rich.console import Console
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.data.exif import read_exif, read_position
+from nrfgs_ns.data.pictures import read_exif, read_position
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.prepare import photos, structure
 from nrfgs_ns.prepare.command import Prepare, Run

@@ -12,7 +12,7 @@ from PIL import ExifTags, Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.image.overlap import Pairs
+from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.training.photographs import exif_of, exposure, physical_cameras, verdict
 from nrfgs_ns.training.run import parse
@@ -28,17 +28,18 @@ def pairs_with(shifts) -> Pairs:
     return Pairs(torch.arange(count), torch.arange(count) + 1, shift, torch.full((count, 3), 0.05))
 
 
-SAME, DIFFERENT = pairs_with([0.01] * 10), pairs_with([0.5, -0.5] * 5)
+SAME, DIFFERENT = pairs_with([0.01] * 10), pairs_with([0.5, -0.8, 0.2, 0.5, -0.4, -0.3, 0.7, 0.1, -0.9, 0.4])
+CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
     ("choice", "pairs", "known", "wanted", "words"),
     [
-        ("auto", SAME, [NAN] * 11, False, "in colour by 0.00 (10 pairs); EXIF says nothing; 0.3, and 0.2"),
-        ("auto", DIFFERENT, [NAN] * 11, True, "differs from those next to it by 0.50 stops"),
-        ("auto", pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "(3 pairs)"),
+        ("auto", SAME, [NAN] * 11, False, "in colour by 0.01 (10 pairs); EXIF says nothing; 0.12, and 0.06"),
+        ("auto", DIFFERENT, [NAN] * 11, True, "differs from what its place explains by 0.38 stops"),
+        ("auto", pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them (3 pairs)"),
         ("auto", pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
-        ("auto", pairs_with([]), [NAN] * 11, False, "no points to compare them by; EXIF says nothing"),
+        ("auto", pairs_with([]), [NAN] * 11, False, "in common to compare them (0 pairs); EXIF says nothing"),
         ("auto", SAME, [0.3] * 11, False, "EXIF says that exposure is the same"),
         ("auto", SAME, [0.3] + [NAN] * 10, False, "EXIF says that exposure is the same"),
         ("auto", SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF says that exposure is almost the same"),
@@ -47,7 +48,7 @@ SAME, DIFFERENT = pairs_with([0.01] * 10), pairs_with([0.5, -0.5] * 5)
             DIFFERENT,
             [0.0, 0.5] * 5 + [0.0],
             True,
-            "in colour by 0.00 (10 pairs); EXIF says that exposure is almost",
+            "in colour by 0.01 (10 pairs); EXIF says that exposure is almost",
         ),
         (
             "auto",
@@ -60,7 +61,8 @@ SAME, DIFFERENT = pairs_with([0.01] * 10), pairs_with([0.5, -0.5] * 5)
     ],
 )
 def test_the_evidence_decides_and_is_told(choice, pairs, known, wanted, words):
-    found, why = verdict(choice, pairs, torch.tensor(known))
+    seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
+    found, why = verdict(choice, pairs, seen, torch.tensor(known))
     assert found == wanted
     assert words in why
 

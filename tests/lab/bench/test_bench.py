@@ -128,25 +128,25 @@ def test_a_failure_is_shown_whoever_asks(fake, capsys):
 
 
 def test_parts_of_a_file_report_all_that_is_there(fake):
-    """Runs, seeds, scenes and protocols of the same file, asked for one after the other."""
+    """Runs, seeds, scenes and strategies of the same file, asked for one after the other."""
     (fake / "data" / "other").mkdir()
     (fake / "data" / "other" / "transforms.json").write_text("{}")
     file = spec_file(
         fake,
         "runs: {no split: {method: nrfgs, options: --x 1}, SH: nrfgs-sh, NRF: nrfgs}\n"
-        "scenes: [scene, {path: other, downscale: 2}]\nseeds: [1, 2]\nsteps: 100\nprotocols: [original, mcmc@9]\n",
+        "scenes: [scene, {path: other, downscale: 2}]\nseeds: [1, 2]\nsteps: 100\nstrategies: [original, mcmc@9]\n",
     )
 
     def rows(**chosen) -> list[list[str]]:
         bench_in(fake, **{"spec": file, "runs": (), "data": (), "seeds": (), "steps": None, **chosen}).main()
         return [row[:3] + row[4:5] for row in summaries(fake)]
 
-    assert rows(runs=("NRF",), data=("scene",), seeds=(1,), protocols=("mcmc@9",)) == [["scene", "NRF", "mcmc@9", [1]]]
-    assert rows(runs=("no split",), data=("scene",), seeds=(2,), protocols=("mcmc@9",)) == [
+    assert rows(runs=("NRF",), data=("scene",), seeds=(1,), strategies=("mcmc@9",)) == [["scene", "NRF", "mcmc@9", [1]]]
+    assert rows(runs=("no split",), data=("scene",), seeds=(2,), strategies=("mcmc@9",)) == [
         ["scene", "no split", "mcmc@9", [2]],
         ["scene", "NRF", "mcmc@9", [1]],
     ]
-    shown = rows(runs=("NRF",), data=("other",), seeds=(1,), protocols=("original",))
+    shown = rows(runs=("NRF",), data=("other",), seeds=(1,), strategies=("original",))
     assert [row for row in shown if row[3] and row[0] != "average"] == [
         ["scene", "no split", "mcmc@9", [2]],
         ["scene", "NRF", "mcmc@9", [1]],
@@ -160,9 +160,9 @@ def test_parts_of_a_file_report_all_that_is_there(fake):
 
 
 def summaries(folder: Path) -> list[list]:
-    """scene, run, protocol, absent, seeds of each row of the report."""
+    """scene, run, strategy, absent, seeds of each row of the report."""
     rows = json.loads((folder / "out" / "summary.json").read_text())
-    return [[row[key] for key in ("scene", "run", "protocol", "absent", "seeds")] for row in rows]
+    return [[row[key] for key in ("scene", "run", "strategy", "absent", "seeds")] for row in rows]
 
 
 def test_a_report_made_while_another_command_runs(fake):

@@ -23,7 +23,7 @@ class Killed(BaseException):
 
 
 def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monkeypatch):
-    content = {"runs": {"NRF": "nrfgs"}, "scenes": ["tiny"], "protocols": ["mcmc@310"], "steps": 8}
+    content = {"runs": {"NRF": "nrfgs"}, "scenes": ["tiny"], "strategies": ["mcmc@310"], "steps": 8}
     content |= {"checkpoint_every": 2, "train_views": 3, "options": "--pipeline.model.warmup-length 1"}
     spec = make_spec(content, "test")
     (cell,) = cells_of(spec)
@@ -144,12 +144,12 @@ def test_everything_of_a_file_and_what_is_asked_for():
     both = united(file, asked)
     assert both["runs"] == {"a": "nrfgs-sg", "5": "nrfgs-sh", "b": "nrfgs"} and list(both["runs"]) == ["a", "5", "b"]
     assert both["scenes"] == [{"path": "s", "downscale": 2}, "t", "u"]
-    assert both["steps"] == 3 and "seeds" not in both and "protocols" not in both
-    # A file without seeds or protocols has the defaults of a benchmark.
-    more = united(file, {**asked, "seeds": [7, 42], "protocols": ["mcmc"]})
-    assert more["seeds"] == [42, 7] and more["protocols"] == ["own", "mcmc"]
-    more = united({**file, "seeds": 1, "protocols": "original"}, {**asked, "seeds": [7], "protocols": ["mcmc"]})
-    assert more["seeds"] == [1, 7] and more["protocols"] == ["original", "mcmc"]
+    assert both["steps"] == 3 and "seeds" not in both and "strategies" not in both
+    # A file without seeds or strategies has the defaults of a benchmark.
+    more = united(file, {**asked, "seeds": [7, 42], "strategies": ["mcmc"]})
+    assert more["seeds"] == [42, 7] and more["strategies"] == ["own", "mcmc"]
+    more = united({**file, "seeds": 1, "strategies": "original"}, {**asked, "seeds": [7], "strategies": ["mcmc"]})
+    assert more["seeds"] == [1, 7] and more["strategies"] == ["original", "mcmc"]
     assert united({}, asked) == asked
 
 
@@ -162,21 +162,21 @@ def test_a_report_has_what_is_asked_for_and_what_is_there():
     content = {
         "runs": {"a": "nrfgs", "b": "nrfgs", "c": "nrfgs"},
         "scenes": ["s", "t", "u"],
-        "protocols": ["splatfacto", "original", "mcmc"],
+        "strategies": ["splatfacto", "original", "mcmc"],
         "seeds": [1, 2, 3],
     }
     whole = make_spec(content, "file")
-    asked = make_spec({"runs": {"b": "nrfgs"}, "scenes": "t", "protocols": "original", "seeds": 2}, "file")
+    asked = make_spec({"runs": {"b": "nrfgs"}, "scenes": "t", "strategies": "original", "seeds": 2}, "file")
 
     def shown(*there):
         spec = with_records(whole, asked, lambda name: name in there)
-        return [run.name for run in spec.runs], [one.name for one in spec.scenes], spec.protocols, spec.seeds
+        return [run.name for run in spec.runs], [one.name for one in spec.scenes], spec.strategies, spec.seeds
 
     assert shown() == (["b"], ["t"], ["original"], [2])
     (name,) = (
         cell.name
         for cell in cells_of(whole)
-        if (cell.run.name, cell.scene.name) == ("c", "s") and (cell.protocol, cell.seed) == ("mcmc", 1)
+        if (cell.run.name, cell.scene.name) == ("c", "s") and (cell.strategy, cell.seed) == ("mcmc", 1)
     )
     assert shown(name) == (["b", "c"], ["s", "t"], ["original", "mcmc"], [1, 2])
 

@@ -61,7 +61,7 @@ def test_markdown():
     lines = markdown(with_averages(rows())).splitlines()
     psnr = [column.name for column in COLUMNS].index("PSNR")
     table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    assert table[0][: 4 + 3] == ["scene", "run", "protocol", "seeds", "splats", "time s", "SSIM"]
+    assert table[0][: 4 + 3] == ["scene", "run", "strategy", "seeds", "splats", "time s", "SSIM"]
     body = {(line[0], line[1]): line for line in table[2:]}
     assert body["s", "SH"][4 + psnr] == "_30.50 ± 0.71_"
     assert body["s", "NRF"][4 + psnr] == "**33.00 ± 1.41**"
@@ -162,22 +162,22 @@ def test_times_only_of_runs_that_were_alone():
 
 
 def table_of(rows):
-    """Markdown's cells, (scene, run, protocol) -> column -> text; and the lines below."""
+    """Markdown's cells, (scene, run, strategy) -> column -> text; and the lines below."""
     lines = markdown(rows).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
     body = {tuple(line[:3]): dict(zip(cells[0], line, strict=True)) for line in cells[2:]}
     return body, [line for line in lines if line and not line.startswith("|")]
 
 
-def test_marks_are_among_rows_of_one_protocol():
+def test_marks_are_among_rows_of_one_strategy():
     """A budget of a tenth is not best in bytes beside methods that chose their number themselves."""
     plan = [("original", "SH", 30.0, 900), ("original", "NRF", 31.0, 400), ("mcmc@9", "SH", 20.0, 9)]
-    group = [Row("s", run, protocol, {1: record(psnr, splats=n)}).fill() for protocol, run, psnr, n in plan]
+    group = [Row("s", run, strategy, {1: record(psnr, splats=n)}).fill() for strategy, run, psnr, n in plan]
     body, _ = table_of(group)
     assert body["s", "SH", "mcmc@9"]["splats"] == "9" and body["s", "SH", "mcmc@9"]["PSNR"] == "20.00"
     assert body["s", "SH", "original"]["splats"] == "_900_" and body["s", "NRF", "original"]["PSNR"] == "**31.00**"
     lines = latex(group).splitlines()
-    assert lines[lines.index(r"\hline", 4) + 1].startswith("s & SH & mcmc@9"), "no line between the protocols"
+    assert lines[lines.index(r"\hline", 4) + 1].startswith("s & SH & mcmc@9"), "no line between the strategies"
 
 
 def test_times_of_different_machines_are_not_ranked():
@@ -246,7 +246,7 @@ def test_every_test_view_has_a_line():
         ("2", "b, c.jpg", "20.1235"),
         ("2", "a.jpg", "31"),
     ]
-    assert {(line["scene"], line["run"], line["protocol"]) for line in found} == {("s", "A", "own")}
+    assert {(line["scene"], line["run"], line["strategy"]) for line in found} == {("s", "A", "own")}
     assert found[1]["SSIM"] == "" and found[1]["L1"] == ""
 
 
@@ -276,7 +276,7 @@ def test_one_scene_needs_no_average():
     assert len(with_averages(rows()[:2])) == 2
 
 
-def test_figure_has_a_panel_for_each_scene_and_protocol(tmp_path, monkeypatch):
+def test_figure_has_a_panel_for_each_scene_and_strategy(tmp_path, monkeypatch):
     """Twelve runs, of which one has two seeds: a mean on a band; all told apart, and the legend covers nothing."""
     from matplotlib import pyplot
 
@@ -432,7 +432,7 @@ def test_a_picture_that_cannot_be_read_breaks_no_report(tmp_path, pictures, caps
 
 
 def test_report_of_hand_made_records(tmp_path, pictures, capsys):
-    spec = make_spec({"runs": {"A": "nrfgs", "B": "nrfgs-sh"}, "scenes": ["x/s"], "protocols": ["mcmc@9"]}, "test")
+    spec = make_spec({"runs": {"A": "nrfgs", "B": "nrfgs-sh"}, "scenes": ["x/s"], "strategies": ["mcmc@9"]}, "test")
     for cell, psnr in zip(cells_of(spec), (30.0, 31.0), strict=True):
         content = {**record(psnr), "identity": identity(spec, cell, None)}
         (tmp_path / "out" / "runs").mkdir(parents=True, exist_ok=True)
@@ -443,7 +443,7 @@ def test_report_of_hand_made_records(tmp_path, pictures, capsys):
     assert (tmp_path / "out" / "crops" / "x_s.png").exists()
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [row["PSNR"] for row in summary] == [[30.0, None], [31.0, None]]
-    assert (tmp_path / "out" / "views.csv").read_text().startswith("scene,run,protocol,seed,image,PSNR")
+    assert (tmp_path / "out" / "views.csv").read_text().startswith("scene,run,strategy,seed,image,PSNR")
     assert "**31.00**" in capsys.readouterr().out
     # Pictures of records that are not to be used are not shown beside the others.
     (tmp_path / "out" / "crops" / "x_s.png").unlink()

@@ -259,7 +259,7 @@ def test_without_submitit_it_says_what_to_install(tmp_path, monkeypatch):
 
 SPEC = """
 runs: {SH: nrfgs-sh, NRF: nrfgs}
-protocols: [original, mcmc@400]
+strategies: [original, mcmc@400]
 scenes: [tiny]
 seeds: [1]
 steps: 120
@@ -289,7 +289,7 @@ def test_killed_in_the_middle_and_resumed(tiny_scene, tmp_path):
     assert (runs / "SH-original-tiny-1.json").stat().st_mtime_ns == finished
     records = {file.stem: json.loads(file.read_text()) for file in runs.glob("*.json")}
     assert set(records) == {
-        f"{run}-{protocol}-tiny-1" for run in ("SH", "NRF") for protocol in ("original", "mcmc@400")
+        f"{run}-{strategy}-tiny-1" for run in ("SH", "NRF") for strategy in ("original", "mcmc@400")
     }
     parts = {name: record["train"]["parts"] for name, record in records.items()}
     assert parts.pop("NRF-original-tiny-1") == 2 and set(parts.values()) == {1}

@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import tyro
 from nerfstudio.utils.eval_utils import eval_setup  # noqa: F401  (registers the data parsers once, before the timing)
 from PIL import Image
 
+from nrfgs_lab.bench.command import Bench
 from nrfgs_lab.bench.data import parser_options
 from nrfgs_lab.bench.spec import (
     PRESET_STEPS,
@@ -46,11 +48,11 @@ def test_shipped_files_are_valid(name):
     plan = make_spec(load_spec(ROOT / "docs" / "bench" / f"{name}.yaml"), name)
     rows, cells = rows_of(plan), cells_of(plan)
     assert len(cells) == len(rows) * len(plan.scenes) * len(plan.seeds)
-    assert {protocol for protocol, _ in rows} == set(plan.protocols)
+    assert {strategy for strategy, _ in rows} == set(plan.strategies)
 
 
-def test_seeds_come_one_after_the_other_and_protocols_together():
-    cells = cells_of(spec(protocols=["original", "mcmc@500"], seeds=[1, 2], scenes=["a", "b"]))
+def test_seeds_come_one_after_the_other_and_strategies_together():
+    cells = cells_of(spec(strategies=["original", "mcmc@500"], seeds=[1, 2], scenes=["a", "b"]))
     assert len(cells) == 16 and [cell.seed for cell in cells] == [1] * 8 + [2] * 8
     assert [cell.name for cell in cells[:4]] == [
         "SH-original-a-1",
@@ -61,8 +63,8 @@ def test_seeds_come_one_after_the_other_and_protocols_together():
 
 
 def test_methods_of_others_run_as_they_are():
-    plan = spec(runs={"NRF": "nrfgs", "host": "splatfacto"}, protocols=["original", "mcmc"])
-    assert [(protocol, run.name) for protocol, run in rows_of(plan)] == [
+    plan = spec(runs={"NRF": "nrfgs", "host": "splatfacto"}, strategies=["original", "mcmc"])
+    assert [(strategy, run.name) for strategy, run in rows_of(plan)] == [
         ("original", "NRF"),
         ("mcmc", "NRF"),
         ("own", "host"),
@@ -77,8 +79,8 @@ def test_methods_of_others_run_as_they_are():
         ({"scenes": []}, "scenes"),
         ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
         ({"runs": {"NRF": {"method": "nrfgs", "speed": 1}}}, "speed"),
-        ({"protocols": ["mcmc@many"]}, "mcmc@many"),
-        ({"protocols": ["original@5"]}, "original@5"),
+        ({"strategies": ["mcmc@many"]}, "mcmc@many"),
+        ({"strategies": ["original@5"]}, "original@5"),
         ({"steps": 0}, "steps"),
         ({"seeds": ["x"]}, "seeds"),
         ({"jobs": True}, "jobs"),
@@ -87,14 +89,14 @@ def test_methods_of_others_run_as_they_are():
         ({"scenes": ["a b", "a_b"]}, "twice"),
         ({"options": "'open"}, "options"),
         ({"crops": {"bonsai": 3}}, "crops"),
-        ({"runs": {"host": {"method": "splatfacto", "protocols": ["original"]}}}, "splatfacto knows no protocol"),
+        ({"runs": {"host": {"method": "splatfacto", "strategies": ["original"]}}}, "splatfacto knows no strategy"),
         ({"runs": {"N": {"method": "nrfgs", "options": "--max-num-iterations 9"}}}, "N: options: --max-num.*use steps"),
         ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
         ({"options": "--time_budget 1"}, "--time-budget"),
         ({"seeds": []}, "seeds is empty"),
-        ({"protocols": []}, "protocols is empty"),
-        ({"runs": {"NRF": {"method": "nrfgs", "protocols": []}}}, "NRF: protocols is empty"),
-        ({"seeds": [1, 1]}, "twice.*each protocol and seed once"),
+        ({"strategies": []}, "strategies is empty"),
+        ({"runs": {"NRF": {"method": "nrfgs", "strategies": []}}}, "NRF: strategies is empty"),
+        ({"seeds": [1, 1]}, "twice.*each strategy and seed once"),
         ({"runs": {"NRF": "nrfgs --x 1"}}, "no single word"),
         ({"runs": {"NRF": ""}}, "no single word"),
         ({"options": {"--x": 1}}, "options must be a string or a list"),
@@ -103,10 +105,13 @@ def test_methods_of_others_run_as_they_are():
         ({"scenes": ["/data/bonsai"]}, "no folder below --scenes"),
         ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
         ({"scenes": ["."]}, "no folder below --scenes"),
-        ({"protocols": ["mcmc"], "options": "--pipeline.model.densification original"}, "densification is what.*mcmc"),
-        ({"protocols": ["mcmc@9"], "options": "--pipeline.model.splat_budget 5"}, "splat-budget is what.*mcmc@9"),
+        ({"strategies": ["mcmc"], "options": "--pipeline.model.densification original"}, "densification is what.*mcmc"),
+        ({"strategies": ["mcmc@9"], "options": "--pipeline.model.splat_budget 5"}, "splat-budget is what.*mcmc@9"),
         (
-            {"protocols": ["mcmc@9"], "runs": {"N": {"method": "nrfgs", "options": "--pipeline.model.splat-budget=5"}}},
+            {
+                "strategies": ["mcmc@9"],
+                "runs": {"N": {"method": "nrfgs", "options": "--pipeline.model.splat-budget=5"}},
+            },
             "N: --pipeline.model.splat-budget is what.*mcmc@9",
         ),
     ],
@@ -118,14 +123,14 @@ def test_what_is_wrong_is_named(content, says):
 
 def test_a_run_as_it_is_may_choose_its_densification():
     run = {"method": "nrfgs", "options": "--pipeline.model.densification mcmc"}
-    assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}))] == ["own"]
+    assert [cell.strategy for cell in cells_of(spec(runs={"NRF": run}))] == ["own"]
 
 
-def test_a_budget_may_be_an_option_where_the_protocol_names_none():
+def test_a_budget_may_be_an_option_where_the_strategy_names_none():
     run = {"method": "nrfgs", "options": "--pipeline.model.splat-budget 5"}
-    assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}, protocols=["mcmc"]))] == ["mcmc"]
+    assert [cell.strategy for cell in cells_of(spec(runs={"NRF": run}, strategies=["mcmc"]))] == ["mcmc"]
     run["options"] = "--pipeline.model.appearance.latent-dim 9"  # the budget's number, but another option's
-    assert [cell.protocol for cell in cells_of(spec(runs={"NRF": run}, protocols=["mcmc@9"]))] == ["mcmc@9"]
+    assert [cell.strategy for cell in cells_of(spec(runs={"NRF": run}, strategies=["mcmc@9"]))] == ["mcmc@9"]
 
 
 @pytest.mark.parametrize("text", ["runs: [", "just words", None])
@@ -156,13 +161,13 @@ def test_presets_steps_are_those_of_the_presets():
 
 
 @pytest.mark.parametrize(
-    "protocol, densification, budget",
+    "strategy, densification, budget",
     [("own", "splatfacto", 10**6), ("original", "original", 10**6), ("mcmc@77", "mcmc", 77)],
 )
-def test_the_command_means_what_the_file_says(protocol, densification, budget, tiny_scene, tmp_path):
+def test_the_command_means_what_the_file_says(strategy, densification, budget, tiny_scene, tmp_path):
     runs = {"NRF": {"method": "nrfgs", "options": "--pipeline.model.appearance.latent-dim 9"}}
     more = "--pipeline.model.num-downscales 0"
-    plan = spec(runs=runs, protocols=[protocol], steps=7, seeds=[5], options=more)
+    plan = spec(runs=runs, strategies=[strategy], steps=7, seeds=[5], options=more)
     (cell,) = cells_of(plan)
     parser = parser_options(tiny_scene.parent, Scene(tiny_scene.name), tmp_path)
     config = parse(command(plan, cell, parser, tmp_path))
@@ -420,3 +425,12 @@ def torn(folder: Path, content: bytes | None) -> None:
     file.unlink()
     if content is not None:
         file.write_bytes(content)
+
+
+def test_the_words_of_an_older_version_are_understood(tmp_path):
+    (tmp_path / "old.yaml").write_text(
+        "runs: {NRF: {method: nrfgs, protocols: [mcmc@9]}}\nprotocols: [original]\nscenes: s\n"
+    )
+    plan = make_spec(load_spec(tmp_path / "old.yaml"), "file")
+    assert plan.strategies == ["original"] and plan.runs[0].strategies == ("mcmc@9",)
+    assert tyro.cli(Bench, args=["--protocols", "mcmc@9"]).strategies == ("mcmc@9",)

@@ -41,7 +41,7 @@ KNOBS = {
     "knobs": {
         "D": {"option": D, "values": [4, 8]},
         "steps": {"steps": [50]},
-        "budget": {"protocols": ["mcmc@200"]},
+        "budget": {"strategies": ["mcmc@200"]},
         "precision": {"option": "--p", "values": ["fp32"], "cuda": True},
         "head": {"settings": {"SH": {"method": "nrfgs-sh", "options": "--b 2"}, "one": {"options": "--c 3"}}},
     },
@@ -60,7 +60,7 @@ def test_knobs_become_runs():
     assert list(runs) == ["default", "D 4", "D 8", "steps 50", "budget mcmc@200", "head SH", "head one"]
     assert runs["D 4"].options == ("--a", "1", D, "4") and runs["D 4"].method == "nrfgs"
     assert runs["steps 50"].steps == 50 and runs["default"].steps is None
-    assert runs["budget mcmc@200"].protocols == ("mcmc@200",)
+    assert runs["budget mcmc@200"].strategies == ("mcmc@200",)
     assert runs["head SH"].method == "nrfgs-sh" and runs["head SH"].options == ("--b", "2")  # not the default's
     assert runs["head one"].options == ("--a", "1", "--c", "3")
     # Every setting once for each seed; a run's own steps are in its command and in what its record is compared with.
@@ -94,7 +94,7 @@ def test_gpu_knobs_and_chosen_knobs():
         ({"knobs": {"a": {"settings": {"b c": {}}}, "a b": {"settings": {"c": {}}}}}, "there twice"),
         ({"default": {"options": "--a"}}, "default names no method"),
         ({"runs": {"x": "nrfgs"}}, "Leave runs out"),
-        ({"protocols": ["splatfacto", "original"]}, "protocols names several"),
+        ({"strategies": ["splatfacto", "original"]}, "strategies names several"),
     ],
 )
 def test_a_bad_file_is_named(change, words):

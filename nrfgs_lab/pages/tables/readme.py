@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of README.md."""
+
+from collections import defaultdict
+from statistics import fmean, median
+from typing import Any
+
+from nrfgs_lab.pages.tables import bench_rows, grid, mean_of, records, signed
+
+TRAINING_VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "castle": 26, "kitchen": 21, "fern": 17}
+FIELD, HARMONICS = "nrfgs", "nrfgs-sh, nrfgs's steps"
+
+
+def _runs(scene: str, name: str) -> list[dict[str, Any]]:
+    """The trainings of a capture, as results/captures.json has them, by seed."""
+    found = [one for one in records("captures").values() if (one.get("scene"), one.get("name")) == (scene, name)]
+    if not found and (scene, name) == ("bonsai", HARMONICS):
+        window = next(one for one in records("averaging")["bonsai-sh"]["windows"] if one["window"] == 200)
+        found = [{**window, "seed": 42, "per_image": []}]
+    return sorted(found, key=lambda one: one["seed"])
+
+
+def captures() -> str:
+    """`nrfgs` as it comes beside harmonics with the same steps and mean, on test views."""
+    body = []
+    for scene, views in TRAINING_VIEWS.items():
+        field, harmonics = _runs(scene, FIELD), _runs(scene, HARMONICS)
+        if not field or not harmonics:
+            body.append([f"{scene}, {views}", *(["not run"] * 5)])
+            continue
+        gains = _gains(field, harmonics)
+        psnr = [fmean(one["psnr"] for one in runs) for runs in (field, harmonics)]
+        ssim = [fmean(one["ssim"] for one in runs) for runs in (field, harmonics)]
+        splats = [fmean(one["splats"] for one in runs) for runs in (field, harmonics)]
+        body.append(
+            [
+                f"{scene}, {views}",
+                f"{psnr[0]:.2f}, {ssim[0]:.3f}",
+                f"{psnr[1]:.2f}, {ssim[1]:.3f}",
+                signed(median(gains)) if gains else f"{signed(psnr[0] - psnr[1])} (mean)",
+                f"{sum(gain > 0 for gain in gains)} of {len(gains)}" if gains else "-",
+                f"{splats[0] / splats[1]:.2f}",
+            ]
+        )
+    head = ["capture, training views", "`nrfgs`", "harmonics", "median view, dB", "better in", "splats, of harmonics'"]
+    return grid(head, body)
+
+
+def _gains(field: list[dict[str, Any]], harmonics: list[dict[str, Any]]) -> list[float]:
+    """Decibels by which the field is above harmonics in each test view, in the mean of the seeds that both have."""
+    seeds = {one["seed"] for one in field} & {one["seed"] for one in harmonics}
+    views: dict[str, list[list[float]]] = defaultdict(lambda: [[], []])
+    for number, runs in enumerate((field, harmonics)):
+        for one in runs:
+            for name, psnr, *_ in one["per_image"] if one["seed"] in seeds else ():
+                views[name][number].append(psnr)
+    return [fmean(ours) - fmean(theirs) for ours, theirs in views.values() if ours and theirs]
+
+
+def preset(run: str, column: str) -> str:
+    """A number of a training of bonsai."""
+    row = next(row for (scene, _, name), row in bench_rows("presets").items() if (scene, name) == ("bonsai", run))
+    form = {"PSNR": ".2f", "time s": ".0f", "splats": ",.0f"}[column]
+    return format(mean_of(row, column), form)
+
+
+def demo(what: str) -> str:
+    """Decibels by which the field is ahead in the demo: over whole pictures, or where it shines."""
+    methods = records("demo")["results"]["methods"]
+    part, key = {"whole": ("eval", "psnr"), "shine": ("shine", "psnr")}[what]
+    return signed(methods["nrfgs"][part][key] - methods["nrfgs-sh"][part][key], 2)
+
+
+def compact(what: str) -> str:
+    """Size in MB, or loss in dB, of bonsai's compact file."""
+    one = records("compact")["full-bonsai"]
+    return f"{one['bytes'] / 1e6:.1f}" if what == "size" else f"{one['loss_db']:.2f}"
