@@ -1,21 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What growth by gradients remembers: the kernel (statistics_interpreted.py, in its own process) and its choice."""
-
-import importlib.util
-from pathlib import Path
+"""What growth by gradients remembers, on a GPU. In Triton's interpreter: statistics_interpreted.py."""
 
 import pytest
 import torch
-from interpreted import passes_in_the_interpreter
 
 from nrfgs_ns.densification import statistics
-
-INTERPRETED = Path(__file__).with_name("statistics_interpreted.py")
-
-
-@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
-def test_the_kernel_in_the_interpreter():
-    passes_in_the_interpreter(INTERPRETED)
 
 
 @pytest.mark.gpu

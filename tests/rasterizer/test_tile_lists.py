@@ -1,21 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lists of what each tile draws: their kernels (tile_lists_interpreted.py, in a process of its own), and on a GPU
-gsplat's images and gradients from them."""
-
-import importlib.util
-from pathlib import Path
+"""The lists of what each tile draws, on a GPU: gsplat's images and gradients from them. In Triton's interpreter:
+tile_lists_interpreted.py."""
 
 import pytest
 import torch
-from interpreted import passes_in_the_interpreter
 from tile_list_cases import assert_lists, splats
-
-INTERPRETED = Path(__file__).with_name("tile_lists_interpreted.py")
-
-
-@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
-def test_kernels_in_the_interpreter():
-    passes_in_the_interpreter(INTERPRETED)
 
 
 @pytest.mark.gpu

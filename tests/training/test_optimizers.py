@@ -1,26 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lean optimisers step as torch's own."""
+"""The lean optimisers step as torch's own. Their kernel in Triton's interpreter: adam_interpreted.py."""
 
-import importlib.util
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
-from interpreted import passes_in_the_interpreter
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from torch.amp import GradScaler
 from torch.testing import assert_close
 
 from nrfgs_ns.training.optimizers import LeanOptimizers, fused_adam_step
-
-INTERPRETED = Path(__file__).with_name("adam_interpreted.py")
-
-
-@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
-def test_the_kernel_in_the_interpreter():
-    passes_in_the_interpreter(INTERPRETED)
 
 
 @pytest.mark.gpu
