@@ -141,8 +141,7 @@ def _refuse_options(config: Any) -> None:
     """Raise InputError where an option was set that this strategy does not read: it would be ignored silently."""
     strategy, default = config.densification, type(config)()
     for name in UNREAD[strategy]:
-        usual = getattr(default, name)
-        if getattr(config, name, usual) != usual:  # a config.yml of an older version has fewer options
+        if getattr(config, name) != getattr(default, name):
             reader = READ_BY.get(name)
             raise InputError(
                 f"pipeline.model.{name} has no effect with the densification {strategy!r}. Leave it out, or use "

@@ -98,6 +98,10 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Be what a config.yml says; that of an older version has fewer options."""
+        self.__dict__.update({**vars(type(self)()), **state})
+
 
 class NrfgsModel(SplatfactoModel):
     """Gaussian splatting with an appearance head.
@@ -277,14 +281,29 @@ class NrfgsModel(SplatfactoModel):
             and "depth" [H, W, 1], which is left out of training unless `output_depth_during_training`.
         """
         field = self.field
+        outputs, appearance = self.render(field, camera, self._as_learnt(field))
+        if self.training:
+            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
+        return outputs
+
+    def render(self, field: Field, camera: Cameras, asked: Field) -> tuple[dict[str, Tensor], SplatAppearance]:
+        """Render a field, which need not be the model's own, as `get_outputs` renders that.
+
+        Args:
+            field: what is drawn.
+            camera: a batch of one camera, [1].
+            asked: the same field as its head is asked about it, with or without noise.
+
+        Returns:
+            what `get_outputs` does, and what the visible splats look like.
+        """
         view = self.project(camera, field.splats)
-        appearance = self._as_learnt(field).seen_from(view)
+        appearance = asked.seen_from(view)
         background = self._get_background_color()
         outputs, self.info = self.composite(view, appearance, background, self._photograph_of(camera))
         if self.training:
-            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._finish_for_training(outputs, camera, background)
-        return outputs
+        return outputs, appearance
 
     def against_photograph(
         self, camera: Cameras, batch: Mapping[str, Any], view: View, appearance: SplatAppearance
@@ -482,7 +501,7 @@ class NrfgsModel(SplatfactoModel):
 
         Terms that are zero in this step are left out. Nothing waits for the GPU.
         """
-        losses = {"main_loss": self._photometric_loss(outputs, batch)}
+        losses = {"main_loss": self.photometric_loss(outputs, batch)}
         if self.config.use_scale_regularization and self.step % 10 == 0:
             scales = self.scales.exp()
             ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
@@ -499,7 +518,7 @@ class NrfgsModel(SplatfactoModel):
             self.watched_image = batch.get("image_idx")
         return losses
 
-    def _photometric_loss(self, outputs, batch) -> Tensor:
+    def photometric_loss(self, outputs, batch) -> Tensor:
         """Splatfacto's loss of an image against its photograph, a scalar."""
         truth = self.truth_of(batch, outputs["background"])
         rgb = outputs["rgb"]
