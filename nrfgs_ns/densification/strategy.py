@@ -87,6 +87,10 @@ class Densification(ABC):
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
         return False
 
+    def rests_at(self, step: int) -> bool:
+        """Whether it looks at nothing in this step and adds nothing to the loss."""
+        return False
+
     def see_cameras(self, centers: Tensor) -> None:  # noqa: B027  (only some strategies measure by the cameras)
         """Tell the strategy where the training cameras are, [V, 3], before the first step."""
 

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rendering, loss and gradients of a training step as one CUDA graph.
+
+A step launches a hundred kernels, and the host takes longer to launch them than a GPU takes to run them: 4 ms against
+2 ms at 250,000 splats. Once densification is over, each step does the same to the same tensors. Then it is recorded
+once, and launched as a whole from then on, with another camera, photograph and noise.
+
+What makes steps differ in size must not be there: all splats have a row, visible or not, and the tiles' lists have room
+for half as many pairs again as any training view had. Should a view need more, which the host learns a step later, the
+farthest splats were missing from that step, and there is more room from then on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from nrfgs_ns.data.checks import warn
+from nrfgs_ns.image.ssim import photometric_loss
+from nrfgs_ns.model.pinhole import Pinhole
+from nrfgs_ns.model.renderer import composite_view, project_view
+
+MORE_ROOM = 1.5
+"""Room for pairs of splats and tiles, for each that the view with the most has."""
+VIEWS_ASKED = 20
+"""Views that are asked how many pairs they have."""
+MOST_SIZES = 4
+"""Sizes of photographs that are recorded; of others, steps are made one kernel after the other."""
+
+
+class StepGraphs:
+    """The graphs of one training, one for each size of photograph.
+
+    Args:
+        model: an NrfgsModel.
+        datamanager: of its training.
+    """
+
+    def __init__(self, model, datamanager):
+        self.model = model
+        self.datamanager = datamanager
+        self._graphs: dict[tuple[int, int], _StepGraph] = {}
+        self._of: list[Any] = []
+        self._given_up = False
+
+    def take(self, step: int, batch: Mapping[str, Any]) -> bool:
+        """Whether this step can be a graph's."""
+        model = self.model
+        return (
+            not self._given_up
+            and model.device.type == "cuda"
+            and model.densification.rests_at(step)
+            and model.schedule_step >= model.config.num_downscales * model.config.resolution_schedule
+            and not (model.config.use_scale_regularization and step % 10 == 0)
+            and not model.config.use_bilateral_grid
+            and not model.config.output_depth_during_training
+            and model.photograph is None
+            and model.trimming is None
+            and model.num_diffuse == 0
+            and model.camera_optimizer.config.mode == "off"
+            and "mask" not in batch
+            and batch["image"].shape[-1] == 3
+            and batch["image"].dtype == torch.uint8
+            and (batch["image"].shape[:2] in self._graphs or len(self._graphs) < MOST_SIZES)
+        )
+
+    def losses(
+        self, camera: Cameras, batch: Mapping[str, Any], step: int
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]] | None:
+        """Outputs and losses as of the model, and the gradients of the losses' sum to all parameters, when that is
+        differentiated. None: it cannot be; from then on nothing is taken."""
+        try:
+            graph = self._graph_for(camera, batch)
+        except Exception as error:
+            self._given_up = True
+            self._graphs.clear()
+            torch.cuda.empty_cache()
+            reason = next(iter(str(error).splitlines()), "")
+            warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
+            return None
+        outputs, loss = graph.run(self.model.pinhole(camera), batch["image"], step)
+        self.model.watched = {"the rendered image": outputs["rgb"], "loss main_loss": loss.detach()}
+        self.model.watched_image = batch.get("image_idx")
+        return outputs, {"main_loss": loss}
+
+    def _graph_for(self, camera: Cameras, batch: Mapping[str, Any]) -> _StepGraph:
+        """The graph of a photograph's size, recorded if there is none for the parameters as they are."""
+        objects = [self.model.head, *self.model.gauss_params.values()]
+        if len(objects) != len(self._of) or any(a is not b for a, b in zip(objects, self._of, strict=True)):
+            self._graphs.clear()  # splats have come or gone
+            self._of = objects
+        size = tuple(batch["image"].shape[:2])
+        graph = self._graphs.get(size)
+        if graph is None or not graph.had_room():
+            self._graphs.pop(size, None)
+            del graph  # whose memory the new one can have
+            seen_from = self.model.pinhole(camera)
+            self._graphs[size] = _StepGraph(self.model, seen_from, batch["image"], self._room())
+        return self._graphs[size]
+
+    @torch.no_grad()
+    def _room(self) -> int:
+        """Room for pairs, by what views evenly taken from all need."""
+        from nrfgs_ns.rasterizer.tile_lists import room_on
+
+        model, most = self.model, 0
+        count = len(self.datamanager.train_dataset)
+        field = model.field
+        for index in range(0, count, max(count // VIEWS_ASKED, 1)):
+            camera, _ = self.datamanager.train_view(index)
+            view = model.project(camera, field.splats)
+            composite_view(view, field.seen_from(view), torch.zeros(3, device=model.device), with_depth=False)
+            most = max(most, room_on(model.device).needed())
+        return int(MORE_ROOM * most) + 1
+
+
+class _StepGraph:
+    """One graph, and the tensors that it reads and writes.
+
+    Args:
+        model: an NrfgsModel in training.
+        seen_from, photograph: some camera, and its photograph, bytes [H, W, 3].
+        pairs: room for pairs.
+    """
+
+    def __init__(self, model, seen_from: Pinhole, photograph: Tensor, pairs: int):
+        from nrfgs_ns.rasterizer.tile_lists import FixedRoom
+
+        self.model = model
+        self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+        device = photograph.device
+        self.seen_from = seen_from._replace(
+            viewmat=seen_from.viewmat.clone(), K=seen_from.K.clone(), center=seen_from.center.clone()
+        )
+        self.photograph = photograph.clone()
+        self.room = FixedRoom(pairs, device)
+        self._counted = torch.zeros(1, dtype=torch.int64, pin_memory=True)
+        self._arrived = torch.cuda.Event()
+        self._arrived.record()
+        noise = model.view_noise
+        self.noise = None if noise.sigma == 0.0 else noise.generator(device, 0)
+
+        aside = torch.cuda.Stream(device)
+        aside.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(aside), torch.random.fork_rng([device]):
+            self._compute()  # what is made or compiled at a first call is there from here on
+        torch.cuda.current_stream(device).wait_stream(aside)
+        self.graph = torch.cuda.CUDAGraph()
+        if self.noise is not None:
+            self.graph.register_generator_state(self.noise)
+        with torch.cuda.graph(self.graph, capture_error_mode="thread_local"):  # a viewer's thread may do as it likes
+            self._compute()
+        self.gradients = [parameter.grad for parameter in self.parameters]
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    def _compute(self) -> None:
+        """One step's rendering, loss and gradients, from and to tensors that stay where they are."""
+        model = self.model
+        for parameter in self.parameters:
+            parameter.grad = None
+        with torch.enable_grad(), self.room.in_use():
+            field = model.field
+            view = project_view(field.splats, self.seen_from, model.projecting._replace(every_row=True))
+            learnt = field._replace(splats=model.view_noise.moved_by(field.splats, self.noise))
+            background = model._get_background_color()
+            outputs, _ = composite_view(view, learnt.seen_from(view), background, with_depth=False, assume_finite=True)
+            truth = self.photograph.float() / 255.0
+            loss = photometric_loss(outputs["rgb"], truth, model.config.ssim_lambda)
+            loss.backward()
+        self.outputs = {name: outputs[name].detach() for name in ("rgb", "accumulation")}
+        self.outputs["background"] = background
+        self.loss = loss.detach()
+
+    def had_room(self) -> bool:
+        """Whether the step before had room for all pairs."""
+        self._arrived.synchronize()
+        return int(self._counted[0]) <= self.room.pairs
+
+    def run(self, seen_from: Pinhole, photograph: Tensor, step: int) -> tuple[dict[str, Tensor], Tensor]:
+        """Outputs, and the loss, whose gradients are ready to be handed out."""
+        for parameter, gradient in zip(self.parameters, self.gradients, strict=True):
+            if parameter.grad is gradient and gradient is not None:  # kept to be added to
+                parameter.grad = gradient.clone()
+        for name in ("viewmat", "K", "center"):
+            getattr(self.seen_from, name).copy_(getattr(seen_from, name))
+        self.photograph.copy_(photograph)
+        if self.noise is not None:
+            self.model.view_noise.generator(self.photograph.device, step)
+        self.graph.replay()
+        self._counted.copy_(self.room.counted, non_blocking=True)
+        self._arrived.record()
+        return dict(self.outputs), _Ready.apply(self.loss, self, self.parameters[0])
+
+
+class _Ready(torch.autograd.Function):
+    """A loss whose gradients have been computed with it. It is differentiated as it is: nothing else is in the sum."""
+
+    @staticmethod
+    def forward(ctx, loss: Tensor, graph: _StepGraph, _: Tensor) -> Tensor:
+        ctx.graph = graph
+        return loss.clone()
+
+    @staticmethod
+    def backward(ctx, d_loss: Tensor) -> tuple[None, None, None]:
+        for parameter, gradient in zip(ctx.graph.parameters, ctx.graph.gradients, strict=True):
+            if gradient is not None:
+                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+        return None, None, None
