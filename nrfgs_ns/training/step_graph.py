@@ -144,6 +144,9 @@ class _StepGraph:
         noise = model.view_noise
         self.noise = None if noise.sigma == 0.0 else noise.generator(device, 0)
 
+        # What an earlier step has left keeps its gradients' way to the parameters alive, which is another stream's.
+        left = getattr(model, "info", {})
+        model.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in left.items()}
         aside = torch.cuda.Stream(device)
         aside.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(aside), torch.random.fork_rng([device]):
