@@ -4,10 +4,10 @@
     python -m nrfgs_lab.timing.step_profile --scene SCENES/bonsai --splats 300000 --out step_profile.json
 
 Each method trains for a few hundred steps at full resolution from the same number of random splats, densification
-off, or with as many splats of a scene (`grown`), as `ns-train` would run it. Wall-clock is taken over steps that
-nothing watches; then the same steps are timed section by section on the host (no waiting added, so a section that waits
-for the GPU shows its wait), and a last few are traced with torch's profiler for kernels. Methods take turns within a
-round, so that a drifting machine hurts all alike.
+off, as `ns-train` would run it. Wall-clock is taken over steps that nothing watches; then the same steps are timed
+section by section on the host (no waiting added, so a section that waits for the GPU shows its wait), and a last few
+are traced with torch's profiler for kernels. Methods take turns within a round, so that a drifting machine hurts all
+alike.
 """
 
 import contextlib
@@ -50,9 +50,6 @@ class StepProfile:
     """numbers of splats"""
     extent: float = 1.0
     """side of the cube that the splats fill, in scene units"""
-    grown: bool = False
-    """begin with the data set's points, and let MCMC grow them to that many splats, which takes a few thousand more
-    steps before the first (`warm`): a scene's splats instead of random ones"""
     steps: int = 200
     """steps in each timed stretch"""
     warm: int = 300
@@ -81,13 +78,9 @@ class StepProfile:
         args = [name, "--max-num-iterations", str(end + 1), "--vis", "tensorboard", "--steps-per-save", "1000000"]
         args += ["--steps-per-eval-image", "1000000", "--steps-per-eval-all-images", "1000000"]
         args += ["--logging.local-writer.enable", "False", "--logging.profiler", "none"]
-        if self.grown:
-            args += ["--pipeline.model.densification", "mcmc", "--pipeline.model.splat-budget", str(count)]
-        else:
-            args += ["--pipeline.model.random-init", "True", "--pipeline.model.num-random", str(count)]
-            args += ["--pipeline.model.random-scale", str(self.extent), "--pipeline.model.warmup-length", "1000000"]
-        args += ["--pipeline.model.num-downscales", "0"]
-        args += [*options.split(), "nrfgs-data", "--data", str(self.scene)]
+        args += ["--pipeline.model.random-init", "True", "--pipeline.model.num-random", str(count)]
+        args += ["--pipeline.model.random-scale", str(self.extent), "--pipeline.model.num-downscales", "0"]
+        args += ["--pipeline.model.warmup-length", "1000000", *options.split(), "nrfgs-data", "--data", str(self.scene)]
         folder = tempfile.mkdtemp()  # left behind: tensorboard's thread writes to it until the process ends
         with host_without_downloads(name):
             config = parse([name, "--output-dir", folder, *args[1:]])
@@ -119,7 +112,6 @@ class StepProfile:
             peak = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak
         return {
             "method": label,
-            "trained": trainer.pipeline.model.num_points,
             "step_ms": 1e3 * (wall[1] - wall[0]) / self.steps,
             "peak_memory_bytes": peak,
             "host_ms": {name: 1e3 * seconds / self.steps for name, seconds in clock.seconds.items()},
