@@ -21,7 +21,7 @@ from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import View, project_splats, project_view
 from nrfgs_ns.model.view_noise import ViewNoise
 from nrfgs_ns.rasterizer import Projection
-from nrfgs_ns.training.sharding import ShardingConfig
+from nrfgs_ns.training.pipeline import ShardingConfig
 
 
 @dataclass

@@ -23,8 +23,7 @@ from nrfgs_ns.compact.format import Table, write_container
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.loading import load_model
-from nrfgs_ns.export.loss import measure_loss
+from nrfgs_ns.export.loading import load_model, measure_loss
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.simplify.field_views import FieldViews, slim

@@ -21,6 +21,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
 from nerfstudio.utils.colors import get_color
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -88,7 +89,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
     """whether each photograph's exposure and white balance are learnt. auto: where EXIF says that exposure varies, or
-    where each photograph disagrees with those taken next to it; a line in the log says why"""
+    where photographs disagree by more than their places explain; a line in the log says why"""
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0
@@ -168,8 +169,9 @@ class NrfgsModel(SplatfactoModel):
             rgb = torch.rand(len(means), 3)
         neighbours = min(3, len(means) - 1)
         if neighbours > 0:
-            distances, _ = self.k_nearest_sklearn(means, neighbours)
-            width = torch.from_numpy(distances).mean(dim=-1, keepdim=True)
+            # The distances of splatfacto's scikit-learn to the last bit, without a second to import it.
+            distances, _ = cKDTree(means.cpu().numpy()).query(means.cpu().numpy(), k=neighbours + 1, workers=-1)
+            width = torch.from_numpy(distances[:, 1:]).float().mean(dim=-1, keepdim=True)
         else:
             width = torch.full((len(means), 1), self.config.densify_size_thresh * self.scene_unit)
         return {
