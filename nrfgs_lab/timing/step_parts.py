@@ -39,20 +39,18 @@ from nrfgs_ns.training.guard import remove_splats
 from nrfgs_ns.training.run import machine, parse
 
 GATES: dict[str, Gate] = {"lists": gsplat_cuda._GATE, "adam": optimizers._GATE, "statistics": growth._GATE}
-GROWING: dict[str, tuple[str, ...]] = {
+VARIANTS: dict[str, tuple[str, ...]] = {
     "whole": (),
-    "without lists": ("lists",),
-    "without adam": ("adam",),
-    "without statistics": ("statistics",),
-    "without all": tuple(GATES),
-}
-"""Variants of a step of a training that densifies -> the parts that are closed."""
-AT_REST: dict[str, tuple[str, ...]] = {
-    "graph": (),
     "without graph": ("graph",),
-    "without graph, all": ("graph", *GATES),
+    "without graph, lists": ("graph", "lists"),
+    "without graph, adam": ("graph", "adam"),
+    "without graph, statistics": ("graph", "statistics"),
+    "without all": ("graph", *GATES),
+    "at rest: whole": (),
+    "at rest: without graph": ("graph",),
+    "at rest: without all": ("graph", *GATES),
 }
-"""The same for a training that does not densify any more."""
+"""Variants of a step -> the parts that are closed. At rest nothing is remembered for densification."""
 NEVER = 10**9
 
 
@@ -101,8 +99,7 @@ class StepParts:
 
     def measure(self, method: str) -> tuple[list[dict[str, Any]], tuple[Any, dict[str, list]]]:
         """Train a method and time its variants; the model is there afterwards, with test cameras by their size."""
-        variants = [(name, closed, False) for name, closed in GROWING.items()]
-        variants += [(name, closed, True) for name, closed in AT_REST.items()]
+        variants = list(VARIANTS.items())
         length = 5 + self.steps + self.traced + 1  # the first few of a variant are not timed
         begin = self.grow + self.settle
         args = [method, "--max-num-iterations", str(begin + length * len(variants) + 1), "--vis", "tensorboard"]
@@ -127,9 +124,9 @@ class StepParts:
                 which, at = divmod(step - begin, length)
                 if not 0 <= which < len(variants):
                     return
-                name, closed, rests = variants[which]
+                name, closed = variants[which]
                 if at == 0:
-                    model.densification.strategy.refine_stop_iter = 0 if rests else NEVER
+                    model.densification.strategy.refine_stop_iter = 0 if "at rest" in name else NEVER
                     trainer.pipeline.graphs = None if "graph" in closed else graphs
                     closing.enter_context(shut(closed))
                 if at in (5, 5 + self.steps):
@@ -144,7 +141,7 @@ class StepParts:
                     start, end, traced = watch
                     watch.clear()
                     closing.close()
-                    row = {"variant": name, "rests": rests, "splats": model.num_points}
+                    row = {"variant": name, "splats": model.num_points}
                     rows.append({**row, "step_ms": 1e3 * (end - start) / self.steps, **kernels(traced, self.traced)})
 
             trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after))

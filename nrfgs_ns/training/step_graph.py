@@ -2,11 +2,11 @@
 """Rendering, loss and gradients of a training step as one CUDA graph.
 
 A step launches a hundred kernels, and the host takes longer to launch them than a GPU takes to run them: 4 ms against
-2 ms at 250,000 splats. Once densification is over, each step does the same to the same tensors. Then it is recorded
-once, and launched as a whole from then on, with another camera, photograph and noise.
+2 ms at 250,000 splats. Between two refinements each step does the same to the same tensors. So it is recorded once,
+and launched as a whole from then on, with another camera, photograph and noise.
 
 What makes steps differ in size must not be there: all splats have a row, visible or not, and the tiles' lists have room
-for half as many pairs again as any training view had. Should a view need more, which the host learns a step later, the
+for half as many pairs again as any view had lately. Should a view need more, which the host learns a step later, the
 farthest splats were missing from that step, and there is more room from then on.
 """
 
@@ -45,6 +45,9 @@ class StepGraphs:
         self.datamanager = datamanager
         self._graphs: dict[tuple[int, int], _StepGraph] = {}
         self._of: list[Any] = []
+        self._how: list[Any] = []
+        self._pairs_for_each = 0.0
+        """the most pairs of a view, for each splat, at this resolution"""
         self._given_up = False
 
     def take(self, step: int, batch: Mapping[str, Any]) -> bool:
@@ -53,8 +56,8 @@ class StepGraphs:
         return (
             not self._given_up
             and model.device.type == "cuda"
-            and model.densification.rests_at(step)
-            and model.schedule_step >= model.config.num_downscales * model.config.resolution_schedule
+            and step > 0  # in the first step PyTorch makes what the optimisers keep
+            and model.densification.takes_all_rows
             and not (model.config.use_scale_regularization and step % 10 == 0)
             and not model.config.use_bilateral_grid
             and not model.config.output_depth_during_training
@@ -72,7 +75,10 @@ class StepGraphs:
         self, camera: Cameras, batch: Mapping[str, Any], step: int
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]] | None:
         """Outputs and losses as of the model, and the gradients of the losses' sum to all parameters, when that is
-        differentiated. None: it cannot be; from then on nothing is taken."""
+        differentiated. None: the step is the first of its kind, or cannot be recorded; then none is taken any more."""
+        model = self.model
+        if self._is_new():
+            return None
         try:
             graph = self._graph_for(camera, batch)
         except Exception as error:
@@ -82,29 +88,50 @@ class StepGraphs:
             reason = next(iter(str(error).splitlines()), "")
             warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
             return None
-        outputs, loss = graph.run(self.model.pinhole(camera), batch["image"], step)
-        self.model.watched = {"the rendered image": outputs["rgb"], "loss main_loss": loss.detach()}
-        self.model.watched_image = batch.get("image_idx")
-        return outputs, {"main_loss": loss}
+        loss = graph.run(model.pinhole(camera), batch["image"], step)
+        model.info = graph.info
+        model.watched = {"the rendered image": graph.outputs["rgb"], "loss main_loss": loss.detach()}
+        model.watched_image = batch.get("image_idx")
+        return dict(graph.outputs), {"main_loss": loss}
+
+    def _is_new(self) -> bool:
+        """Whether a step is another than the one before, and none that has been recorded: splats have come or gone,
+        pixels are others, or the head or the densification does something else."""
+        model = self.model
+        now = [*model.gauss_params.values(), model.head, *model.head.parameters()]
+        how = [model.head.phase, model.densification.rests_at(model.step), model._get_downscale_factor()]
+        same = len(now) == len(self._of) and all(a is b for a, b in zip(now, self._of, strict=True))
+        if same and how == self._how:
+            return False
+        self._see_pairs()
+        if how[-1:] != self._how[-1:]:
+            self._pairs_for_each = 0.0
+        self._graphs.clear()
+        self._of, self._how = now, how
+        return True
 
     def _graph_for(self, camera: Cameras, batch: Mapping[str, Any]) -> _StepGraph:
-        """The graph of a photograph's size, recorded if there is none for the parameters as they are."""
-        objects = [self.model.head, *self.model.gauss_params.values()]
-        if len(objects) != len(self._of) or any(a is not b for a, b in zip(objects, self._of, strict=True)):
-            self._graphs.clear()  # splats have come or gone
-            self._of = objects
+        """The graph of a photograph's size, recorded if there is none."""
+        model = self.model
         size = tuple(batch["image"].shape[:2])
-        graph = self._graphs.get(size)
-        if graph is None or not graph.had_room():
-            self._graphs.pop(size, None)
-            del graph  # whose memory the new one can have
-            seen_from = self.model.pinhole(camera)
-            self._graphs[size] = _StepGraph(self.model, seen_from, batch["image"], self._room())
+        if size in self._graphs and not self._graphs[size].had_room():
+            self._see_pairs()
+            del self._graphs[size]
+        if size not in self._graphs:
+            if self._pairs_for_each == 0.0:
+                self._pairs_for_each = self._most_pairs() / model.num_points
+            room = int(MORE_ROOM * self._pairs_for_each * model.num_points) + 1
+            self._graphs[size] = _StepGraph(model, model.pinhole(camera), batch["image"], room)
         return self._graphs[size]
 
+    def _see_pairs(self) -> None:
+        """Learn from the graphs that there are how many pairs views have."""
+        for graph in self._graphs.values():
+            self._pairs_for_each = max(self._pairs_for_each, graph.most_pairs() / graph.count)
+
     @torch.no_grad()
-    def _room(self) -> int:
-        """Room for pairs, by what views evenly taken from all need."""
+    def _most_pairs(self) -> int:
+        """The most pairs of views that are evenly taken from all."""
         from nrfgs_ns.rasterizer.tile_lists import room_on
 
         model, most = self.model, 0
@@ -115,7 +142,7 @@ class StepGraphs:
             view = model.project(camera, field.splats)
             composite_view(view, field.seen_from(view), torch.zeros(3, device=model.device), with_depth=False)
             most = max(most, room_on(model.device).needed())
-        return int(MORE_ROOM * most) + 1
+        return most
 
 
 class _StepGraph:
@@ -130,15 +157,15 @@ class _StepGraph:
     def __init__(self, model, seen_from: Pinhole, photograph: Tensor, pairs: int):
         from nrfgs_ns.rasterizer.tile_lists import FixedRoom
 
-        self.model = model
+        self.model, self.count = model, model.num_points
         self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-        device = photograph.device
+        self.device = device = photograph.device
         self.seen_from = seen_from._replace(
             viewmat=seen_from.viewmat.clone(), K=seen_from.K.clone(), center=seen_from.center.clone()
         )
         self.photograph = photograph.clone()
         self.room = FixedRoom(pairs, device)
-        self._counted = torch.zeros(1, dtype=torch.int64, pin_memory=True)
+        self._counted = torch.zeros(2, dtype=torch.int64, pin_memory=True)
         self._arrived = torch.cuda.Event()
         self._arrived.record()
         noise = model.view_noise
@@ -147,16 +174,24 @@ class _StepGraph:
         # What an earlier step has left keeps its gradients' way to the parameters alive, which is another stream's.
         left = getattr(model, "info", {})
         model.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in left.items()}
-        aside = torch.cuda.Stream(device)
-        aside.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(aside), torch.random.fork_rng([device]):
-            self._compute()  # what is made or compiled at a first call is there from here on
-        torch.cuda.current_stream(device).wait_stream(aside)
+        for parameter in self.parameters:
+            parameter.grad = None
         self.graph = torch.cuda.CUDAGraph()
         if self.noise is not None:
             self.graph.register_generator_state(self.noise)
-        with torch.cuda.graph(self.graph, capture_error_mode="thread_local"):  # a viewer's thread may do as it likes
-            self._compute()
+        now, aside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+        aside.wait_stream(now)
+        with torch.cuda.stream(aside):
+            with torch.random.fork_rng([device]):
+                self._compute()  # what is made or compiled at a first call is there from here on
+            for parameter in self.parameters:
+                parameter.grad = None
+            self.graph.capture_begin(capture_error_mode="thread_local")  # a viewer's thread may do as it likes
+            try:
+                self._compute()
+            finally:
+                self.graph.capture_end()
+        now.wait_stream(aside)
         self.gradients = [parameter.grad for parameter in self.parameters]
         for parameter in self.parameters:
             parameter.grad = None
@@ -164,28 +199,45 @@ class _StepGraph:
     def _compute(self) -> None:
         """One step's rendering, loss and gradients, from and to tensors that stay where they are."""
         model = self.model
-        for parameter in self.parameters:
-            parameter.grad = None
         with torch.enable_grad(), self.room.in_use():
             field = model.field
             view = project_view(field.splats, self.seen_from, model.projecting._replace(every_row=True))
             learnt = field._replace(splats=model.view_noise.moved_by(field.splats, self.noise))
+            appearance = learnt.seen_from(view)
             background = model._get_background_color()
-            outputs, _ = composite_view(view, learnt.seen_from(view), background, with_depth=False, assume_finite=True)
-            truth = self.photograph.float() / 255.0
+            outputs, info = composite_view(
+                view,
+                appearance,
+                background,
+                with_depth=False,
+                absgrad=model.densification.needs_absgrad(model.step),
+                assume_finite=True,
+            )
+            model.densification.pre_backward(model.step, info, appearance.opacities, model.gauss_params["opacities"])
+            truth = model.truth_of({"image": self.photograph}, background)
             loss = photometric_loss(outputs["rgb"], truth, model.config.ssim_lambda)
             loss.backward()
         self.outputs = {name: outputs[name].detach() for name in ("rgb", "accumulation")}
         self.outputs["background"] = background
         self.loss = loss.detach()
+        self.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in info.items()}
+        for name in ("grad", "absgrad"):
+            gradient = getattr(info["means2d"], name, None)
+            if gradient is not None:  # what is not finite counts as zero in densification's statistics
+                setattr(self.info["means2d"], name, gradient.nan_to_num_(0.0, 0.0, 0.0))
 
     def had_room(self) -> bool:
         """Whether the step before had room for all pairs."""
         self._arrived.synchronize()
         return int(self._counted[0]) <= self.room.pairs
 
-    def run(self, seen_from: Pinhole, photograph: Tensor, step: int) -> tuple[dict[str, Tensor], Tensor]:
-        """Outputs, and the loss, whose gradients are ready to be handed out."""
+    def most_pairs(self) -> int:
+        """The most pairs of any step."""
+        self._arrived.synchronize()
+        return int(self._counted[1])
+
+    def run(self, seen_from: Pinhole, photograph: Tensor, step: int) -> Tensor:
+        """The loss, whose gradients are ready to be handed out; `outputs` and `info` are this step's."""
         for parameter, gradient in zip(self.parameters, self.gradients, strict=True):
             if parameter.grad is gradient and gradient is not None:  # kept to be added to
                 parameter.grad = gradient.clone()
@@ -193,11 +245,11 @@ class _StepGraph:
             getattr(self.seen_from, name).copy_(getattr(seen_from, name))
         self.photograph.copy_(photograph)
         if self.noise is not None:
-            self.model.view_noise.generator(self.photograph.device, step)
+            self.model.view_noise.generator(self.device, step)
         self.graph.replay()
         self._counted.copy_(self.room.counted, non_blocking=True)
         self._arrived.record()
-        return dict(self.outputs), _Ready.apply(self.loss, self, self.parameters[0])
+        return _Ready.apply(self.loss, self, self.parameters[0])
 
 
 class _Ready(torch.autograd.Function):
