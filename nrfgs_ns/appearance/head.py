@@ -147,6 +147,9 @@ class AppearanceHead(nn.Module, ABC):
         """What `set_step` has decided: in steps of one phase the head computes the same."""
         return None
 
+    def try_kernels(self, device: torch.device) -> None:  # noqa: B027  (most heads have none)
+        """Find out whether the head's own kernels run on a CUDA device, which compiles them: the first step would."""
+
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor | None:
         """How far the head is from adding nothing to the base appearance, as a scalar to minimise in the warm-up.
 

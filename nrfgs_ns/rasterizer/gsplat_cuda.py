@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
+from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
 
 from nrfgs_ns.host import GSPLAT, gsplat_version
@@ -29,6 +29,11 @@ if HAS_BATCHES and gsplat_version() < (1, 5, 3):
 CHANNEL_CHUNK = 32  # more channels at once slow the kernels down
 MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` look through
 MOST_TILES = 2**15  # those beyond have no 16-bit number, as `tile_lists.py` wants
+
+
+def load_kernels(device: torch.device) -> None:
+    """See `nrfgs_ns.rasterizer.load_kernels`: any kernel loads all."""
+    spherical_harmonics(0, torch.ones(1, 3, device=device), torch.ones(1, 1, 3, device=device))
 
 
 def project(

@@ -62,12 +62,12 @@ def adam_kernel(base, table, skip, BLOCK: tl.constexpr, COLUMNS: tl.constexpr):
     column = tl.sum((ends <= program).to(tl.int32), axis=0)
     first = tl.max(tl.where(ends <= program, ends, 0), axis=0)
     counter = base + _entry(table, STEP, column, COLUMNS)
-    steps = tl.load(counter)
+    counted = tl.load(counter)
     if tl.load(skip) != 0.0:
         if program == first:
-            tl.store(counter, steps - 1.0)
+            tl.store(counter, counted - 1.0)
     else:
-        steps = steps.to(tl.float64)
+        steps = counted.to(tl.float64)
         beta1 = _number(table, BETA1, column, COLUMNS)
         beta2 = _number(table, BETA2, column, COLUMNS)
         correction1 = 1.0 - tl.exp(steps * tl.log(beta1))

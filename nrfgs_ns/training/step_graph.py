@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
+from torch.func import functional_call
 
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.image.ssim import photometric_loss
@@ -89,7 +90,7 @@ class StepGraphs:
             warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
             return None
         loss = graph.run(model.pinhole(camera), batch["image"], step)
-        model.info = graph.info
+        model.info = {**graph.info, "pairs": graph.last_pairs}
         model.watched = {"the rendered image": graph.outputs["rgb"], "loss main_loss": loss.detach()}
         model.watched_image = batch.get("image_idx")
         return dict(graph.outputs), {"main_loss": loss}
@@ -158,52 +159,60 @@ class _StepGraph:
         from nrfgs_ns.rasterizer.tile_lists import FixedRoom
 
         self.model, self.count = model, model.num_points
-        self.parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+        self.parameters = {f"splats.{name}": value for name, value in model.gauss_params.items()}
+        self.parameters |= {f"head.{name}": value for name, value in model.head.named_parameters()}
         self.device = device = photograph.device
         self.seen_from = seen_from._replace(
             viewmat=seen_from.viewmat.clone(), K=seen_from.K.clone(), center=seen_from.center.clone()
         )
         self.photograph = photograph.clone()
         self.room = FixedRoom(pairs, device)
-        self._counted = torch.zeros(2, dtype=torch.int64, pin_memory=True)
+        self._counted = torch.ones(2, dtype=torch.int64, pin_memory=True)
         self._arrived = torch.cuda.Event()
         self._arrived.record()
+        self.last_pairs = 1
+        """of the step before, as far as the host has learnt"""
         noise = model.view_noise
         self.noise = None if noise.sigma == 0.0 else noise.generator(device, 0)
 
-        # What an earlier step has left keeps its gradients' way to the parameters alive, which is another stream's.
-        left = getattr(model, "info", {})
-        model.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in left.items()}
-        for parameter in self.parameters:
-            parameter.grad = None
+        generators = [torch.cuda.default_generators[device.index], *([] if self.noise is None else [self.noise])]
+        states = [generator.get_state() for generator in generators]
         self.graph = torch.cuda.CUDAGraph()
         if self.noise is not None:
             self.graph.register_generator_state(self.noise)
         now, aside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
         aside.wait_stream(now)
-        with torch.cuda.stream(aside):
-            with torch.random.fork_rng([device]):
+        try:
+            with torch.cuda.stream(aside):
                 self._compute()  # what is made or compiled at a first call is there from here on
-            for parameter in self.parameters:
-                parameter.grad = None
-            self.graph.capture_begin(capture_error_mode="thread_local")  # a viewer's thread may do as it likes
-            try:
-                self._compute()
-            finally:
-                self.graph.capture_end()
+                for generator, state in zip(generators, states, strict=True):
+                    generator.set_state(state)
+                self.graph.capture_begin(capture_error_mode="thread_local")  # a viewer's thread may do as it likes
+                try:
+                    self._compute()
+                finally:
+                    self.graph.capture_end()
+        except Exception:
+            for generator, state in zip(generators, states, strict=True):  # they believe that they are recorded
+                generator.graphsafe_set_state(torch.Generator(device).graphsafe_get_state())
+                generator.set_state(state)
+            raise
         now.wait_stream(aside)
-        self.gradients = [parameter.grad for parameter in self.parameters]
-        for parameter in self.parameters:
-            parameter.grad = None
 
     def _compute(self) -> None:
-        """One step's rendering, loss and gradients, from and to tensors that stay where they are."""
+        """One step's rendering, loss and gradients, from and to tensors that stay where they are.
+
+        Gradients go to leaves that share the parameters' numbers. The parameters themselves may be held by what an
+        earlier step has left, and would be another stream's.
+        """
         model = self.model
+        leaves = {name: value.detach().requires_grad_() for name, value in self.parameters.items()}
+        splats = {name: leaves[f"splats.{name}"] for name in model.gauss_params}
+        weights = {name: leaves[f"head.{name}"] for name, _ in model.head.named_parameters()}
         with torch.enable_grad(), self.room.in_use():
-            field = model.field
-            view = project_view(field.splats, self.seen_from, model.projecting._replace(every_row=True))
-            learnt = field._replace(splats=model.view_noise.moved_by(field.splats, self.noise))
-            appearance = learnt.seen_from(view)
+            view = project_view(splats, self.seen_from, model.projecting._replace(every_row=True))
+            asked = model.view_noise.moved_by(splats, self.noise)
+            appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
             background = model._get_background_color()
             outputs, info = composite_view(
                 view,
@@ -213,15 +222,16 @@ class _StepGraph:
                 absgrad=model.densification.needs_absgrad(model.step),
                 assume_finite=True,
             )
-            model.densification.pre_backward(model.step, info, appearance.opacities, model.gauss_params["opacities"])
+            model.densification.pre_backward(model.step, info, appearance.opacities, splats["opacities"])
             truth = model.truth_of({"image": self.photograph}, background)
             loss = photometric_loss(outputs["rgb"], truth, model.config.ssim_lambda)
             loss.backward()
+        self.gradients = {name: leaf.grad for name, leaf in leaves.items()}
         self.outputs = {name: outputs[name].detach() for name in ("rgb", "accumulation")}
         self.outputs["background"] = background
         self.loss = loss.detach()
         self.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in info.items()}
-        for name in ("grad", "absgrad"):
+        for name in ("grad", "absgrad") if info["means2d"].retains_grad else ():
             gradient = getattr(info["means2d"], name, None)
             if gradient is not None:  # what is not finite counts as zero in densification's statistics
                 setattr(self.info["means2d"], name, gradient.nan_to_num_(0.0, 0.0, 0.0))
@@ -229,7 +239,8 @@ class _StepGraph:
     def had_room(self) -> bool:
         """Whether the step before had room for all pairs."""
         self._arrived.synchronize()
-        return int(self._counted[0]) <= self.room.pairs
+        self.last_pairs = int(self._counted[0])
+        return self.last_pairs <= self.room.pairs
 
     def most_pairs(self) -> int:
         """The most pairs of any step."""
@@ -238,9 +249,9 @@ class _StepGraph:
 
     def run(self, seen_from: Pinhole, photograph: Tensor, step: int) -> Tensor:
         """The loss, whose gradients are ready to be handed out; `outputs` and `info` are this step's."""
-        for parameter, gradient in zip(self.parameters, self.gradients, strict=True):
-            if parameter.grad is gradient and gradient is not None:  # kept to be added to
-                parameter.grad = gradient.clone()
+        for name, parameter in self.parameters.items():
+            if parameter.grad is not None and parameter.grad is self.gradients[name]:  # kept to be added to
+                parameter.grad = parameter.grad.clone()
         for name in ("viewmat", "K", "center"):
             getattr(self.seen_from, name).copy_(getattr(seen_from, name))
         self.photograph.copy_(photograph)
@@ -249,7 +260,7 @@ class _StepGraph:
         self.graph.replay()
         self._counted.copy_(self.room.counted, non_blocking=True)
         self._arrived.record()
-        return _Ready.apply(self.loss, self, self.parameters[0])
+        return _Ready.apply(self.loss, self, self.parameters["splats.means"])
 
 
 class _Ready(torch.autograd.Function):
@@ -262,7 +273,8 @@ class _Ready(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, d_loss: Tensor) -> tuple[None, None, None]:
-        for parameter, gradient in zip(ctx.graph.parameters, ctx.graph.gradients, strict=True):
+        for name, parameter in ctx.graph.parameters.items():
+            gradient = ctx.graph.gradients[name]
             if gradient is not None:
                 parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
         return None, None, None
