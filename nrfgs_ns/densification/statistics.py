@@ -68,8 +68,13 @@ def _kernel_takes(state: Mapping[str, Tensor], info: Mapping[str, Any], gradient
         device.type == "cuda"
         and info["n_cameras"] == 1
         and all(tensor.dtype == torch.float32 and tensor.is_contiguous() for tensor in tensors)
-        and _GATE.opens(device, device, lambda: _try_kernel(device))
+        and try_kernel(device)
     )
+
+
+def try_kernel(device: torch.device) -> bool:
+    """Whether the kernel runs on a CUDA device; tried once, which compiles it: the first step would."""
+    return _GATE.opens(device, device, lambda: _try_kernel(device))
 
 
 def _try_kernel(device: torch.device) -> None:

@@ -38,6 +38,7 @@ from nrfgs_ns.densification import (
     OriginalDensification,
     Strategy,
     build_densification,
+    statistics,
 )
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust, ssim
@@ -192,7 +193,8 @@ class NrfgsModel(SplatfactoModel):
         """What loads or compiles the kernels that a first step would wait for (`kernels.trial`); none on a CPU."""
         if self.device.type != "cuda":
             return []
-        return [partial(trial, self.device) for trial in (load_kernels, self.head.try_kernels, ssim.try_kernels)]
+        trials = load_kernels, self.head.try_kernels, ssim.try_kernels, statistics.try_kernel
+        return [partial(trial, self.device) for trial in trials]
 
     @property
     def parameter_bytes(self) -> int:

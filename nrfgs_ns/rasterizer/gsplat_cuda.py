@@ -32,8 +32,9 @@ MOST_TILES = 2**15  # those beyond have no 16-bit number, as `tile_lists.py` wan
 
 
 def load_kernels(device: torch.device) -> None:
-    """See `nrfgs_ns.rasterizer.load_kernels`: any kernel loads all."""
+    """See `nrfgs_ns.rasterizer.load_kernels`: any of gsplat's kernels loads all."""
     spherical_harmonics(0, torch.ones(1, 3, device=device), torch.ones(1, 1, 3, device=device))
+    _kernels_run_on(device)
 
 
 def project(
@@ -301,8 +302,13 @@ def _kernels_take(projection: Projection, opacities: Tensor, tile_size: int) -> 
         projection.n_cameras == 1
         and tiles <= MOST_TILES
         and opacities.dtype == projection.means2d.dtype == torch.float32
-        and _GATE.opens(device, device, lambda: _try_kernels(device))
+        and _kernels_run_on(device)
     )
+
+
+def _kernels_run_on(device: torch.device) -> bool:
+    """Whether the kernels of `tile_lists.py` run on a device; tried once."""
+    return _GATE.opens(device, device, lambda: _try_kernels(device))
 
 
 def _try_kernels(device: torch.device) -> None:

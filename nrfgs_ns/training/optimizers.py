@@ -164,13 +164,18 @@ def _step_at_once(work: list[tuple], skips: list[Tensor | None]) -> bool:
     device = work[0][1][0].device
     if device.type != "cuda" or any(skip is not skips[0] for skip in skips):
         return False
-    if not _GATE.opens(device, device, lambda: _try_kernel(device)):
+    if not try_kernel(device):
         return False
     from nrfgs_ns.training.adam_triton import AdamTable
 
     if device not in _TABLES:
         _TABLES[device] = AdamTable(device)
     return _TABLES[device].step(work, skips[0])
+
+
+def try_kernel(device: torch.device) -> bool:
+    """Whether Adam's kernel runs on a CUDA device; tried once, which compiles it: the first step would."""
+    return _GATE.opens(device, device, lambda: _try_kernel(device))
 
 
 def _try_kernel(device: torch.device) -> None:
