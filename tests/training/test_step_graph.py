@@ -63,9 +63,10 @@ def gradients(pipeline) -> dict[str, torch.Tensor]:
     """Copies of all gradients, those on the screen among them, by name."""
     named = {name: value.grad.clone() for name, value in pipeline.model.named_parameters() if value.grad is not None}
     info = pipeline.model.info
-    if info["means2d"].grad is not None:
-        named["means2d"] = torch.zeros(pipeline.model.num_points, 2, device=info["means2d"].device)
-        named["means2d"][info["gaussian_ids"]] = info["means2d"].grad
+    means2d = info["means2d"]
+    if (means2d.is_leaf or means2d.retains_grad) and means2d.grad is not None:
+        named["means2d"] = torch.zeros(pipeline.model.num_points, 2, device=means2d.device)
+        named["means2d"][info["gaussian_ids"]] = means2d.grad
     return named
 
 
