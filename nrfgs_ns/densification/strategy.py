@@ -83,6 +83,12 @@ class Densification(ABC):
         self.opacity_seen = opacity_seen
         self.state = {CHANGE: None} if opacity_seen == "peak" else {}
 
+    @property
+    def diffuse(self) -> Tensor | None:
+        """Which splats have no residual, bool [N], where a checkpoint says so: a row of the table as any other, which
+        is moved with it."""
+        return self.state.get(DIFFUSE)
+
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
         return False

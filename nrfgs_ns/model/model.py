@@ -207,7 +207,7 @@ class NrfgsModel(SplatfactoModel):
     @property
     def num_diffuse(self) -> int:
         """How many splats have no residual."""
-        diffuse = self.densification.state.get(DIFFUSE)
+        diffuse = self.densification.diffuse
         return 0 if diffuse is None else int(diffuse.sum())
 
     # Rendering.
@@ -216,7 +216,7 @@ class NrfgsModel(SplatfactoModel):
     def field(self) -> Field:
         """What is rendered: the head with all splats, or those in the crop box, and which of them are diffuse."""
         splats: dict[str, Tensor] = dict(self.gauss_params.items())
-        if (diffuse := self.densification.state.get(DIFFUSE)) is not None:
+        if (diffuse := self.densification.diffuse) is not None:
             splats[DIFFUSE] = diffuse
         if self.crop_box is not None and not self.training:
             inside = self.crop_box.within(splats["means"]).reshape(-1)
