@@ -75,7 +75,8 @@ def _columns(row, x, y, a, b, c, bound, det, left, right, SIDE: tl.constexpr):
     # Centres of the row's pixels, from the splat's.
     above = row.to(tl.float32) * SIDE + 0.5 - y
     below = above + (SIDE - 1.0)
-    flat = det <= 0.0  # not an ellipse to be sure of: the whole square
+    # Where there is no ellipse to be sure of, the whole box: what is not finite must be seen in the image.
+    flat = ~(det > 0.0) | ~(tl.abs(bound) < float("inf"))
     det = tl.where(flat, 1.0, det)
     reach_x = tl.sqrt(bound * c / det)
     reach_y = tl.sqrt(bound * a / det)
@@ -110,7 +111,7 @@ def count_kernel(
     rows = tl.load(order + at, mask=valid, other=0)
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
     left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
-    drawn = valid & (bound > 0.0)
+    drawn = valid & ~(bound <= 0.0)
     if CHANNELS > 0:
         total = x + y + a + b + c + bound
         for channel in tl.static_range(CHANNELS):
