@@ -50,7 +50,7 @@ class Seen(NamedTuple):
     rows: Tensor
     """of the table, int64 [M]"""
     pixels: Tensor
-    """how much of the picture each is, alpha T summed over pixels, [M]"""
+    """how much of the picture each is, alpha T summed over pixels, in pixels of the photograph, [M]"""
     wrong: Tensor
     """the same over wrong pixels alone, [M]"""
     loss: Tensor
