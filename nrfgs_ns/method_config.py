@@ -35,6 +35,11 @@ know_callers_quickly()  # plugins are loaded right before nerfstudio asks
 HALF_A_SPACING = 0.5
 """Noise on where the field is asked from, in distances between neighbouring training cameras (docs/captures.md)."""
 
+HEAD_FROM = 0.3
+"""Share of the training after which the field learns (docs/captures.md)."""
+SHRINKAGE = 0.15
+"""Weight of mean opacity and mean size in the loss, divided by the number of training views."""
+
 
 def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str, Any]:
     """Adam at learning rate `lr`, decaying exponentially to `lr_final` over the training if that is given."""
@@ -103,7 +108,7 @@ nrfgs = preset(
     "nrfgs",
     method("nrfgs", NrfConfig(), "", latents=adam(0.0025), field=adam(5e-3, lr_final=5e-4)),
     "Gaussian splatting with a neural residual field for view-dependent colour and opacity.",
-    model={"view_noise": HALF_A_SPACING},
+    model={"view_noise": HALF_A_SPACING, "head_from": HEAD_FROM, "few_views": "auto", "shrinkage": SHRINKAGE},
     max_num_iterations=0,
 )
 

@@ -99,7 +99,7 @@ class ShardedModel(NrfgsModel):
         field = self.field
         projection = self._project_everywhere(field.splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
-        appearance = self._as_learnt(field).seen_from(View(projection, centers))
+        appearance = self._appearance(field, View(projection, centers))
 
         absgrad = self.training and self.densification.needs_absgrad(self.step)
         own, colored = send_to_cameras(projection, appearance, *self.sizes[comm.rank()], absgrad)
@@ -161,7 +161,7 @@ class ShardedModel(NrfgsModel):
         if not self.training:
             return losses
         devices = comm.world()
-        over_splats = {"scale_reg", *self.densification.regularisation(self.gauss_params)}
+        over_splats = {"scale_reg", *self.densification.regularisation(self.gauss_params), *self.shrinking()}
         share = self.num_points * devices / sum(self.counts)
         for name in over_splats & losses.keys():
             if self.num_points == 0:

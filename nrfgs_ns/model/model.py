@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import Field, Sight
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import (
@@ -42,7 +42,7 @@ from nrfgs_ns.image import robust
 from nrfgs_ns.image.metrics import ImageMetrics
 from nrfgs_ns.image.photograph import Part, PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
-from nrfgs_ns.model.checkpoint import check_compatible, reduced_config
+from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.pinhole import Pinhole, pinhole
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
@@ -52,6 +52,10 @@ from nrfgs_ns.model.warmup import warm_up
 
 LOOK = "NRFGS_LOOK"
 """Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
+FEW_VIEWS = 100
+"""Fewer training views are few."""
+NOISE_OF_FEW_VIEWS = 2.0
+"""How many times as long the noise is then."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
 
@@ -67,6 +71,15 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     view_noise: float = 0.0
     """in training the head sees each splat from a camera centre of its own, moved by noise this many times as long as
     neighbouring training cameras are apart (docs/captures.md). 0: from the camera's"""
+    head_from: float = 0.0
+    """share of the training after which the head is asked and learns. Until then splats have their base colours and
+    opacities, so that what these can explain is theirs and not the head's (docs/captures.md)"""
+    few_views: Literal["auto", "on", "off"] = "off"
+    """what few views cannot tell is left out of the head, and view_noise is twice as long (docs/captures.md). auto:
+    with fewer than 100 training views"""
+    shrinkage: float = 0.0
+    """weight, in the loss, of the mean opacity and of the mean standard deviation in scene units, divided by the number
+    of training views: what no view needs becomes faint and small. mcmc has its own instead (docs/captures.md)"""
     warmup_steps: int | None = None
     """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
     A head that adds nothing from the start skips them."""
@@ -117,6 +130,8 @@ class NrfgsModel(SplatfactoModel):
     camera_spacing: float = 0.0
     """world units between neighbouring training cameras; 0 until a training begins"""
     _scheduled: int | None = None
+    head_learns: bool = True
+    """whether the head is asked in training; it is, once `head_from` of it is over"""
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
@@ -127,7 +142,11 @@ class NrfgsModel(SplatfactoModel):
             )
         self.scene_unit: float = (self.kwargs.get("metadata") or {}).get("scene_unit", 1.0)
         """World units in a scene unit; lengths in the configuration are in scene units."""
-        self.head = self.config.appearance.setup(self.scene_unit)
+        appearance = self.config.appearance
+        if self.has_few_views:
+            appearance = appearance.for_few_views()
+            self.reduced_head = differences(self.config.appearance, appearance)
+        self.head = appearance.setup(self.scene_unit)
         self.config.sh_degree = self.head.sh_degree
         self.gauss_params = torch.nn.ParameterDict(self._initial_splats())
         self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
@@ -146,13 +165,29 @@ class NrfgsModel(SplatfactoModel):
             else get_color(self.config.background_color)
         )
         self.densification = self._strategy()
-        if not self.config.view_noise >= 0.0:
-            raise InputError(f"pipeline.model.view_noise is {self.config.view_noise}; it must be zero or positive.")
+        for name in ("view_noise", "shrinkage"):
+            if not getattr(self.config, name) >= 0:
+                raise InputError(f"pipeline.model.{name} is {getattr(self.config, name)}; it must be zero or positive.")
+        if not 0 <= self.config.head_from < 1:
+            raise InputError(f"pipeline.model.head_from is {self.config.head_from}; it must be at least 0 and below 1.")
+        self.head_learns = self.config.head_from == 0
         self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
 
     def _strategy(self) -> Densification:
         """What makes splats come and go."""
         return build_densification(self.config, self.num_train_data, self.scene_unit)
+
+    @property
+    def has_few_views(self) -> bool:
+        """Whether the head is the one for few views."""
+        if self.config.few_views not in ("auto", "on", "off"):
+            raise InputError(f"pipeline.model.few_views is {self.config.few_views!r}; use 'auto', 'on' or 'off'.")
+        return self.config.few_views == "on" or self.config.few_views == "auto" and self.num_train_data < FEW_VIEWS
+
+    @property
+    def noise_factor(self) -> float:
+        """Length of the noise on where the head is asked from, in spacings of the training cameras."""
+        return self.config.view_noise * (NOISE_OF_FEW_VIEWS if self.has_few_views else 1.0)
 
     def _initial_splats(self) -> dict[str, Parameter]:
         """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
@@ -276,7 +311,7 @@ class NrfgsModel(SplatfactoModel):
         """
         field = self.field
         view = self.project(camera, field.splats)
-        appearance = self._as_learnt(field).seen_from(view)
+        appearance = self._appearance(field, view)
         background = self._get_background_color()
         outputs, self.info = self.composite(view, appearance, background, self._photograph_of(camera))
         if self.training:
@@ -316,11 +351,14 @@ class NrfgsModel(SplatfactoModel):
             )
         return self.photograph.names.index(name) if name else None
 
-    def _as_learnt(self, field: Field) -> Field:
-        """The field as its head is asked about it in this step (`view_noise.py`); outside of training, the field."""
-        if not self.training:
-            return field
-        return field._replace(splats=self.view_noise.moved(field.splats, self.step))
+    def _appearance(self, field: Field, view: Sight) -> SplatAppearance:
+        """What a field's visible splats look like; in training as it learns in this step: nothing that depends on the
+        view before `head_from`, then under noise (`view_noise.py`)."""
+        if self.training:
+            if not self.head_learns:
+                return field.base_of(view)
+            field = field._replace(splats=self.view_noise.moved(field.splats, self.step))
+        return field.seen_from(view)
 
     def _finish_for_training(self, outputs: dict[str, Tensor], camera: Cameras, background: Tensor) -> None:
         """Leave the background a colour [3], and apply the camera's bilateral grid, if there are grids."""
@@ -438,7 +476,7 @@ class NrfgsModel(SplatfactoModel):
         self.densification.see_cameras(centers)
         self.densification.see_training_views(ComparedViews(self, attributes.pipeline.datamanager))
         self.camera_spacing = camera_spacing(centers)
-        sigma = self.config.view_noise * self.camera_spacing / math.sqrt(3.0)
+        sigma = self.noise_factor * self.camera_spacing / math.sqrt(3.0)
         self.view_noise = ViewNoise(sigma, self.view_noise.seed)
 
         def before_first_step(step: int) -> None:
@@ -467,6 +505,10 @@ class NrfgsModel(SplatfactoModel):
         """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
         self._scheduled = step
 
+    def begin_step(self, share: float) -> None:
+        """A training step begins when this share of the training is over, in [0, 1]. A head that learns goes on."""
+        self.head_learns = self.head_learns or share >= self.config.head_from
+
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
         self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
@@ -485,13 +527,24 @@ class NrfgsModel(SplatfactoModel):
             self.camera_optimizer.get_loss_dict(losses)
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
-            losses |= self.densification.regularisation(self.gauss_params)
+            losses |= self.densification.regularisation(self.gauss_params) | self.shrinking()
             if self.photograph is not None and self.photograph.has_penalty and self.step % 10 == 0:
                 losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")
         return losses
+
+    def shrinking(self) -> dict[str, Tensor]:
+        """What `shrinkage` adds to the loss. The loss of a step is the mean over views, a scene's prior counts once:
+        hence its weight is divided by their number."""
+        weight = self.config.shrinkage / max(self.num_train_data, 1)
+        if weight == 0.0 or self.config.densification == "mcmc":
+            return {}
+        return {
+            "shrink_opacities": weight * torch.sigmoid(self.gauss_params["opacities"]).mean(),
+            "shrink_scales": weight / self.scene_unit * self.gauss_params["scales"].exp().mean(),
+        }
 
     def _photometric_loss(self, outputs, batch) -> Tensor:
         """Splatfacto's loss of an image against its photograph, a scalar."""
@@ -587,6 +640,7 @@ class NrfgsModel(SplatfactoModel):
             "head": self.head.name,
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
+            "head_learns": self.head_learns,
         }
         if self.reduced_head is not None:
             state["capacity"] = {"head": self.reduced_head}
@@ -600,6 +654,7 @@ class NrfgsModel(SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
+        self.head_learns = state.get("head_learns", True)  # older checkpoints do not say: it did from the start
         if "pace" in state:  # of version 0.1.0
             state = {**state, "schedule_step": int(state["pace"]["position"])}
         if "schedule_step" in state:

@@ -7,6 +7,7 @@ group, and after its first step that kernel is called directly. Numbers and stat
 and checkpoints find what they expect.
 """
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -33,6 +34,8 @@ class LeanOptimizers(Optimizers):
 
     def __init__(self, config, param_groups, steps_per_log: int = 10, pace: Pace | None = None):
         super().__init__(config, param_groups)
+        # That is so of a head that rests at first (`head_from`).
+        warnings.filterwarnings("ignore", message=r"Detected call of `lr_scheduler\.step\(\)` before `optimizer\.step")
         self.steps_per_log = steps_per_log
         self.pace = pace
         self._warm: set[Optimizer] = set()
