@@ -15,9 +15,10 @@ MOVED = {
     "nrfgs_ns.capacity": None,
     "nrfgs_ns.capacity.config": "nrfgs_ns.model.retired",
     "nrfgs_ns.diffuse_splats": "nrfgs_ns.model.retired",
-    "nrfgs_ns.distributed.config": "nrfgs_ns.training.sharding",
+    "nrfgs_ns.distributed.config": "nrfgs_ns.training.pipeline",
     "nrfgs_ns.pipeline": "nrfgs_ns.training.pipeline",
     "nrfgs_ns.trainer": "nrfgs_ns.training.trainer",
+    "nrfgs_ns.training.sharding": "nrfgs_ns.training.pipeline",
 }
 """Modules that a config.yml saved by an older version may name -> where their classes are now. None: a package of some
 of them."""

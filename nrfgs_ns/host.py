@@ -29,7 +29,8 @@ PRIVATE = {
     "nerfstudio.configs.external_methods": ("inspect",),
     # Seeds as ns-train seeds.
     "nerfstudio.scripts.train": ("_set_random_seed",),
-    # Images are kept where the training runs; a dataset knows its files.
+    # Images are kept where there is room for them; a dataset knows its files; what undistorts a photograph.
+    "nerfstudio.data.datamanagers.full_images_datamanager": ("_undistort_image",),
     "nerfstudio.data.datamanagers.full_images_datamanager:FullImageDatamanager": ("_load_images",),
     # Splatfacto's own, which the model calls or replaces.
     "nerfstudio.models.splatfacto:SplatfactoModel": (

@@ -27,7 +27,7 @@ from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS
 from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
 from nrfgs_ns.training.progress import ProgressLineConfig
 from nrfgs_ns.training.start import know_callers_quickly
-from nrfgs_ns.training.trainer import AVERAGED, NrfgsTrainerConfig
+from nrfgs_ns.training.trainer_config import AVERAGED, NrfgsTrainerConfig
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 know_callers_quickly()  # plugins are loaded right before nerfstudio asks

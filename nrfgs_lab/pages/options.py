@@ -62,12 +62,12 @@ def own_options(config: Any, prefix: str = "") -> Iterator[Option]:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             yield from own_options(value, f"{prefix}{field.name}.")
         elif not field.name.startswith("_") and "Suppress" not in str(field.type):
-            text = _explanation(type(config), field.name)
+            text = explanation(type(config), field.name)
             if text is not None:
                 yield Option((prefix + field.name).replace("_", "-"), value, text)
 
 
-def _explanation(config: type, name: str) -> str | None:
+def explanation(config: type, name: str) -> str | None:
     """What the nearest of this project's classes says of a field, or None if none of them has it."""
     for base in config.__mro__:
         if base.__module__.split(".")[0] in PACKAGES and name in vars(base).get("__annotations__", {}):
@@ -111,27 +111,6 @@ def _shown(default: Any) -> str:
     return default.as_posix() if isinstance(default, Path) else str(default)
 
 
-def command_options(command: type) -> Iterator[Option]:
-    """The options of a command of `nrfgs`, with their hyphens. What has no name on the command line is in capitals."""
-    for field in dataclasses.fields(command):
-        default = field.default
-        if field.default_factory is not dataclasses.MISSING:
-            default = field.default_factory()
-        if dataclasses.is_dataclass(default):
-            for option in own_options(default, f"{field.name}."):
-                yield option._replace(flag=f"--{option.flag}")
-            continue
-        name = field.name.replace("_", "-")
-        flag = (
-            field.name.upper()
-            if "Positional" in str(field.type)
-            else f"--{name}, --no-{name}"
-            if default is True
-            else f"--{name}"
-        )
-        yield Option(flag, default, _explanation(command, field.name) or "")
-
-
 def methods() -> list[MethodSpecification]:
     """The registered methods."""
     return [value for value in vars(method_config).values() if isinstance(value, MethodSpecification)]
@@ -165,19 +144,18 @@ def page() -> str:
         for one in others
         if one not in presets
     ]
-    parts += [_listed("method", rows), "## Learning rates\n", rates(first)]
-    parts += ["## Commands\n\n`nrfgs COMMAND --help` explains their options.\n"]
-    loaded = {name: entry_point.load() for name, entry_point in commands().items()}
-    rows = [
-        (f"nrfgs {name}", command_options(command), inspect.getdoc(command).split("\n")[0])
-        for name, command in loaded.items()
-    ]
-    return "\n".join([*parts, _listed("command", rows)])
+    parts += [_listed(rows), "## Learning rates\n", rates(first)]
+    parts += ["## Commands\n\n`nrfgs COMMAND --help` lists and explains their options.\n"]
+    lines = ["| command | |", "|---|---|"]
+    for name, entry_point in commands().items():
+        summary, *_ = inspect.getdoc(entry_point.load()).splitlines()
+        lines.append(f"| `nrfgs {name}` | {linked(summary)} |")
+    return "\n".join([*parts, *lines]) + "\n"
 
 
-def _listed(title: str, rows: list[tuple[str, Iterator[Option], str]]) -> str:
-    """A table of methods or commands by name, with their options and defaults in one cell."""
-    lines = [f"| {title} | | options |", "|---|---|---|"]
+def _listed(rows: list[tuple[str, Iterator[Option], str]]) -> str:
+    """A table of methods by name, with their options and defaults in one cell."""
+    lines = ["| method | | options |", "|---|---|---|"]
     for name, options, text in rows:
         shown = [(option.flag, _shown(option.default)) for option in options]
         cell = ", ".join(f"`{flag}`" + ("" if value in UNSAID else f" {value}") for flag, value in shown)
@@ -191,13 +169,13 @@ def is_preset(method: MethodSpecification, of: MethodSpecification) -> bool:
 
 
 def rates(method: MethodSpecification) -> str:
-    """The learning rates of a method's parameters."""
-    lines = ["| `--optimizers.NAME` | `.optimizer.lr` | `.scheduler.lr-final` |", "|---|---|---|"]
+    """The learning rates of a method's parameters, in a sentence."""
+    parts = []
     for name, group in method.config.optimizers.items():
         scheduler = group["scheduler"]
-        final = "no scheduler" if scheduler is None else f"{scheduler.lr_final:g}"
-        lines.append(f"| `{name}` | {group['optimizer'].lr:g} | {final} |")
-    return "\n".join(lines) + "\n"
+        final = "" if scheduler is None else f" to {scheduler.lr_final:g}"
+        parts.append(f"`{name}` {group['optimizer'].lr:g}{final}")
+    return f"`--optimizers.NAME.optimizer.lr` to `.scheduler.lr-final`: {', '.join(parts)}.\n"
 
 
 if __name__ == "__main__":

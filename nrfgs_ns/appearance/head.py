@@ -94,8 +94,6 @@ class AppearanceHead(nn.Module, ABC):
     scene_unit: float = 1.0
     """World units in a scene unit: the lengths in a head's configuration, and what it makes of distances, are in scene
     units, so that a scene looks the same whatever it is measured in."""
-    knows_diffuse: bool = False
-    """Whether a table may have "diffuse" among its entries (`diffuse.py`)."""
     residual_params: tuple[str, ...] = ()
     """Those of `splat_params` that only the residual reads: a diffuse splat need not store them."""
     is_harmonics: bool = False

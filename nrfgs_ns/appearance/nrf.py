@@ -112,7 +112,6 @@ class NeuralResidualField(AppearanceHead):
     """The field, as in the module's docstring."""
 
     name = "nrf"
-    knows_diffuse = True
     residual_params = ("latents",)
 
     def __init__(self, config: NrfConfig):

@@ -13,15 +13,18 @@ from torch import Tensor
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.compact.encode import FORMAT, GROUPS
+from nrfgs_ns.compact.encode import COLUMNS, FORMAT, GROUPS
 from nrfgs_ns.compact.format import LARGEST_RATIO, SMALL, read_container
 from nrfgs_ns.compact.quantise import Grid, from_morton, from_smallest_three
+from nrfgs_ns.compact.tables import splats_of
 from nrfgs_ns.errors import InputError
 
 MOST_BANDS = 16
 """Of a head: the sixteenth repeats every ten microradians."""
 NUMBERS = 14
 """Of a splat beside its latents."""
+WIDTHS = dict(zip(COLUMNS, (1, 3, 3, 3), strict=True))
+"""Columns of each table in the stream "splats"."""
 LONGEST = 200
 """Characters of what a message quotes."""
 
@@ -49,8 +52,10 @@ def decode(path: Path) -> Decoded:
         if header["format"] != FORMAT:
             raise ValueError(f"it holds {header['format']!r}")
         config, weights = _config(header["head"]), _weights(streams)
-        _check(header, config, weights, sum(stream.nbytes for stream in streams.values()))
-        return Decoded(config, weights, _splats(header, streams, config.latent_dim), header)
+        version = 2 if "splats" in streams else 1
+        _check(version, header, config, weights, sum(stream.nbytes for stream in streams.values()))
+        read = _coded_splats if version > 1 else _splats
+        return Decoded(config, weights, read(header, streams, config.latent_dim), header)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RuntimeError) as error:
         # The checksums hold: it was written like this.
         reason = " ".join(str(error).split())[:LONGEST]
@@ -81,15 +86,17 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     return config
 
 
-def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor], unpacked: int) -> None:
+def _check(version: int, header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor], unpacked: int) -> None:
     """Raise ValueError where the header names sizes that the file does not have, or grids that are none."""
     if config.latent_dim >= weights["low.0.weight"].shape[1]:  # it sees more than the latents
         raise ValueError(
             f"head.low.0.weight of shape {list(weights['low.0.weight'].shape)} with latents of {config.latent_dim}"
         )
-    if not isinstance(header["quats_bits"], int) or not 2 <= header["quats_bits"] <= 16:
-        raise ValueError(f"quats_bits is {header['quats_bits']}")
     columns = {"means": 3, "scales": 3, "opacities": 1, "colors": 3, "latents": config.latent_dim}
+    if version > 1:
+        columns["turns"] = 3
+    elif not isinstance(header["quats_bits"], int) or not 2 <= header["quats_bits"] <= 16:
+        raise ValueError(f"quats_bits is {header['quats_bits']}")
     for name, count in columns.items():
         for part in ("low", "step"):
             numbers = np.asarray(header["grids"][name][part])
@@ -109,7 +116,10 @@ def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor]
             raise ValueError(f"head.{name} of shape {found}, for a head that has {shapes.get(name, 'none')}")
         if not torch.isfinite(weights[name]).all():
             raise ValueError(f"head.{name} is not finite")
-    count = sum(header["splats"][group] for group in GROUPS)
+    counts = [header["splats"][group] for group in GROUPS]
+    if not all(isinstance(count, int) and count >= 0 for count in counts):
+        raise ValueError(f"{counts} splats")
+    count = sum(counts)
     tables = 4 * count * (config.latent_dim + NUMBERS)
     if tables > max(LARGEST_RATIO * unpacked, SMALL):
         raise ValueError(f"{count} splats with latents of {config.latent_dim}, unpacked from {unpacked} bytes")
@@ -158,6 +168,34 @@ def _splats(header: dict[str, Any], streams: dict[str, np.ndarray], rank: int) -
         if not torch.isfinite(value).all():
             raise ValueError(f"{name} beyond float32")
     return tables
+
+
+def _coded_splats(header: dict[str, Any], streams: dict[str, np.ndarray], rank: int) -> dict[str, Tensor]:
+    """The same from version 2 on."""
+    count, of_view = sum(header["splats"][group] for group in GROUPS), header["splats"]["view"]
+    shapes = {"means": (2, count), "splats": (1 + sum(WIDTHS.values()), count), "latents": (rank, of_view)}
+    for name, shape in shapes.items():
+        if streams[name].shape != shape or streams[name].dtype.kind not in "iu":
+            raise ValueError(f"{name} of shape {list(streams[name].shape)} instead of {list(shape)}")
+    upper, lower = streams["means"].astype(np.uint64)
+    if upper.max(initial=0) >= 2**31:
+        raise ValueError("means beyond 63 bits")
+    places = np.cumsum((upper << np.uint64(32)) | lower, dtype=np.uint64)
+    diffuse = streams["splats"][0] != 0
+    if int((~diffuse).sum()) != of_view:
+        raise ValueError(f"{int((~diffuse).sum())} view-dependent splats instead of {of_view}")
+    codes = {"means": from_morton(places), "latents": streams["latents"].T}
+    first = 1
+    for name, width in WIDTHS.items():
+        codes[name], first = streams["splats"][first : first + width].T, first + width
+    grids = {name: Grid(np.array(grid["low"]), np.array(grid["step"])) for name, grid in header["grids"].items()}
+    values = {name: torch.from_numpy(grids[name].values(table.astype(np.float64))) for name, table in codes.items()}
+    splats = splats_of(values, torch.from_numpy(diffuse))
+    splats = {name: value if value.dtype == torch.bool else value.float() for name, value in splats.items()}
+    for name, value in splats.items():
+        if not torch.isfinite(value).all():
+            raise ValueError(f"{name} beyond float32")
+    return splats
 
 
 def model_state(model, path: Path) -> dict[str, Any]:

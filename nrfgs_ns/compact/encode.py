@@ -1,92 +1,88 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A field as the arrays of a compact file. docs/compact-format.md describes each of them.
+"""A field as the streams of a compact file. docs/compact-format.md describes each of them.
 
-View-dependent and diffuse splats are kept apart: the second have no latents. Within each, splats are in Morton order of
-their quantised means, and the means are the differences between successive Morton numbers. Every other table lies on a
-uniform grid whose step is a choice of precision, not of bits: outliers then cost a few long codes, and not everyone's
-precision.
+All splats lie in Morton order of their rounded means, so that a number's neighbours in its table are neighbours in
+space, and the means are the differences between successive Morton numbers. Every table lies on a grid whose step is a
+choice of precision, not of bits: outliers then cost a few long codes, and not everyone's precision.
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import base_colors
+from nrfgs_ns.compact.format import Table
 from nrfgs_ns.compact.precision import Precision
-from nrfgs_ns.compact.quantise import (
-    MOST_BITS,
-    Grid,
-    grid_with_bits,
-    grid_with_step,
-    morton,
-    narrowest,
-    smallest_three,
-)
+from nrfgs_ns.compact.quantise import MOST_BITS, Grid, morton
+from nrfgs_ns.compact.tables import steps_of, tables_of
 from nrfgs_ns.errors import InputError
 
 FORMAT = "nrfgs-compact"
-FEWEST_BITS = 10
-"""For a coordinate."""
 LARGEST_LOGIT = 10.0
 """Opacities' logits are cut off here: beyond, the opacity changes by less than 5e-5."""
 LARGEST_HALF = 6e4
 """Weights beyond float16's range are kept in float32."""
+LARGEST_CODE = 2**30
+"""Whole numbers are cut off here: nothing that a splat has is a thousand million steps from 0."""
 GROUPS = ("view", DIFFUSE)
+COLUMNS = ("opacities", "scales", "colors", "turns")
+"""Tables whose columns, behind the one that says which splats are diffuse, are the stream "splats" of version 2."""
 
 
-def encode(field: Field, precision: Precision, render: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def encode(
+    field: Field, precision: Precision, render: dict[str, Any], steps: Mapping[str, np.ndarray] | None = None
+) -> tuple[dict[str, Any], dict[str, np.ndarray | Table]]:
     """The header and streams of a compact file.
 
     Splats that are not finite are left out: nothing draws them.
 
     Args:
         field: the head, and its splats.
-        precision: the steps.
+        precision: the steps of the grids, unless they are given.
         render: what else decides a picture, for the header.
+        steps: of the grids, for each column of `tables.py`'s tables: those on which a field that was trained for the
+            file lies.
 
     Raises:
         InputError: no splat is finite.
     """
     precision.validate()
-    tables = {name: _array(value) for name, value in field.splats.items()}
-    tables["colors"] = _array(base_colors(field.splats["features_dc"].detach().double()))
-    diffuse = tables.get(DIFFUSE, np.zeros(len(tables["means"]))).astype(bool)
-    finite = np.isfinite(np.concatenate([v.reshape(len(v), -1) for v in tables.values()], axis=1)).all(axis=1)
-    finite &= np.abs(tables["quats"]).max(axis=1) > 0
+    rows = [value.detach().reshape(len(value), -1) for value in field.splats.values()]
+    finite = torch.stack([row.isfinite().all(dim=1) for row in rows]).all(dim=0)
+    finite &= field.splats["quats"].detach().abs().amax(dim=1) > 0
     if not finite.any():
         raise InputError(f"None of the {len(finite)} splats is finite: there is nothing to write.")
-    tables["opacities"] = tables["opacities"].clip(-LARGEST_LOGIT, LARGEST_LOGIT)
-    tables["colors"][diffuse] = tables["colors"][diffuse].clip(min=0.0)  # as it is drawn
+    tables, diffuse = tables_of({name: value[finite] for name, value in field.splats.items()})
+    tables["opacities"] = tables["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
+    tables["colors"][diffuse] = tables["colors"][diffuse].clamp_min(0.0)  # as it is drawn
+    steps = steps_of(tables, precision) if steps is None else dict(steps)
+    steps["means"] = wide_enough(steps["means"], np.ptp(tables["means"].cpu().numpy(), axis=0))
+    grids, codes = {}, {}
+    for name, table in tables.items():
+        values = table.cpu().numpy()
+        low = values.min(axis=0) if name == "means" else np.zeros(values.shape[1])
+        grids[name] = Grid(low, steps[name])
+        codes[name] = grids[name].codes(values).clip(-LARGEST_CODE, LARGEST_CODE)
 
-    grids = {"means": means_grid(tables["means"][finite], tables["scales"][finite], precision.means)}
-    for name in ("scales", "opacities", "colors"):
-        grids[name] = grid_with_step(tables[name][finite], getattr(precision, name))
-    of_view = tables["latents"][finite & ~diffuse]
-    spread = float(of_view.std(axis=0).max()) if len(of_view) > 1 else 0.0
-    grids["latents"] = grid_with_step(of_view, precision.latents * spread if spread > 0 else 1.0)
-
-    streams: dict[str, np.ndarray] = {}
-    counts = {}
-    for group in GROUPS:
-        rows = np.flatnonzero(finite & (diffuse if group == DIFFUSE else ~diffuse))
-        places = morton(grids["means"].codes(tables["means"][rows]))
-        order = np.argsort(places, kind="stable")
-        rows, places = rows[order], places[order]
-        counts[group] = len(rows)
-        streams[f"{group}.means"] = np.diff(places, prepend=np.uint64(0))
-        largest, codes = smallest_three(tables["quats"][rows], precision.quats)
-        streams[f"{group}.quats_largest"] = largest.astype(np.uint8)
-        streams[f"{group}.quats"] = narrowest(codes.T)
-        for name in ("scales", "opacities", "colors", *(["latents"] if group == "view" else [])):
-            streams[f"{group}.{name}"] = narrowest(grids[name].codes(tables[name][rows]).T)
+    diffuse = diffuse.cpu().numpy()
+    places = morton(codes["means"])
+    order = np.argsort(places, kind="stable")
+    differences = np.diff(places[order], prepend=np.uint64(0))
+    of_view = order[~diffuse[order]]
+    splats = np.concatenate([diffuse[:, None], *(codes[name] for name in COLUMNS)], axis=1)
+    latents = codes["latents"][np.cumsum(~diffuse)[of_view] - 1]
+    streams: dict[str, np.ndarray | Table] = {
+        "means": Table(np.stack([differences >> np.uint64(32), differences & np.uint64(0xFFFFFFFF)]), signed=False),
+        "splats": Table(splats[order].T),
+        "latents": Table(latents.T),
+    }
     for name, weight in field.head.state_dict().items():
-        values = _array(weight)
+        values = weight.detach().cpu().double().numpy()
         half = np.abs(values).max(initial=0.0) < LARGEST_HALF
         streams[f"head.{name}"] = values.astype(np.float16 if half else np.float32)
 
@@ -94,37 +90,21 @@ def encode(field: Field, precision: Precision, render: dict[str, Any]) -> tuple[
     config.pop("_target")
     header = {
         "format": FORMAT,
-        "splats": counts,
+        "splats": {"view": len(of_view), DIFFUSE: len(order) - len(of_view)},
         "head": {"name": field.head.name, "config": config, "scene_unit": field.head.scene_unit},
         "render": render,
         "grids": {name: grid.as_json() for name, grid in grids.items()},
-        "quats_bits": precision.quats,
     }
     return header, streams
 
 
-def means_grid(means: np.ndarray, log_scales: np.ndarray, precision: float) -> Grid:
-    """2^b points along each side of the bounding box, b from 10 to 21, the fewest that are precise enough.
-
-    Args:
-        means: [N, 3].
-        log_scales: [N, 3].
-        precision: largest step, in standard deviations (the geometric mean of three) of the median splat.
-    """
-    wanted = precision * float(np.exp(np.median(log_scales.mean(axis=1))))
-    for bits in range(FEWEST_BITS, MOST_BITS + 1):
-        grid = grid_with_bits(means, bits)
-        extent = means.max(axis=0) > means.min(axis=0)
-        if (grid.step[extent] <= wanted).all():
-            return grid
-    CONSOLE.print(
-        f"[bold yellow]Some splats are so far from the others that {MOST_BITS} bits are too few for a coordinate: "
-        f"means are rounded to {float(grid.step.max()):.3g} units instead of {wanted:.3g}.",
-        soft_wrap=True,
-    )
-    return grid
-
-
-def _array(value: Tensor) -> np.ndarray:
-    value = value.detach().cpu()
-    return value.numpy() if value.dtype == torch.bool else value.double().numpy()
+def wide_enough(steps: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """Steps of the means, [3], no finer than MOST_BITS allow over the sides [3] of the splats' box."""
+    needed = extent / (2**MOST_BITS - 1)
+    if (needed > steps).any():
+        CONSOLE.print(
+            f"[bold yellow]Some splats are so far from the others that {MOST_BITS} bits are too few for a coordinate: "
+            f"means are rounded to {float(needed.max()):.3g} units instead of {float(steps.min()):.3g}.",
+            soft_wrap=True,
+        )
+    return np.maximum(steps, needed).clip(min=np.finfo(np.float32).tiny)

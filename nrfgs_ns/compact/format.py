@@ -10,10 +10,13 @@
     24 + L  4      CRC-32 of everything before, uint32
     28 + L         the streams, one after the other, in the order of the list
 
-All numbers are little-endian. An entry of "streams" has "name", "dtype" (of the numbers: uint8, uint16, uint32, uint64,
-float16 or float32), "shape", "bytes" (in the file) and "crc32" (of these bytes). A stream is in the xz format and holds
-the numbers' bytes by significance: first every number's lowest byte, then every number's next, and so on; numbers are
-in row-major order.
+All numbers are little-endian. An entry of "streams" has "name", "dtype" (of the numbers), "shape", "bytes" (in the
+file), "crc32" (of these bytes) and, from version 2 on, "coding". In version 1 every stream is "xz".
+
+"xz": the xz format; unpacked, the numbers' bytes by significance: first every number's lowest byte, then every number's
+next, and so on; numbers (uint8, uint16, uint32, uint64, float16 or float32) in row-major order.
+"rans": a table [columns, rows] of int16, int32 or uint32, by an entropy coder (`entropy.py`): uint32 how many numbers
+its model has, uint32 how many bytes, the model (int32, packed like "xz"), and the coder's bytes.
 
 Nothing in a file is ever run, and nothing is allocated before its size was checked against the lengths in the header,
 and these against the size of the file: it cannot unpack to more than 32 times that, or 16 MB.
@@ -26,46 +29,68 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from nrfgs_ns.compact.entropy import MOST_MODEL, BadStream, decode_table, encode_table
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole
 
 MAGIC = b"\x89NRF\r\n\x1a\n"
-VERSION = 1
+VERSION = 2
 PREAMBLE = struct.Struct("<8sIIQ")
 CHECKSUM = struct.Struct("<I")
+MODEL = struct.Struct("<II")
+"""Numbers of a coded table's model, and its bytes."""
 DTYPES = ("uint8", "uint16", "uint32", "uint64", "float16", "float32")
 ENTRY = {"name": str, "dtype": str, "shape": list, "bytes": int, "crc32": int}
-"""What a stream's entry in the header has."""
+"""What a stream's entry in the header has; from version 2 on also "coding", one of CODINGS."""
+CODINGS = ("xz", "rans")
+CODED = ("int16", "int32", "uint32")
+"""Types of coded tables."""
 LARGEST_RATIO = 32
 """Times its own size that a file may unpack to. Those of results/compact.json unpack to 1.4 to 2.6 times theirs."""
 SMALL = 2**24
 """Bytes that any file may unpack to."""
 MOST_AXES = 4
+MOST_COLUMNS = 1024
+"""Of a coded table."""
 LARGEST_DICTIONARY = 2**26
 """Bytes within which xz looks for repetitions."""
 LARGEST_MEMORY = 2**28
 """Bytes that xz may take to unpack: more than the dictionary needs."""
 
 
-def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray]) -> int:
-    """Write a file, whole or not at all.
+class Table(NamedTuple):
+    """Whole numbers that an entropy coder packs (`entropy.py`)."""
+
+    numbers: np.ndarray
+    """[C, n]"""
+    signed: bool = True
+    """False: from 0 to 2^32 - 1, each on its own; otherwise from -2^31 to 2^31 - 1, like their neighbours"""
+
+
+def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> int:
+    """Write a file, whole or not at all: of version 2 if it holds a Table, else of version 1.
 
     Args:
         header: what JSON can hold; "streams" is added.
-        streams: arrays of DTYPES.
+        streams: arrays of DTYPES, and tables.
 
     Returns:
         The bytes of the file.
     """
     entries, bodies = [], []
-    for name, array in streams.items():
-        if array.dtype.name not in DTYPES:
+    version = 2 if any(isinstance(stream, Table) for stream in streams.values()) else 1
+    for name, stream in streams.items():
+        if isinstance(stream, Table):
+            array, body, coding = _coded(stream)
+        else:
+            array, body, coding = stream, None, "xz"
+        if body is None and array.dtype.name not in DTYPES:
             raise ValueError(f"stream {name} is {array.dtype.name}; use one of {', '.join(DTYPES)}")
-        bodies.append(body := _pack(_planes(array)))
+        bodies.append(body := _pack(_planes(array)) if body is None else body)
         entries.append(
             {
                 "name": name,
@@ -73,11 +98,12 @@ def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str,
                 "shape": list(array.shape),
                 "bytes": len(body),
                 "crc32": zlib.crc32(body),
+                **({"coding": coding} if version > 1 else {}),
             }
         )
     text = json.dumps({**header, "streams": entries}, allow_nan=False).encode("utf-8")
     total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
-    start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
+    start = PREAMBLE.pack(MAGIC, version, len(text), total) + text
     with whole(path) as aside:
         aside.write_bytes(b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies]))
     return total
@@ -117,19 +143,20 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     header_end = first - CHECKSUM.size
     if version < 1 or zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
         raise InputError(f"{path} is damaged: the header's checksum does not hold. {fix}")
-    header = _header(path, data[PREAMBLE.size : header_end], max(LARGEST_RATIO * len(data), SMALL))
+    header = _header(path, data[PREAMBLE.size : header_end], version, max(LARGEST_RATIO * len(data), SMALL))
     streams = {}
     for entry in header["streams"]:
         body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
         if len(body) != entry["bytes"] or zlib.crc32(body) != entry["crc32"]:
             raise InputError(f"{path} is damaged: the checksum of its stream {entry['name']!r} does not hold. {fix}")
-        streams[entry["name"]] = _unpack(path, entry, body)
+        unpack = _uncoded if entry.get("coding") == "rans" else _unpack
+        streams[entry["name"]] = unpack(path, entry, body)
     if first != len(data):
         raise InputError(f"{path} has {len(data) - first} bytes after its last stream. {fix}")
     return header, streams
 
 
-def _header(path: Path, text: bytes, most: int) -> dict[str, Any]:
+def _header(path: Path, text: bytes, version: int, most: int) -> dict[str, Any]:
     """The header, whose checksum holds, with a list of streams of which each has what it must, and which together
     unpack to no more than `most` bytes."""
     try:
@@ -144,8 +171,13 @@ def _header(path: Path, text: bytes, most: int) -> dict[str, Any]:
         if not (isinstance(entry, dict) and all(_is(entry.get(key), kind) for key, kind in ENTRY.items())):
             raise InputError(f"{path}: its header has a stream {ascii(entry)[:200]}, which cannot be.")
         name, sizes = ascii(entry["name"])[:80], entry["shape"]
+        coding = entry.get("coding") if version > 1 else entry.setdefault("coding", "xz")
+        if coding not in CODINGS:
+            raise InputError(f"{path}: its stream {name} has the coding {ascii(coding)[:80]}, which is none.")
+        dtypes = CODED if coding == "rans" else DTYPES
         shape_is_one = len(sizes) <= MOST_AXES and all(_is(size, int) and 0 <= size < 2**48 for size in sizes)
-        if entry["dtype"] not in DTYPES or not shape_is_one or entry["bytes"] < 0:
+        shape_is_one &= coding == "xz" or len(sizes) == 2
+        if entry["dtype"] not in dtypes or not shape_is_one or entry["bytes"] < 0:
             raise InputError(
                 f"{path}: its stream {name} is {ascii(entry['dtype'])[:80]} {ascii(sizes)[:80]}, which cannot be."
             )
@@ -184,6 +216,35 @@ def _unpack(path: Path, entry: Mapping[str, Any], body: bytes) -> np.ndarray:
         raise InputError(f"{path}: its stream {entry['name']!r} does not hold {count} numbers of {size} bytes.")
     planes = np.frombuffer(raw, dtype=np.uint8).reshape(size, count)
     return np.ascontiguousarray(planes.T).view(np.dtype(entry["dtype"]).newbyteorder("<")).reshape(entry["shape"])
+
+
+def _coded(table: Table) -> tuple[np.ndarray, bytes, str]:
+    """A table in its narrowest type, its bytes, and how they are coded."""
+    low, high = int(table.numbers.min(initial=0)), int(table.numbers.max(initial=0))
+    dtype = "uint32" if not table.signed else "int16" if -(2**15) <= low and high < 2**15 else "int32"
+    if not np.iinfo(dtype).min <= low <= high <= np.iinfo(dtype).max or len(table.numbers) > MOST_COLUMNS:
+        raise ValueError(f"a table of {len(table.numbers)} columns, from {low} to {high}, is no {dtype}")
+    model, words = encode_table(table.numbers, table.signed)
+    packed = _pack(_planes(model))
+    return table.numbers.astype(dtype), MODEL.pack(len(model), len(packed)) + packed + words, "rans"
+
+
+def _uncoded(path: Path, entry: Mapping[str, Any], body: bytes) -> np.ndarray:
+    """The numbers of one table whose checksum holds; a file that was made to mislead is refused all the same."""
+    columns, rows = entry["shape"]
+    try:
+        count, size = MODEL.unpack_from(body)
+        if columns > MOST_COLUMNS or count > min(columns * MOST_MODEL, SMALL // 4):
+            raise BadStream(f"a model of {count} numbers for {columns} columns is too large")
+        packed = body[MODEL.size : MODEL.size + size]
+        model = _unpack(path, {"name": entry["name"], "shape": [count], "dtype": "int32"}, packed)
+        table = decode_table(model, body[MODEL.size + size :], columns, rows)
+        bounds = np.iinfo(entry["dtype"])
+        if table.size and not bounds.min <= table.min() <= table.max() <= bounds.max:
+            raise BadStream(f"it holds numbers that are no {entry['dtype']}")
+    except (BadStream, struct.error) as error:
+        raise InputError(f"{path}: its stream {entry['name']!r} cannot be decoded ({error}).") from error
+    return table.astype(entry["dtype"])
 
 
 def _planes(array: np.ndarray) -> bytes:

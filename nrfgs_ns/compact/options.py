@@ -2,6 +2,9 @@
 """Options of `nrfgs export compact`. Imports next to nothing: `nrfgs --help` reads it."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
 
 from nrfgs_ns.compact.precision import Precision
 
@@ -10,6 +13,10 @@ from nrfgs_ns.compact.precision import Precision
 class CompactOptions:
     """What a compact file may leave out."""
 
+    finetune: Annotated[int, tyro.conf.arg(aliases=("--finetune",))] = 0
+    """steps in which the model is trained on for the file: tables that cost less, and how finely each is rounded"""
+    rate: float = 2.5e-5
+    """with finetune: how much of the training's loss a byte for each splat is worth. More: a smaller file"""
     rank: int | None = None
     """numbers in a latent. None: as few as the budget allows"""
     threshold: float | None = None

@@ -21,8 +21,9 @@ class Grid(NamedTuple):
     """[C], > 0"""
 
     def codes(self, values: Array) -> Array:
-        """Nearest grid points of [N, C], int64. Off by at most step / 2, and float64's rounding."""
-        return np.rint((values - self.low) / self.step).astype(np.int64)
+        """Nearest grid points of [N, C], int64, of those within 2^62 steps. Off by at most step / 2, and float64's
+        rounding."""
+        return np.rint((values - self.low) / self.step).clip(-(2.0**62), 2.0**62).astype(np.int64)
 
     def values(self, codes: Array) -> Array:
         """[N, C]"""
@@ -30,21 +31,6 @@ class Grid(NamedTuple):
 
     def as_json(self) -> dict[str, list[float]]:
         return {"low": self.low.tolist(), "step": self.step.tolist()}
-
-
-def grid_with_bits(values: Array, bits: int) -> Grid:
-    """The grid of 2^bits points from the smallest to the largest number of each column of [N, C]."""
-    if len(values) == 0:
-        return Grid(np.zeros(values.shape[1]), np.ones(values.shape[1]))
-    low, high = values.min(axis=0), values.max(axis=0)
-    step = (high - low) / (2**bits - 1)
-    return Grid(low, np.where(step > 0, step, 1.0))
-
-
-def grid_with_step(values: Array, step: float) -> Grid:
-    """The grid with a given step from the smallest number of each column of [N, C]."""
-    low = values.min(axis=0) if len(values) else np.zeros(values.shape[1])
-    return Grid(low, np.full(values.shape[1], step))
 
 
 def morton(codes: Array) -> Array:
@@ -79,23 +65,6 @@ _SPREADS = (
 """Shifts and masks that pull 21 bits apart, two zeros between neighbours."""
 
 
-def smallest_three(quats: Array, bits: int) -> tuple[Array, Array]:
-    """Rotations [N, 4] (w, x, y, z), of any length but 0: which component is largest, and codes of the other three.
-
-    The quaternion is made of unit length, and its sign such that the largest component is positive; the others lie
-    within sqrt(1/2) of 0 and go on a grid of 2^bits points over that range.
-
-    Returns:
-        largest [N], 0..3, and codes [N, 3] of the others in order, int64.
-    """
-    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    largest = np.abs(unit).argmax(axis=1)
-    rows = np.arange(len(unit))
-    unit = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
-    others = unit[_others_of(largest)].reshape(-1, 3)
-    return largest, np.rint((others + HALF_SQRT2) / (2 * HALF_SQRT2) * (2**bits - 1)).astype(np.int64)
-
-
 def from_smallest_three(largest: Array, codes: Array, bits: int) -> Array:
     """Rotations of unit length [N, 4]. Each of the three is off by at most sqrt(1/2) / (2^bits - 1)."""
     others = codes / (2**bits - 1) * (2 * HALF_SQRT2) - HALF_SQRT2
@@ -110,10 +79,67 @@ def _others_of(largest: Array) -> Array:
     return np.arange(4) != largest[:, None]
 
 
-def narrowest(codes: Array) -> Array:
-    """The same whole numbers >= 0 in the narrowest of uint8, uint16, uint32 and uint64."""
-    top = int(codes.max()) if codes.size else 0
-    for dtype in (np.uint8, np.uint16, np.uint32):
-        if top <= np.iinfo(dtype).max:
-            return codes.astype(dtype)
-    return codes.astype(np.uint64)
+def _octahedral() -> Array:
+    """The rotations [24, 4] that take the axes to the axes."""
+    half, root = 0.5, 0.5**0.5
+    turns = [np.eye(4)[i] for i in range(4)]
+    for a in range(4):
+        for b in range(a + 1, 4):
+            for sign in (root, -root):
+                turn = np.zeros(4)
+                turn[a], turn[b] = root, sign
+                turns.append(turn)
+    turns += [np.array([half, x, y, z]) for x in (half, -half) for y in (half, -half) for z in (half, -half)]
+    return np.array(turns)
+
+
+OCTAHEDRAL = _octahedral()
+NEAR = 0.8
+"""A rotation by 74 degrees; the nearest of 24 turns by no more than 62.8, where w is 0.853."""
+
+
+def nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:
+    """The same ellipsoids by the rotations that turn least: of the 24 ways to name an ellipsoid's axes, the one whose
+    rotation is nearest to none. A rotation with |w| > NEAR is left as it is.
+
+    Args:
+        quats: rotations (w, x, y, z) of any length but 0. [N, 4]
+        scales: one for each axis. [N, 3]
+
+    Returns:
+        quats [N, 4] of unit length with w >= NEAR, and scales [N, 3], permuted.
+    """
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    conjugate = OCTAHEDRAL * [1, -1, -1, -1]
+    best = np.abs(unit @ conjugate.T).argmax(axis=1)  # |w| of q g
+    best[np.abs(unit[:, 0]) > NEAR] = 0
+    turned = multiplied(unit, OCTAHEDRAL[best])
+    turned *= np.where(turned[:, :1] < 0, -1.0, 1.0)
+    axes = np.array([np.abs(matrix(turn)).argmax(axis=0) for turn in OCTAHEDRAL])  # new axis j is old axis axes[j]
+    return turned, np.take_along_axis(scales, axes[best], axis=1)
+
+
+def multiplied(p: Array, q: Array) -> Array:
+    """Products of quaternions (w, x, y, z), [N, 4] each."""
+    (a, b, c, d), (e, f, g, h) = p.T, q.T
+    return np.stack(
+        [
+            a * e - b * f - c * g - d * h,
+            a * f + b * e + c * h - d * g,
+            a * g - b * h + c * e + d * f,
+            a * h + b * g - c * f + d * e,
+        ],
+        axis=1,
+    )
+
+
+def matrix(quat: Array) -> Array:
+    """The rotation matrix [3, 3] of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quat
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

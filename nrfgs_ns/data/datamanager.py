@@ -2,7 +2,9 @@
 """Images in memory, and the order in which training sees them: nerfstudio's datamanager made to fail early and clearly,
 to run without an accelerator, and to continue where it stopped."""
 
+import math
 import random
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -15,12 +17,21 @@ from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from torch import Tensor
 
 from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, checked
 from nrfgs_ns.data.pictures import read_picture
+from nrfgs_ns.data.pixels import (
+    free_memory,
+    from_files,
+    in_parallel,
+    look_through,
+    pixels_folder,
+    undistorted,
+)
 from nrfgs_ns.data.views import scene_unit
 from nrfgs_ns.errors import InputError
 
@@ -88,6 +99,9 @@ class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
     """specifies the dataparser config"""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """The image type returned from manager, caching images in uint8 saves memory"""
+    image_memory: float | None = None
+    """gigabytes of host memory that the decoded images may take; of more, files are made and read whenever an image is
+    needed (docs/own-data.md). None: half of what is free"""
 
 
 class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
@@ -102,6 +116,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             raise InputError(
                 f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, at most {LARGEST_SCALE}."
             )
+        if config.image_memory is not None and not config.image_memory >= 0:
+            raise InputError(f"--pipeline.datamanager.image-memory is {config.image_memory}. Give 0 or more gigabytes.")
         super().__init__(config, *args, **kwargs)
 
     def load_all_images(self) -> tuple[int, int]:
@@ -156,6 +172,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         index = self.train_unseen_cameras.pop(0)
         if len(self.train_unseen_cameras) == 0:
             self.train_unseen_cameras = self.sample_train_cameras()
+        if self._place == "files":
+            self._reader.submit(look_through, self.cached_train[self.train_unseen_cameras[0]]["image"])
         return index
 
     def _image(self, index: int) -> dict[str, Any]:
@@ -176,17 +194,64 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         """Training cameras by index, as far as they have had their turn."""
         return {}
 
+    @cached_property
+    def _reader(self) -> ThreadPoolExecutor:
+        """Who looks through the next image while this one is trained on."""
+        return ThreadPoolExecutor(1)
+
+    @cached_property
+    def _place(self) -> Literal["device", "memory", "files"]:
+        """Where decoded images are kept: on the device if they take at most half of what is free there, else on the
+        host, else in files."""
+        device, each = torch.device(self.device), 1 if self.config.cache_images_type == "uint8" else 4
+        size = 0
+        for dataset in (self.train_dataset, self.eval_dataset):
+            channels = 3 * each + (dataset._dataparser_outputs.mask_filenames is not None)
+            size += channels * int((dataset.cameras.width.long() * dataset.cameras.height).sum())
+        if device.type == "cuda" and self.config.cache_images == "gpu":
+            if size <= torch.cuda.mem_get_info(device)[0] / 2:
+                return "device"
+            CONSOLE.print(
+                f"Decoded images take {size / 1e9:.1f} GB, half of the GPU's free memory: the host keeps them."
+            )
+        budget, free = self.config.image_memory, free_memory()
+        budget = budget * 1e9 if budget is not None else math.inf if free is None else free / 2
+        if size <= budget:
+            return "memory"
+        CONSOLE.print(
+            f"Decoded images take {size / 1e9:.1f} GB, and may take {budget / 1e9:.1f} (--pipeline.datamanager."
+            f"image-memory): they are read from files in {pixels_folder()}.",
+            markup=False,
+            soft_wrap=True,
+        )
+        return "files"
+
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, Tensor]]:
-        if torch.device(self.device).type == "cpu":
-            # "gpu" means `self.device`. "cpu" means pinned memory, which needs an accelerator's driver, and which
-            # nerfstudio chooses by itself above 500 images.
-            cache_images_device = "gpu"
-        images = super()._load_images(split, cache_images_device)
-        # What is in memory is a pinhole's, whatever the lens: nerfstudio undistorts, and keeps the camera's type.
+        """All images of a split, decoded and undistorted on all processors, each put in its place as it comes.
+
+        Args:
+            split: which.
+            cache_images_device: nerfstudio's choice; `_place` decides.
+        """
         dataset = self.train_dataset if split == "train" else self.eval_dataset
+        on_gpu = torch.device(self.device).type != "cpu"
+        place, kind = self._place, self.config.cache_images_type
+        read = from_files if place == "files" else undistorted
+
+        def placed(data: dict[str, Any]) -> dict[str, Any]:
+            if not on_gpu or place == "files":
+                return data
+            move = Tensor.pin_memory if place == "memory" else lambda values: values.to(self.device)
+            return data | {name: move(data[name]) for name in ("image", "mask") if name in data}
+
+        indices, workers = range(len(dataset)), self.config.max_thread_workers
+        found = in_parallel(lambda index: read(dataset, index, kind), indices, f"Reading {split} images", workers)
+        images = [placed(data) for data in found]
+        # What is in memory is a pinhole's, whatever the lens; the camera's type is still the photograph's.
         dataset.cameras.camera_type[:] = CameraType.PERSPECTIVE.value
+        self.train_cameras = self.train_dataset.cameras.to(self.device if place == "device" else "cpu")
         return images
 
     def sampling_state(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from PIL import ExifTags, Image
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole
@@ -94,9 +94,9 @@ def smaller_copies(
     if missing:
         from nerfstudio.utils.rich_utils import CONSOLE  # 20 seconds, which `nrfgs prepare` need not spend
 
-        columns = TextColumn(f"Resizing {kind}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        with ThreadPoolExecutor(os.cpu_count()) as pool, Progress(*columns, console=CONSOLE, transient=True) as bar:
-            list(bar.track(pool.map(lambda job: _resize(*job, kind), missing), total=len(missing)))
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            made = pool.map(lambda job: _resize(*job, kind), missing)
+            list(track(made, f"Resizing {kind}", total=len(missing), console=CONSOLE, transient=True))
         CONSOLE.print(f"{len(missing)} {kind} were resized into {cache_folder()}.", markup=False, soft_wrap=True)
     return copies
 

@@ -26,7 +26,7 @@ FEWEST_SEEN = 0.01
 """Share of the points that must be in some view."""
 MOST_BLIND = 0.5
 """Share of the views that may see no point."""
-MEND = "Poses, intrinsics and points must be of one reconstruction, in one world and unit."
+ONE_WORLD = "Poses, intrinsics and points must be of one reconstruction, in one world and unit."
 
 
 def in_reach(xyz: np.ndarray, cameras: Cameras, source: Path) -> np.ndarray:
@@ -44,7 +44,7 @@ def in_reach(xyz: np.ndarray, cameras: Cameras, source: Path) -> np.ndarray:
     if lost > len(xyz) / 2:
         raise InputError(
             f"{source}: {lost} of {len(xyz)} points are {FARTHEST:,.0f} times as far away as the farthest camera. "
-            f"{MEND}"
+            f"{ONE_WORLD}"
         )
     if lost:
         warn(
@@ -73,12 +73,12 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
     if share < FEWEST_SEEN:
         raise InputError(
             f"{source}: of the {len(xyz)} points to start from, {100 * share:.2g} % are in any of the {len(names)} "
-            f"training views. {MEND}"
+            f"training views. {ONE_WORLD}"
         )
     if len(blind) > MOST_BLIND * len(names):
         raise InputError(
             f"{source}: {len(blind)} of {len(names)} training views see none of the {len(xyz)} points to start from: "
-            f"{some(blind)}. {MEND}"
+            f"{some(blind)}. {ONE_WORLD}"
         )
     if blind:
         warn(

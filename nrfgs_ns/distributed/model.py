@@ -21,7 +21,7 @@ from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import View, project_splats, project_view
 from nrfgs_ns.model.view_noise import ViewNoise
 from nrfgs_ns.rasterizer import Projection
-from nrfgs_ns.training.sharding import ShardingConfig
+from nrfgs_ns.training.pipeline import ShardingConfig
 
 
 @dataclass
@@ -99,7 +99,7 @@ class ShardedModel(NrfgsModel):
         field = self.field
         projection = self._project_everywhere(field.splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
-        appearance = self._appearance(field, View(projection, centers))
+        appearance = self._as_learnt(field).seen_from(View(projection, centers))
 
         absgrad = self.training and self.densification.needs_absgrad(self.step)
         own, colored = send_to_cameras(projection, appearance, *self.sizes[comm.rank()], absgrad)

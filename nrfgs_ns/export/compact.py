@@ -2,11 +2,13 @@
 """`nrfgs export compact`: choose what is left out, write the file, and a config.yml with which nerfstudio reads it."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -16,13 +18,14 @@ from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.format import write_container
+from nrfgs_ns.compact.finetune import fine_tune
+from nrfgs_ns.compact.format import Table, write_container
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.loading import load_model
-from nrfgs_ns.export.loss import measure_loss
+from nrfgs_ns.export.loading import load_model, measure_loss
 from nrfgs_ns.files import write_whole
+from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.simplify.field_views import FieldViews, slim
 from nrfgs_ns.simplify.residuals import look_over
 from nrfgs_ns.training.config_file import read_config
@@ -39,8 +42,7 @@ def export_compact(
     pipeline = load_model(load_config, "test")
     field, threshold = chosen_field(pipeline, load_config, options)
     model = pipeline.model
-    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
-    header, streams = encode(field, options.precision, render)
+    header, streams = encoded(pipeline, field, options)
     size = write_container(output, header, streams)
     count = sum(header["splats"].values())
     config = write_config(load_config, output)
@@ -75,12 +77,34 @@ def export_compact(
         write_whole(report, json.dumps(numbers, indent=1) + "\n")
 
 
+def encoded(pipeline, field: Field, options: CompactOptions) -> tuple[dict[str, Any], dict[str, np.ndarray | Table]]:
+    """Header and streams of a field, trained for the file if that is asked for."""
+    model = pipeline.model
+    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
+    if options.finetune == 0:
+        return encode(field, options.precision, render)
+    centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
+    noise = ViewNoise(model.config.view_noise * camera_spacing(centers) / math.sqrt(3.0), torch.initial_seed())
+    columns = TextColumn("Training for the file {task.description}"), BarColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=CONSOLE, transient=True) as progress:
+        task = progress.add_task("", total=options.finetune)
+
+        def tell(step: int, bits: float) -> None:
+            progress.update(task, completed=step, description=f"({bits / 8e6:.2f} MB)")
+
+        next_view = pipeline.datamanager.next_train
+        tuned = fine_tune(model, field, next_view, noise, options.finetune, options.rate, options.precision, tell)
+    return encode(tuned.field, options.precision, render, tuned.steps)
+
+
 def check_options(options: CompactOptions) -> None:
     """Raise InputError, naming the option, if a value cannot work."""
     options.precision.validate()
     if options.views < 1:
         raise InputError(f"--compact.views is {options.views}; it must be at least 1.")
-    for name in ("budget", "threshold"):
+    if options.finetune < 0:
+        raise InputError(f"--compact.finetune is {options.finetune}; it must be 0 or a number of steps.")
+    for name in ("budget", "threshold", "rate"):
         value = getattr(options, name)
         if value is not None and not value >= 0:
             raise InputError(f"--compact.{name} is {value}; it must be zero or positive.")

@@ -2,8 +2,13 @@
 """Trained models, for what looks at them or writes them."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import torch
+from rich.progress import track
+from torch import Tensor
 
 from nrfgs_ns.errors import InputError
 
@@ -114,3 +119,39 @@ def load_file(path: Path) -> "NrfgsModel":
     model.to("cuda" if torch.cuda.is_available() else "cpu")
     model.update_to_step(config.stop_split_at)
     return model.eval()
+
+
+@torch.no_grad()
+def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict[str, Any]:
+    """Compare pictures with the photographs, on the test views.
+
+    Args:
+        pipeline: of the model, with its test images.
+        pictures: renders a camera, a batch of one: name -> image [H, W, 3]. One of them is "file".
+
+    Returns:
+        Means over the images, dB, inside their masks: psnr_model, and psnr_NAME of each picture. loss_db: what the file
+        lacks of the model. per_image: each image's values.
+
+    Raises:
+        InputError: no test image has pixels inside its mask.
+    """
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    from nrfgs_ns.image.metrics import psnr
+
+    model = pipeline.model
+    names = [Path(name).name for name in pipeline.datamanager.eval_dataset.image_filenames]
+    images = list(zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True))
+    per_image, scores = [], {}
+    for image, (camera, batch) in track(images, "Measuring the loss", console=CONSOLE, transient=True):
+        outputs = model.get_outputs_for_camera(camera)
+        truth, mask = model.truth_of(batch, outputs["background"]), model.mask_of(batch)
+        every = {"model": outputs["rgb"], **pictures(camera)}
+        scores = {f"psnr_{name}": psnr(picture, truth, mask) for name, picture in every.items()}
+        if None not in scores.values():  # nothing inside the mask
+            per_image.append({"image": image, **scores})
+    if not per_image:
+        raise InputError("The file is written, but no test image has pixels inside its mask. Use --no-measure.")
+    means = {key: sum(one[key] for one in per_image) / len(per_image) for key in scores}
+    return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}

@@ -52,8 +52,7 @@ def export_ply(load_config: Path, output: Path, options: "PlyOptions", measure: 
 
     from nrfgs_ns.data.world import CaptureFrame
     from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, to_capture
-    from nrfgs_ns.export.loading import load_model
-    from nrfgs_ns.export.loss import measure_loss
+    from nrfgs_ns.export.loading import load_model, measure_loss
 
     if options.largest is not None and not 0 < options.largest < math.inf:
         raise InputError(f"--ply.largest is {options.largest}; it must be positive.")

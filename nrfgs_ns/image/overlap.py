@@ -13,7 +13,9 @@ their places explain (`estimate`).
 """
 
 import math
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import torch
@@ -43,8 +45,9 @@ ENOUGH_KNOWN_STOPS = 0.3
 """By so much must known exposures vary."""
 FEWEST_PAIRS = 8
 """Of a capture, to be told by."""
-MOST_PHOTOGRAPHS = 2000
-"""Of more, only their mean is taken for the scene's: telling patterns apart takes their number cubed."""
+MOST_PHOTOGRAPHS = 1000
+"""Of more, the first so many say how photographs differ, and of all only the mean is taken for the scene's: telling
+patterns apart takes their number cubed."""
 
 SMALLEST_SPREAD = 0.02
 """Stops; regions that agree by chance do not make a pair certain."""
@@ -52,7 +55,7 @@ USUAL_STOPS = 0.3, 0.1, 0.1
 """How far exposure, log2(R/G) and log2(B/G) of a photograph are from the mean's where too few pairs tell it."""
 SIZES = tuple(0.01 * 1.5**step for step in range(12))
 """Stops that are tried for what differs between photographs and between places: 0.01 to 0.86."""
-SCALES = 2.0, 4.0, 8.0, 16.0, 32.0
+SCALES = 2.0, 8.0, 32.0
 """Distances in which brightness changes with the place that are tried, in spacings of the cameras."""
 MOST_PATTERNS = 128
 """Of a column that are held."""
@@ -142,6 +145,16 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
     distance = torch.cdist(centers.double(), centers.double())
     distance.fill_diagonal_(torch.inf)
     nearest = distance.argsort(dim=1)[:, :CANDIDATES]
+
+    def shift_of(pair: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
+        return _shift(sightings[pair[0]], sightings[pair[1]])
+
+    # Those that are asked for below unless they tell too little, on all processors.
+    near = sorted(
+        {(min(a, b), max(a, b)) for a, row in enumerate(nearest[:, :NEIGHBOURS].tolist()) for b in row if a != b}
+    )
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        shifts = dict(zip(near, pool.map(shift_of, near), strict=True))
     done: set[tuple[int, int]] = set()
     found: list[tuple[int, int, Tensor, Tensor]] = []
     for one, candidates in enumerate(nearest.tolist()):
@@ -150,7 +163,7 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
             if neighbours == NEIGHBOURS or other == one:
                 break
             pair = min(one, other), max(one, other)
-            shift = None if pair in done else _shift(sightings[pair[0]], sightings[pair[1]])
+            shift = None if pair in done else shifts[pair] if pair in shifts else shift_of(pair)
             neighbours += shift is not None or pair in done
             if shift is not None:
                 done.add(pair)
@@ -222,7 +235,8 @@ class Looks(NamedTuple):
     """for each column, orthonormal patterns over the photographs that are the scene's rather than theirs, the constant
     among them, [V, K]"""
     random: tuple[float, float, float]
-    """by how many stops a photograph differs from what the place explains, a standard deviation"""
+    """by how many stops a photograph differs from what the place explains, a standard deviation; 0 where too few pairs
+    tell it"""
 
 
 def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
@@ -248,15 +262,24 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
     rows = torch.arange(len(pairs.first))
     difference = torch.zeros(len(rows), count, dtype=torch.float64)
     difference[rows, pairs.second], difference[rows, pairs.first] = 1.0, -1.0
-    places = None if len(rows) < FEWEST_PAIRS or count > MOST_PHOTOGRAPHS else _places(centers)
+    usual_stops, places, told = USUAL_STOPS, None, False
+    if count > MOST_PHOTOGRAPHS:
+        first = (pairs.first < MOST_PHOTOGRAPHS) & (pairs.second < MOST_PHOTOGRAPHS)
+        part = Pairs(*(value[first] for value in pairs))
+        of_part = estimate(part, known[:MOST_PHOTOGRAPHS], centers[:MOST_PHOTOGRAPHS])
+        if told := any(of_part.random):
+            usual_stops = of_part.random
+    elif len(rows) >= FEWEST_PAIRS:
+        places = _places(centers)
     stops, held, random = torch.empty_like(expected), [], []
-    for column, usual in enumerate(USUAL_STOPS):
+    for column, usual in enumerate(usual_stops):
         weight = pairs.spread[:, column].double().clamp_min(SMALLEST_SPREAD) ** -2
         missing = pairs.shift[:, column].double() - difference @ expected[:, column]
         precision = difference.T @ (weight[:, None] * difference)
         seen = difference.T @ (weight * missing)
         if places is None:
-            own, patterns, size = usual**2 * torch.eye(count, dtype=torch.float64), _constant(count), usual
+            own, patterns = usual**2 * torch.eye(count, dtype=torch.float64), _constant(count)
+            size = usual if told else 0.0
             total = own
         else:
             own, total, patterns, size = _split(places, precision, seen)
@@ -300,10 +323,9 @@ def _split(
     """
     count = len(seen)
     eye = torch.eye(count, dtype=torch.float64)
-    values, vectors = torch.linalg.eigh(precision)
-    told = values > values.max() * 1e-9
-    brightness = vectors[:, told] @ ((vectors[:, told].T @ seen) / values[told])
-    noise = float((1.0 / values[told]).median())
+    told = precision.diagonal().clamp_min(1e-9)
+    brightness = torch.linalg.solve(precision + 1e-6 * told.mean() * eye, seen)
+    noise = float((1.0 / told).median())
     best = None
     for shares, basis in places:
         squares = (basis.T @ brightness).square()

@@ -21,11 +21,12 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
 from nerfstudio.utils.colors import get_color
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import Field, Sight
+from nrfgs_ns.appearance.field import BaseField, Field
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import (
@@ -101,7 +102,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
     """whether each photograph's exposure and white balance are learnt. auto: where EXIF says that exposure varies, or
-    where each photograph disagrees with those taken next to it; a line in the log says why"""
+    where photographs disagree by more than their places explain; a line in the log says why"""
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0
@@ -110,6 +111,10 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Be what a config.yml says; that of an older version has fewer options."""
+        self.__dict__.update({**vars(type(self)()), **state})
 
 
 class NrfgsModel(SplatfactoModel):
@@ -198,8 +203,9 @@ class NrfgsModel(SplatfactoModel):
             rgb = torch.rand(len(means), 3)
         neighbours = min(3, len(means) - 1)
         if neighbours > 0:
-            distances, _ = self.k_nearest_sklearn(means, neighbours)
-            width = torch.from_numpy(distances).mean(dim=-1, keepdim=True)
+            # The distances of splatfacto's scikit-learn to the last bit, without a second to import it.
+            distances, _ = cKDTree(means.cpu().numpy()).query(means.cpu().numpy(), k=neighbours + 1, workers=-1)
+            width = torch.from_numpy(distances[:, 1:]).float().mean(dim=-1, keepdim=True)
         else:
             width = torch.full((len(means), 1), self.config.densify_size_thresh * self.scene_unit)
         return {
@@ -310,14 +316,29 @@ class NrfgsModel(SplatfactoModel):
             and "depth" [H, W, 1], which is left out of training unless `output_depth_during_training`.
         """
         field = self.field
+        outputs, appearance = self.render(field, camera, self._as_learnt(field))
+        if self.training:
+            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
+        return outputs
+
+    def render(self, field: Field, camera: Cameras, asked: Field) -> tuple[dict[str, Tensor], SplatAppearance]:
+        """Render a field, which need not be the model's own, as `get_outputs` renders that.
+
+        Args:
+            field: what is drawn.
+            camera: a batch of one camera, [1].
+            asked: the same field as its head is asked about it, with or without noise.
+
+        Returns:
+            what `get_outputs` does, and what the visible splats look like.
+        """
         view = self.project(camera, field.splats)
-        appearance = self._appearance(field, view)
+        appearance = asked.seen_from(view)
         background = self._get_background_color()
         outputs, self.info = self.composite(view, appearance, background, self._photograph_of(camera))
         if self.training:
-            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
             self._finish_for_training(outputs, camera, background)
-        return outputs
+        return outputs, appearance
 
     def against_photograph(
         self, camera: Cameras, batch: Mapping[str, Any], view: View, appearance: SplatAppearance
@@ -351,14 +372,14 @@ class NrfgsModel(SplatfactoModel):
             )
         return self.photograph.names.index(name) if name else None
 
-    def _appearance(self, field: Field, view: Sight) -> SplatAppearance:
-        """What a field's visible splats look like; in training as it learns in this step: nothing that depends on the
-        view before `head_from`, then under noise (`view_noise.py`)."""
-        if self.training:
-            if not self.head_learns:
-                return field.base_of(view)
-            field = field._replace(splats=self.view_noise.moved(field.splats, self.step))
-        return field.seen_from(view)
+    def _as_learnt(self, field: Field) -> Field:
+        """The field as its head is asked about it in this step; outside of training, the field. Before `head_from` the
+        head is not asked; then it is under noise (`view_noise.py`)."""
+        if not self.training:
+            return field
+        if not self.head_learns:
+            return BaseField(*field)
+        return field._replace(splats=self.view_noise.moved(field.splats, self.step))
 
     def _finish_for_training(self, outputs: dict[str, Tensor], camera: Cameras, background: Tensor) -> None:
         """Leave the background a colour [3], and apply the camera's bilateral grid, if there are grids."""
@@ -518,7 +539,7 @@ class NrfgsModel(SplatfactoModel):
 
         Terms that are zero in this step are left out. Nothing waits for the GPU.
         """
-        losses = {"main_loss": self._photometric_loss(outputs, batch)}
+        losses = {"main_loss": self.photometric_loss(outputs, batch)}
         if self.config.use_scale_regularization and self.step % 10 == 0:
             scales = self.scales.exp()
             ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
@@ -546,7 +567,7 @@ class NrfgsModel(SplatfactoModel):
             "shrink_scales": weight / self.scene_unit * self.gauss_params["scales"].exp().mean(),
         }
 
-    def _photometric_loss(self, outputs, batch) -> Tensor:
+    def photometric_loss(self, outputs, batch) -> Tensor:
         """Splatfacto's loss of an image against its photograph, a scalar."""
         truth = self.truth_of(batch, outputs["background"])
         rgb = outputs["rgb"]

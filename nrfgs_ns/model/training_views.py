@@ -13,6 +13,19 @@ from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.rasterizer import contributions
 
 
+def wrong_pixels(error: Tensor, counted: Tensor, wrong: float) -> Tensor:
+    """Pixels whose error is large, bool [H, W, 1].
+
+    Args:
+        error: [H, W, 1].
+        counted: which pixels count, bool [H, W, 1].
+        wrong: how large, as a share of the way from the smallest of those that count to the largest.
+    """
+    least = error.where(counted, math.inf).amin()
+    most = error.where(counted, -math.inf).amax()
+    return counted & (error - least > wrong * (most - least))
+
+
 class ComparedViews:
     """A training's views, compared with their photographs as its loss compares them.
 
@@ -41,10 +54,7 @@ class ComparedViews:
         appearance = field.seen_from(view)
         outputs, truth = model.against_photograph(camera, batch, view, appearance)
         rgb, counted = outputs["rgb"], self._counted(outputs["rgb"], truth, model.mask_of(batch))
-        error = (rgb - truth).abs().mean(dim=-1, keepdim=True)
-        least = error.where(counted, math.inf).amin()
-        most = error.where(counted, -math.inf).amax()
-        high = counted & (error - least > wrong * (most - least))
+        high = wrong_pixels((rgb - truth).abs().mean(dim=-1, keepdim=True), counted, wrong)
         maps = torch.cat([counted, high], dim=-1)[None].to(rgb.dtype)
         pixels, of_those = contributions(view.projection, appearance.opacities, maps).unbind(dim=-1)
         loss = photometric_loss(rgb * counted, truth * counted, model.config.ssim_lambda)

@@ -31,7 +31,8 @@ from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory
 from nrfgs_ns.training.checkpoint_files import read_or_refuse
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.run import parse
-from nrfgs_ns.training.trainer import NrfgsTrainer, NrfgsTrainerConfig
+from nrfgs_ns.training.trainer import NrfgsTrainer
+from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig
 
 BACKGROUND = "pipeline.model.background_color"
 MODELS = "nerfstudio_models"

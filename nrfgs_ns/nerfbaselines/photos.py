@@ -6,6 +6,7 @@ have y up and z backwards, in a world that is turned upright, centred and scaled
 one to the other. Pixels are the same: the centre of the first is (0.5, 0.5).
 """
 
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -160,6 +161,7 @@ def hold_in_memory(config: NrfgsDatamanagerConfig, dataset: dict[str, Any], worl
             return len(self.cached_train), 0
 
     config._target, config.dataparser._target = GivenDatamanager, GivenParser
+    config.image_memory = math.inf  # they are in memory
 
 
 def _as_bytes(image: np.ndarray) -> np.ndarray:

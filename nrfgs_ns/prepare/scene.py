@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 from nrfgs_ns.data.pictures import exif_of, exif_of_copy, known, open_picture
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare.structure import colmap
+from nrfgs_ns.scenes.dataset import write_points
 
 DOWNSCALES = (2, 4, 8)
 """nerfstudio looks for these copies; it takes the largest whose sides are at most 1600 pixels."""
@@ -57,7 +57,10 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[]
         except OSError:  # a file system without hard links
             shutil.copyfile(source, out / "images" / image.name)
         advance()
-    _write_points(model, out / "sparse.ply")
+    points = list(model.points3D.values())
+    xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+    write_points(out / "sparse.ply", xyz, rgb)
     write_whole(out / "transforms.json", json.dumps(transforms(model, images, taken), indent=1) + "\n")
 
 
@@ -104,14 +107,3 @@ def _intrinsics(camera: Any) -> dict[str, Any]:
     """Of a PINHOLE camera, in pixels; the centre of the first pixel is (0.5, 0.5) for COLMAP and nerfstudio alike."""
     fl_x, fl_y, cx, cy = (float(value) for value in camera.params)
     return {"w": camera.width, "h": camera.height, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
-
-
-def _write_points(model: Any, path: Path) -> None:
-    fields = [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
-    points = list(model.points3D.values())
-    vertices = np.empty(len(points), dtype=fields)
-    xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
-    rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
-    for column, (position, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
-        vertices[position], vertices[colour] = xyz[:, column], rgb[:, column]
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))

@@ -125,7 +125,8 @@ def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
             progress(i, config.views)
 
     is_train = np.isin(names, train)
-    _write_ply(folder / "sparse.ply", *sparse_points(scene, cameras[is_train]))
+    points, colours = sparse_points(scene, cameras[is_train])
+    write_points(folder / "sparse.ply", points, np.round(255.0 * colours).astype(np.uint8))
     transforms = {
         "camera_model": "OPENCV",
         "w": config.width,
@@ -147,13 +148,12 @@ def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
     _write_json(folder / "transforms.json", transforms)
 
 
-def _write_ply(path: Path, points: Array, colours: Array) -> None:
-    fields = [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
-    vertices = np.empty(len(points), dtype=fields)
-    for axis, name in enumerate(("x", "y", "z")):
-        vertices[name] = points[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        vertices[name] = np.round(255.0 * colours[:, channel]).astype(np.uint8)
+def write_points(path: Path, points: Array, colours: Array) -> None:
+    """Write a .ply of points float32 [P, 3] with colours uint8 [P, 3]."""
+    names = ("x", "y", "z", "red", "green", "blue")
+    vertices = np.empty(len(points), dtype=list(zip(names, ["<f4"] * 3 + ["u1"] * 3, strict=True)))
+    for name, values in zip(names, (*points.T, *colours.T), strict=True):
+        vertices[name] = values
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
 
 

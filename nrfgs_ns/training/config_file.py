@@ -102,7 +102,7 @@ def _object(loader: _Loader, suffix: str, node: yaml.Node):
             raise _refuse(node, f"{value.__module__}.{value.__qualname__}")
         if callable(getattr(kind, str(name), None)) and name != "_target":
             raise _refuse(node, f"{suffix}.{name}")
-    made.__dict__.update(values)
+    getattr(made, "__setstate__", made.__dict__.update)(values)
 
 
 def _fits(config: type, target: type) -> bool:

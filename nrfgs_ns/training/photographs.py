@@ -5,9 +5,11 @@ It does if the capture needs it: if EXIF says that exposure varies, or if photog
 more than their places explain (`image/overlap.py`). What they say is where it starts.
 """
 
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -18,9 +20,9 @@ from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import (
     ENOUGH_STOPS,
-    FEWEST_PAIRS,
     Looks,
     Pairs,
+    Sighting,
     channels,
     compare,
     drawn,
@@ -34,6 +36,37 @@ from nrfgs_ns.model.pinhole import world_to_camera
 
 Choice = Literal["auto", "on", "off"]
 Exif = dict[str, Any]
+
+
+class Evidence(NamedTuple):
+    """What is known of V photographs before a training."""
+
+    pairs: Pairs
+    centers: Tensor
+    """where they were taken, [V, 3]"""
+    exif: list[Exif]
+    """[V]"""
+    known: Tensor
+    """exposures from EXIF in stops, NaN where it says nothing, [V]"""
+    seen: Looks
+    """what the pairs say by themselves"""
+
+    @property
+    def learnt_by_itself(self) -> bool:
+        """Whether exposure and white balance are learnt unless somebody says otherwise."""
+        vary = any(size >= enough for size, enough in zip(self.seen.random, ENOUGH_STOPS, strict=True))
+        return vary or varies(self.known)
+
+
+def evidence(datamanager: Any) -> Evidence:
+    """Compare a training's photographs, whose images have been read."""
+    dataset = datamanager.train_dataset
+    told = datamanager.train_dataparser_outputs.metadata
+    exif = exif_of(dataset.image_filenames, told.get("exif"))
+    known = torch.tensor([exposure(of_one) for of_one in exif])
+    pairs = compare_photographs(told.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
+    centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
+    return Evidence(pairs, centers, exif, known, estimate(pairs, torch.full_like(known, torch.nan), centers))
 
 
 def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
@@ -57,39 +90,27 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
                 "pipeline.model.photographs is on and use_bilateral_grid, too: both would learn the same. Use one."
             )
         return None
-    dataset = datamanager.train_dataset
-    paths, cameras = dataset.image_filenames, dataset.cameras
-    told = datamanager.train_dataparser_outputs.metadata
-    exif = exif_of(paths, told.get("exif"))
-    known = torch.tensor([exposure(of_one) for of_one in exif])
-    pairs = compare_photographs(told.get("points3D_xyz"), cameras, datamanager.cached_train)
-    centers = cameras.camera_to_worlds[:, :3, 3].cpu()
-    seen = estimate(pairs, torch.full_like(known, torch.nan), centers)
-    wanted, why = verdict(config.photographs, pairs, seen, known)
+    found = evidence(datamanager)
+    wanted, why = verdict(config.photographs, found)
     what = " and ".join(part.replace("-", " ") for part in config.photograph_parts)
     CONSOLE.print(f"Photographs: {what} {'learnt' if wanted else 'not learnt'}: {why}.", soft_wrap=True, markup=False)
     if not wanted:
         return None
-    camera_of, lenses = physical_cameras(cameras, exif)
-    looks = estimate(pairs, known, centers) if torch.isfinite(known).any() else seen
-    names = [path.name for path in paths]
+    known = found.known
+    looks = estimate(found.pairs, known, found.centers) if torch.isfinite(known).any() else found.seen
+    names = [path.name for path in datamanager.train_dataset.image_filenames]
+    camera_of, lenses = physical_cameras(datamanager.train_dataset.cameras, found.exif)
     return PhotographModel(names, camera_of, lenses, config.photograph_parts, channels(looks.stops), looks.held)
 
 
-def verdict(choice: Choice, pairs: Pairs, seen: Looks, known: Tensor) -> tuple[bool, str]:
-    """Whether photographs differ enough, and the evidence in words.
-
-    Args:
-        choice: of the user.
-        pairs: of photographs.
-        seen: what they say by themselves.
-        known: exposures from EXIF in stops, NaN where it says nothing. [V]
-    """
-    count = len(pairs.first)
-    exposures, *colors = seen.random
-    told_by_pairs = count >= FEWEST_PAIRS
+def verdict(choice: Choice, found: Evidence) -> tuple[bool, str]:
+    """Whether a training learns photographs' exposure, and why, in words."""
+    pairs, known = found.pairs, found.known
+    exposures, *colors = found.seen.random
     words = f"each differs from what its place explains by {exposures:.2f} stops, in colour by {max(colors):.2f}"
-    words = f"{words} ({count} pairs)" if told_by_pairs else f"too few points in common to compare them ({count} pairs)"
+    if not any(found.seen.random):
+        words = "too few points in common to compare them"
+    words += f" ({len(pairs.first)} pairs)"
     there = known[torch.isfinite(known)]
     spread = float(there.std(correction=0)) if len(there) else 0.0
     if len(there) == 0:
@@ -101,8 +122,7 @@ def verdict(choice: Choice, pairs: Pairs, seen: Looks, known: Tensor) -> tuple[b
         _, explained = slope(pairs, known)
         if explained is not None:
             told += f", which explains {explained:.0%} of their difference"
-    vary = any(size >= enough for size, enough in zip(seen.random, ENOUGH_STOPS, strict=True))
-    needed = told_by_pairs and vary or varies(known)
+    needed = found.learnt_by_itself
     enough = "" if needed else f"; {ENOUGH_STOPS[0]:g}, and {ENOUGH_STOPS[1]:g} in colour, would be enough"
     asked = "asked for; " if choice == "on" else ""
     return needed or choice == "on", f"{asked}{words}; {told}{enough}"
@@ -159,15 +179,18 @@ def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequenc
     points = drawn(points)
     viewmats = world_to_camera(cameras.camera_to_worlds)
     matrices = cameras.get_intrinsics_matrices()
-    sightings = []
-    for viewmat, K, batch in zip(viewmats, matrices, images, strict=True):
+
+    def seen(viewmat: Tensor, K: Tensor, batch: Mapping[str, Any]) -> Sighting:
         image, mask = batch["image"], None
         if image.shape[-1] == 4:
             mask, image = image[..., 3] >= (128 if image.dtype == torch.uint8 else 0.5), image[..., :3]
         if "mask" in batch:
             inside = batch["mask"][..., 0] >= 0.5
             mask = inside if mask is None else mask & inside.to(mask.device)
-        sightings.append(sight(points, viewmat, K, image, mask))
+        return sight(points, viewmat, K, image, mask)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        sightings = list(pool.map(seen, viewmats, matrices, images))
     return compare(sightings, centers)
 
 

@@ -6,13 +6,13 @@ import random
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 from torchvision.utils import save_image
 
 from nrfgs_ns.compact.decode import model_state
@@ -23,8 +23,19 @@ from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.evaluation_table import print_evaluation
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
-from nrfgs_ns.training.sharding import ShardingConfig
 from nrfgs_ns.viewer.panel import ViewerPanel
+
+
+@dataclass
+class ShardingConfig:
+    """How the splats are spread over the devices, and what a step counts. Nothing of it is read with one device."""
+
+    rebalance_at: float = 1.1
+    """splats move between devices once one has more than this many times the mean; looked at after each refinement"""
+    schedules: Literal["steps", "images"] = "steps"
+    """what step numbers and learning rates mean. steps: what they say; each step sees one image for each device.
+    images: they are written for one device, and a training sees as many images as it would there, in fewer steps: all
+    step numbers are divided by the number of devices, and Adam takes larger steps (docs/many-gpus.md)"""
 
 
 @dataclass
@@ -124,21 +135,20 @@ class NrfgsPipeline(VanillaPipeline):
         images = self.datamanager.fixed_indices_eval_dataloader
         names = [Path(name).name for name in self.datamanager.eval_dataset.image_filenames]
         per_image: list[dict[str, Any]] = []
-        columns = TextColumn("Evaluating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        with Progress(*columns, console=CONSOLE, transient=True) as progress:
-            for index, (name, (camera, batch)) in enumerate(progress.track(list(zip(names, images, strict=True)))):
-                start = perf_counter()
-                outputs = self.model.get_outputs_for_camera(camera=camera)
-                if outputs["rgb"].is_cuda:
-                    torch.cuda.synchronize()
-                seconds = perf_counter() - start
-                outputs = self.model.as_photographed(outputs, camera)
-                metrics, pictures = self.model.get_image_metrics_and_images(outputs, batch)
-                per_image.append({"image": name, **metrics, "seconds_per_image": seconds})
-                if output_path is not None:
-                    for key, picture in pictures.items():
-                        file = output_path / f"eval_{key}_{index:04d}_{Path(name).stem}.png"
-                        save_image(picture.permute(2, 0, 1).cpu(), file)
+        pairs = list(zip(names, images, strict=True))
+        for index, (name, (camera, batch)) in enumerate(track(pairs, "Evaluating", console=CONSOLE, transient=True)):
+            start = perf_counter()
+            outputs = self.model.get_outputs_for_camera(camera=camera)
+            if outputs["rgb"].is_cuda:
+                torch.cuda.synchronize()
+            seconds = perf_counter() - start
+            outputs = self.model.as_photographed(outputs, camera)
+            metrics, pictures = self.model.get_image_metrics_and_images(outputs, batch)
+            per_image.append({"image": name, **metrics, "seconds_per_image": seconds})
+            if output_path is not None:
+                for key, picture in pictures.items():
+                    file = output_path / f"eval_{key}_{index:04d}_{Path(name).stem}.png"
+                    save_image(picture.permute(2, 0, 1).cpu(), file)
         self.train()
 
         result: dict[str, Any] = {}

@@ -4,32 +4,28 @@ over the last steps, and an end in order whatever ends it."""
 
 import gc
 import math
-import re
 import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
-from itertools import count
+from dataclasses import replace
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_eval_enabled
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.data.checks import warn
-from nrfgs_ns.errors import DEBUG, ForTheUser, InputError
+from nrfgs_ns.errors import ForTheUser, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, tell, tell_why_not
 from nrfgs_ns.training.checkpoint_files import DiskFull
-from nrfgs_ns.training.cpu_command import ten_minute_command
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 from nrfgs_ns.training.optimizers import in_world_units
@@ -51,152 +47,9 @@ from nrfgs_ns.training.stopping import (
     rows_agree,
 )
 from nrfgs_ns.training.tracking import track
+from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, nothing_left_where_refused
 
-AVERAGED = 200
-"""Last steps whose mean is the trained model, where their number is chosen and in the presets."""
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
-TIME_STAMP = re.compile(r"\d{4}-\d\d-\d\d_\d{6}")
-"""What nerfstudio calls a training's folder if it is not told."""
-
-
-SEVERAL_DEVICES = "nrfgs_ns.distributed"
-"""The package that trains on several devices. It builds on this one, and is looked up by name when it is asked for."""
-
-
-@dataclass
-class NrfgsTrainerConfig(TrainerConfig):
-    """Nerfstudio's trainer options."""
-
-    _target: type = field(default_factory=lambda: NrfgsTrainer)
-    """target class to instantiate"""
-    max_num_iterations: int = STEPS
-    """training steps. 0: chosen, 120 for each training view but at least 10,000 and at most 30,000, with all schedules
-    stretched to them (docs/captures.md)"""
-    time_budget: float | None = None
-    """minutes that training may take, from the first step to the end of the last. As many steps are made as fit, and
-    all schedules are stretched to them. None: max_num_iterations steps"""
-    schedule_steps: int | None = None
-    """steps of the training that learning rates, resolution, harmonics and densification are laid out for; they are
-    stretched to the steps that are made. None: not stretched, or with a time budget laid out for max_num_iterations"""
-    average_steps: int | None = None
-    """the trained model is the mean of its parameters over the last so many steps, or over those since splats or the
-    field last changed if they are fewer; with a time budget about so many. 0: the last step's numbers. None:
-    200 where the number of steps is chosen, 0 otherwise"""
-
-    def setup(self, **kwargs) -> "NrfgsTrainer":
-        """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
-
-        Raises:
-            InputError: an option is out of range, cannot be had on several devices, or there is nothing to go on from.
-        """
-        with nothing_left_where_refused(self):
-            self._check(kwargs.get("world_size", 1))
-            if kwargs.get("world_size", 1) == 1:
-                return super().setup(**kwargs)
-            # Schedules are not stretched there.
-            whole = replace(
-                self, max_num_iterations=self.max_num_iterations or STEPS, average_steps=self.average_steps or 0
-            )
-            return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
-
-    def _check(self, devices: int) -> None:
-        """Raise InputError where an option makes no sense on so many devices; see `setup`."""
-        for name in ("time_budget", "schedule_steps"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name} is {value}; it must be positive.")
-            if value is not None and devices > 1:
-                raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
-        for name in ("max_num_iterations", "average_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 0:
-                raise InputError(f"{name} is {value}; it must be zero or positive.")
-        if devices > 1 and self.pipeline.model.densification == "consistent":
-            raise InputError(
-                "pipeline.model.densification is 'consistent', which is for one device: it compares whole pictures "
-                "with their photographs, and here each device has a part of the splats. Use 'splatfacto', 'original' "
-                "or 'mcmc', or --machine.num-devices 1."
-            )
-        scale = self.pipeline.datamanager.camera_res_scale_factor
-        if not 0 < scale < math.inf:
-            raise InputError(f"pipeline.datamanager.camera_res_scale_factor is {scale}; it must be positive.")
-        warmup = self.pipeline.model.warmup_steps
-        if warmup is not None and warmup < 0:
-            raise InputError(f"pipeline.model.warmup_steps is {warmup}; it must be zero or positive.")
-        if self.load_dir is not None:
-            checkpoint_files.checkpoints_in(self.load_dir)
-
-    def for_views(self, views: int) -> "NrfgsTrainerConfig":
-        """The configuration with what is left open chosen: steps, schedules and mean of a training on one device."""
-        if self.max_num_iterations > 0:
-            return replace(self, average_steps=self.average_steps or 0)
-        return replace(
-            self,
-            max_num_iterations=STEPS if self.time_budget is not None else steps_for(views),
-            schedule_steps=STEPS if self.schedule_steps is None else self.schedule_steps,
-            average_steps=AVERAGED if self.average_steps is None else self.average_steps,
-        )
-
-    def print_to_terminal(self) -> None:
-        """What ns-train says before it begins: one line, and on several devices whether they are there. The whole
-        configuration is in config.yml, and shown with NRFGS_DEBUG=1.
-
-        Raises:
-            InputError: there are fewer devices than were asked for.
-        """
-        if DEBUG:
-            super().print_to_terminal()
-        machine = self.machine
-        if machine.num_devices * machine.num_machines > 1:
-            resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
-        data = self.data or self.pipeline.datamanager.data
-        lines = [f"{self.method_name} on {data}"]
-        if machine.device_type == "cpu" and self.time_budget is None:
-            lines.append(f"No CUDA device: the CPU trains. A result in ten minutes: {ten_minute_command(data)}")
-        CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
-
-    def save_config(self) -> None:
-        """Save config.yml, with paths that lead to the same places from any folder."""
-        if TIME_STAMP.fullmatch(self.timestamp):
-            self._take_a_folder()
-        data = self.pipeline.datamanager
-        dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
-        pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
-        whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
-        TrainerConfig.save_config(whole)
-
-    def _take_a_folder(self) -> None:
-        """Make this training's folder; another one may have begun in the same second."""
-        first = self.timestamp
-        for number in count(2):
-            try:
-                self.get_base_dir().mkdir(parents=True)
-                return
-            except FileExistsError:
-                self.timestamp = f"{first}_{number}"
-
-
-def _absolute(path: Path | None) -> Path | None:
-    return None if path is None else Path(path).absolute()
-
-
-@contextmanager
-def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
-    """Take back the config.yml that ns-train saves before it reads the data, with the folders that this leaves empty,
-    where the training is refused before it has written anything else.
-    """
-    try:
-        yield
-    except InputError:
-        folder = config.get_base_dir()
-        if [file.name for file in folder.glob("*")] == ["config.yml"]:
-            with suppress(OSError):  # another device was faster, or other trainings are there
-                (folder / "config.yml").unlink()
-                for empty in (folder, *folder.parents):
-                    empty.rmdir()
-                    if empty == config.output_dir:
-                        break
-        raise
 
 
 def end_earlier_logs() -> None:

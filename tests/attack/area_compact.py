@@ -6,7 +6,6 @@ import lzma
 import zlib
 from functools import lru_cache, partial
 from pathlib import Path
-from types import SimpleNamespace
 
 from attempt import Case
 from hypothesis import strategies as st
@@ -16,12 +15,14 @@ AREA = "compact file"
 
 
 @lru_cache
-def written() -> bytes:
+def written(version: int = 2) -> bytes:
     """A field of sixty splats."""
     import tempfile
 
     import torch
+    from compact_1 import encode_1
 
+    from nrfgs_ns.appearance.field import Field
     from nrfgs_ns.appearance.nrf import NrfConfig
     from nrfgs_ns.compact.encode import encode
     from nrfgs_ns.compact.format import write_container
@@ -31,7 +32,7 @@ def written() -> bytes:
     head = NrfConfig(latent_dim=8, hidden_width=16, output_init="default").setup().requires_grad_(False)
     columns = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "features_dc": 3, "latents": 8}
     splats = {name: torch.randn(60, count) for name, count in columns.items()}
-    header, streams = encode(SimpleNamespace(head=head, splats=splats), Precision(), {})
+    header, streams = (encode_1 if version == 1 else encode)(Field(head, splats), Precision(), {})
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "field.nrf"
         write_container(path, header, streams)
@@ -65,7 +66,7 @@ def parts(data: bytes) -> tuple[dict, list[bytes]]:
     return header, bodies
 
 
-def joined(text: bytes, bodies: list[bytes], version: int = 1) -> bytes:
+def joined(text: bytes, bodies: list[bytes], version: int = 2) -> bytes:
     """A file whose checksums and lengths hold."""
     from nrfgs_ns.compact.format import CHECKSUM, MAGIC, PREAMBLE
 
@@ -74,41 +75,71 @@ def joined(text: bytes, bodies: list[bytes], version: int = 1) -> bytes:
     return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
 
 
-def claiming(name: str, change) -> Case:
+def claiming(name: str, change, version: int = 2) -> Case:
     """A header that says something else."""
 
     def build(folder: Path):
-        header, bodies = parts(written())
+        header, bodies = parts(written(version))
         change(header)
-        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies))
+        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies, version))
         return partial(read, folder / "field.nrf")
 
     return Case(name, build)
 
 
-def bomb(count: int, dtype: str, stream: str, **config) -> Case:
-    """A stream of so many zeros, which packs to next to nothing."""
+def zeros(size: int) -> bytes:
+    """So many, packed to next to nothing."""
+    packer = lzma.LZMACompressor(format=lzma.FORMAT_XZ, check=lzma.CHECK_NONE, preset=0)
+    piece = bytes(2**20)
+    return b"".join([*(packer.compress(piece) for _ in range(size // 2**20)), packer.flush()])
+
+
+def replaced(name: str, stream: str, version: int, count: int, body, entry: dict, **config) -> Case:
+    """A stream with another body, and a header that says so."""
 
     def build(folder: Path):
-        header, bodies = parts(written())
+        header, bodies = parts(written(version))
         header["head"]["config"].update(config)
-        group, _, _ = stream.partition(".")
-        size = int(dtype.removeprefix("uint")) // 8
-        packer = lzma.LZMACompressor(format=lzma.FORMAT_XZ, check=lzma.CHECK_NONE, preset=0)
-        zeros, packed = bytes(2**20), []
-        for _ in range(count * size // 2**20):
-            packed.append(packer.compress(zeros))
-        body = b"".join(packed) + packer.flush()
-        for index, entry in enumerate(header["streams"]):
-            if entry["name"] == stream:
-                shape = [count] if len(entry["shape"]) == 1 else [entry["shape"][0], count // entry["shape"][0]]
-                entry.update(dtype=dtype, shape=shape, bytes=len(body), crc32=zlib.crc32(body))
-                bodies[index] = body
-        header["splats"][group] = count
-        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies))
+        content = body()
+        for index, one in enumerate(header["streams"]):
+            if one["name"] == stream:
+                shape = [count] if len(one["shape"]) == 1 else [one["shape"][0], count // one["shape"][0]]
+                one.update({"shape": shape, "bytes": len(content), "crc32": zlib.crc32(content), **entry})
+                bodies[index] = content
+        group = stream.partition(".")[0]
+        header["splats"][group if version == 1 else "view"] = count
+        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies, version))
         return partial(read, folder / "field.nrf")
 
-    return Case(f"{stream} of {count * int(dtype[4:]) // 8:,} bytes when unpacked", build)
+    return Case(name, build)
+
+
+def bomb(count: int, dtype: str, stream: str, version: int, **config) -> Case:
+    """A stream of so many zeros."""
+    size = count * int(dtype.removeprefix("uint")) // 8
+    entry = {"dtype": dtype} if version == 1 else {"dtype": dtype, "coding": "xz"}
+    name = f"{stream} of {size:,} bytes when unpacked"
+    return replaced(name, stream, version, count, lambda: zeros(size), entry, **config)
+
+
+def coded(name: str, stream: str, shape: list[int], body) -> Case:
+    """A coded table of another shape and with another body."""
+    return replaced(f"{stream}: {name}", stream, 2, 60, body, {"shape": shape})
+
+
+def table_of_zeros(columns: int, rows: int) -> bytes:
+    import numpy as np
+
+    from nrfgs_ns.compact.format import Table, _coded
+
+    return _coded(Table(np.zeros((columns, rows), dtype=np.int64)))[1]
+
+
+def large_model(count: int, unpacked: int) -> bytes:
+    from nrfgs_ns.compact.format import MODEL
+
+    packed = zeros(unpacked)
+    return MODEL.pack(count, len(packed)) + packed + bytes(400)
 
 
 def text(name: str, content: bytes) -> Case:
@@ -132,10 +163,19 @@ def grid(table: str, part: str, value) -> Case:
 
 
 CASES = [
-    bomb(2**28, "uint8", "view.means"),
-    bomb(2**26, "uint64", "view.means"),
-    bomb(2**25, "uint64", "view.latents"),
-    bomb(2**25, "uint64", "diffuse.means", latent_dim=22),
+    bomb(2**28, "uint8", "view.means", 1),
+    bomb(2**26, "uint64", "view.means", 1),
+    bomb(2**25, "uint64", "view.latents", 1),
+    bomb(2**25, "uint64", "diffuse.means", 1, latent_dim=22),
+    bomb(2**28, "uint8", "means", 2),
+    bomb(2**25, "uint64", "latents", 2),
+    coded("many rows of zeros", "latents", [8, 10**6], lambda: table_of_zeros(8, 10**6)),
+    coded("many columns of zeros", "latents", [1000, 8000], lambda: table_of_zeros(1000, 8000)),
+    coded("more columns than rows", "splats", [10**6, 1], lambda: table_of_zeros(11, 60)),
+    coded("a model of 4 GB", "splats", [11, 60], lambda: large_model(2**30, 2**28)),
+    coded("a model of 16 MB", "splats", [11, 60], lambda: large_model(2**22, 2**24)),
+    coded("no body", "splats", [11, 60], lambda: b""),
+    coded("a state too few", "means", [2, 60], lambda: table_of_zeros(2, 60)[:-4]),
     *(
         claiming(f"{count} splats", lambda header, c=count: header["splats"].update(view=c))
         for count in (-1, 0, 61, 2**40, 2**63, 1.5, "60", None, [])
@@ -156,7 +196,7 @@ CASES = [
     claiming("another head", lambda header: header["head"].update(name="sh")),
     claiming("no grids", lambda header: header.update(grids=None)),
     *(
-        claiming(f"quats_bits {bits}", lambda header, b=bits: header.update(quats_bits=b))
+        claiming(f"quats_bits {bits}", lambda header, b=bits: header.update(quats_bits=b), 1)
         for bits in (0, 1, 17, 10**9, True, "8", None)
     ),
     *(config("latent_dim", value) for value in (0, -1, 9, 10**9, 2**63, 8.0, "8", None, [8], True)),
@@ -170,6 +210,10 @@ CASES = [
         grid(table, "step", value)
         for table in ("means", "latents")
         for value in (0.0, -1.0, float("nan"), float("inf"), 1e300, "x", None)
+    ),
+    *(
+        claiming(f"coding {str(coding)[:20]}", lambda header, c=coding: header["streams"][0].update(coding=c))
+        for coding in ("xz", "zip", None, 3, ["rans"], {})
     ),
     *(grid("scales", "low", value) for value in (float("nan"), 1e300, -1e39, [], None)),
     text("deep", b"[" * 200_000),

@@ -10,7 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.compact.format import CHECKSUM, DTYPES, MAGIC, PREAMBLE, read_container, write_container
+from nrfgs_ns.compact.format import (
+    CHECKSUM,
+    DTYPES,
+    MAGIC,
+    MODEL,
+    MOST_COLUMNS,
+    PREAMBLE,
+    SMALL,
+    Table,
+    read_container,
+    write_container,
+)
 from nrfgs_ns.errors import InputError
 
 
@@ -25,6 +36,19 @@ def arrays() -> dict[str, np.ndarray]:
 def written(arrays, tmp_path_factory):
     path = tmp_path_factory.mktemp("compact") / "deep" / "file.nrf"
     assert write_container(path, {"format": "x", "list": [1.5, None]}, arrays) == path.stat().st_size
+    return path
+
+
+TABLES = {
+    "signed": Table(np.random.default_rng(1).integers(-99, 99, (3, 300))),
+    "not signed": Table(np.random.default_rng(2).integers(0, 2**32, (2, 100)), signed=False),
+}
+
+
+@pytest.fixture(scope="module")
+def coded(arrays, tmp_path_factory):
+    path = tmp_path_factory.mktemp("compact") / "coded.nrf"
+    write_container(path, {}, {**TABLES, "half": arrays["half"]})
     return path
 
 
@@ -50,6 +74,71 @@ def test_layout_is_as_documented(written):
         assert data[first : first + 6] == b"\xfd7zXZ\x00"
         first += entry["bytes"]
     assert first == len(data)
+
+
+def test_a_file_with_a_coded_table_is_of_version_2(arrays, coded):
+    assert coded.read_bytes()[8:12] == struct.pack("<I", 2)
+    header, streams = read_container(coded)
+    assert [entry["coding"] for entry in header["streams"]] == ["rans", "rans", "xz"]
+    for name, table in TABLES.items():
+        assert (streams[name] == table.numbers).all()
+    assert streams["signed"].dtype == np.int16 and streams["not signed"].dtype == np.uint32
+    assert (streams["half"] == arrays["half"]).all()
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        Table(np.array([[-1]]), signed=False),
+        Table(np.array([[2**31]])),
+        Table(np.array([[2**32]]), signed=False),
+        Table(np.zeros((MOST_COLUMNS + 1, 1), dtype=np.int64)),
+    ],
+)
+def test_a_table_that_no_reader_would_take_is_not_written(table, tmp_path):
+    with pytest.raises(ValueError, match="a table of"):
+        write_container(tmp_path / "x.nrf", {}, {"a": table})
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        (lambda entry: entry.update(coding="zip"), "coding 'zip'"),
+        (lambda entry: entry.pop("coding"), "coding None"),
+        (lambda entry: entry.update(coding="xz", dtype="uint16"), "cannot be unpacked"),
+        (lambda entry: entry.update(dtype="float16"), "which cannot be"),
+        (lambda entry: entry.update(dtype="uint32"), "no uint32"),
+        (lambda entry: entry.update(shape=[900]), "which cannot be"),
+        (lambda entry: entry.update(shape=[3, 301]), "cannot be decoded"),
+        (lambda entry: entry.update(shape=[900, 1]), "cannot be decoded"),
+        (lambda entry: entry.update(shape=[10**6, 0]), "too large"),
+        (lambda entry: entry.update(shape=[3, 10**9]), "would unpack to"),
+    ],
+)
+def test_a_misleading_entry_of_a_table_is_refused(change, says, coded, tmp_path):
+    path = tmp_path / "made.nrf"
+    path.write_bytes(coded.read_bytes())
+    rewritten(path, lambda header: change(header["streams"][0]) and None)
+    with pytest.raises(InputError, match=says):
+        read_container(path)
+
+
+@pytest.mark.parametrize("count, size", [(2**32 - 1, 10), (SMALL // 4 + 1, 10), (5, 2**32 - 1), (0, 0), (5, 3)])
+def test_a_misleading_model_of_a_table_is_refused(count, size, coded, tmp_path):
+    path = tmp_path / "made.nrf"
+    path.write_bytes(coded.read_bytes())
+
+    def change(header):
+        data = bytearray(path.read_bytes())
+        _, _, length, _ = PREAMBLE.unpack_from(data)
+        first, entry = PREAMBLE.size + length + CHECKSUM.size, header["streams"][0]
+        MODEL.pack_into(data, first, count, size)
+        entry["crc32"] = zlib.crc32(data[first : first + entry["bytes"]])
+        path.write_bytes(data)
+
+    rewritten(path, change)
+    with pytest.raises(InputError, match="made.nrf: its stream 'signed' (cannot be|does not hold)"):
+        read_container(path)
 
 
 @settings(max_examples=150)
@@ -100,7 +189,7 @@ def write_with(path, text: bytes, version: int = 1) -> None:
 @pytest.mark.parametrize(
     "change, says",
     [
-        (lambda header: 2, "version 2"),
+        (lambda header: 3, "version 3"),
         (lambda header: header["streams"][0].update(shape=[3, 18]), "does not hold 54 numbers"),
         (lambda header: header["streams"][0].update(shape=[3, 16]), "does not hold 48 numbers"),
         (lambda header: header["streams"][0].update(shape=[2**40]), "would unpack to"),

@@ -3,18 +3,11 @@
 
 import numpy as np
 import pytest
+from compact_1 import grid_with_bits, grid_with_step, narrowest, smallest_three
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nrfgs_ns.compact.quantise import (
-    from_morton,
-    from_smallest_three,
-    grid_with_bits,
-    grid_with_step,
-    morton,
-    narrowest,
-    smallest_three,
-)
+from nrfgs_ns.compact.quantise import NEAR, OCTAHEDRAL, from_morton, from_smallest_three, matrix, morton, nearest_turn
 
 
 @given(seed=st.integers(0, 99), count=st.integers(0, 40))
@@ -70,3 +63,29 @@ def test_grids_are_half_a_step_off_at_most(seed, bits):
 def test_narrowest(top, dtype):
     assert narrowest(np.array([0, top])).dtype == dtype
     assert narrowest(np.array([0, top]))[1] == top
+
+
+def ellipsoids(quats, scales):
+    """R S R^T, [N, 3, 3]."""
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    turns = np.stack([matrix(quat) for quat in unit])
+    return turns * scales[:, None, :] @ turns.transpose(0, 2, 1)
+
+
+def test_the_axes_turns_are_24():
+    turns = np.stack([matrix(turn) for turn in OCTAHEDRAL])
+    assert np.allclose(np.abs(turns).sum(axis=1), 1.0) and np.allclose(np.linalg.det(turns), 1.0)
+    assert len({tuple(np.rint(turn).astype(int).ravel()) for turn in turns}) == 24
+
+
+@given(seed=st.integers(0, 99))
+def test_the_nearest_turn_draws_the_same_ellipsoid(seed):
+    random = np.random.default_rng(seed)
+    quats = random.normal(size=(200, 4)) * 10.0 ** random.uniform(-3, 3, (200, 1))
+    quats[:24] = OCTAHEDRAL
+    scales = random.normal(size=(200, 3))
+    turned, permuted = nearest_turn(quats, scales)
+    assert np.allclose(np.linalg.norm(turned, axis=1), 1.0) and (turned[:, 0] > NEAR).all()
+    assert np.allclose(ellipsoids(turned, permuted), ellipsoids(quats, scales), atol=1e-9)
+    again, same = nearest_turn(turned, permuted)
+    assert np.allclose(again, turned) and (same == permuted).all()

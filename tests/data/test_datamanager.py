@@ -211,3 +211,76 @@ def test_states_of_other_runs_are_refused(capture):
         manager(capture, train_cameras_sampling_strategy="fps").load_sampling_state(state)
     with pytest.raises(InputError, match=r"trained on 8 images, but there are 5 now"):
         manager(capture, {"eval_interval": 2}).load_sampling_state(state)
+
+
+# Where images are kept.
+
+
+def files_of(folder) -> dict:
+    return {path.relative_to(folder): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, printed, distorted):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    capture.add_masks()
+    if distorted:
+        capture.meta |= {"k1": 0.3, "fl_x": 12.0, "fl_y": 12.0}
+    in_memory = manager(capture)
+    in_memory.load_all_images()
+    assert not (tmp_path / "cache").exists()
+    for _ in range(2):
+        in_files = manager(capture, image_memory=0.0)
+        in_files.load_all_images()
+        assert "read from files" in printed()
+        for name in ("cached_train", "cached_eval"):
+            for one, other in zip(getattr(in_memory, name), getattr(in_files, name), strict=True):
+                assert one.keys() == other.keys()
+                torch.testing.assert_close(one, other, rtol=0, atol=0)
+        for part in ("fx", "fy", "cx", "cy", "width", "height"):
+            for one, other in zip(
+                (in_memory.train_dataset, in_memory.eval_dataset),
+                (in_files.train_dataset, in_files.eval_dataset),
+                strict=True,
+            ):
+                torch.testing.assert_close(getattr(one.cameras, part), getattr(other.cameras, part))
+        for step in range(20):
+            camera, batch = in_files.next_train(step)
+            kept = in_memory.cached_train[camera.metadata["cam_idx"]]
+            torch.testing.assert_close(batch["image"], kept["image"])
+    made = files_of(tmp_path / "cache")
+    assert len(made) == 10 * 3, "an image, a mask and what they are, each made once"
+
+    picture = Image.open(capture.folder / "images/004.png").convert("RGB")
+    Image.eval(picture, lambda value: 255 - value).save(capture.folder / "images/004.png")
+    anew = manager(capture, image_memory=0.0)
+    anew.load_all_images()
+    assert len(files_of(tmp_path / "cache")) == 10 * 3 + 3
+    assert not torch.equal(anew.cached_train[3]["image"], in_memory.cached_train[3]["image"])
+
+
+def test_training_does_not_write_into_the_files(capture, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    image = manager(capture, image_memory=0.0).cached_train[0]["image"]
+    before = image.clone()
+    image.zero_()
+    torch.testing.assert_close(manager(capture, image_memory=0.0).cached_train[0]["image"], before)
+
+
+def test_no_room_for_files_is_said(capture, tmp_path, monkeypatch):
+    (tmp_path / "cache").write_text("in the way")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with pytest.raises(InputError, match="cannot be written .*image-memory"):
+        manager(capture, image_memory=0.0).load_all_images()
+    with pytest.raises(InputError, match="image-memory is -1"):
+        manager(capture, image_memory=-1.0)
+
+
+def test_the_first_broken_image_ends_the_reading(capture, monkeypatch):
+    capture.save()
+    for name in ("002", "005"):
+        (capture.folder / f"images/{name}.png").write_bytes(b"no picture")
+    monkeypatch.setattr("nrfgs_ns.data.dataparser.check_headers", lambda paths, *_: ["RGB"] * len(paths))
+    data = manager(capture, max_thread_workers=3)
+    with pytest.raises(InputError, match=r"images/002.png"):
+        data.load_all_images()

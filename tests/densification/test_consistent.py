@@ -6,6 +6,7 @@ import torch
 from densification_cases import REFINES, Table, Views, arguments, strategy, trainer_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nerfstudio.scripts.train import _set_random_seed
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import ConsistentDensification
@@ -236,3 +237,25 @@ def test_looking_changes_nothing(training):
 def test_several_devices_are_refused(tiny_scene, tmp_path):
     with pytest.raises(InputError, match="'consistent', which is for one device"):
         parse(arguments(tiny_scene, tmp_path, "consistent")).setup(local_rank=0, world_size=2)
+
+
+# In a training.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_fewer_splats_at_no_loss(seed, tiny_scene, tmp_path):
+    """Splatfacto's rule grows wherever a gradient is; what the views confirm is less than half of it, and predicts test
+    views no worse."""
+    options = {"refine-every": 20, "warmup-length": 20, "stop-split-at": 160, "stop-screen-size-at": 0}
+    results = {}
+    for name in ("splatfacto", "consistent"):
+        config = parse(arguments(tiny_scene, tmp_path / name, name, steps=200, **options))
+        config.machine.seed = seed
+        _set_random_seed(seed)
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.train()
+        results[name] = trainer.pipeline.get_average_eval_image_metrics()
+    assert results["consistent"]["splats"] < 0.6 * results["splatfacto"]["splats"]
+    assert results["consistent"]["psnr"] > results["splatfacto"]["psnr"]

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from nrfgs_ns.image import overlap
 from nrfgs_ns.image.overlap import ENOUGH_STOPS, channels, compare, drawn, estimate, sight, slope, varies
 from nrfgs_ns.image.photograph import exposed
 
@@ -101,6 +102,17 @@ def test_what_changes_slowly_from_place_to_place_is_the_scenes():
     assert (looks.held[0].T @ pattern).norm() > 0.99 * pattern.norm()
     shuffled = looks_of(slowly[torch.randperm(16, generator=torch.Generator().manual_seed(0))])
     assert enough(shuffled)[0] and shuffled.held[0].shape[1] < 8
+
+
+def test_of_a_large_capture_a_part_says_how_photographs_differ(monkeypatch):
+    monkeypatch.setattr(overlap, "MOST_PHOTOGRAPHS", 16)
+    torch.manual_seed(3)
+    stops = torch.randn(24, 1) * 0.4 + torch.zeros(24, 3)
+    looks = looks_of(stops)
+    assert enough(looks) == [True, False, False]
+    assert (channels(looks.stops) - (stops - stops.mean(0))).abs().max() < 0.2
+    assert all(pattern.shape == (24, 1) for pattern in looks.held)
+    assert not any(enough(looks_of(torch.zeros(24, 3))))
 
 
 def test_held_patterns_are_orthonormal_and_the_constant_is_one_of_them():

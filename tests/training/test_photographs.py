@@ -8,13 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import tyro
 from PIL import ExifTags, Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
-from nrfgs_ns.training.photographs import exif_of, exposure, physical_cameras, verdict
+from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, physical_cameras, verdict
 from nrfgs_ns.training.run import parse
 
 NAN = math.nan
@@ -62,7 +63,7 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 )
 def test_the_evidence_decides_and_is_told(choice, pairs, known, wanted, words):
     seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
-    found, why = verdict(choice, pairs, seen, torch.tensor(known))
+    found, why = verdict(choice, Evidence(pairs, CENTERS, [{}] * 11, torch.tensor(known), seen))
     assert found == wanted
     assert words in why
 
@@ -192,6 +193,21 @@ def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished,
         model.get_outputs_for_camera(camera)
     with pytest.raises(InputError, match="nobody.jpg"):  # a training says so before its first step
         model.learn_photographs(model.photograph)
+
+
+def test_an_exported_file_has_the_mean_look(finished, tmp_path):
+    """Its splats' zeroth harmonics are the model's own base colours, whatever the photographs' stops are."""
+    from plyfile import PlyData
+
+    from nrfgs_ns.export.command import Export
+
+    tyro.cli(Export, args=["ply", "--load-config", str(finished), "--output", str(tmp_path / "scene.ply")]).main()
+    splats = PlyData.read(tmp_path / "scene.ply")["vertex"].data
+    written = np.stack([splats[f"f_dc_{channel}"] for channel in range(3)], axis=-1)
+    own = checkpoint_of(finished)["pipeline"]["_model.gauss_params.features_dc"].numpy()
+    assert len(written) <= len(own)
+    nearest = np.abs(written[:20, None] - own[None]).max(axis=-1).min(axis=1)
+    assert nearest.max() < 1e-6
 
 
 def test_a_compact_file_is_chosen_by_photographs_with_their_look(finished):

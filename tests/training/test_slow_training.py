@@ -14,6 +14,8 @@ import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, command_line, trained
+from smoke_runs import STEPS as SHORT
+from smoke_runs import after_one_step, bound, cases, gain_bound, shine
 
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.checkpoint_files import find, read_latest
@@ -47,7 +49,17 @@ def test_the_field_carries_what_depends_on_the_view(tmp_path):
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
 def test_real_photographs_train(scene, method, captures, tmp_path):
     scale = {"--pipeline.datamanager.camera-res-scale-factor": 0.125}
-    assert psnr(method, captures / scene, tmp_path, 300, scale) > 17
+    assert psnr(method, captures / scene, tmp_path, SHORT, scale) > bound(f"{scene}/{method}")
+
+
+def test_bounds_of_short_trainings_tell_learning_from_nothing():
+    assert all(bound(case) > after_one_step(case) + 2 for case in cases())
+
+
+@pytest.mark.slow
+def test_the_field_is_ahead_of_harmonics_where_it_shines(tmp_path):
+    reached = shine(tmp_path / "demo", 42)
+    assert 0 < gain_bound() < reached["nrfgs"] - reached["nrfgs-sh"]
 
 
 @pytest.mark.slow

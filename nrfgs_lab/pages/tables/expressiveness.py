@@ -5,11 +5,8 @@ from nrfgs_lab.express.report import PAPER, ROWS, SETUPS, change_cells, number
 from nrfgs_lab.pages.tables import grid, records
 
 TOLD = {
-    "synthetic": (
-        *("four times the passes", "24 directions", "192 directions"),
-        *("samples mix 8 factors", "each sample is one grey lobe"),
-    ),
-    "measured, pixels": ("four times the passes", "a quarter of the passes", "192 directions"),
+    "synthetic": ("192 directions", "samples mix 8 factors", "each sample is one grey lobe"),
+    "measured, pixels": ("a quarter of the passes", "192 directions"),
     "measured, image": ("four times the passes", "without the glossiest quarter of the materials"),
 }
 """Set-up -> variations that docs/expressiveness.md speaks of."""

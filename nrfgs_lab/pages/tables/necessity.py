@@ -9,11 +9,10 @@ MODELS = {
     "inspect-classic-gloss-0": "dense, matte",
     "inspect-classic-gloss-1": "dense, glossy",
     "inspect-antialiased-gloss-0": "dense, matte, antialiased",
-    "inspect-antialiased-gloss-1": "dense, glossy, antialiased",
 }
 PARTS = (
     *("high branch", "low branch", "opacity residual", "distance"),
-    *("latent rank 1", "latent rank 2", "latent rank 4", "latent rank 8"),
+    *("latent rank 2", "latent rank 4", "latent rank 8"),
     *("residuals below 0.5 steps", "residuals below 8 steps", "all residuals"),
 )
 

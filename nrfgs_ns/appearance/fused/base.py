@@ -2,8 +2,8 @@
 """What needs no network in the fused kernels: base colours and opacities, and blocks of which all splats are diffuse.
 
 A program first walks backwards over its last blocks, as long as all their splats are diffuse, and does without the
-network there. In a training diffuse splats come last in the table (`diffuse_splats.py`), so that these are all blocks
-that have some, but one. A branch in the loop that the network runs in would serve a table in any order, but it keeps
+network there. Diffuse splats come last in the table (`appearance/diffuse.py`), so that these are all blocks that have
+some, but one. A branch in the loop that the network runs in would serve a table in any order, but it keeps
 the compiler from loading the next blocks while one is computed.
 
 Tiles [B, 4], B, lanes, and what the arguments are: `kernels.py`.

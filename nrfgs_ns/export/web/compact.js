@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// Reads a compact file (docs/compact-format.md): container, xz streams, tables. Runs in the worker.
+// Reads a compact file (docs/compact-format.md): container, xz streams, coded tables, splats. Runs in the worker.
 
 const MAGIC = [0x89, 0x4e, 0x52, 0x46, 0x0d, 0x0a, 0x1a, 0x0a];
-const VERSION = 1;
-const BYTES = { uint8: 1, uint16: 2, uint32: 4, uint64: 8, float16: 2, float32: 4 };
+const VERSION = 2;
+const BYTES = { uint8: 1, uint16: 2, uint32: 4, uint64: 8, float16: 2, float32: 4, int16: 2, int32: 4 };
 const LARGEST_STREAM = 2 ** 31;
 
 // What is said to a reader: a fault of the file, or what a device lacks.
@@ -34,6 +34,10 @@ function readScene(bytes, progress) {
       const values = stream.dtype === "float32" ? new Float32Array(numbers(stream).buffer) : halves(numbers(stream));
       scene.weights[name.slice("head.".length)] = { shape: stream.shape, values };
     }
+  }
+  if (streams.splats) {
+    readTables(streams, scene, rank);
+    return scene;
   }
   let first = 0;
   for (const group of ["view", "diffuse"]) {
@@ -81,7 +85,8 @@ function readContainer(bytes, progress) {
   if (bytes.length < 28 || MAGIC.some((byte, i) => bytes[i] !== byte)) {
     throw new BadFile("The page does not hold a scene of nrfgs, or only a part of one.");
   }
-  if (view.getUint32(8, true) !== VERSION) throw new BadFile("The scene is of another version than this page reads.");
+  const version = view.getUint32(8, true);
+  if (version < 1 || version > VERSION) throw new BadFile("The scene is of another version than this page reads.");
   const length = view.getUint32(12, true), total = Number(view.getBigUint64(16, true));
   if (total !== bytes.length || 28 + length > total) {
     throw new BadFile(`The scene has ${bytes.length} bytes instead of ${total}: the page is cut short.`);
@@ -92,7 +97,7 @@ function readContainer(bytes, progress) {
   const header = JSON.parse(new TextDecoder().decode(bytes.subarray(24, 24 + length)));
   const streams = {};
   let at = 28 + length;
-  for (const { name, dtype, shape, bytes: size, crc32: sum } of header.streams) {
+  for (const { name, dtype, shape, bytes: size, crc32: sum, coding } of header.streams) {
     const body = bytes.subarray(at, at + size);
     at += size;
     if (body.length !== size || crc32(body) !== sum) {
@@ -100,10 +105,45 @@ function readContainer(bytes, progress) {
     }
     const unpacked = BYTES[dtype] * shape.reduce((a, b) => a * b, 1);
     if (!(unpacked <= LARGEST_STREAM)) throw new BadFile(`The scene's stream ${name} is too large.`);
-    streams[name] = { dtype, shape, planes: unxz(body, unpacked) };
+    streams[name] = { dtype, shape };
+    if (coding === "rans") streams[name].columns = decodeTable(body, shape[0], shape[1]);
+    else streams[name].planes = unxz(body, unpacked);
     progress(at / total);
   }
   return { header, streams };
+}
+
+// The tables of a file of version 2: all splats in one order; the scene has the view-dependent ones first.
+function readTables({ means, splats, latents }, scene, rank) {
+  const n = scene.count, of = scene.viewDependent, { grids } = scene.header;
+  const fits = ({ columns, shape } = {}, c, rows) => columns && shape[0] === c && shape[1] === rows;
+  if (!fits(means, 2, n) || !fits(splats, 11, n) || !fits(latents, rank, of)) {
+    throw new BadFile("The scene's tables do not fit its number of splats.");
+  }
+  const diffuse = splats.columns[0], place = new Uint32Array(n);
+  let first = 0, last = of;
+  for (let i = 0; i < n; i++) place[i] = diffuse[i] ? last++ : first++;
+  if (first !== of) throw new BadFile("The scene's tables do not fit its number of splats.");
+  readPlaces(means.columns[1], means.columns[0], grids.means, scene.table, place);
+  const put = (column, { low, step }, c, offset, value) => {
+    for (let i = 0; i < n; i++) scene.table[16 * place[i] + offset] = value(low[c] + step[c] * column[i]);
+  };
+  put(splats.columns[1], grids.opacities, 0, 3, (x) => x);
+  for (let c = 0; c < 3; c++) {
+    put(splats.columns[2 + c], grids.scales, c, 8 + c, Math.exp);
+    put(splats.columns[5 + c], grids.colors, c, 12 + c, (x) => x);
+  }
+  const turns = splats.columns.slice(8), { low, step } = grids.turns;
+  for (let i = 0; i < n; i++) {
+    const [x, y, z] = turns.map((column, c) => low[c] + step[c] * column[i]);
+    const w = Math.sqrt(Math.max(1 - (x * x + y * y + z * z), 1e-6)), norm = Math.sqrt(w * w + x * x + y * y + z * z);
+    scene.table.set([w / norm, x / norm, y / norm, z / norm], 16 * place[i] + 4);
+  }
+  const width = 4 * Math.ceil(rank / 4);
+  for (let r = 0; r < rank; r++) {
+    const column = latents.columns[r], low = grids.latents.low[r], step = grids.latents.step[r];
+    for (let i = 0; i < of; i++) scene.latents[width * i + r] = low + step * column[i];
+  }
 }
 
 let crcTable = null;
@@ -150,17 +190,28 @@ function thirds(x) {
 
 // Running sums of 64-bit differences, and the coordinates whose bits alternate in them.
 function readMeans({ planes }, { low, step }, table, first, n) {
-  let lower = 0, upper = 0;
-  const byte = (k, i) => planes[k * n + i];
+  const lower = new Uint32Array(n), upper = new Uint32Array(n), place = new Uint32Array(n);
   for (let i = 0; i < n; i++) {
-    const sum = lower + ((byte(0, i) | (byte(1, i) << 8) | (byte(2, i) << 16) | (byte(3, i) << 24)) >>> 0);
+    const word = (k) => planes[k * n + i] | (planes[(k + 1) * n + i] << 8) | (planes[(k + 2) * n + i] << 16) | (planes[(k + 3) * n + i] << 24);
+    lower[i] = word(0);
+    upper[i] = word(4);
+    place[i] = first + i;
+  }
+  readPlaces(lower, upper, { low, step }, table, place);
+}
+
+// The same from the differences' lower and upper 32 bits, for splats whose rows of the table are `place`.
+function readPlaces(lowers, uppers, { low, step }, table, place) {
+  let lower = 0, upper = 0;
+  for (let i = 0; i < place.length; i++) {
+    const sum = lower + lowers[i];
     const carry = sum >= 2 ** 32 ? 1 : 0;
     lower = sum >>> 0;
-    upper = (upper + carry + (byte(4, i) | (byte(5, i) << 8) | (byte(6, i) << 16) | (byte(7, i) << 24))) >>> 0;
+    upper = (upper + carry + uppers[i]) >>> 0;
     const middle = (lower >>> 30) | ((upper & 0x0fffffff) << 2);
     for (let a = 0; a < 3; a++) {
       const code = thirds(lower >>> a & 0x3fffffff >>> a) | (thirds(middle >>> a) << 10) | (((upper >>> (28 + a)) & 1) << 20);
-      table[16 * (first + i) + a] = low[a] + step[a] * code;
+      table[16 * place[i] + a] = low[a] + step[a] * code;
     }
   }
 }
@@ -181,6 +232,104 @@ function readRotations(largest, codes, bits, table, first, n) {
     table[at + which[i]] = rest;
     for (let k = 0; k < 4; k++) table[at + k] /= norm;
   }
+}
+
+// ---- coded tables: rANS in lanes, as docs/compact-format.md has it. Whole numbers alone, so that every reader agrees.
+
+const PRECISION = 14, LOWEST = 1 << 16, DIRECT = 32, TOKENS = 140;
+
+// The columns of a table [C, n]: Int32Array where they are signed, Uint32Array where they are not.
+function decodeTable(body, C, n) {
+  const broken = () => new BadFile("The scene is damaged: one of its tables cannot be decoded.");
+  const view = new DataView(body.buffer, body.byteOffset, body.byteLength);
+  const count = view.getUint32(0, true), size = view.getUint32(4, true);
+  if (count > 4096 * C || 8 + size > body.length) throw broken();
+  const model = new Int32Array(numbers({ dtype: "int32", planes: unxz(body.subarray(8, 8 + size), 4 * count) }).buffer);
+  let read = 0;
+  const take = () => {
+    if (read >= count) throw broken();
+    return model[read++];
+  };
+  let lanes = 1;
+  while (lanes < Math.min(1024, Math.ceil((C * n) / 2048))) lanes *= 2;
+  const S = Math.ceil(n / lanes), state = new Uint32Array(lanes);
+  let at = 8 + size;
+  if (at + 4 * lanes > body.length) throw broken();
+  for (let l = 0; l < lanes; l++, at += 4) state[l] = view.getUint32(at, true);
+  const word = () => {
+    at += 2;
+    if (at > body.length) throw broken();
+    return body[at - 2] | (body[at - 1] << 8);
+  };
+
+  const columns = [], zeros = new Int32Array(n);
+  const tokens = [new Uint8Array(n), new Uint8Array(n), new Uint8Array(n)];  // of a column and the two to its left
+  for (let c = 0; c < C; c++) {
+    const signed = take() !== 0;
+    const weights = Array.from({ length: 7 }, take), shares = Array.from({ length: 4 }, take);
+    const thresholds = Array.from({ length: take() }, take);
+    const frequencies = new Uint16Array((thresholds.length + 1) * TOKENS), starts = new Uint16Array(frequencies.length);
+    const lookup = new Uint8Array((thresholds.length + 1) << PRECISION);
+    for (let k = 0; k <= thresholds.length; k++) {
+      const first = take(), used = take();
+      let sum = 0;
+      if (first < 0 || first + used > TOKENS) throw broken();
+      for (let token = first; token < first + used; token++) {
+        const frequency = take();
+        if (frequency < 0 || sum + frequency > 1 << PRECISION) throw broken();
+        frequencies[k * TOKENS + token] = frequency;
+        starts[k * TOKENS + token] = sum;
+        lookup.fill(token, (k << PRECISION) + sum, (k << PRECISION) + sum + frequency);
+        sum += frequency;
+      }
+      if (sum !== 1 << PRECISION) throw broken();
+    }
+    const [w0, w1, w2, w3, w4, w5, w6] = weights, [s1, s2, s3, s4] = shares;
+    const own = tokens[c % 3], out = signed ? new Int32Array(n) : new Uint32Array(n);
+    const left = c > 0 ? columns[c - 1] : zeros, left2 = c > 1 ? columns[c - 2] : zeros;
+    const near = c > 0 ? tokens[(c + 2) % 3] : zeros, near2 = c > 1 ? tokens[(c + 1) % 3] : zeros;
+    for (let t = 0; t < S; t++) {
+      const active = Math.ceil((n - t) / S);
+      // First all tokens of a step, then the low bits that they leave: words lie in this order.
+      let most = 0;
+      for (let l = 0, i = t; l < active; l++, i += S) {
+        const activity = s1 * (t > 0 ? own[i - 1] : 0) + s2 * (t > 1 ? own[i - 2] : 0) + s3 * near[i] + s4 * near2[i];
+        let k = 0;
+        while (k < thresholds.length && thresholds[k] <= activity) k++;
+        let x = state[l];
+        const slot = x & ((1 << PRECISION) - 1), token = lookup[(k << PRECISION) + slot];
+        x = frequencies[k * TOKENS + token] * (x >>> PRECISION) + slot - starts[k * TOKENS + token];
+        state[l] = x < LOWEST ? x * LOWEST + word() : x;
+        own[i] = token;
+        if (token > most) most = token;
+      }
+      for (let l = 0, i = t; l < active; l++, i += S) out[i] = own[i];
+      if (most >= DIRECT) {
+        for (const shift of (most - DIRECT >> 2) + 3 > 16 ? [0, 16] : [0]) {
+          for (let l = 0, i = t; l < active; l++, i += S) {
+            const large = own[i] - DIRECT;
+            if (large < 0) continue;
+            const spare = (large >> 2) + 3, bits = Math.min(Math.max(spare - shift, 0), 16), scale = 2 ** bits;
+            if (shift === 0) out[i] = (4 + (large & 3)) * 2 ** spare;
+            let x = state[l];
+            out[i] += (x % scale) * 2 ** shift;
+            x = Math.floor(x / scale);
+            state[l] = x < LOWEST ? x * LOWEST + word() : x;
+          }
+        }
+      }
+      if (!signed) continue;
+      for (let l = 0, i = t; l < active; l++, i += S) {
+        const u = out[i] >>> 0, b = t > 0 ? i - 1 : -1;
+        const sum = w0 + 128 + w1 * (t > 0 ? out[i - 1] : 0) + w2 * (t > 1 ? out[i - 2] : 0) +
+          w3 * left[i] + w4 * (b < 0 ? 0 : left[b]) + w5 * left2[i] + w6 * (b < 0 ? 0 : left2[b]);
+        out[i] = Math.floor(sum / 256) + ((u >>> 1) ^ -(u & 1));
+      }
+    }
+    columns.push(out);
+  }
+  if (at !== body.length || state.some((x) => x !== LOWEST) || read !== count) throw broken();
+  return columns;
 }
 
 // ---- xz (https://tukaani.org/xz/xz-file-format.txt): blocks with the LZMA2 filter and no check, as the format has them.

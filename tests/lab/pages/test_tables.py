@@ -2,6 +2,7 @@
 """The numbers of the pages are those of the records, and links lead somewhere."""
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -79,3 +80,19 @@ def test_every_record_is_named_in_the_index():
     index = PAGES["docs/measurements.md"]
     named = {word for line in re.findall(r"^\| ([\w, -]+) \|", index, re.MULTILINE) for word in line.split(", ")}
     assert {path.stem for path in (ROOT / "results").glob("*.json")} <= named
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_files_that_a_page_names_are_there(name):
+    paths = re.findall(
+        r"(?<![\w/])(?:nrfgs_ns|nrfgs_lab|tests|results|docs)/[\w/.-]*\.(?:py|md|json|yaml)\b", PAGES[name]
+    )
+    modules = re.findall(r"python -m (nrfgs_(?:ns|lab)[\w.]*)", PAGES[name])
+    paths = [path for path in paths if "NAME" not in path]
+    paths += [module.replace(".", "/") for module in modules]
+    assert [path for path in paths if not any((ROOT / f"{path}{end}").exists() for end in ("", ".py"))] == []
+
+
+def test_every_picture_is_shown():
+    shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
+    assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of docs/exposure.md."""
+
+from statistics import fmean
+from typing import Any
+
+from nrfgs_lab.pages.tables import grid, records
+
+CAPTURES = "lund", "fern", "fox", "castle", "caliterra", "goldcape", "kitchen"
+ROWS = (
+    ("bonsai, varied", "bonsai", "varied", "varied"),
+    ("bonsai, varied, EXIF tells", "bonsai", "varied", "told"),
+    ("bonsai as it is", "bonsai", "as-is", "as-is"),
+    *((scene, scene, "as-is", "as-is") for scene in CAPTURES),
+)
+SHARE = "--pipeline.model.robust-loss "
+STUDIES = {"occluded": "something pasted in", "unmasked": "people, no masks", "as-is": "as it is"}
+
+
+def of(scene: str, case: str, options: str = "", timed: bool = False) -> list[dict[str, Any]]:
+    """The records of all seeds."""
+    return [
+        record
+        for record in records("exposure").values()
+        if (record["study"]["scene"], record["case"], record["study"]["options"]) == (scene, case, options)
+        and (record["measured"] is None) == timed
+    ]
+
+
+def mean(found: list[dict[str, Any]], metric: str) -> str:
+    """Of the test views, over the seeds."""
+    return f"{fmean(record['measured']['test'][metric] for record in found):.2f}" if found else "-"
+
+
+def worth() -> str:
+    """With and without the part."""
+    body = []
+    for name, scene, off, on in ROWS:
+        pair = of(scene, f"{off}-off"), of(scene, f"{on}-on")
+        if all(pair):
+            seeds = len(pair[1])
+            name += f", {seeds} seeds" if seeds > 1 else ""
+            body.append([name, *(mean(found, metric) for found in pair for metric in ("psnr", "cc_psnr"))])
+    return grid(["", "off: PSNR", "cc PSNR", "on: PSNR", "cc PSNR"], body)
+
+
+def gap(one: str, other: str, metric: str) -> str:
+    """By how many dB one case of bonsai is above another."""
+    values = [fmean(r["measured"]["test"][metric] for r in of("bonsai", case)) for case in (one, other)]
+    return f"{values[0] - values[1]:.1f}"
+
+
+def recovered(case: str) -> str:
+    """How near the exposures that were learnt are to those that were put on."""
+    (record,) = of("bonsai", f"{case}-on")
+    learnt = record["photographs"]
+    return (
+        f"correlation {learnt['correlation']:.3f}, error {learnt['rms_error_stops']:.2f} of "
+        f"{learnt['rms_truth_stops']:.2f} stops, white balance {learnt['white_balance_rms_error_stops']:.2f}"
+    )
+
+
+def rule() -> str:
+    """What photographs say before a training."""
+    body = []
+    for scene, found in sorted(records("exposure-rule").items(), key=lambda item: item[1]["random"][0]):
+        exposure, *colors = found["random"]
+        exif = "-" if found["exif"] is None else f"varies by {found['exif']:.2f} stops"
+        if found["exif"] is not None and found["exif"] >= 0.005 and found["explained"] is not None:
+            exif += f", explains {found['explained']:.0%}"
+        if found["exif"] is not None and found["exif"] < 0.005:
+            exif = "the same for all"
+        body.append([scene, f"{exposure:.2f}", f"{max(colors):.2f}", exif, "on" if found["learnt"] else "off"])
+    return grid(["capture", "stops", "colour", "EXIF", ""], body)
+
+
+def trimming() -> str:
+    """The robust loss, by the share that it trims: PSNR of the test views."""
+    shares = ("0", "0.05", "0.1")
+    body = []
+    for study, words in STUDIES.items():
+        for scene in ("fern", "fox", "castle", "goldcape"):
+            found = [of(scene, f"{study}-off", SHARE + share) for share in shares]
+            if study == "as-is":
+                found[0] = of(scene, "as-is-off")
+            if all(found):
+                body.append([f"{scene}, {words}", *(mean(one, "psnr") for one in found)])
+    return grid(["", "off", "0.05", "0.1"], body)
+
+
+def times() -> str:
+    """Milliseconds of a step, off and on."""
+    body = []
+    for scene in ("castle", "bonsai"):
+        off, on = (
+            fmean(1e3 * one["train"]["seconds"] / one["train"]["steps"] for one in of(scene, case, timed=True))
+            for case in ("as-is-off", "as-is-on")
+        )
+        body.append([scene, f"{off:.2f}", f"{on:.2f}", f"{on / off - 1:+.1%}"])
+    return grid(["", "off, ms", "on, ms", ""], body)

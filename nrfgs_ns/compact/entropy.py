@@ -1,0 +1,389 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of whole numbers, coded by what their neighbours let expect: rANS in lanes, with integers alone.
+
+A table has C columns of n numbers; row i follows row i - 1 in space. A number is told by its residual: it, less a
+linear prediction from its neighbours (two rows before it, and two columns to its left). Which residuals are likely
+depends on how large the neighbours' residuals were. Frequencies and weights are part of the stream, as whole numbers;
+nothing here or in a reader rounds, so that a reader in another language finds the same numbers to the bit.
+
+The coder is range ANS (Duda, arXiv 1311.2540) with states of 32 bits and words of 16, interleaved as by Giesen (arXiv
+1402.3392): lane l codes the rows from l S on, S of them, and all lanes take a step at once, which is what makes it
+quick in numpy. docs/compact-format.md has the stream, byte by byte.
+"""
+
+import numpy as np
+
+Array = np.ndarray
+
+PRECISION = 14
+"""Bits of a frequency: those of a context sum up to 2^14."""
+LOWEST = 1 << 16
+"""States are at least this."""
+WORD = 16
+MOST_LANES = 1024
+SYMBOLS_OF_A_LANE = 2048
+"""Of a table of two million numbers or fewer; larger ones have longer lanes."""
+DIRECT = 32
+"""Residuals that have a token of their own; larger ones share one with those that begin with the same three bits."""
+TOKENS = DIRECT + 4 * 27
+"""0 to 2^32 - 1."""
+CONTEXTS = (1, 2, 3, 4, 6, 8, 12)
+"""How many an encoder tries for a column."""
+MOST_CONTEXTS = 16
+BITS_OF_A_FREQUENCY = 10
+"""What a frequency adds to a stream, about."""
+ACTIVITY = 4
+"""Neighbours whose tokens say how large a residual is going to be."""
+SHIFT = 8
+"""Bits behind the point of a prediction's weights."""
+PREDICTORS = 6
+LARGEST_WEIGHT = 1 << 16
+LARGEST = 1 << 32
+NO_PREDICTION: tuple[list[int], Array | int] = [0] * (1 + PREDICTORS), 0
+MOST_MODEL = 2 + PREDICTORS + ACTIVITY + 1 + MOST_CONTEXTS * (3 + TOKENS)
+"""Numbers that describe a column."""
+
+
+class BadStream(ValueError):
+    """A stream that no encoder wrote."""
+
+
+def lanes_of(columns: int, rows: int) -> int:
+    """How many lanes code a table: the smallest power of two that gives none more than SYMBOLS_OF_A_LANE numbers, at
+    most MOST_LANES."""
+    wanted = -(-columns * rows // SYMBOLS_OF_A_LANE)
+    return min(1 << max(wanted - 1, 0).bit_length(), MOST_LANES)
+
+
+def token_of(unsigned: Array) -> tuple[Array, Array]:
+    """Tokens of numbers >= 0, and how many low bits each leaves to be told."""
+    bits = np.frexp(np.maximum(unsigned, 1).astype(np.float64))[1] - 1
+    spare = np.where(unsigned < DIRECT, 0, bits - 2)
+    tokens = np.where(unsigned < DIRECT, unsigned, DIRECT + 4 * (bits - 5) + ((unsigned >> spare) & 3))
+    return tokens.astype(np.int64), spare.astype(np.int64)
+
+
+def folded(residuals: Array) -> Array:
+    """0, -1, 1, -2, ... as 0, 1, 2, 3, ..."""
+    return np.where(residuals < 0, -2 * residuals - 1, 2 * residuals)
+
+
+class _Lanes:
+    """A table [C, n] in the order in which it is coded: [C, S, lanes], with zeros behind the last row."""
+
+    def __init__(self, columns: int, rows: int):
+        self.columns, self.rows, self.lanes = columns, rows, lanes_of(columns, rows)
+        self.steps = -(-rows // self.lanes)
+
+    def laid(self, table: Array) -> Array:
+        padded = np.zeros((len(table), self.steps * self.lanes), dtype=np.int64)
+        padded[:, : self.rows] = table
+        return np.ascontiguousarray(padded.reshape(len(table), self.lanes, self.steps).transpose(0, 2, 1))
+
+    def taken_up(self, laid: Array) -> Array:
+        return laid.transpose(0, 2, 1).reshape(len(laid), self.lanes * self.steps)[:, : self.rows]
+
+    def active(self, step: int) -> int:
+        """Lanes that have a row in a step: the first so many."""
+        return -(-(self.rows - step) // self.steps)
+
+
+def _before(values: Array, count: int) -> Array:
+    """[S, lanes], `count` steps later; zeros come first."""
+    out = np.zeros_like(values)
+    out[count:] = values[: len(values) - count] if count < len(values) else 0
+    return out
+
+
+def _from_left(laid: Array, column: int) -> list[Array]:
+    """What a prediction reads of the two columns to the left: the same row, and the row before it."""
+    zero = np.zeros_like(laid[0])
+    found = []
+    for left in (column - 1, column - 2):
+        found += [laid[left], _before(laid[left], 1)] if left >= 0 else [zero, zero]
+    return found
+
+
+# ---- encoding
+
+
+def encode_table(table: Array, signed: Array | bool = True) -> tuple[Array, bytes]:
+    """A table as its model and its words.
+
+    Args:
+        table: whole numbers, |x| < 2^31; from 0 to 2^32 - 1 in columns that are not signed. [C, n]
+        signed: whether numbers of a column are predicted and may be negative; others are as they are.
+
+    Returns:
+        the model, int32 numbers, and the coder's bytes.
+    """
+    columns, rows = table.shape
+    lanes = _Lanes(columns, rows)
+    laid = lanes.laid(table.astype(np.int64))
+    signed = np.broadcast_to(signed, columns)
+    real = lanes.laid(np.ones((1, rows)))[0].astype(bool)
+    tokens, spares, lows, contexts = (np.zeros_like(laid) for _ in range(4))
+    model: list[int] = []
+    frequencies = []
+    for column in range(columns):
+        weights, prediction = _fitted_prediction(laid, column, real) if signed[column] else NO_PREDICTION
+        if np.abs(laid[column] - prediction).max(initial=0) >= LARGEST >> 1:
+            weights, prediction = NO_PREDICTION
+        residuals = laid[column] - prediction
+        unsigned = folded(residuals) if signed[column] else residuals
+        unsigned = np.where(real, unsigned, 0)
+        tokens[column], spares[column] = token_of(unsigned)
+        lows[column] = unsigned & ((1 << spares[column]) - 1)
+        shares, thresholds, contexts[column] = _fitted_contexts(tokens, column, real)
+        model += [int(signed[column]), *weights, *shares, len(thresholds), *thresholds]
+        found = []
+        for context in range(len(thresholds) + 1):
+            counts = np.bincount(tokens[column][real & (contexts[column] == context)], minlength=TOKENS)
+            found.append(_normalised(counts))
+            used = np.flatnonzero(found[-1])
+            first, last = int(used[0]), int(used[-1])
+            model += [first, last - first + 1, *map(int, found[-1][first : last + 1])]
+        frequencies.append(np.array(found))
+    return np.array(model, dtype=np.int32), _coded(lanes, frequencies, contexts, tokens, spares, lows)
+
+
+def _fitted_prediction(laid: Array, column: int, real: Array) -> tuple[list[int], Array]:
+    """Least squares, in 1/2^SHIFT."""
+    values = laid[column]
+    inputs = [_before(values, 1), _before(values, 2), *_from_left(laid, column)]
+    matrix = np.stack([np.ones_like(values), *inputs])[:, real].astype(np.float64)
+    gram = matrix @ matrix.T
+    ridge = 1e-6 * np.trace(gram) / len(gram) + 1e-9
+    fit = np.linalg.solve(gram + ridge * np.eye(len(gram)), matrix @ values[real].astype(np.float64))
+    weights = np.rint(fit * (1 << SHIFT)).clip(-LARGEST_WEIGHT, LARGEST_WEIGHT).astype(np.int64)
+    return weights.tolist(), predicted(weights, inputs)
+
+
+def predicted(weights: Array, inputs: list[Array]) -> Array:
+    total = weights[0] + (1 << (SHIFT - 1))
+    for weight, values in zip(weights[1:], inputs, strict=True):
+        total = total + weight * values
+    return total >> SHIFT
+
+
+def _fitted_contexts(tokens: Array, column: int, real: Array) -> tuple[list[int], list[int], Array]:
+    """How much each neighbour's token counts, thresholds of the sum, and each number's context."""
+    own = tokens[column]
+    zero = np.zeros_like(own)
+    neighbours = [_before(own, 1), _before(own, 2)]
+    neighbours += [tokens[column - k] if column >= k else zero for k in (1, 2)]
+    matrix = np.stack([np.ones_like(own), *neighbours])[:, real].astype(np.float64)
+    gram = matrix @ matrix.T
+    fit = np.linalg.solve(gram + 1e-6 * np.eye(5) * (1 + np.trace(gram)), matrix @ own[real].astype(np.float64))[1:]
+    shares = np.rint(16 * fit.clip(0, None) / max(fit.max(), 1e-9)).clip(0, 16).astype(np.int64)
+    activity = sum(share * values for share, values in zip(shares, neighbours, strict=True))
+    thresholds, least = np.zeros(0, dtype=np.int64), np.inf
+    levels = activity[real]
+    for count in CONTEXTS if len(levels) else ():
+        tried = np.unique(np.quantile(levels, np.arange(1, count) / count, method="higher")).astype(np.int64)
+        tried = tried[tried > levels.min()]
+        bits = _bits(own[real], np.searchsorted(tried, levels, side="right"), len(tried) + 1)
+        if bits < least:
+            thresholds, least = tried, bits
+    return shares.tolist(), thresholds.tolist(), np.searchsorted(thresholds, activity, side="right")
+
+
+def _bits(tokens: Array, contexts: Array, count: int) -> float:
+    """About what tokens cost in their contexts, and the contexts' frequencies."""
+    counts = np.bincount(contexts * TOKENS + tokens, minlength=count * TOKENS).reshape(count, TOKENS)
+    totals = counts.sum(axis=1, keepdims=True).clip(1)
+    entropy = -(counts * np.log2(np.where(counts > 0, counts / totals, 1.0))).sum()
+    return float(entropy + BITS_OF_A_FREQUENCY * (counts > 0).sum())
+
+
+def _normalised(counts: Array) -> Array:
+    """Frequencies that sum up to 2^PRECISION, at least 1 where there is a count."""
+    total = 1 << PRECISION
+    if counts.sum() == 0:
+        counts = counts.copy()
+        counts[0] = 1
+    found = np.where(counts > 0, np.maximum(np.rint(counts * (total / counts.sum())), 1), 0).astype(np.int64)
+    while (over := int(found.sum()) - total) != 0:  # from the most frequent, which it costs least
+        largest = int(found.argmax())
+        found[largest] -= min(over, int(found[largest]) - 1) if over > 0 else over
+    return found
+
+
+def _coded(
+    lanes: _Lanes, frequencies: list[Array], contexts: Array, tokens: Array, spares: Array, lows: Array
+) -> bytes:
+    state = np.full(lanes.lanes, LOWEST, dtype=np.uint64)
+    chunks: list[Array] = []
+
+    def push(x: Array, limit: Array) -> Array:
+        """Words out of the lanes whose state is not below the limit."""
+        out = x >= limit
+        if out.any():
+            chunks.append((x[out] & np.uint64(0xFFFF)).astype("<u2"))
+            x = np.where(out, x >> np.uint64(WORD), x)
+        return x
+
+    for column in reversed(range(lanes.columns)):
+        table = frequencies[column]
+        starts = np.cumsum(table, axis=1) - table
+        f = table[contexts[column], tokens[column]].astype(np.uint64)
+        start = starts[contexts[column], tokens[column]].astype(np.uint64)
+        limits = f << np.uint64(32 - PRECISION)
+        most = spares[column].max(axis=1)
+        for step in reversed(range(lanes.steps)):
+            count = lanes.active(step)
+            x = state[:count]
+            if most[step] > 0:
+                spare, low = spares[column, step, :count], lows[column, step, :count]
+                for shift in (WORD, 0) if most[step] > WORD else (0,):  # the lower 16 bits are read first
+                    bits = (spare - shift).clip(0, WORD).astype(np.uint64)
+                    x = push(x, np.uint64(1) << (np.uint64(32) - bits))
+                    x = (x << bits) | ((low >> shift).astype(np.uint64) & ((np.uint64(1) << bits) - np.uint64(1)))
+            fs = f[step, :count]
+            x = push(x, limits[step, :count])
+            quotient = x // fs
+            x = (quotient << np.uint64(PRECISION)) + (x - quotient * fs) + start[step, :count]
+            state[:count] = x
+    return state.astype("<u4").tobytes() + b"".join(chunk.tobytes() for chunk in reversed(chunks))
+
+
+# ---- decoding
+
+
+def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
+    """The table that `encode_table` was given, int64 [C, n].
+
+    Raises:
+        BadStream: the model is none, or words are missing or left over.
+    """
+    lanes = _Lanes(columns, rows)
+    if len(data) < 4 * lanes.lanes or len(data) % 2:
+        raise BadStream("too few bytes for its lanes")
+    state = np.frombuffer(data, "<u4", lanes.lanes).astype(np.int64)
+    words = np.frombuffer(data, "<u2", offset=4 * lanes.lanes).astype(np.int64)
+    if (state < LOWEST).any():
+        raise BadStream("a state is too small")
+    reader = _Model(model)
+    laid = np.zeros((columns, lanes.steps, lanes.lanes), dtype=np.int64)
+    tokens = np.zeros((3, lanes.steps, lanes.lanes), dtype=np.int64)  # of this column, and of the two to the left
+    at = 0
+    mask = (1 << PRECISION) - 1
+    for column in range(columns):
+        part = reader.column()
+        own, out = tokens[column % 3], laid[column]
+        base = part.weights[0] + (1 << (SHIFT - 1))
+        for weight, values in zip(part.weights[3:], _from_left(laid, column), strict=True):
+            base = base + weight * values
+        base = np.broadcast_to(base, out.shape)
+        activity = np.zeros_like(own)
+        for left, share in ((1, part.shares[2]), (2, part.shares[3])):
+            if column >= left:
+                activity += share * tokens[(column - left) % 3]
+        first, second = part.weights[1:3]
+        share_1, share_2 = part.shares[:2]
+        zero = np.zeros(lanes.lanes, dtype=np.int64)
+        before, before_2, token_1, token_2 = zero, zero, zero, zero
+        for step in range(lanes.steps):
+            count = lanes.active(step)
+            x = state[:count]
+            if part.thresholds.size:
+                likely = activity[step] + share_1 * token_1 + share_2 * token_2
+                context = part.thresholds.searchsorted(likely[:count], side="right") << PRECISION
+            else:
+                context = 0
+            slot = x & mask
+            token = part.lookup.take(context + slot)
+            entry = (context >> PRECISION) * TOKENS + token
+            x = part.frequencies.take(entry) * (x >> PRECISION) + slot - part.starts.take(entry)
+            x, at = _refilled(x, words, at)
+            unsigned = token
+            if token.max(initial=0) >= DIRECT:
+                large = token - DIRECT
+                spare = np.where(large < 0, 0, (large >> 2) + 3)
+                low = np.zeros_like(token)
+                for shift in (0, WORD) if spare.max() > WORD else (0,):
+                    bits = (spare - shift).clip(0, WORD)
+                    low += (x & ((1 << bits) - 1)) << shift
+                    x, at = _refilled(x >> bits, words, at)
+                unsigned = np.where(large < 0, token, ((4 + (large & 3)) << spare) + low)
+            state[:count] = x
+            if part.signed:
+                value = np.zeros(lanes.lanes, dtype=np.int64)
+                expected = (base[step, :count] + first * before[:count] + second * before_2[:count]) >> SHIFT
+                value[:count] = expected + ((unsigned >> 1) ^ -(unsigned & 1))
+                out[step] = value
+                before, before_2 = value, before
+            else:
+                out[step, :count] = unsigned
+            own[step, :count] = token
+            token_1, token_2 = own[step], token_1
+        if (np.abs(out) >= LARGEST).any():
+            raise BadStream("a number is too large")
+    if at != len(words) or (state != LOWEST).any() or not reader.empty:
+        raise BadStream("it does not end where its table does")
+    return lanes.taken_up(laid)
+
+
+def _refilled(x: Array, words: Array, at: int) -> tuple[Array, int]:
+    """A word for each lane whose state is below LOWEST."""
+    low = (x < LOWEST).nonzero()[0]
+    if low.size == 0:
+        return x, at
+    end = at + low.size
+    if end > len(words):
+        raise BadStream("it is cut short")
+    x[low] = (x[low] << WORD) | words[at:end]
+    return x, end
+
+
+class _Column:
+    """What a model says of a column."""
+
+    signed: bool
+    weights: list[int]
+    shares: list[int]
+    thresholds: Array
+    lookup: Array
+    frequencies: Array
+    starts: Array
+
+
+class _Model:
+    """Reads a model's numbers."""
+
+    def __init__(self, numbers: Array):
+        self.numbers, self.at = numbers.astype(np.int64), 0
+
+    @property
+    def empty(self) -> bool:
+        return self.at == len(self.numbers)
+
+    def take(self, count: int) -> Array:
+        found = self.numbers[self.at : self.at + count]
+        self.at += count
+        if count < 0 or len(found) != count:
+            raise BadStream("its model is cut short")
+        return found
+
+    def column(self) -> _Column:
+        column = _Column()
+        column.signed = bool(self.take(1)[0])
+        column.weights = self.take(1 + PREDICTORS).tolist()
+        column.shares = self.take(ACTIVITY).tolist()
+        (count,) = self.take(1)
+        if not 0 <= count < MOST_CONTEXTS or max(map(abs, column.weights)) > LARGEST_WEIGHT:
+            raise BadStream("its model has too many contexts, or a weight that is too large")
+        column.thresholds = self.take(int(count)).copy()
+        if (np.diff(column.thresholds) <= 0).any() or not all(0 <= share <= 16 for share in column.shares):
+            raise BadStream("its model's contexts are in no order")
+        column.frequencies = np.zeros((count + 1, TOKENS), dtype=np.int64)
+        for frequencies in column.frequencies:
+            first, used = self.take(2).tolist()
+            if not (0 <= first and 0 < used and first + used <= TOKENS):
+                raise BadStream("its model has tokens that are none")
+            frequencies[first : first + used] = self.take(used)
+        if (column.frequencies < 0).any() or (column.frequencies.sum(axis=1) != 1 << PRECISION).any():
+            raise BadStream("its model's frequencies do not add up")
+        column.starts = np.cumsum(column.frequencies, axis=1) - column.frequencies
+        column.lookup = np.concatenate([np.repeat(np.arange(TOKENS), row) for row in column.frequencies])
+        return column

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of a file, from version 2 on: what the numbers of a splat are before they are rounded.
+
+means      [N, 3]
+turns      [N, 3]   x, y, z of the rotation with w > 0 that turns least and draws the same ellipsoid
+scales     [N, 3]   natural logarithms of the standard deviations, along the axes that the rotation names
+opacities  [N, 1]   logits
+colors     [N, 3]   base colours, 1 is white
+latents    [V, R]   of the V splats that are not diffuse
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.head import SH_C0, base_colors
+from nrfgs_ns.compact.precision import Precision
+from nrfgs_ns.compact.quantise import nearest_turn
+
+SMALLEST_W2 = 1e-6
+"""Of a rotation, w squared: x, y and z may be rounded beyond unit length."""
+
+
+def tables_of(splats: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
+    """The file's tables of a field's table, float64 without gradients, and which splats are diffuse, bool [N]."""
+    double = {name: value.detach().double() for name, value in splats.items() if name != DIFFUSE}
+    like = double["means"]
+    diffuse = splats.get(DIFFUSE, torch.zeros(len(like), dtype=torch.bool, device=like.device))
+    quats, scales = nearest_turn(double["quats"].cpu().numpy(), double["scales"].cpu().numpy())
+    return {
+        "means": like,
+        "turns": torch.from_numpy(quats[:, 1:]).to(like),
+        "scales": torch.from_numpy(scales).to(like),
+        "opacities": double["opacities"],
+        "colors": base_colors(double["features_dc"]),
+        "latents": double["latents"][~diffuse],
+    }, diffuse
+
+
+def splats_of(tables: Mapping[str, Tensor], diffuse: Tensor) -> dict[str, Tensor]:
+    """The field's table of a file's, with gradients."""
+    turns, latents = tables["turns"], tables["latents"]
+    w = (1.0 - turns.square().sum(dim=1, keepdim=True)).clamp_min(SMALLEST_W2).sqrt()
+    rows = (~diffuse).nonzero()[:, 0]
+    return {
+        "means": tables["means"],
+        "quats": torch.nn.functional.normalize(torch.cat([w, turns], dim=1), dim=1),
+        "scales": tables["scales"],
+        "opacities": tables["opacities"],
+        "features_dc": (tables["colors"] - 0.5) / SH_C0,
+        "latents": latents.new_zeros(len(turns), latents.shape[1]).index_copy(0, rows, latents),
+        DIFFUSE: diffuse,
+    }
+
+
+def steps_of(tables: Mapping[str, Tensor], precision: Precision) -> dict[str, np.ndarray]:
+    """Steps of the grids, one for each column: `precision`, for tables that were not trained for the file."""
+    median = float(np.exp(np.median(tables["scales"].mean(dim=1).cpu().numpy())))
+    latents = tables["latents"]
+    spread = float(latents.std(dim=0, correction=0).max()) if len(latents) > 1 else 0.0
+    steps = {
+        "means": precision.means * median,
+        "turns": 2.0**0.5 / (2**precision.quats - 1),
+        "scales": precision.scales,
+        "opacities": precision.opacities,
+        "colors": precision.colors,
+        "latents": precision.latents * spread if spread > 0 else 1.0,
+    }
+    return {name: np.full(tables[name].shape[1], step) for name, step in steps.items()}

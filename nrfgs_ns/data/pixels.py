@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs as training reads them, decoded and undistorted: where they are kept, and the files of those for which
+there is no memory.
+
+A file has a photograph's bytes as they are, and is mapped into memory: what is not looked at costs none, and what has
+been looked at may go again. Files are made once, and anew where the photograph, its mask or its camera has changed.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from nrfgs_ns.data.pictures import cache_folder
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import whole, write_whole
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+LENS = ("fx", "fy", "cx", "cy", "width", "height")
+"""What undistortion changes of a camera."""
+MAPPED = ("image", "mask")
+"""What a photograph's files hold."""
+KEPT = {"image_idx", *MAPPED}
+PAGE = 4096
+"""Bytes."""
+
+
+def in_parallel(
+    read: Callable[[Item], Result], items: Sequence[Item], what: str, workers: int | None
+) -> Iterator[Result]:
+    """`map` on several threads, with a bar; where one fails, those that have not begun are left out.
+
+    Args:
+        what: is done, for the bar.
+        workers: threads; None: one for each processor.
+    """
+    columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with (
+        ThreadPoolExecutor(workers or os.cpu_count()) as pool,
+        Progress(*columns, console=CONSOLE, transient=True) as bar,
+    ):
+        try:
+            yield from bar.track(pool.map(read, items), total=len(items))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
+    """A photograph as a pinhole would have taken it; its camera in the data set becomes that pinhole.
+
+    Args:
+        dataset: a NrfgsInputDataset.
+        index: of the photograph.
+        image_type: "uint8" or "float32".
+
+    Returns:
+        "image" [H, W, 3 or 4], "image_idx", and "mask" bool [H, W, 1] if there are masks.
+    """
+    data = dataset.get_data(index, image_type=image_type)
+    camera = dataset.cameras[index].reshape(())
+    if camera.distortion_params is None or not camera.distortion_params.any():
+        return data
+    K, image, mask = _undistort_image(
+        camera,
+        camera.distortion_params.numpy(),
+        data,
+        data["image"].numpy(),
+        camera.get_intrinsics_matrices().numpy(),
+    )
+    data["image"] = torch.from_numpy(image)
+    if mask is not None:
+        data["mask"] = mask
+    lens = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], image.shape[1], image.shape[0])
+    _set_lens(dataset.cameras, index, lens)
+    return data
+
+
+def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
+    """The same from files, which are made if they are not there.
+
+    Raises:
+        InputError: there is no room for them.
+    """
+    folder = _folder(dataset, index, image_type)
+    about = folder / "about.json"
+    if not about.is_file():
+        data = undistorted(dataset, index, image_type)
+        if not data.keys() <= KEPT:
+            raise InputError(f"{data.keys() - KEPT} of a photograph cannot be kept in a file. Give more image-memory.")
+        try:
+            _write(folder, data, [getattr(dataset.cameras, name)[index].item() for name in LENS])
+        except OSError as error:
+            raise InputError(
+                f"{folder} cannot be written ({error.strerror}). Make room there, set XDG_CACHE_HOME to another "
+                "folder, or give more --pipeline.datamanager.image-memory."
+            ) from error
+    found = json.loads(about.read_text(encoding="utf-8"))
+    _set_lens(dataset.cameras, index, found["lens"])
+    return {"image_idx": index} | {name: _mapped(folder, name, found[name]) for name in MAPPED if name in found}
+
+
+def look_through(image: torch.Tensor) -> None:
+    """Have a mapped image's bytes in memory when they are needed: read one of each page."""
+    image.view(torch.uint8).flatten()[::PAGE].sum()
+
+
+def free_memory() -> int | None:
+    """Bytes that programs can still have without anything being swapped out; None where the system does not tell."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration, ValueError):
+        return None
+
+
+def pixels_folder() -> Path:
+    """Where the files are: nrfgs-ns/pixels in XDG_CACHE_HOME, or else in .cache of the home folder."""
+    return cache_folder().with_name("pixels")
+
+
+def _write(folder: Path, data: dict[str, Any], lens: list[float]) -> None:
+    about: dict[str, Any] = {"lens": lens}
+    for name in MAPPED:
+        if name in data:
+            values = data[name].contiguous()
+            with whole(folder / f"{name}.bin") as aside:
+                values.view(torch.uint8).numpy().tofile(aside)
+            about[name] = [str(values.dtype).removeprefix("torch."), *values.shape]
+    write_whole(folder / "about.json", json.dumps(about))  # last: with it the photograph is there
+
+
+def _mapped(folder: Path, name: str, form: list) -> torch.Tensor:
+    """A tensor that is a file; what is written into it stays in memory."""
+    kind, *shape = form
+    dtype = getattr(torch, kind)
+    count = torch.Size(shape).numel()
+    return torch.from_file(str(folder / f"{name}.bin"), shared=False, size=count, dtype=dtype).view(shape)
+
+
+def _folder(dataset: Any, index: int, image_type: str) -> Path:
+    """Where the photograph's files belong: a folder named after all that decides its pixels."""
+    outputs = dataset._dataparser_outputs
+    paths = [outputs.image_filenames[index]]
+    if outputs.mask_filenames is not None:
+        paths.append(outputs.mask_filenames[index])
+    files = [(str(path.resolve()), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in paths]
+    cameras = dataset.cameras
+    distortion = None if cameras.distortion_params is None else cameras.distortion_params[index].tolist()
+    camera = [distortion, *(getattr(cameras, name)[index].item() for name in (*LENS, "camera_type"))]
+    kept = [files, camera, image_type, dataset.scale_factor, str(dataset.mask_color), str(outputs.alpha_color)]
+    name = hashlib.sha256(json.dumps(kept).encode("utf-8", "surrogateescape")).hexdigest()[:24]
+    return pixels_folder() / name
+
+
+def _set_lens(cameras: Cameras, index: int, lens: Sequence[float]) -> None:
+    for name, value in zip(LENS, lens, strict=True):
+        getattr(cameras, name)[index] = float(value)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coded tables: what goes in comes out, in Python and in the page's JavaScript; what is damaged is refused."""
+
+import hashlib
+import json
+import shutil
+import struct
+import subprocess
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nrfgs_ns.compact.entropy import (
+    LOWEST,
+    MOST_LANES,
+    TOKENS,
+    BadStream,
+    decode_table,
+    encode_table,
+    lanes_of,
+    token_of,
+)
+from nrfgs_ns.compact.format import Table, write_container
+
+
+def laplacian(columns: int, rows: int, scale: float = 5.0, seed: int = 0) -> np.ndarray:
+    """Columns that follow their neighbours, and each other."""
+    random = np.random.default_rng(seed)
+    steps = random.laplace(size=(columns, rows)) * scale * (1 + np.sin(np.arange(rows) / 50))
+    return np.rint(steps + 0.8 * np.roll(steps, 1, axis=0) + np.cumsum(steps, axis=1) * 0.2).astype(np.int64)
+
+
+TABLES = {
+    "none": (np.zeros((3, 0)), True),
+    "no columns": (np.zeros((0, 7)), True),
+    "one": (np.array([[-7]]), True),
+    "constant": (np.full((2, 5000), 3), True),
+    "small": (laplacian(3, 17), True),
+    "lanes of unequal length": (laplacian(11, 4099), True),
+    "large": (laplacian(1, 3000, 1e6), True),
+    "largest": (np.array([[2**31 - 1, -(2**31), 0, 2**31 - 1, -(2**31)]]), True),
+    "unsigned": (np.random.default_rng(1).integers(0, 2**32, (2, 2500)), False),
+    "unsigned and small": (np.random.default_rng(2).integers(0, 3, (2, 2500)), False),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_what_goes_in_comes_out(name):
+    table, signed = TABLES[name]
+    model, data = encode_table(table, signed)
+    found = decode_table(model, data, *table.shape)
+    assert found.shape == table.shape and (found == table).all()
+
+
+@settings(max_examples=60)
+@given(
+    st.integers(1, 4),
+    st.integers(1, 300),
+    st.sampled_from([1, 3, 100, 10**5, 2**31 - 1]),
+    st.booleans(),
+    st.integers(0, 2**32 - 1),
+)
+def test_any_table_comes_back(columns, rows, largest, signed, seed):
+    table = np.random.default_rng(seed).integers(-largest if signed else 0, largest, (columns, rows), endpoint=True)
+    assert (decode_table(*encode_table(table, signed), columns, rows) == table).all()
+
+
+def test_it_takes_what_entropy_says():
+    """Independent numbers cannot take less than their entropy; this takes 1 % more, and a model."""
+    random = np.random.default_rng(3)
+    table = np.rint(random.laplace(size=(4, 50_000)) * 3).astype(np.int64)
+    model, data = encode_table(table)
+    _, counts = np.unique(table, return_counts=True)
+    entropy = -(counts * np.log2(counts / counts.sum())).sum() / 8
+    assert entropy * 0.999 < len(data) < entropy * 1.01
+    assert len(model) < 2000
+
+
+def test_neighbours_are_worth_something():
+    table = laplacian(3, 30_000)
+    shuffled = table[:, np.random.default_rng(0).permutation(30_000)]
+    assert len(encode_table(table)[1]) < 0.8 * len(encode_table(shuffled)[1])
+
+
+def test_tokens():
+    numbers = np.array([0, 31, 32, 39, 40, 47, 63, 64, 2**32 - 1])
+    tokens, spares = token_of(numbers)
+    assert tokens.tolist() == [0, 31, 32, 32, 33, 33, 35, 36, TOKENS - 1]
+    assert spares.tolist() == [0, 0, 3, 3, 3, 3, 3, 4, 29]
+
+
+def test_lanes():
+    assert [lanes_of(1, n) for n in (0, 1, 2048, 2049, 4097, 10**9)] == [1, 1, 1, 2, 4, MOST_LANES]
+
+
+@settings(max_examples=200)
+@given(st.data())
+def test_a_changed_byte_is_refused_or_gives_numbers(data):
+    """Without a checksum in front of it: whatever it is given, it ends, with numbers or with BadStream."""
+    table = laplacian(2, 200)
+    model, stream = encode_table(table)
+    if data.draw(st.booleans()):
+        stream = bytearray(stream)
+        stream[data.draw(st.integers(0, len(stream) - 1))] ^= data.draw(st.integers(1, 255))
+    else:
+        model = model.copy()
+        model[data.draw(st.integers(0, len(model) - 1))] = data.draw(st.integers(-(2**31), 2**31 - 1))
+    try:
+        assert decode_table(model, bytes(stream), 2, 200).shape == (2, 200)
+    except BadStream:
+        pass
+
+
+@pytest.mark.parametrize("columns, rows", [(2, 199), (2, 201), (1, 200), (3, 200), (2, 10_000)])
+def test_another_shape_is_refused(columns, rows):
+    model, data = encode_table(laplacian(2, 200))
+    with pytest.raises(BadStream):
+        decode_table(model, data, columns, rows)
+
+
+def test_a_stream_that_is_cut_or_longer_is_refused():
+    model, data = encode_table(laplacian(2, 200))
+    for broken in (data[:-2], data[:-1], data + b"\0\0", data[:3], b"", struct.pack("<I", LOWEST - 1) + data[4:]):
+        with pytest.raises(BadStream):
+            decode_table(model, broken, 2, 200)
+    for broken in (model[:-1], np.append(model, np.int32(0)), model[:0]):
+        with pytest.raises(BadStream):
+            decode_table(broken, data, 2, 200)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node: the page's reader is tried by pytest -m browser")
+def test_the_pages_reader_finds_the_same_numbers(tmp_path):
+    tables = {name: Table(table, signed) for name, (table, signed) in TABLES.items()}
+    write_container(tmp_path / "tables.nrf", {}, {**tables, "plain": np.arange(5, dtype=np.uint16)})
+    script = (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + READ
+    (tmp_path / "read.js").write_text(script, encoding="utf-8")
+    said = subprocess.run(
+        ["node", "read.js", "tables.nrf"], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
+    )
+    for name, found in json.loads(said.stdout).items():
+        table, signed = TABLES[name]
+        assert found == hashlib.sha256(table.astype("<i4" if signed else "<u4").tobytes()).hexdigest(), name
+
+
+READ = """
+const fs = require("fs"), crypto = require("crypto");
+const { streams } = readContainer(new Uint8Array(fs.readFileSync(process.argv[2])), () => {});
+const found = {};
+for (const [name, { columns }] of Object.entries(streams)) {
+  if (!columns) continue;
+  const hash = crypto.createHash("sha256");
+  for (const column of columns) hash.update(new Uint8Array(column.buffer));
+  found[name] = hash.digest("hex");
+}
+console.log(JSON.stringify(found));
+"""
