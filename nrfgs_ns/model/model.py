@@ -53,7 +53,9 @@ from nrfgs_ns.model.warmup import warm_up
 
 LOOK = "NRFGS_LOOK"
 """Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
-FEW_VIEWS = 100
+HEAD_FROM = 0.3
+"""Share of a training after which the head learns, where that is chosen."""
+FEW_VIEWS = 30
 """Fewer training views are few."""
 NOISE_OF_FEW_VIEWS = 2.0
 """How many times as long the noise is then."""
@@ -72,15 +74,17 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     view_noise: float = 0.0
     """in training the head sees each splat from a camera centre of its own, moved by noise this many times as long as
     neighbouring training cameras are apart (docs/captures.md). 0: from the camera's"""
-    head_from: float = 0.0
+    head_from: float | None = 0.0
     """share of the training after which the head is asked and learns. Until then splats have their base colours and
-    opacities, so that what these can explain is theirs and not the head's (docs/captures.md)"""
+    opacities, so that what these can explain is theirs and not the head's (docs/captures.md). None: 0.3 where schedules
+    are stretched to the training's steps, 0 otherwise"""
     few_views: Literal["auto", "on", "off"] = "off"
     """what few views cannot tell is left out of the head, and view_noise is twice as long (docs/captures.md). auto:
-    with fewer than 100 training views"""
+    with fewer than 30 training views"""
     shrinkage: float = 0.0
-    """weight, in the loss, of the mean opacity and of the mean standard deviation in scene units, divided by the number
-    of training views: what no view needs becomes faint and small. mcmc has its own instead (docs/captures.md)"""
+    """weight, in the loss, of the mean opacity and of the mean standard deviation in scene units, divided by the square
+    of the number of training views: what few views need becomes faint and small. mcmc has its own instead
+    (docs/captures.md)"""
     warmup_steps: int | None = None
     """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
     A head that adds nothing from the start skips them."""
@@ -135,8 +139,10 @@ class NrfgsModel(SplatfactoModel):
     camera_spacing: float = 0.0
     """world units between neighbouring training cameras; 0 until a training begins"""
     _scheduled: int | None = None
-    head_learns: bool = True
-    """whether the head is asked in training; it is, once `head_from` of it is over"""
+    head_has_begun: bool = False
+    """whether the head has learnt in a step of this training, or of the one that it goes on from"""
+    head_rests: bool = False
+    """whether the head is left out of the present step"""
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
@@ -149,6 +155,7 @@ class NrfgsModel(SplatfactoModel):
         """World units in a scene unit; lengths in the configuration are in scene units."""
         appearance = self.config.appearance
         if self.has_few_views:
+            appearance.validate()
             appearance = appearance.for_few_views()
             self.reduced_head = differences(self.config.appearance, appearance)
         self.head = appearance.setup(self.scene_unit)
@@ -173,9 +180,8 @@ class NrfgsModel(SplatfactoModel):
         for name in ("view_noise", "shrinkage"):
             if not getattr(self.config, name) >= 0:
                 raise InputError(f"pipeline.model.{name} is {getattr(self.config, name)}; it must be zero or positive.")
-        if not 0 <= self.config.head_from < 1:
+        if not 0 <= (self.config.head_from or 0.0) < 1:
             raise InputError(f"pipeline.model.head_from is {self.config.head_from}; it must be at least 0 and below 1.")
-        self.head_learns = self.config.head_from == 0
         self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
 
     def _strategy(self) -> Densification:
@@ -377,7 +383,7 @@ class NrfgsModel(SplatfactoModel):
         head is not asked; then it is under noise (`view_noise.py`)."""
         if not self.training:
             return field
-        if not self.head_learns:
+        if self.head_rests:
             return BaseField(*field)
         return field._replace(splats=self.view_noise.moved(field.splats, self.step))
 
@@ -526,9 +532,18 @@ class NrfgsModel(SplatfactoModel):
         """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
         self._scheduled = step
 
-    def begin_step(self, share: float) -> None:
-        """A training step begins when this share of the training is over, in [0, 1]. A head that learns goes on."""
-        self.head_learns = self.head_learns or share >= self.config.head_from
+    def begin_step(self, share: float, is_stretched: bool) -> None:
+        """A training step begins.
+
+        Args:
+            share: of the training that is over, in [0, 1].
+            is_stretched: whether its schedules are stretched to its steps.
+        """
+        begins = self.config.head_from
+        if begins is None:
+            begins = HEAD_FROM if is_stretched else 0.0
+        self.head_has_begun = self.head_has_begun or share >= begins  # and goes on in a longer training
+        self.head_rests = not self.head_has_begun
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
@@ -557,9 +572,8 @@ class NrfgsModel(SplatfactoModel):
         return losses
 
     def shrinking(self) -> dict[str, Tensor]:
-        """What `shrinkage` adds to the loss. The loss of a step is the mean over views, a scene's prior counts once:
-        hence its weight is divided by their number."""
-        weight = self.config.shrinkage / max(self.num_train_data, 1)
+        """What `shrinkage` adds to the loss."""
+        weight = self.config.shrinkage / max(self.num_train_data, 1) ** 2
         if weight == 0.0 or self.config.densification == "mcmc":
             return {}
         return {
@@ -661,7 +675,7 @@ class NrfgsModel(SplatfactoModel):
             "head": self.head.name,
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
-            "head_learns": self.head_learns,
+            "head_has_begun": self.head_has_begun,
         }
         if self.reduced_head is not None:
             state["capacity"] = {"head": self.reduced_head}
@@ -675,7 +689,7 @@ class NrfgsModel(SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
-        self.head_learns = state.get("head_learns", True)  # older checkpoints do not say: it did from the start
+        self.head_has_begun = state.get("head_has_begun", True)  # older checkpoints do not say: it did at once
         if "pace" in state:  # of version 0.1.0
             state = {**state, "schedule_step": int(state["pace"]["position"])}
         if "schedule_step" in state:

@@ -316,7 +316,7 @@ class NrfgsTrainer(Trainer):
         if pace is not None:
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
-        model.begin_step(step / self.total_steps if pace is None else pace.position / pace.length)
+        model.begin_step(step / self.total_steps if pace is None else pace.position / pace.length, pace is not None)
         with self._last_good_state_on_disk():
             self.guard.begin(step, self.optimizers)
             loss, losses, metrics = super().train_iteration(step)

@@ -40,10 +40,17 @@ def test_the_head_rests_until_its_share_of_the_training_is_over(tiny_scene, tmp_
 def test_a_head_that_learns_goes_on_in_a_longer_training(tiny_scene, tmp_path, no_cuda):
     options = {"--pipeline.model.head-from": 0.4}
     config = trained(command_line("nrfgs", tiny_scene, tmp_path / "short", 5, QUICK, options))
-    assert checkpoint_of(config)["pipeline"]["_model._extra_state"]["head_learns"] is True
+    assert checkpoint_of(config)["pipeline"]["_model._extra_state"]["head_has_begun"] is True
     trainer = ready(tiny_scene, tmp_path / "long", 100, options, {"--load-dir": models_of(config)})
     trainer.train_iteration(5)
-    assert trainer.pipeline.model.head_learns
+    assert not trainer.pipeline.model.head_rests
+
+
+def test_it_rests_by_itself_where_schedules_are_stretched(tiny_scene, tmp_path, no_cuda):
+    for stretched, rests in (({}, False), ({"--schedule-steps": 50}, True)):
+        trainer = ready(tiny_scene, tmp_path, 5, stretched)
+        trainer.train_iteration(0)
+        assert trainer.pipeline.model.head_rests is rests
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])
@@ -82,11 +89,11 @@ def test_only_a_field_has_less_to_say_of_few_views():
     assert ShConfig().for_few_views() == ShConfig()
 
 
-def test_shrinkage_is_a_prior_that_counts_once_for_all_views(tiny_scene, tmp_path, no_cuda):
+def test_shrinkage_falls_with_the_square_of_the_number_of_views(tiny_scene, tmp_path, no_cuda):
     model = ready(tiny_scene, tmp_path, 1, {"--pipeline.model.shrinkage": 0.5}).pipeline.model
     views, table = model.num_train_data, model.gauss_params
     terms = model.shrinking()
-    assert_close(terms["shrink_opacities"], 0.5 / views * torch.sigmoid(table["opacities"]).mean())
-    assert_close(terms["shrink_scales"], 0.5 / views * table["scales"].exp().mean() / model.scene_unit)
+    assert_close(terms["shrink_opacities"], 0.5 / views**2 * torch.sigmoid(table["opacities"]).mean())
+    assert_close(terms["shrink_scales"], 0.5 / views**2 * table["scales"].exp().mean() / model.scene_unit)
     model.config.densification = "mcmc"  # which has terms of its own
     assert model.shrinking() == {}

@@ -13,7 +13,6 @@ from torch.testing import assert_close
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing, distinct_places
 
 NRFGS = {
-    "--pipeline.model.head-from": 0,
     "--pipeline.model.num-downscales": 0,
     "--pipeline.model.warmup-length": 2,
     "--pipeline.model.refine-every": 4,
