@@ -25,6 +25,12 @@ hide_open3d()
 SCENES = Path(os.environ.get("NRFGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
 
 
+def pytest_configure(config):
+    """Without `-m gpu` there is no GPU: on which device a training runs is decided when the methods are imported."""
+    if "gpu" not in config.option.markexpr.replace("not gpu", ""):
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
+
+
 def pytest_collection_finish():
     keep_what_is_imported()
 

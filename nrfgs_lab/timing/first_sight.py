@@ -5,7 +5,8 @@
 
 starts `ns-train` with the words behind the dashes in a process of its own, and tells when it has imported, read the
 images, made its first step, and when the mean PSNR of all test views has reached each target. Looking costs time, which
-is not counted; it is done twice a second. The training ends with the last target, unless it is to go on (--whole).
+is not counted; it is done twice a second (--every). The training ends with the last target, unless it is to go on
+(--whole).
 """
 
 import argparse
@@ -20,9 +21,7 @@ from typing import Any
 
 from nrfgs_ns.files import write_whole
 
-EVERY = 0.5
-"""Seconds of training between two looks."""
-BEGAN, RECORD, TARGETS, WHOLE = "NRFGS_BEGAN", "NRFGS_RECORD", "NRFGS_TARGETS", "NRFGS_WHOLE"
+BEGAN, RECORD, TARGETS, WHOLE, EVERY = (f"NRFGS_{name}" for name in ("BEGAN", "RECORD", "TARGETS", "WHOLE", "EVERY"))
 """What the process is told by its environment."""
 
 
@@ -62,7 +61,7 @@ def child() -> None:
     from nrfgs_ns.training.run import machine
     from nrfgs_ns.training.trainer import NrfgsTrainer
 
-    whole = os.environ[WHOLE] == "True"
+    whole, every = os.environ[WHOLE] == "True", float(os.environ[EVERY])
     targets = [float(word) for word in os.environ[TARGETS].split()]
     reached: dict[str, Any] = {}
     curve: list[list[float]] = []
@@ -83,7 +82,7 @@ def child() -> None:
         return result
 
     def look(self: NrfgsTrainer, step: int) -> None:
-        if clock.now() - last[0] < EVERY or len(reached) == len(targets):
+        if clock.now() - last[0] < every or len(reached) == len(targets):
             return
         if torch.cuda.is_available():
             torch.cuda.synchronize()
@@ -140,6 +139,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("record", type=Path, help="JSON to write")
     parser.add_argument("--targets", type=float, nargs="+", default=[30.0], help="dB")
+    parser.add_argument("--every", type=float, default=0.5, help="seconds of training between two looks")
     parser.add_argument("--whole", action="store_true", help="train on when the last target is reached")
     parser.add_argument("words", nargs="+", help="of ns-train, after --")
     options = parser.parse_args()
@@ -150,6 +150,7 @@ def main() -> None:
         RECORD: str(options.record.absolute()),
         TARGETS: " ".join(map(str, options.targets)),
         WHOLE: str(options.whole),
+        EVERY: str(options.every),
     }
     options.record.parent.mkdir(parents=True, exist_ok=True)
     subprocess.run([sys.executable, "-c", code, *options.words], env=environment, check=True)

@@ -87,6 +87,10 @@ class HashGrid(nn.Module):
             return Interpolation.apply(positions, self.table, self.resolutions, len(self.sides), self.table_size)
         return self.in_torch(positions)
 
+    def try_kernels(self, device: torch.device) -> None:
+        """Find out whether the kernels run on a CUDA device."""
+        _kernels_run_on(device, self.table.shape[1])
+
     def in_torch(self, positions: Tensor) -> Tensor:
         """The same in PyTorch alone, on any device and of any floating dtype: the kernels' twin."""
         scaled = positions[:, None, :] * self.resolutions[:, None]  # [M, L, 3]

@@ -146,6 +146,9 @@ class AppearanceHead(nn.Module, ABC):
     def set_step(self, step: int) -> None:  # noqa: B027  (most heads have no schedule)
         """Tell the head which training step it is, for heads that grow with training."""
 
+    def try_kernels(self, device: torch.device) -> None:  # noqa: B027  (most heads have none)
+        """Find out whether the head's own kernels run on a CUDA device, which compiles them: the first step would."""
+
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor | None:
         """How far the head is from adding nothing to the base appearance, as a scalar to minimise in the warm-up.
 

@@ -133,6 +133,9 @@ class NeuralResidualField(AppearanceHead):
                 nn.init.zeros_(branch[-1].bias)
         self.fused = FusedField(config, self.low, self.high)
 
+    def try_kernels(self, device: torch.device) -> None:
+        self.fused.try_on(device)
+
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Base colours and latents: "features_dc" [N, 3], "latents" [N, D] ~ N(0, latent_std^2)."""
         latents = torch.randn(len(rgb), self.config.latent_dim, device=rgb.device) * self.config.latent_std

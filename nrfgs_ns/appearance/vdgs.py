@@ -94,6 +94,9 @@ class ViewDirectionFactors(SphericalHarmonics):
             nn.Linear(config.hidden_width, outputs),
         )
 
+    def try_kernels(self, device: torch.device) -> None:
+        self.grid.try_kernels(device)
+
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         means = splats["means"].index_select(0, visible)
         directions = unit_vectors(means - camera_centers, self.config.distance_eps * self.scene_unit)

@@ -77,10 +77,10 @@ class NrfgsDataParserConfig(NerfstudioDataParserConfig):
     _target: type = field(default_factory=lambda: NrfgsDataParser)
     """target class to instantiate"""
     eval_mode: Literal["interior", "interval", "fraction", "filename", "all"] = "interior"
-    """How to split into train and eval if the data set does not name its own split: interior (every eval_interval-th by
-    sorted name is eval, beginning in the middle of the first eval_interval images), interval (beginning with the first,
-    as in the literature), fraction (train_split_fraction of them train), filename (train or eval in the name), all
-    (every image is both)."""
+    """How to split where the data set names no split. interior: every eval_interval-th image by name is for
+    testing, beginning in the middle of the first eval_interval. interval: beginning with the first, as in the
+    literature. fraction: train_split_fraction of them train. filename: by train or eval in the name. all: every image
+    is both."""
     load_3D_points: bool = True
     """Whether to start from the points of the data set (ply_file_path, or else colmap/sparse/0)."""
 
@@ -247,18 +247,30 @@ class NrfgsDataParser(DataParser):
         """A file that a frame names, in full size."""
         return self._folder / name
 
+    def _root(self, key: str) -> Path:
+        """The folder of a frame's files of one kind, in full size."""
+        return self._folder / FOLDERS[key]
+
+    def _smaller(self, key: str, factor: int) -> Path:
+        """The folder where the data set keeps its own copies at 1 / factor of the size, if it does."""
+        root = self._root(key)
+        return root.with_name(f"{root.name}_{factor}")
+
     def _copy(self, name: str, key: str, factor: int) -> Path:
-        """Where the data set keeps its own copy of the file at 1 / factor of its size, if it does."""
-        return self._folder / f"{FOLDERS[key]}_{factor}" / Path(name).name
+        return self._smaller(key, factor) / Path(name).name
+
+    def _may_halve(self, name: str, factor: int) -> bool:
+        """Whether images may be taken at 1 / factor of their size without having been asked for."""
+        return self._copy(name, "file_path", factor).exists()
 
     def _factor(self, frames: list[dict[str, Any]]) -> int:
         """The factor that was asked for, or the smallest power of two that makes the first image no larger than 1600
-        pixels and for which there is a folder."""
+        pixels and that `_may_halve` admits."""
         if self.config.downscale_factor is not None:
             return self.config.downscale_factor
         name = frames[0]["file_path"]
         size, factor = max(read_header(self._file(name))[0]), 1
-        while size / factor > MAX_AUTO_RESOLUTION and self._copy(name, "file_path", 2 * factor).exists():
+        while size / factor > MAX_AUTO_RESOLUTION and self._may_halve(name, 2 * factor):
             factor *= 2
         return factor
 
@@ -269,7 +281,7 @@ class NrfgsDataParser(DataParser):
         return [self._copy(name, key, factor) if copies else self._file(name, key) for name in names]
 
     def _has_copies(self, key: str, factor: int) -> bool:
-        return factor > 1 and (self._folder / f"{FOLDERS[key]}_{factor}").is_dir()
+        return factor > 1 and self._smaller(key, factor).is_dir()
 
     def _checked_files(
         self,
@@ -458,20 +470,10 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         return path if key == "file_path" else path.with_suffix(".png")
 
     def _copy(self, name: str, key: str, factor: int) -> Path:
-        root = self._root(key)
-        return root.with_name(f"{root.name}_{factor}") / self._file(name, key).relative_to(root)
+        return self._smaller(key, factor) / self._file(name, key).relative_to(self._root(key))
 
-    def _has_copies(self, key: str, factor: int) -> bool:
-        root = self._root(key)
-        return factor > 1 and root.with_name(f"{root.name}_{factor}").is_dir()
-
-    def _factor(self, frames: list[dict[str, Any]]) -> int:
-        if self.config.downscale_factor is not None:
-            return self.config.downscale_factor
-        size, factor = max(read_header(self._file(frames[0]["file_path"]))[0]), 1
-        while size / factor > MAX_AUTO_RESOLUTION:
-            factor *= 2
-        return factor
+    def _may_halve(self, name: str, factor: int) -> bool:
+        return True
 
     def _named_splits(self, meta: dict[str, Any], source: Path) -> dict[str, tuple[str, Any]] | None:
         named = {}

@@ -16,6 +16,7 @@ from nrfgs_ns.distributed.exchange import scale_gradient, send_to_cameras
 from nrfgs_ns.distributed.schedules import fewer
 from nrfgs_ns.distributed.shards import cut_model_state, rebalance, rows_of, shard_counts
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import View, project_splats, project_view
@@ -72,6 +73,11 @@ class ShardedModel(NrfgsModel):
         self.counts = shard_counts(total, comm.world())
         rows = rows_of(comm.rank(), total, comm.world())
         return {name: Parameter(value.detach()[rows].clone()) for name, value in whole.items()}
+
+    def learn_photographs(self, photographs: PhotographModel | None) -> None:
+        """Let each photograph's look be learnt, from where the main device starts: others may round differently."""
+        states = comm.gather_objects(None if photographs is None else photographs.state_dict())
+        super().learn_photographs(None if states[0] is None else PhotographModel.from_state(states[0]))
 
     @property
     def parameter_bytes(self) -> int:

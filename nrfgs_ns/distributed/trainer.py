@@ -231,7 +231,7 @@ class ShardedTrainer(NrfgsTrainer):
             config = with_fewer_steps(config, world_size)
         config = replace(config, vis=vis, pipeline=replace(config.pipeline, _target=ShardedPipeline))
         super().__init__(config, local_rank, world_size)
-        self.request.quiet = comm.rank() > 0
+        self.request = StopRequest(quiet=comm.rank() > 0)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         # nerfstudio seeds each device differently; the initial splats and the order of the cameras must be the same.

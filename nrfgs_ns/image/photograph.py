@@ -103,22 +103,23 @@ class PhotographModel(nn.Module):
             stops = torch.zeros(len(names), 3) if start is None else start.float()
             self.shots = Parameter((stops - stops.mean(dim=0)) @ torch.linalg.pinv(basis))
             columns = [column for column, part in enumerate(COLUMNS) if part in parts]
-            constant = torch.full((len(names), 1), max(len(names), 1) ** -0.5)
-            self._hold([constant if held is None else held[column].float() for column in columns])
+            self._hold([self._constant() if held is None else held[column].float() for column in columns])
         self._radii: dict[tuple[int, int, int], Tensor] = {}
 
     def _hold(self, patterns: Sequence[Tensor]) -> None:
         """Keep patterns over the photographs [P, K], of each column of the exposures, as they are now."""
-        width = len(patterns)
-        rows = torch.zeros(sum(pattern.shape[1] for pattern in patterns), *self.shots.shape)
+        rows = self.shots.new_zeros(sum(pattern.shape[1] for pattern in patterns), *self.shots.shape)
         first = 0
         for column, pattern in enumerate(patterns):
             rows[first : first + pattern.shape[1], :, column] = pattern.T
             first += pattern.shape[1]
-        held = rows.flatten(1)
-        assert held.shape[1] == width * len(self.names)
-        self.register_buffer("held", held)
-        self.register_buffer("kept", held @ self.shots.detach().flatten())
+        self.register_buffer("held", rows.flatten(1).detach())
+        self.register_buffer("kept", self.held @ self.shots.detach().flatten())
+
+    def _constant(self) -> Tensor:
+        """The pattern that all photographs have in common, [P, 1]."""
+        count = len(self.names)
+        return self.shots.new_full((count, 1), max(count, 1) ** -0.5).detach()
 
     # What a picture becomes.
 
@@ -235,11 +236,13 @@ class PhotographModel(nn.Module):
         return model
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        for name in ("held", "kept"):  # as many patterns as the checkpoint's; the constants alone if it knows of none
-            if self.shots is not None:
-                buffer = getattr(self, name)
-                written = state_dict.setdefault(prefix + name, buffer)
-                setattr(self, name, torch.empty_like(written, device=buffer.device))
+        # The patterns are the checkpoint's; one that knows of none held the means.
+        if self.shots is not None and f"{prefix}shots" in state_dict:
+            if f"{prefix}held" not in state_dict:
+                self._hold([self._constant()] * self.shots.shape[1])
+            for name in ("held", "kept"):
+                own = getattr(self, name)
+                setattr(self, name, torch.empty_like(state_dict.setdefault(prefix + name, own), device=own.device))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 

@@ -4,7 +4,11 @@
 The statistics of SpotLessSplats (Sabour et al., arXiv 2406.20055), without its features: a pixel is trimmed if its
 residual is among the largest of the photographs seen lately, unless most pixels around it are not. The photographs
 share one threshold, so that much is trimmed of a photograph in which much has moved, and little of one in which
-nothing has.
+nothing has. What a scene has not learnt yet has large residuals, too, and must not be left out for good:
+
+- Only residuals far above the usual one count, so that of a clean capture almost nothing is trimmed.
+- What moved is large: a pixel is kept where many in a patch around it are (as in RobustNeRF, arXiv 2302.00833).
+- Trimmed pixels lose their weight little by little (in SpotLessSplats they are drawn at random, more and more seldom).
 """
 
 import torch
@@ -15,17 +19,23 @@ BINS = 1000
 """Of the histogram of residuals in [0, 1]."""
 MEMORY = 0.95
 """What is left of a photograph in the histogram when the next one comes."""
+USUAL = 5.0
+"""Times the median residual that a pixel's must be at least."""
 WINDOW = 3
 """Side of the square around a pixel, in pixels."""
+PATCH, MOST_KEPT = 0.04, 0.6
+"""Side of the patch around a pixel, as a share of the image's longer side, and which share of it is kept at most."""
 FIRST_STEP = 500
 """Before it nothing is trimmed: a scene that has just begun fits nothing."""
+FADE_STEPS = 1500
+"""In which trimmed pixels lose their weight from then on."""
 
 
 class Trimming(nn.Module):
     """Remembers how large residuals are, and trims the largest.
 
     Args:
-        share: of the pixels that are trimmed, above 0 and below 1, before neighbours are asked.
+        share: of the pixels that are trimmed at most, above 0 and below 1.
 
     Raises:
         ValueError: the share is out of range.
@@ -39,11 +49,12 @@ class Trimming(nn.Module):
         self.register_buffer("histogram", torch.zeros(BINS))
 
     @torch.no_grad()
-    def forward(self, prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Which pixels to keep, 1.0 or 0.0. Nothing waits for a GPU.
+    def forward(self, prediction: Tensor, truth: Tensor, step: int, mask: Tensor | None = None) -> Tensor:
+        """Weights of the pixels, 1.0 for those that are kept. Nothing waits for a GPU.
 
         Args:
             prediction, truth: [H, W, 3] in [0, 1].
+            step: in the schedule, `FIRST_STEP` or later.
             mask: [H, W, 1], what counts; None: everything.
 
         Returns:
@@ -52,14 +63,24 @@ class Trimming(nn.Module):
         error = (prediction - truth).abs().mean(dim=-1)
         counted = error if mask is None else torch.where(mask[..., 0] >= 0.5, error, -1.0)  # beyond the bins
         self.histogram.mul_(MEMORY).add_(torch.histc(counted, BINS, 0.0, 1.0))
-        return self.kept(prediction, truth)
+        return self.kept(prediction, truth).clamp_min(max(1.0 - (step - FIRST_STEP) / FADE_STEPS, 0.0))
 
     @torch.no_grad()
     def kept(self, prediction: Tensor, truth: Tensor) -> Tensor:
-        """As `forward`, by the residuals remembered, without remembering these."""
+        """Which pixels are kept, 1.0 or 0.0, by the residuals remembered, without remembering these. [H, W, 1]"""
         error = (prediction - truth).abs().mean(dim=-1)
-        reached = self.histogram.cumsum(0) >= (1.0 - self.share) * self.histogram.sum()
-        threshold = (BINS - reached.sum() + 1) / BINS
+        threshold = torch.maximum(self._quantile(1.0 - self.share), USUAL * self._quantile(0.5))
         kept = (error <= threshold).to(prediction.dtype)
-        around = F.avg_pool2d(kept[None], WINDOW, stride=1, padding=WINDOW // 2, count_include_pad=False)[0]
-        return torch.maximum(kept, (around > 0.5).to(kept.dtype))[..., None]
+        kept = torch.maximum(kept, (_mean_around(kept, WINDOW) > 0.5).to(kept.dtype))
+        patch = 2 * round(PATCH * max(error.shape) / 2) + 1
+        return torch.maximum(kept, (_mean_around(kept, patch) > MOST_KEPT).to(kept.dtype))[..., None]
+
+    def _quantile(self, share: float) -> Tensor:
+        """The residual below which this share of those remembered lies, a scalar."""
+        reached = self.histogram.cumsum(0) >= share * self.histogram.sum()
+        return (BINS - reached.sum() + 1) / BINS
+
+
+def _mean_around(values: Tensor, side: int) -> Tensor:
+    """Mean over a square around each pixel, [H, W]."""
+    return F.avg_pool2d(values[None], side, stride=1, padding=side // 2, count_include_pad=False)[0]

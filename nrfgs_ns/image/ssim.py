@@ -82,6 +82,11 @@ def _weighted_sum(prediction: Tensor, truth: Tensor, l1_weight: float, ssim_weig
     return total if l1_weight == 0.0 else total + l1_weight * (prediction - truth).abs().mean()
 
 
+def try_kernels(device: torch.device) -> None:
+    """Find out whether the kernels run on a CUDA device, which compiles them: the first step would."""
+    _kernels_run_on(device)
+
+
 class SsimInTorch(torch.autograd.Function):
     """SSIM in PyTorch: the kernels' twin, for images with both sides at least the window's."""
 

@@ -7,7 +7,9 @@ Nothing here imports Triton: it is missing on machines without CUDA. Trials do, 
 
 import importlib.util
 import logging
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from threading import Thread
 from typing import Any, TypeVar
 
 import torch
@@ -38,6 +40,32 @@ def try_triton(trial: Callable[[], Outcome]) -> Outcome | str:
     except Exception as error:
         first_line = next(iter(str(error).splitlines()), "")
         return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
+
+
+@contextmanager
+def tried_meanwhile(trials: Sequence[Callable[[], object]], device: torch.device) -> Iterator[None]:
+    """Try kernels, which compiles them, on a thread of its own while the block runs; when it ends they have been tried.
+
+    Args:
+        trials: what finds out whether some kernels run, and remembers it. What goes wrong is not said here: whoever
+            needs the kernels will meet it again.
+        device: that they are launched on.
+    """
+
+    def run() -> None:
+        with torch.cuda.device(device) if device.type == "cuda" else nullcontext():  # each thread has its own
+            for trial in trials:
+                with suppress(Exception):
+                    trial()
+
+    thread = Thread(target=run, name="kernels") if trials else None
+    if thread is not None:
+        thread.start()
+    try:
+        yield
+    finally:
+        if thread is not None:
+            thread.join()
 
 
 class Gate(dict[Hashable, Any]):

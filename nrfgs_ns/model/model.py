@@ -9,8 +9,9 @@ hold, so that an interrupted training can go on.
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -39,7 +40,7 @@ from nrfgs_ns.densification import (
     build_densification,
 )
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.image import robust
+from nrfgs_ns.image import robust, ssim
 from nrfgs_ns.image.metrics import ImageMetrics
 from nrfgs_ns.image.photograph import Part, PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
@@ -50,6 +51,7 @@ from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_vi
 from nrfgs_ns.model.training_views import ComparedViews
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
+from nrfgs_ns.rasterizer import load_kernels
 
 LOOK = "NRFGS_LOOK"
 """Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
@@ -110,8 +112,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0
-    """share of the pixels, those with the largest residuals, that the loss leaves out: passers-by, moving shadows.
-    0: none"""
+    """share of the pixels that the loss leaves out at most, those with the largest residuals: passers-by, moving
+    shadows. 0: none; 0.1 is a start"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
@@ -225,6 +227,12 @@ class NrfgsModel(SplatfactoModel):
                 **self.head.splat_params(rgb),
             }.items()
         }
+
+    def kernel_trials(self) -> list[Callable[[], object]]:
+        """What loads or compiles the kernels that a first step would wait for (`kernels.trial`); none on a CPU."""
+        if self.device.type != "cuda":
+            return []
+        return [partial(trial, self.device) for trial in (load_kernels, self.head.try_kernels, ssim.try_kernels)]
 
     @property
     def parameter_bytes(self) -> int:
@@ -589,7 +597,7 @@ class NrfgsModel(SplatfactoModel):
             mask = self._downscale_if_required(batch["mask"]).to(self.device)
             truth, rgb = truth * mask, rgb * mask
         if self.trimming is not None and self.training and self.schedule_step >= robust.FIRST_STEP:
-            kept = self.trimming(rgb, truth, mask if "mask" in batch else None)
+            kept = self.trimming(rgb, truth, self.schedule_step, mask if "mask" in batch else None)
             truth, rgb = truth * kept, rgb * kept
         return photometric_loss(rgb, truth, self.config.ssim_lambda)
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from .contract import Projection
 
-__all__ = ["Projection", "composite", "contributions", "project", "rasterization"]
+__all__ = ["Projection", "composite", "contributions", "load_kernels", "project", "rasterization"]
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
@@ -41,6 +41,12 @@ def _backend(device: torch.device):
 
         return torch_cpu
     raise NotImplementedError(f"splats are on device {device}; the rasterizer runs on 'cuda' and 'cpu'")
+
+
+def load_kernels(device: torch.device) -> None:
+    """Have the compiled kernels of a CUDA device loaded, as the first picture would. A gsplat that came without them
+    compiles them, once, for minutes."""
+    _backend(device).load_kernels(device)
 
 
 def _check_shape(name: str, tensor: Tensor, *shape: int) -> None:

@@ -9,7 +9,7 @@ names images, not cameras; and in the packed layout takes no backgrounds of seve
 from __future__ import annotations
 
 import torch
-from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
+from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
 
 from nrfgs_ns.host import GSPLAT, gsplat_version
@@ -21,6 +21,11 @@ if HAS_BATCHES and gsplat_version() < (1, 5, 3):
     raise ImportError(f"gsplat {'.'.join(map(str, gsplat_version()))} is not known here; use {' or '.join(GSPLAT)}.")
 
 CHANNEL_CHUNK = 32  # more channels at once slow the kernels down
+
+
+def load_kernels(device: torch.device) -> None:
+    """See `nrfgs_ns.rasterizer.load_kernels`: any kernel loads all."""
+    spherical_harmonics(0, torch.ones(1, 3, device=device), torch.ones(1, 1, 3, device=device))
 
 
 def project(

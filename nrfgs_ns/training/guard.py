@@ -90,6 +90,11 @@ class Guard:
     def model(self):
         return self.pipeline.model
 
+    def before_first_step(self, step: int, optimizers: LeanOptimizers) -> None:
+        """A training is about to begin, or to go on, at a step: its parameters must be finite."""
+        self.step = step
+        self.check_parameters(optimizers)
+
     def begin(self, step: int, optimizers: LeanOptimizers) -> None:
         """Head of a training step: learn about the step before, and now and then look at the parameters.
 

@@ -19,6 +19,7 @@ from nrfgs_ns.compact.decode import model_state
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.metrics import METRIC_NAMES
+from nrfgs_ns.kernels.trial import tried_meanwhile
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.evaluation_table import print_evaluation
@@ -34,8 +35,8 @@ class ShardingConfig:
     """splats move between devices once one has more than this many times the mean; looked at after each refinement"""
     schedules: Literal["steps", "images"] = "steps"
     """what step numbers and learning rates mean. steps: what they say; each step sees one image for each device.
-    images: they are written for one device, and a training sees as many images as it would there, in fewer steps: all
-    step numbers are divided by the number of devices, and Adam takes larger steps (docs/many-gpus.md)"""
+    images: they are one device's; a training sees as many images as there, in fewer and larger steps
+    (docs/many-gpus.md)"""
 
 
 @dataclass
@@ -78,8 +79,9 @@ class NrfgsPipeline(VanillaPipeline):
         super().__init__(config, device, test_mode, **kwargs)
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
-            self.datamanager.load_all_images()
-            photographs = photograph_model(config.model, self.datamanager)
+            with tried_meanwhile(self.model.kernel_trials(), self.model.device):
+                self.datamanager.load_all_images()
+                photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
             self.model.fit_on(self.datamanager.train_dataset.cameras)

@@ -270,8 +270,7 @@ class NrfgsTrainer(Trainer):
             SystemExit: a signal has ended it, with the status of that; the state has been written.
         """
         with self._last_good_state_on_disk():  # the warm-up comes before the first step
-            self.guard.step = self._start_step
-            self.guard.check_parameters(self.optimizers)
+            self.guard.before_first_step(self._start_step, self.optimizers)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
             self.config = replace(self.config, max_num_iterations=sys.maxsize // 2)
         gc.collect()

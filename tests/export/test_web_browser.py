@@ -386,6 +386,76 @@ def test_every_control_changes_the_picture(demo, browser):
     page.page.close()
 
 
+def test_fingers_turn_move_and_zoom(demo, browser):
+    page = Page(browser, demo[1].as_uri(), (480, 360)).begun()
+    touch = page.page.context.new_cdp_session(page.page)
+
+    def fingers(*paths: list[tuple[int, int]]) -> None:
+        """Put fingers down where their paths begin, move them along, and lift them."""
+        for step, places in enumerate(zip(*paths, strict=True)):
+            points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(places)]
+            kind = "touchMove" if step else "touchStart"
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+    first = page.picture()
+    seen = [first]
+    for paths in (
+        [[(100, 150), (130, 140), (160, 130)]],  # turns
+        [[(100, 150), (130, 170)], [(140, 150), (170, 170)]],  # moves
+        [[(200, 180), (150, 180), (100, 180)], [(240, 180), (290, 180), (340, 180)]],  # comes closer
+    ):
+        fingers(*paths)
+        now = page.picture()
+        assert all(different(255 * now.numpy(), 255 * before.numpy()) for before in seen)
+        seen.append(now)
+        page.page.evaluate("document.getElementById('home').click()")
+        assert not different(255 * page.picture().numpy(), 255 * first.numpy())
+    assert not page.errors
+    page.page.close()
+
+
+def test_whoever_cannot_see_the_page_is_told_what_is_there(demo, browser):
+    page = Page(browser, demo[1].as_uri(), (900, 600)).begun()
+    assert page.page.locator("html").get_attribute("lang") == "en"
+    named = {
+        "application": "page: a scene in three dimensions",
+        "heading": "page",
+        "slider": re.compile("^Residual gain"),
+        "textbox": None,  # hidden until it is asked for
+    }
+    for role, name in named.items():
+        assert page.page.get_by_role(role, name=name).count() == (name is not None), role
+    for role, names in {
+        "combobox": [re.compile("^Show"), re.compile("^Drag to"), "Photograph"],
+        "checkbox": ["Freeze view", "Mark where taken"],
+        "button": ["Controls", "Previous photograph", "Next photograph", "First view", "Save picture", "Embed"],
+    }.items():
+        for name in names:
+            assert page.page.get_by_role(role, name=name, exact=isinstance(name, str)).count() == 1, name
+    unnamed = page.page.evaluate(
+        "[...document.querySelectorAll('button, select, input, textarea')].filter((one) => !one.labels?.length"
+        " && !one.ariaLabel && !one.textContent.trim()).map((one) => one.id)"
+    )
+    assert unnamed == []
+
+    # The keyboard alone gets everywhere, and what happens is said.
+    page.page.evaluate("document.activeElement.blur()")
+    reached = set()
+    for _ in range(20):
+        page.page.keyboard.press("Tab")
+        reached.add(page.page.evaluate("document.activeElement.id"))
+    assert {"scene", "toggle", "show", "gain", "freeze", "drag", "photograph", "mark", "home", "embed"} <= reached
+    page.page.focus("#scene")
+    page.page.keyboard.press("]")
+    assert page.page.get_by_text(re.compile("^Photograph ")).count() == 1
+    page.page.keyboard.press("h")
+    assert page.page.locator("#panel").is_hidden()
+    assert page.page.get_by_role("button", name="Controls").get_attribute("aria-expanded") == "false"
+    assert not page.errors
+    page.page.close()
+
+
 def test_a_page_asks_the_network_for_nothing_and_works_in_a_frame(demo, browser, tmp_path):
     outer = tmp_path / "outer.html"
     outer.write_text(f'<iframe src="{demo[1].as_uri()}#photograph=2" width="300" height="200"></iframe>')

@@ -176,6 +176,11 @@ def test_a_checkpoint_without_patterns_holds_the_constants():
     state = {name: value for name, value in model.state_dict().items() if name not in ("held", "kept")}
     again = PhotographModel.from_state(state)
     assert again.held.shape == (3, 15) and torch.equal(again.shots, model.shots)
+    eye = torch.eye(5)
+    goes_on = PhotographModel(model.names, [0, 1, 0, 1, 0], LENSES, start=torch.randn(5, 3), held=[eye, eye, eye])
+    goes_on.load_state_dict({name: value for name, value in state.items() if name not in ("held", "kept")})
+    goes_on.center_()
+    torch.testing.assert_close(goes_on.shots, model.shots)
 
 
 def test_a_checkpoint_brings_its_own_patterns():

@@ -2,6 +2,8 @@
 """`try_triton`: what is a verdict about Triton and what is not, and that its callers remember nothing else. No GPU is
 needed for that, nor Triton."""
 
+import threading
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from nrfgs_ns.appearance import hash_grid
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.image import ssim
 from nrfgs_ns.kernels import trial
-from nrfgs_ns.kernels.trial import Gate, try_triton
+from nrfgs_ns.kernels.trial import Gate, tried_meanwhile, try_triton
 
 CPU = torch.device("cpu")
 
@@ -84,3 +86,22 @@ def test_nor_is_it_by_the_field(monkeypatch, caplog):
     with pytest.raises(torch.OutOfMemoryError):
         head.fused._ready_on(CPU)
     assert head.fused.ready == {} and not caplog.records
+
+
+def test_kernels_are_tried_while_something_else_is_done():
+    begun, done, tried = threading.Event(), threading.Event(), []
+
+    def trial():
+        begun.set()
+        assert done.wait(20)
+        tried.append(threading.current_thread().name)
+
+    with tried_meanwhile([raises(torch.OutOfMemoryError("no room")), raises(OSError("no compiler")), trial], CPU):
+        assert begun.wait(20), "at the same time"
+        done.set()
+    assert tried == ["kernels"], "all have been tried, whatever went wrong"
+    with pytest.raises(KeyError), tried_meanwhile([lambda: tried.append("again")], CPU):
+        raise KeyError
+    assert tried == ["kernels", "again"]
+    with tried_meanwhile([], CPU):
+        assert all(thread.name != "kernels" for thread in threading.enumerate())

@@ -65,6 +65,11 @@ class FusedField:
             )
         return reason is None
 
+    def try_on(self, device: torch.device) -> None:
+        """Find out whether the kernels run on a CUDA device."""
+        if self.config.implementation != "torch":
+            self._ready_on(device)
+
     def __call__(
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float = 1.0
     ) -> tuple[Tensor, Tensor]:

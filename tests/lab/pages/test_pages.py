@@ -7,15 +7,19 @@ import importlib.util
 import io
 import json
 import re
+import shlex
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+import tyro
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
+from smoke_runs import after_one_step
 
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
+from nrfgs_lab.pages.tables import pages
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import commands
@@ -67,7 +71,8 @@ def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tm
     record = train([*args, "--pipeline.model.num-downscales", "0"])
     state = torch.load(next(tmp_path.rglob("*.ckpt")), weights_only=True)["pipeline"]
     assert state["_model.gauss_params.slopes"].abs().max() > 0
-    assert evaluate(record.config_path, tmp_path / "eval.json")["psnr"] > 10
+    reached = evaluate(record.config_path, tmp_path / "eval.json")["psnr"]
+    assert reached > after_one_step("tiny/nrfgs-sh")
 
 
 def test_the_page_is_current():
@@ -115,3 +120,25 @@ def test_the_page_has_the_commands_that_were_run():
     assert f"{record['eval']['psnr']:.2f}" in page and f"{record['export']['loss_db']:.2f}" in page
     pictures = re.findall(r"\]\((images/\S+)\)", page)
     assert len(pictures) == 4 and all((DOCS / picture).is_file() for picture in pictures)
+
+
+def commands_shown() -> list[str]:
+    """The commands of this package in the pages' shell lines, without comments and variables before them."""
+    found = []
+    for path in pages():
+        for fence in re.findall(r"```bash\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL):
+            lines = re.sub(r"\s#.*", "", fence.replace("\\\n", " "))
+            found += re.findall(r"(?:^|&& )(?:[A-Z_]+=\S+ )?((?:nrfgs|ns-train nrfgs\S*) [^&\n]+)", lines, re.MULTILINE)
+    return sorted({" ".join(line.split()) for line in found})
+
+
+def test_commands_that_pages_show_are_understood():
+    shown = commands_shown()
+    assert len(shown) > 40
+    for line in shown:
+        program, first, *rest = shlex.split(line)
+        try:
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                parse([first, *rest]) if program == "ns-train" else tyro.cli(commands()[first].load(), args=rest)
+        except SystemExit as end:
+            assert not end.code, line

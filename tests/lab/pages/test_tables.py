@@ -96,3 +96,9 @@ def test_files_that_a_page_names_are_there(name):
 def test_every_picture_is_shown():
     shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
     assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_no_line_of_prose_begins_with_a_comment(name):
+    """Markdown takes such a line for HTML: it would end the paragraph, and its links would not be links."""
+    assert re.findall(r"^ {0,3}(<!-- .* -->\S.*)$", PAGES[name], re.MULTILINE) == []
