@@ -48,10 +48,11 @@ class ConsistentDensification:
 
     views: int = 10
     """training views that a refinement looks at"""
-    wrong: float = 0.1
+    wrong: float = 0.05
     """error above which a pixel is wrong, in [0, 1]: that of the view's smallest to its largest"""
-    grow_pixels: float = 1.0
-    """splats with more wrong pixels than that, in the mean over the views, may grow"""
+    grow_pixels: float = 0.2
+    """splats with more wrong pixels of the photographs than that, in the mean over the views, may grow. More: fewer
+    splats"""
     prune_score: float = 0.9
     """splats whose wrong pixels, weighted by the views' losses, are above this share of the largest go. 1: none"""
     prune_unsupported: bool = True

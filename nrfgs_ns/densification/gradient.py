@@ -10,6 +10,7 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
+from nrfgs_ns.densification.statistics import take_statistics
 from nrfgs_ns.densification.strategy import Densification, OpacitySeen, Strategy
 
 EXTENT_MARGIN = 1.1
@@ -111,18 +112,12 @@ class GradientDensification(Densification):
 
     def _take_statistics(self, info: Mapping[str, Any], count: int) -> None:
         """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side."""
-        state, rows, means2d = self.state, info["gaussian_ids"], info["means2d"]
-        grads = (means2d.absgrad if self.strategy.absgrad else means2d.grad).clone()
-        grads[..., 0] *= info["width"] / 2.0 * info["n_cameras"]
-        grads[..., 1] *= info["height"] / 2.0 * info["n_cameras"]
+        state, means2d = self.state, info["means2d"]
+        gradients = means2d.absgrad if self.strategy.absgrad else means2d.grad
         for name in ("grad2d", "count", "radii"):
             if name in state and state[name] is None:
-                state[name] = torch.zeros(count, device=grads.device)
-        state["grad2d"].index_add_(0, rows, grads.norm(dim=-1))
-        state["count"].index_add_(0, rows, torch.ones_like(rows, dtype=torch.float32))
-        if "radii" in state:
-            share = info["radii"] / float(max(info["width"], info["height"]))
-            state["radii"][rows] = torch.maximum(state["radii"][rows], share)
+                state[name] = torch.zeros(count, device=gradients.device)
+        take_statistics(state, info, gradients)
 
     def _refine(self, step: int, splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""

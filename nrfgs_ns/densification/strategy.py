@@ -50,7 +50,7 @@ class Seen(NamedTuple):
     rows: Tensor
     """of the table, int64 [M]"""
     pixels: Tensor
-    """how much of the picture each is, alpha T summed over pixels, [M]"""
+    """how much of the picture each is, alpha T summed over pixels, in pixels of the photograph, [M]"""
     wrong: Tensor
     """the same over wrong pixels alone, [M]"""
     loss: Tensor
@@ -82,6 +82,12 @@ class Densification(ABC):
     def __init__(self, opacity_seen: OpacitySeen):
         self.opacity_seen = opacity_seen
         self.state = {CHANGE: None} if opacity_seen == "peak" else {}
+
+    @property
+    def diffuse(self) -> Tensor | None:
+        """Which splats have no residual, bool [N], where a checkpoint says so: a row of the table as any other, which
+        is moved with it."""
+        return self.state.get(DIFFUSE)
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""

@@ -41,21 +41,25 @@ class Launcher:
             arguments: the plain ones, the first of them a tensor.
             constants: the kernel's, and options of the compiler (num_warps, ...).
         """
-        key = (arguments[0].get_device(), *map(type, arguments), *constants.items())
+        kinds: list[Any] = []
+        plain: list[int | float] = []  # a tensor by its address: asked for it, Triton's launcher also asks the driver
+        ordinary = True
+        for argument in arguments:
+            kind = type(argument)
+            if kind is int:
+                ordinary = ordinary and -MAX_INT <= argument <= MAX_INT
+            elif kind is not float:
+                kind, argument = None, argument.data_ptr()
+                ordinary = ordinary and argument % ALIGNMENT == 0
+            kinds.append(kind)
+            plain.append(argument)
+        key = (arguments[0].get_device(), *kinds, *constants.items())
         variant = self.variants.get(key)
-        ordinary = all(map(_is_ordinary, arguments))
         if variant is not None and ordinary:
             compiled, in_order = variant
-            compiled[grid](*arguments, *in_order)
+            compiled[grid](*plain, *in_order)
             return
         compiled = self.kernel[grid](*arguments, **constants)
         if compiled is not None and ordinary and KEEPS_CONSTANTS:  # the interpreter compiles nothing
             names = self.kernel.arg_names[len(arguments) :]
             self.variants[key] = compiled, tuple(constants[name] for name in names)
-
-
-def _is_ordinary(argument: torch.Tensor | int | float) -> bool:
-    """Whether it asks for the variant that most launches ask for."""
-    if isinstance(argument, torch.Tensor):
-        return argument.data_ptr() % ALIGNMENT == 0
-    return abs(argument) <= MAX_INT or isinstance(argument, float)

@@ -38,6 +38,7 @@ from nrfgs_ns.densification import (
     OriginalDensification,
     Strategy,
     build_densification,
+    statistics,
 )
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust, ssim
@@ -46,7 +47,7 @@ from nrfgs_ns.image.photograph import Part, PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
-from nrfgs_ns.model.pinhole import Pinhole, pinhole
+from nrfgs_ns.model.pinhole import FixedPinholes, Pinhole, pinhole
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
 from nrfgs_ns.model.training_views import ComparedViews
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
@@ -173,6 +174,7 @@ class NrfgsModel(SplatfactoModel):
         self.step = 0
         self.crop_box = None
         self._pinholes: dict[tuple[int, int], Pinhole] = {}  # training cameras by index and downscale
+        self._fixed_pinholes: FixedPinholes | None = None  # all others
         self.background_color = (
             torch.tensor(VISER_BACKGROUND)
             if self.config.background_color == "random"
@@ -232,7 +234,8 @@ class NrfgsModel(SplatfactoModel):
         """What loads or compiles the kernels that a first step would wait for (`kernels.trial`); none on a CPU."""
         if self.device.type != "cuda":
             return []
-        return [partial(trial, self.device) for trial in (load_kernels, self.head.try_kernels, ssim.try_kernels)]
+        trials = load_kernels, self.head.try_kernels, ssim.try_kernels, statistics.try_kernel
+        return [partial(trial, self.device) for trial in trials]
 
     @property
     def parameter_bytes(self) -> int:
@@ -245,7 +248,7 @@ class NrfgsModel(SplatfactoModel):
     @property
     def num_diffuse(self) -> int:
         """How many splats have no residual."""
-        diffuse = self.densification.state.get(DIFFUSE)
+        diffuse = self.densification.diffuse
         return 0 if diffuse is None else int(diffuse.sum())
 
     # Rendering.
@@ -254,7 +257,7 @@ class NrfgsModel(SplatfactoModel):
     def field(self) -> Field:
         """What is rendered: the head with all splats, or those in the crop box, and which of them are diffuse."""
         splats: dict[str, Tensor] = dict(self.gauss_params.items())
-        if (diffuse := self.densification.state.get(DIFFUSE)) is not None:
+        if (diffuse := self.densification.diffuse) is not None:
             splats[DIFFUSE] = diffuse
         if self.crop_box is not None and not self.training:
             inside = self.crop_box.within(splats["means"]).reshape(-1)
@@ -306,8 +309,9 @@ class NrfgsModel(SplatfactoModel):
         """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
         downscale = self._get_downscale_factor()
         if not self.training:
-            pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
-            return pinhole(camera, pose.to(self.device), downscale)
+            if self._fixed_pinholes is None or self._fixed_pinholes.device != self.device:
+                self._fixed_pinholes = FixedPinholes(self.device)
+            return self._fixed_pinholes(camera)
         assert camera.shape[0] == 1, "Only one camera at a time"
         index = (camera.metadata or {}).get("cam_idx")
         if index is None or self.camera_optimizer.config.mode != "off":
@@ -419,16 +423,20 @@ class NrfgsModel(SplatfactoModel):
         """Let a viewer's panel (`viewer/panel.py`) say what its browsers see."""
         self.viewer_panel = panel
 
+    @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Render one camera as it was trained; for a browser, as the viewer's panel says.
+
+        Nerfstudio moves the camera to the GPU first, where the host must wait to learn its size.
 
         Args:
             camera: a batch of one camera, [1].
             obb_box: only splats with their centre inside are drawn, if given.
         """
         if self.viewer_panel is not None and self.viewer_panel.is_asking():
-            return self.viewer_panel.render(camera.to(self.device), obb_box)
-        return super().get_outputs_for_camera(camera, obb_box)
+            return self.viewer_panel.render(camera, obb_box)
+        self.set_crop(obb_box)
+        return self.get_outputs(camera.to(self.device) if self.training else camera)
 
     def set_background(self, background_color: Tensor) -> None:
         """Take the viewer's background [3], for the viewer's pictures alone: what evaluation uses must not change."""

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nerfstudio's cameras as the rasterizer wants them."""
 
+from collections import OrderedDict
 from functools import lru_cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -36,6 +37,50 @@ def pinhole(camera: Cameras, camera_to_world: Tensor, downscale: int) -> Pinhole
     width, height = int(camera.width.item()) // downscale, int(camera.height.item()) // downscale
     center = camera_to_world[0, :3, 3].contiguous()  # so that no kernel has to copy it
     return Pinhole(world_to_camera(camera_to_world), K, width, height, center)
+
+
+class FixedPinholes:
+    """Cameras whose poses are not learnt, converted on the host and sent to the device in one piece.
+
+    A rendering waits for nothing that way, if its camera is in host memory. Of one on the GPU the host must ask what it
+    is, and wait for all that was asked before; so the last ones are remembered, as long as nothing writes to them.
+
+    Args:
+        device: where the pinholes are to be.
+    """
+
+    REMEMBERED: ClassVar[int] = 64
+    """Cameras on a GPU that are remembered."""
+
+    def __init__(self, device: torch.device):
+        self.device = device
+        # By what tells a tensor that is alive, and has not been written to, from all others; the tensors stay alive.
+        self._known: OrderedDict[tuple, tuple[list[Tensor], Pinhole]] = OrderedDict()
+
+    def __call__(self, camera: Cameras) -> Pinhole:
+        """The pinhole of a camera, which is a batch of one, [1] or without batch dimension."""
+        fields = [camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
+        if not fields[0].is_cuda or any(field.is_inference() for field in fields):
+            return self._convert(fields)
+        key = tuple((id(field), field._version) for field in fields)
+        if key not in self._known:
+            self._known[key] = fields, self._convert(fields)
+            if len(self._known) > self.REMEMBERED:
+                self._known.popitem(last=False)
+        return self._known[key][1]
+
+    def _convert(self, fields: list[Tensor]) -> Pinhole:
+        # float64 holds sizes and float32 alike.
+        pose, sizes = torch.cat([field.reshape(-1).double() for field in fields]).cpu().split([12, 6])
+        fx, fy, cx, cy, width, height = sizes.tolist()
+        pose = pose.float().view(1, 3, 4)
+        with torch.inference_mode(False):  # what is remembered outlives a rendering that records nothing
+            whole = torch.zeros(32)  # each part at a multiple of 16 bytes, as Triton's kernels like it
+            whole[:16] = world_to_camera(pose).flatten()
+            whole[16:25] = torch.tensor([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
+            whole[28:31] = pose[0, :, 3]
+            whole = whole.to(self.device, non_blocking=True)
+            return Pinhole(whole[:16].view(1, 4, 4), whole[16:25].view(1, 3, 3), int(width), int(height), whole[28:31])
 
 
 def world_to_camera(camera_to_world: Tensor) -> Tensor:

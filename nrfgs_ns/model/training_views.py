@@ -31,7 +31,7 @@ class ComparedViews:
 
     That is at the resolution of the step, with the photograph's look where that is learnt, and on a background that
     does not change; from the camera's own centre, without view noise. What a mask leaves out, and what the robust loss
-    takes for no part of the scene, has no error, and shows no splat.
+    takes for no part of the scene, has no error, and shows no splat. Pixels are counted at the photograph's size.
 
     Args:
         model: an NrfgsModel in training mode.
@@ -56,7 +56,8 @@ class ComparedViews:
         rgb, counted = outputs["rgb"], self._counted(outputs["rgb"], truth, model.mask_of(batch))
         high = wrong_pixels((rgb - truth).abs().mean(dim=-1, keepdim=True), counted, wrong)
         maps = torch.cat([counted, high], dim=-1)[None].to(rgb.dtype)
-        pixels, of_those = contributions(view.projection, appearance.opacities, maps).unbind(dim=-1)
+        area = float(model._get_downscale_factor() ** 2)  # of a rendered pixel, in the photograph's
+        pixels, of_those = (area * contributions(view.projection, appearance.opacities, maps)).unbind(dim=-1)
         loss = photometric_loss(rgb * counted, truth * counted, model.config.ssim_lambda)
         return Seen(view.visible, pixels, of_those, loss)
 

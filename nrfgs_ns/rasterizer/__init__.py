@@ -152,8 +152,7 @@ def composite(
     Returns:
         render [C, H, W, X], alphas [C, H, W, 1], and gsplat's `info`: camera_ids, gaussian_ids, radii, means2d,
         depths, conics, opacities (compensated), width, height, tile_size, tile_width, tile_height, n_cameras; on CUDA
-        also tiles_per_gauss, isect_ids, flatten_ids and isect_offsets, which index gsplat's own lists and have no
-        counterpart on the CPU.
+        also flatten_ids and isect_offsets, the lists of the splats that each tile draws.
 
     Raises:
         ValueError: a tensor has the wrong shape, or the mode is unknown.
@@ -167,7 +166,9 @@ def composite(
         _check_shape("backgrounds", backgrounds, c, colors.shape[-1])
 
     colors, opacities = colors.to(projection.depths.dtype), opacities.to(projection.depths.dtype)
-    if not assume_finite:
+    backend = _backend(colors.device)
+    leave_out = not assume_finite and backend.leaves_out(projection, colors, opacities, tile_size)
+    if not assume_finite and not leave_out:
         # One such row would spread over every pixel that it covers, and from there into the gradients of all splats.
         drawable = torch.isfinite(colors.detach().sum(-1) + opacities.detach())
         colors, opacities = colors.where(drawable[:, None], 0.0), opacities.where(drawable, 0.0)
@@ -181,8 +182,14 @@ def composite(
         if backgrounds is not None:
             backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(c, 1)], dim=-1)
 
-    render, alphas, lists = _backend(colors.device).composite(
-        projection, colors, opacities, backgrounds=backgrounds, tile_size=tile_size, absgrad=absgrad
+    render, alphas, lists = backend.composite(
+        projection,
+        colors,
+        opacities,
+        backgrounds=backgrounds,
+        tile_size=tile_size,
+        absgrad=absgrad,
+        leave_out=leave_out,
     )
     if render_mode in ("ED", "RGB+ED"):
         render = torch.cat([render[..., :-1], render[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)

@@ -8,24 +8,33 @@ names images, not cameras; and in the packed layout takes no backgrounds of seve
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
 
 from nrfgs_ns.host import GSPLAT, gsplat_version
+from nrfgs_ns.kernels.trial import Gate
 
 from .contract import Projection
+
+if TYPE_CHECKING:  # imports Triton
+    from .tile_lists import Room
 
 HAS_BATCHES = gsplat_version() >= (1, 5)
 if HAS_BATCHES and gsplat_version() < (1, 5, 3):
     raise ImportError(f"gsplat {'.'.join(map(str, gsplat_version()))} is not known here; use {' or '.join(GSPLAT)}.")
 
 CHANNEL_CHUNK = 32  # more channels at once slow the kernels down
+MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` look through
+MOST_TILES = 2**15  # those beyond have no 16-bit number, as `tile_lists.py` wants
 
 
 def load_kernels(device: torch.device) -> None:
-    """See `nrfgs_ns.rasterizer.load_kernels`: any kernel loads all."""
+    """See `nrfgs_ns.rasterizer.load_kernels`: any of gsplat's kernels loads all."""
     spherical_harmonics(0, torch.ones(1, 3, device=device), torch.ones(1, 1, 3, device=device))
+    _kernels_run_on(device)
 
 
 def project(
@@ -122,27 +131,36 @@ def composite(
     backgrounds: Tensor | None,
     tile_size: int,
     absgrad: bool,
+    leave_out: bool = False,
 ) -> tuple[Tensor, Tensor, dict]:
-    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`."""
-    tile_width, tile_height = -(-projection.width // tile_size), -(-projection.height // tile_size)
-    if HAS_BATCHES:
-        extents = projection.extents  # a square where another device has projected them
-        bounds = projection.radii[:, None].expand(-1, 2) if extents is None else extents
-        images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
-    else:
-        bounds, images = projection.radii, {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
-    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
-        projection.means2d,
-        bounds,
-        projection.depths,
-        tile_size,
-        tile_width,
-        tile_height,
-        packed=True,
-        gaussian_ids=projection.gaussian_ids,
-        **images,
-    )
-    isect_offsets = isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height)
+    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`.
+
+    Args:
+        leave_out: rows that are not finite, if `leaves_out` says that this can be.
+    """
+    room = None
+    if len(opacities) > 0 and _kernels_take(projection, opacities, tile_size):
+        from .tile_lists import room_on
+
+        room = room_on(opacities.device)
+    while True:
+        lists = _lists(projection, opacities, tile_size, room, colors if leave_out else None)
+        render, alphas = _blend_all(projection, colors, opacities, backgrounds, tile_size, absgrad, lists)
+        if room is None or room.was_enough():
+            return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1]}
+
+
+def _blend_all(
+    projection: Projection,
+    colors: Tensor,
+    opacities: Tensor,
+    backgrounds: Tensor | None,
+    tile_size: int,
+    absgrad: bool,
+    lists: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Render and alphas from the tiles' lists, as for `composite`."""
+    isect_offsets, flatten_ids = lists
 
     def blend(colors: Tensor, backgrounds: Tensor | None) -> tuple[Tensor, Tensor]:
         behind = backgrounds
@@ -167,16 +185,81 @@ def composite(
         return render, alphas
 
     if colors.shape[-1] <= CHANNEL_CHUNK:  # nothing to cut, and nothing to put together
-        render, alphas = blend(colors, backgrounds)
-    else:
-        chunks = colors.split(CHANNEL_CHUNK, dim=-1)
-        behind = [None] * len(chunks) if backgrounds is None else backgrounds.split(CHANNEL_CHUNK, dim=-1)
-        parts = [blend(*part) for part in zip(chunks, behind, strict=True)]
-        render, alphas = torch.cat([part for part, _ in parts], dim=-1), parts[0][1]
-    lists = {
-        "tiles_per_gauss": tiles_per_gauss,
-        "isect_ids": isect_ids,
-        "flatten_ids": flatten_ids,
-        "isect_offsets": isect_offsets,
-    }
-    return render, alphas, lists
+        return blend(colors, backgrounds)
+    chunks = colors.split(CHANNEL_CHUNK, dim=-1)
+    behind = [None] * len(chunks) if backgrounds is None else backgrounds.split(CHANNEL_CHUNK, dim=-1)
+    parts = [blend(*part) for part in zip(chunks, behind, strict=True)]
+    return torch.cat([part for part, _ in parts], dim=-1), parts[0][1]
+
+
+def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor, tile_size: int) -> bool:
+    """Whether `composite` can leave out rows that are not finite. Their gradients would not all be 0."""
+    few = colors.shape[-1] <= MOST_CHECKED
+    return few and not torch.is_grad_enabled() and _kernels_take(projection, opacities, tile_size)
+
+
+def _lists(
+    projection: Projection, opacities: Tensor, tile_size: int, room: Room | None, finite: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Which splats each tile draws, as gsplat's kernels take it: offsets into a list of rows, and the list.
+
+    Args:
+        room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
+        finite: leave out the rows of which one of these, [M, D], or another number is not finite.
+    """
+    tile_width, tile_height = -(-projection.width // tile_size), -(-projection.height // tile_size)
+    bounds = projection.radii
+    if HAS_BATCHES:
+        extents = projection.extents  # a square where another device has projected them
+        bounds = projection.radii[:, None].expand(-1, 2) if extents is None else extents
+    means2d, depths, conics = projection.means2d, projection.depths, projection.conics
+    if room is not None:
+        from .tile_lists import tile_lists
+
+        tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
+        colors = None if finite is None else finite.detach().contiguous()
+        return tile_lists(*tables, tile_width, tile_height, tile_size, colors, room)
+    images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
+    if HAS_BATCHES:
+        images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
+    _, isect_ids, flatten_ids = isect_tiles(
+        means2d,
+        bounds,
+        depths,
+        tile_size,
+        tile_width,
+        tile_height,
+        packed=True,
+        gaussian_ids=projection.gaussian_ids,
+        **images,
+    )
+    return isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height), flatten_ids
+
+
+_GATE = Gate("The list of each tile's splats")
+
+
+def _kernels_take(projection: Projection, opacities: Tensor, tile_size: int) -> bool:
+    """Whether the kernels of `tile_lists.py` make the lists."""
+    tiles = -(-projection.width // tile_size) * (-(-projection.height // tile_size) + 1)
+    device = opacities.device
+    return (
+        projection.n_cameras == 1
+        and tiles <= MOST_TILES
+        and opacities.dtype == projection.means2d.dtype == torch.float32
+        and _kernels_run_on(device)
+    )
+
+
+def _kernels_run_on(device: torch.device) -> bool:
+    """Whether the kernels of `tile_lists.py` run on a device; tried once."""
+    return _GATE.opens(device, device, lambda: _try_kernels(device))
+
+
+def _try_kernels(device: torch.device) -> None:
+    """Compile and run both kernels on one splat; raise whatever goes wrong."""
+    from .tile_lists import tile_lists
+
+    ones = torch.ones(1, 3, device=device)
+    radii = torch.ones(1, 2, dtype=torch.int32, device=device) if HAS_BATCHES else ones[0, :1].int()
+    tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, 16)

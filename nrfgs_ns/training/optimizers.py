@@ -2,9 +2,9 @@
 """Nerfstudio's optimisers, with less work for the host.
 
 A training step on a GPU is bound by what Python does between kernels. Nerfstudio keeps one Adam for each tensor, and
-each `Optimizer.step` costs the host more than its kernel costs the GPU. Here Adam runs fused, one kernel for each
-group, and after its first step that kernel is called directly. Numbers and state are torch's own, so densification
-and checkpoints find what they expect.
+each `Optimizer.step` costs the host more than its kernel costs the GPU. Here Adam runs fused, and after its first step
+one kernel does all groups (`adam_triton.py`). State is torch's own, so densification and checkpoints find what they
+expect.
 """
 
 import warnings
@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
+from nrfgs_ns.kernels.trial import Gate
 from nrfgs_ns.training.pace import Pace
 
 
@@ -109,49 +110,87 @@ class LeanOptimizers(Optimizers):
 
 
 def fused_adam_step(optimizers: Iterable[Optimizer]) -> None:
-    """One step of several fused Adams whose state exists; the operator is that of `Adam(fused=True).step`.
+    """One step of several fused Adams whose state exists: in one Triton kernel, or where that cannot be by the operator
+    of `Adam(fused=True).step`.
 
     An optimiser's `found_inf` (a tensor on the device, 1.0 for "skip this step") is heeded as torch heeds it.
     """
-    counters: list[Tensor] = []
-    skips: list[Tensor] = []
-    work = []
+    work: list[tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]] = []
+    skips: list[Tensor | None] = []
     for optimizer in optimizers:
-        found_inf = getattr(optimizer, "found_inf", None)
         for group in optimizer.param_groups:
             parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
-            if not parameters:
-                continue
-            states = [optimizer.state[parameter] for parameter in parameters]
-            steps = [state["step"] for state in states]
-            counters += steps
-            skips += [found_inf] * len(steps) if found_inf is not None else []
-            work.append((group, parameters, states, steps, found_inf))
+            if parameters:
+                work.append((group, parameters, [optimizer.state[parameter] for parameter in parameters]))
+                skips.append(getattr(optimizer, "found_inf", None))
     if not work:
         return
+    counters = [state["step"] for _, _, states in work for state in states]
     torch._foreach_add_(counters, 1)
     with torch.no_grad():
-        for group, parameters, states, steps, found_inf in work:
-            beta1, beta2 = group["betas"]
-            torch._fused_adam_(
-                parameters,
-                [parameter.grad for parameter in parameters],
-                [state["exp_avg"] for state in states],
-                [state["exp_avg_sq"] for state in states],
-                [],
-                steps,
-                lr=group["lr"],
-                beta1=beta1,
-                beta2=beta2,
-                weight_decay=group["weight_decay"],
-                eps=group["eps"],
-                amsgrad=False,
-                maximize=False,
-                grad_scale=None,
-                found_inf=found_inf,
-            )
-    if skips:
-        torch._foreach_sub_(counters, skips)
+        if _step_at_once(work, skips):
+            return
+        for (group, parameters, states), found_inf in zip(work, skips, strict=True):
+            _step_group(group, parameters, states, found_inf)
+            if found_inf is not None:
+                torch._foreach_sub_([state["step"] for state in states], [found_inf] * len(states))
+
+
+def _step_group(group: dict[str, Any], parameters: list[Tensor], states: list[dict], found_inf: Tensor | None) -> None:
+    """One step of a group of parameters, whose counters have counted it."""
+    beta1, beta2 = group["betas"]
+    torch._fused_adam_(
+        parameters,
+        [parameter.grad for parameter in parameters],
+        [state["exp_avg"] for state in states],
+        [state["exp_avg_sq"] for state in states],
+        [],
+        [state["step"] for state in states],
+        lr=group["lr"],
+        beta1=beta1,
+        beta2=beta2,
+        weight_decay=group["weight_decay"],
+        eps=group["eps"],
+        amsgrad=False,
+        maximize=False,
+        grad_scale=None,
+        found_inf=found_inf,
+    )
+
+
+_GATE = Gate("Adam")
+_TABLES: dict[torch.device, Any] = {}
+
+
+def _step_at_once(work: list[tuple], skips: list[Tensor | None]) -> bool:
+    """Make the step of all groups in one kernel, if it can be, uncounted if it is skipped."""
+    device = work[0][1][0].device
+    if device.type != "cuda" or any(skip is not skips[0] for skip in skips):
+        return False
+    if not try_kernel(device):
+        return False
+    from nrfgs_ns.training.adam_triton import AdamTable
+
+    if device not in _TABLES:
+        _TABLES[device] = AdamTable(device)
+    return _TABLES[device].step(work, skips[0])
+
+
+def try_kernel(device: torch.device) -> bool:
+    """Whether Adam's kernel runs on a CUDA device; tried once, which compiles it: the first step would."""
+    return _GATE.opens(device, device, lambda: _try_kernel(device))
+
+
+def _try_kernel(device: torch.device) -> None:
+    """Compile and run the kernel on one number; raise whatever goes wrong."""
+    from nrfgs_ns.training.adam_triton import AdamTable
+
+    one = torch.nn.Parameter(torch.ones(1, device=device))
+    one.grad = torch.ones_like(one)
+    state = {name: torch.ones(1, device=device) for name in ("exp_avg", "exp_avg_sq", "step")}
+    group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
+    with torch.no_grad():
+        AdamTable(device).step([(group, [one], [state])], None)
 
 
 def in_world_units(group: dict[str, Any], scene_unit: float) -> dict[str, Any]:

@@ -4,6 +4,7 @@
 import json
 import random
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -23,6 +24,7 @@ from nrfgs_ns.kernels.trial import tried_meanwhile
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.evaluation_table import print_evaluation
+from nrfgs_ns.training.optimizers import try_kernel
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
 from nrfgs_ns.viewer.panel import ViewerPanel
 
@@ -79,7 +81,8 @@ class NrfgsPipeline(VanillaPipeline):
         super().__init__(config, device, test_mode, **kwargs)
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
-            with tried_meanwhile(self.model.kernel_trials(), self.model.device):
+            trials = self.model.kernel_trials()
+            with tried_meanwhile(trials and [*trials, partial(try_kernel, self.model.device)], self.model.device):
                 self.datamanager.load_all_images()
                 photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)

@@ -43,6 +43,16 @@ def test_values_and_gradients(opacity_bound, repeated):
     compare(head, twin, scene(head, 230 if not repeated else 30, 200, repeated), float32_tolerance())
 
 
+@pytest.mark.parametrize("diffuse", [None, 0.5])
+def test_without_gradients_the_values_are_the_same(diffuse):
+    head, _ = heads()
+    case = scene(head, 75, 70)
+    case = case if diffuse is None else some_diffuse(case, diffuse, last=True)
+    with torch.no_grad():
+        alone = head(*case)
+    assert all(map(torch.equal, alone, head(*case)))
+
+
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(
     num_bands=st.integers(1, 5),

@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from nrfgs_ns.densification import ConsistentDensification
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.robust import Trimming
-from nrfgs_ns.model.training_views import ComparedViews
+from nrfgs_ns.model.training_views import ComparedViews, wrong_pixels
 from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -171,6 +171,22 @@ def test_shares_of_the_wrong_pixels(training):
     assert (seen.wrong <= seen.pixels + 1e-5).all()
     assert seen.loss > 0
     assert len(compared(training)) == len(training.pipeline.datamanager.train_dataset)
+
+
+def test_pixels_are_those_of_the_photograph_at_any_resolution(training, monkeypatch):
+    model = training.pipeline.model
+    whole = compared(training).look(3, 0.1)
+    monkeypatch.setattr(model.config, "num_downscales", 1)
+    half = compared(training).look(3, 0.1)
+    assert_close(half.pixels.sum(), whole.pixels.sum(), rtol=0.1, atol=0)
+    assert 0 < half.wrong.sum() < half.pixels.sum()
+
+
+def test_wrong_pixels_are_between_the_smallest_and_the_largest_error_that_count():
+    error = torch.tensor([[0.1, 0.2, 0.31], [0.6, 0.9, 0.0]])[..., None]
+    counted = torch.tensor([[True, True, True], [True, False, False]])[..., None]
+    assert wrong_pixels(error, counted, 0.4)[..., 0].tolist() == [[False, False, True], [True, False, False]]
+    assert not wrong_pixels(torch.full((2, 3, 1), 0.5), counted, 0.0).any()
 
 
 def test_a_perfect_picture_has_no_wrong_pixels(training, monkeypatch):

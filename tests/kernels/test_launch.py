@@ -49,7 +49,7 @@ def test_the_second_launch_is_the_compiled_variants_with_constants_in_the_kernel
     launch((2, 1, 1), x, 7, 0.25, **CONSTANTS)
     assert kernel.launches == [
         ("triton", (1, 1, 1), (x, 8, 0.5), CONSTANTS),
-        ("compiled", (2, 1, 1), (x, 7, 0.25, 64, "bf16")),
+        ("compiled", (2, 1, 1), (x.data_ptr(), 7, 0.25, 64, "bf16")),
     ]
 
 

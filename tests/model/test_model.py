@@ -17,7 +17,7 @@ from pytorch_msssim import SSIM
 from torch.testing import assert_close
 
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.pinhole import pinhole, world_to_camera
+from nrfgs_ns.model.pinhole import FixedPinholes, pinhole, world_to_camera
 from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -194,6 +194,31 @@ def test_intrinsics_shrink_with_the_image():
     seen_from = pinhole(camera, camera.camera_to_worlds, 2)
     assert (seen_from.width, seen_from.height) == (50, 31)
     assert_close(seen_from.K[0], torch.tensor([[50.0, 0, 25], [0, 45, 15.5], [0, 0, 1]]))
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_fixed_camera_is_what_a_camera_is(batched):
+    pose = torch.cat([torch.linalg.qr(torch.randn(3, 3))[0], 100 * torch.randn(3, 1)], dim=1)
+    camera = Cameras(pose[None], fx=100.5, fy=90.25, cx=50.0, cy=31.0, width=101, height=63)[
+        slice(0, 1) if batched else 0
+    ]
+    expected, got = pinhole(camera, pose[None], 1), FixedPinholes(torch.device("cpu"))(camera)
+    assert (got.width, got.height) == (101, 63)
+    for mine, theirs in zip(
+        (got.viewmat, got.K, got.center), (expected.viewmat, expected.K, expected.center), strict=True
+    ):
+        assert torch.equal(mine, theirs) and mine.data_ptr() % 16 == 0
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
+    pinholes = FixedPinholes(torch.device("cuda"))
+    camera = Cameras(torch.eye(4)[None, :3], fx=100.0, fy=90.0, cx=50.0, cy=31.0, width=101, height=63)[0:1].to("cuda")
+    first = pinholes(camera)
+    assert pinholes(camera) is first
+    camera.camera_to_worlds[0, 0, 3] = 7.0
+    assert pinholes(camera).center.tolist() == [7.0, 0.0, 0.0]
 
 
 def test_world_to_camera_inverts_the_pose_and_flips_y_and_z():

@@ -74,13 +74,18 @@ class FusedField:
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float = 1.0
     ) -> tuple[Tensor, Tensor]:
         """Colours [M, 3] and opacities [M]: see AppearanceHead.forward, after `takes` said yes."""
-        from nrfgs_ns.appearance.fused.launch import FusedFunction
+        from nrfgs_ns.appearance.fused.launch import FusedFunction, evaluate, packed_weights
 
         weights = [weight for layer in self.layers for weight in (layer.weight, layer.bias)]
         tables = [splats[name] for name in ("means", "latents", "features_dc", "opacities")]
         diffuse = splats.get(DIFFUSE)
         ready = self._ready_on(visible.device, diffuse is not None)
         options = self._options(scene_unit)
+        if not torch.is_grad_enabled():
+            packing, launches = ready
+            whole = [tensor.detach().contiguous() for tensor in (*tables, visible, camera_centers)]
+            packed = packed_weights(packing, weights)
+            return evaluate(packing, launches.forward, options, whole[:4], diffuse, *whole[4:], packed)[:2]
         return FusedFunction.apply(*ready, options, *tables, diffuse, visible, camera_centers, *weights)
 
     def _why_not(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> str | None:

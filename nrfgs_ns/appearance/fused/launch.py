@@ -9,6 +9,7 @@ zeroed.
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -136,25 +137,8 @@ class FusedFunction(torch.autograd.Function):
     def forward(ctx, packing: Packing, launches: Launches, options: FieldOptions, means, latents, features_dc,
                 opacities, diffuse, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
-        visible, centers = _contiguous(visible), _contiguous(centers)
-        packed = torch.cat([w.reshape(-1) for w in weights] + [_zero(means.device)]).index_select(0, packing.gather)
-        count = len(visible)
-        # Triton lays out a product's factors by the narrowest number that they are computed from: for bytes, it took
-        # more columns to a thread than d_Y has, and float32's d_hidden was wrong.
-        flags = None if diffuse is None else diffuse.to(torch.int32)
-        colors, seen = means.new_empty(count, 3), means.new_empty(count)
-        if count > 0:
-            how = launches.forward
-            launch_forward(
-                (_programs(how, count, means.device), 1, 1), *tables, _or(flags, visible), visible, centers,
-                packed, colors, seen,
-                count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
-                D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
-                B=how.block, COLUMNS=how.columns,
-                ONE_CENTER=centers.dim() == 1, BOUND=options.bound, KIND=KINDS[options.precision][0],
-                DIFFUSE=flags is not None,
-                **how.options(packing.hidden),
-            )  # fmt: skip
+        visible, centers, packed = _contiguous(visible), _contiguous(centers), packed_weights(packing, weights)
+        colors, seen, flags = evaluate(packing, launches.forward, options, tables, diffuse, visible, centers, packed)
         ctx.save_for_backward(*tables, flags, visible, centers, packed)
         ctx.packing, ctx.how, ctx.options = packing, launches.backward, options
         return colors, seen
@@ -195,6 +179,39 @@ class FusedFunction(torch.autograd.Function):
         d_means = d_tables[0] if options.geometry_gradient else None
         d_centers = d_centers if wants_center else None
         return None, None, None, d_means, *d_tables[1:], None, None, d_centers, *d_weights
+
+
+def packed_weights(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
+    """The shared weights as the kernels read them."""
+    flat = [weight.detach().reshape(-1) for weight in weights]
+    return torch.cat([*flat, _zero(flat[0].device)]).index_select(0, packing.gather)
+
+
+def evaluate(packing: Packing, how: Launch, options: FieldOptions, tables: Sequence[Tensor], diffuse: Tensor | None,
+             visible: Tensor, centers: Tensor, packed: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:  # fmt: skip
+    """Colours [M, 3] and opacities [M] without gradients, and `diffuse` as the kernels read it.
+
+    Args:
+        tables: means, latents, features_dc and opacities. These and the other tensors are dense and without gradient.
+        packed: of `packed_weights`.
+    """
+    count, device = len(visible), visible.device
+    # Triton lays out a product's factors by the narrowest number that they are computed from: for bytes, it took
+    # more columns to a thread than d_Y has, and float32's d_hidden was wrong.
+    flags = None if diffuse is None else diffuse.to(torch.int32)
+    colors, seen = packed.new_empty(count, 3), packed.new_empty(count)
+    if count > 0:
+        launch_forward(
+            (_programs(how, count, device), 1, 1), *tables, _or(flags, visible), visible, centers,
+            packed, colors, seen,
+            count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
+            D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
+            B=how.block, COLUMNS=how.columns,
+            ONE_CENTER=centers.dim() == 1, BOUND=options.bound, KIND=KINDS[options.precision][0],
+            DIFFUSE=flags is not None,
+            **how.options(packing.hidden),
+        )  # fmt: skip
+    return colors, seen, flags
 
 
 def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool) -> Launches:

@@ -9,7 +9,12 @@ from ..contract import Projection
 from . import compositing
 from .projection import project
 
-__all__ = ["composite", "project"]
+__all__ = ["composite", "leaves_out", "project"]
+
+
+def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor, tile_size: int) -> bool:
+    """Whether `composite` can leave out rows that are not finite."""
+    return False
 
 
 def composite(
@@ -20,6 +25,7 @@ def composite(
     backgrounds: Tensor | None,
     tile_size: int,
     absgrad: bool,
+    leave_out: bool = False,
 ) -> tuple[Tensor, Tensor, dict]:
     """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and no lists to add to `info`."""
     render, transmittance = compositing.composite(projection, colors, opacities, tile_size=tile_size, absgrad=absgrad)

@@ -102,3 +102,10 @@ def test_every_picture_is_shown():
 def test_no_line_of_prose_begins_with_a_comment(name):
     """Markdown takes such a line for HTML: it would end the paragraph, and its links would not be links."""
     assert re.findall(r"^ {0,3}(<!-- .* -->\S.*)$", PAGES[name], re.MULTILINE) == []
+
+
+@pytest.mark.parametrize("name", ["comparison", "deviations", "expressiveness", "necessity", "opacity", "speed"])
+def test_pages_of_claims_have_at_most_600_words(name):
+    """Beside tables and commands, which are for looking up."""
+    prose = re.sub(r"```.*?```|<!--.*?-->|^\|.*?$", "", PAGES[f"docs/{name}.md"], flags=re.DOTALL | re.MULTILINE)
+    assert len(re.findall(r"\S*\w\S*", prose)) <= 600

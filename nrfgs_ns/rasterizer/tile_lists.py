@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which splats each tile of the image draws, front to back: gsplat's lists without what draws nothing.
+
+gsplat lists a splat in every tile of the square of three standard deviations around it. Its kernels then look at each
+such pair pixel by pixel, and skip pixels where
+
+    opacity exp(-sigma) < 1 / 255        sigma = 1/2 (a dx^2 + c dy^2) + b dx dy,  (a, b, c) the conic.
+
+That is outside of an ellipse, and of most of the square of a flat or transparent splat. Here a splat is listed in
+those tiles of its square that have a pixel's centre in the ellipse (Feng et al., FlashGS, and Hanson et al.,
+Speedy-Splat, 2024). What is left out draws nothing and has no gradient, so images and gradients are gsplat's.
+
+An ellipse meets a row of tiles in one interval of columns. Its ends are at the ellipse's own leftmost and rightmost
+points, or, where these lie outside the row's band, on the band's nearer edge.
+
+Splats are sorted by depth, then listed in that order, splat by splat; a stable sort by tile does the rest. The order is
+gsplat's to the last tie: 16-bit tile numbers take a quarter of the passes that its 64-bit keys take.
+"""
+
+from __future__ import annotations
+
+import threading
+from functools import lru_cache
+from typing import ClassVar
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from nrfgs_ns.kernels.launch import Launcher
+
+SPLATS = 64
+"""Splats that a program counts the tiles of; a power of two."""
+PAIRS = 256
+"""Pairs of a splat and a tile that a program lists; a power of two."""
+
+SLACK = tl.constexpr(0.02)
+"""By how much sigma may exceed its bound: the drawing kernels' exponential and their sigma are rounded."""
+MARGIN = tl.constexpr(1e-3)
+"""By which share the ellipse's half axes are lengthened, and pixels that are added to them, for the rounding here."""
+
+
+@triton.jit
+def _ellipse(means2d, conics, opacities, rows, valid):
+    """What the tests of tiles need of the splats in `rows`: centre, conic, bound of 2 sigma, determinant."""
+    x = tl.load(means2d + rows * 2, mask=valid, other=0.0)
+    y = tl.load(means2d + rows * 2 + 1, mask=valid, other=0.0)
+    a = tl.load(conics + rows * 3, mask=valid, other=1.0)
+    b = tl.load(conics + rows * 3 + 1, mask=valid, other=0.0)
+    c = tl.load(conics + rows * 3 + 2, mask=valid, other=1.0)
+    opacity = tl.load(opacities + rows, mask=valid, other=0.0)
+    bound = 2.0 * (tl.log(255.0 * opacity) + SLACK)
+    # The determinant of a long splat is a small difference of large products.
+    det = (a.to(tl.float64) * c.to(tl.float64) - b.to(tl.float64) * b.to(tl.float64)).to(tl.float32)
+    return x, y, a, b, c, bound, det
+
+
+@triton.jit
+def _box(x, y, radii, rows, valid, width, height, SIDE: tl.constexpr, RADII: tl.constexpr):
+    """Gsplat's tiles of a splat: first and end of columns and rows."""
+    center_x, center_y = x / SIDE, y / SIDE
+    reach_x = tl.load(radii + rows * RADII, mask=valid, other=0).to(tl.float32) / SIDE
+    reach_y = tl.load(radii + rows * RADII + (RADII - 1), mask=valid, other=0).to(tl.float32) / SIDE
+    left = tl.minimum(tl.maximum(tl.floor(center_x - reach_x), 0.0), width).to(tl.int32)
+    top = tl.minimum(tl.maximum(tl.floor(center_y - reach_y), 0.0), height).to(tl.int32)
+    right = tl.minimum(tl.maximum(tl.ceil(center_x + reach_x), 0.0), width).to(tl.int32)
+    bottom = tl.minimum(tl.maximum(tl.ceil(center_y + reach_y), 0.0), height).to(tl.int32)
+    return left, top, right, bottom
+
+
+@triton.jit
+def _columns(row, x, y, a, b, c, bound, det, left, right, SIDE: tl.constexpr):
+    """First and end of the columns of tiles in which a splat meets a row of tiles."""
+    # Centres of the row's pixels, from the splat's.
+    above = row.to(tl.float32) * SIDE + 0.5 - y
+    below = above + (SIDE - 1.0)
+    # Where there is no ellipse to be sure of, the whole box: what is not finite must be seen in the image.
+    flat = ~(det > 0.0) | ~(tl.abs(bound) < float("inf"))
+    det = tl.where(flat, 1.0, det)
+    reach_x = tl.sqrt(bound * c / det)
+    reach_y = tl.sqrt(bound * a / det)
+    reach_y += reach_y * MARGIN + MARGIN
+    meets = (above <= reach_y) & (below >= -reach_y)
+    # Where the ellipse is farthest right; farthest left it is on the opposite side.
+    turn = -b * reach_x / c
+    at_right = tl.minimum(tl.maximum(turn, above), below)
+    at_left = tl.minimum(tl.maximum(-turn, above), below)
+    half_right = tl.sqrt(tl.maximum(a * bound - det * at_right * at_right, 0.0))
+    half_left = tl.sqrt(tl.maximum(a * bound - det * at_left * at_left, 0.0))
+    margin = reach_x * MARGIN + MARGIN
+    most = x + (half_right - b * at_right) / a + margin
+    least = x - (half_left + b * at_left) / a - margin
+    first = tl.ceil((least - (SIDE - 0.5)) / SIDE)
+    end = tl.floor((most - 0.5) / SIDE) + 1.0
+    # As floats: far outside of the image they are no integers of 32 bits.
+    first = tl.where(flat, left, tl.minimum(tl.maximum(first, left.to(tl.float32)), right.to(tl.float32)).to(tl.int32))
+    end = tl.where(flat, right, tl.minimum(tl.maximum(end, left.to(tl.float32)), right.to(tl.float32)).to(tl.int32))
+    return first, tl.where(meets | flat, tl.maximum(end, first), first)
+
+
+@triton.jit(do_not_specialize=["count", "width", "height"])
+def count_kernel(
+    means2d, conics, opacities, radii, order, counts, colors, count, width, height,
+    SPLATS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr, CHANNELS: tl.constexpr,
+):  # fmt: skip
+    """How many tiles each splat is listed in, by its place in `order`. If there are CHANNELS, none where a number is
+    not finite."""
+    at = tl.program_id(0) * SPLATS + tl.arange(0, SPLATS)
+    valid = at < count
+    rows = tl.load(order + at, mask=valid, other=0)
+    x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
+    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
+    drawn = valid & ~(bound <= 0.0)
+    if CHANNELS > 0:
+        total = x + y + a + b + c + bound
+        for channel in tl.static_range(CHANNELS):
+            total += tl.load(colors + rows * CHANNELS + channel, mask=valid, other=0.0)
+        drawn = drawn & (tl.abs(total) < float("inf"))
+    bottom = tl.where(drawn, bottom, top)
+    tiles = tl.zeros((SPLATS,), tl.int32)
+    for step in range(tl.max(bottom - top, axis=0)):
+        row = top + step
+        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, SIDE)
+        tiles += tl.where(row < bottom, end - first, 0)
+    tl.store(counts + at, tiles, mask=valid)
+
+
+@triton.jit(do_not_specialize=["count", "pairs", "width", "height"])
+def list_kernel(
+    means2d, conics, opacities, radii, order, ends, tiles, splats, count, pairs, width, height,
+    PAIRS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr,
+):  # fmt: skip
+    """The tile and the splat of each pair, splats in `order`. Pairs beyond the last, and those that rounding has left
+    without a tile, get the tile behind the last."""
+    at = tl.program_id(0) * PAIRS + tl.arange(0, PAIRS)
+    valid = at < pairs
+    real = at < tl.load(ends + (count - 1))
+    # The splat of a pair: how many splats end at or before it.
+    low = tl.zeros((PAIRS,), tl.int32)
+    high = tl.zeros((PAIRS,), tl.int32) + (count - 1)
+    while tl.max(high - low, axis=0) > 0:
+        middle = (low + high) // 2
+        before = tl.load(ends + middle) <= at
+        low = tl.where(before & (low < high), middle + 1, low)
+        high = tl.where(before, high, middle)
+    begin = tl.load(ends + low - 1, mask=low > 0, other=0)
+    rows = tl.load(order + low)
+    x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
+    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
+    left_over = tl.where(real, at - begin, -1).to(tl.int32)  # tiles of the splat before the pair's, in rows to come
+    tile = tl.zeros((PAIRS,), tl.int32) + width * height
+    row = top
+    while tl.max(tl.where(row < bottom, left_over, -1), axis=0) >= 0:
+        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, SIDE)
+        here = (left_over >= 0) & (left_over < end - first)
+        tile = tl.where(here, row * width + first + left_over, tile)
+        left_over = tl.where(here, -1, left_over - tl.where(left_over >= 0, end - first, 0))
+        row += 1
+    tl.store(tiles + at, tile.to(tl.int16), mask=valid)
+    tl.store(splats + at, rows.to(tl.int32), mask=valid)
+
+
+launch_count, launch_list = Launcher(count_kernel), Launcher(list_kernel)
+
+
+class Room:
+    """How many pairs of splats and tiles there is room for on a GPU.
+
+    How many there are the GPU alone knows. To ask it, the host would wait while there is nothing for the GPU to do. So
+    the host makes room for a little more than there were lately, goes on, and looks whether that was enough when the
+    image is on its way.
+    """
+
+    MORE: ClassVar[float] = 1.25
+    """Room for each pair that there was."""
+    KEPT: ClassVar[float] = 0.99
+    """Share of the room that is there for the next image, if it needs as little."""
+
+    def __init__(self):
+        self.pairs = 0
+        with torch.inference_mode(False):  # it outlives a rendering that records nothing
+            self._counted = torch.empty(1, dtype=torch.int64, pin_memory=True)
+        self._arrived = torch.cuda.Event()
+
+    def send(self, total: Tensor) -> None:
+        """Send the number of pairs [1] home."""
+        self._counted.copy_(total, non_blocking=True)
+        self._arrived.record()
+
+    def needed(self) -> int:
+        """The number that was sent, for which the host waits."""
+        self._arrived.synchronize()
+        return int(self._counted[0])
+
+    def was_enough(self) -> bool:
+        """Whether there was room for all pairs; then, and next time, there is."""
+        pairs, room = self.needed(), self.pairs
+        self.pairs = max(int(self.MORE * pairs), int(self.KEPT * room))
+        return pairs <= room
+
+
+_ROOMS = threading.local()
+
+
+def room_on(device: torch.device) -> Room:
+    """The room on a GPU for the images of this thread: a viewer's are other images than a training's."""
+    rooms = _ROOMS.__dict__
+    if device not in rooms:
+        rooms[device] = Room()
+    return rooms[device]
+
+
+def tile_lists(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    width: int,
+    height: int,
+    side: int,
+    colors: Tensor | None = None,
+    room: Room | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Lists of one camera's tiles. All tensors are dense, of M splats that are all visible.
+
+    Args:
+        means2d, depths, conics: of a `Projection`.
+        radii: half the sides, in pixels, of the boxes that bound the splats: of squares [M] or of rectangles [M, 2].
+        opacities: that the splats are drawn with, [M].
+        width, height: of the image, in tiles; with the row below it has at most 2^15.
+        side: of a tile, in pixels.
+        colors: leave out the splats of which one of these, [M, D], or another number is not finite.
+
+        room: make room for so many pairs, and send home how many there are; None: wait for their number.
+
+    Returns:
+        Where each tile's splats begin, int32 [1, height + 1, width], the last row for tiles below the image; rows of
+        the splats, tile by tile, int32; without room for all pairs, some are missing.
+    """
+    count, device, axes = len(depths), depths.device, 1 if radii.dim() == 1 else 2
+    order = torch.sort(depths, stable=True).indices
+    counts = torch.empty(count, dtype=torch.int32, device=device)
+    splats = means2d, conics, opacities, radii, order
+    if count > 0:
+        launch_count(
+            (-(-count // SPLATS), 1, 1), *splats, counts, conics if colors is None else colors, count, width, height,
+            SPLATS=SPLATS, SIDE=side, RADII=axes, CHANNELS=0 if colors is None else colors.shape[1],
+            num_warps=max(SPLATS // 32, 1),
+        )  # fmt: skip
+    ends = counts.cumsum(0)
+    if count == 0:
+        pairs = 0
+    elif room is None:
+        pairs = int(ends[-1])
+    else:
+        room.send(ends[-1:])
+        pairs = room.pairs
+    tiles = torch.empty(pairs, dtype=torch.int16, device=device)
+    rows = torch.empty(pairs, dtype=torch.int32, device=device)
+    if pairs > 0:
+        launch_list(
+            (-(-pairs // PAIRS), 1, 1), *splats, ends, tiles, rows, count, pairs, width, height,
+            PAIRS=PAIRS, SIDE=side, RADII=axes, num_warps=4,
+        )  # fmt: skip
+    tiles, by_tile = torch.sort(tiles, stable=True)
+    numbers = _numbers(width * (height + 1), device)
+    begins = torch.searchsorted(tiles, numbers, out_int32=True)
+    return begins.view(1, height + 1, width), rows.index_select(0, by_tile)
+
+
+@lru_cache(maxsize=16)
+def _numbers(count: int, device: torch.device) -> Tensor:
+    """0 to count - 1; made once for each size of image."""
+    with torch.inference_mode(False):  # they outlive a rendering that records nothing
+        return torch.arange(count, dtype=torch.int16, device=device)

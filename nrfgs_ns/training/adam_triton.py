@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adam of many tensors in one Triton launch, whatever their learning rates; torch's fused Adam is its twin.
+
+PyTorch launches once for each learning rate, and gives 65,536 numbers to each block of threads: a table of a hundred
+thousand splats keeps a dozen of a card's hundred multiprocessors busy, and small tables take as long as large ones.
+Here a program takes `BLOCK` numbers of any tensor. What the kernel must know of each tensor is a column of one table,
+copied to the device in each step, because gradients lie elsewhere in each.
+
+The equations are torch's (Kingma and Ba 2015, with bias correction), in float32; the corrections, which begin at
+1 - beta2, in float64.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from nrfgs_ns.kernels.launch import ALIGNMENT, Launcher
+
+BLOCK = 512
+"""Numbers that a program takes; a power of two."""
+WARPS = 4
+"""Warps of a program."""
+COLUMNS = 64
+"""Most tensors of a step; a power of two."""
+END, SIZE, PARAMETER, MEAN, SQUARE, STEP, GRADIENT, RATE, BETA1, BETA2, EPSILON, DECAY = map(tl.constexpr, range(12))
+"""Rows of the table: the last program's number + 1, how many numbers there are, where they lie, and the constants."""
+ROWS = 12
+FIXED = slice(PARAMETER.value, STEP.value + 1)
+CONSTANTS = slice(RATE.value, DECAY.value + 1)
+
+Group = tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]
+"""torch's options of some parameters (lr, betas, eps, weight_decay), the parameters, and their states."""
+
+
+@triton.jit
+def _entry(table, row, column, COLUMNS: tl.constexpr):
+    """An integer of the table."""
+    return tl.load(table + row * COLUMNS + column)
+
+
+@triton.jit
+def _number(table, row, column, COLUMNS: tl.constexpr):
+    """A number of the table, float64."""
+    return _entry(table, row, column, COLUMNS).to(tl.float64, bitcast=True)
+
+
+@triton.jit
+def _place(base, table, row, column, COLUMNS: tl.constexpr):
+    """Where a tensor begins. Its distance from `base` is whole fours of numbers, so that four are read at once."""
+    return base + tl.multiple_of(_entry(table, row, column, COLUMNS), 4)
+
+
+@triton.jit
+def adam_kernel(base, table, skip, BLOCK: tl.constexpr, COLUMNS: tl.constexpr):
+    """One step of all tensors of `table`, which their counters have counted; if `skip` is not 0, they uncount it."""
+    program = tl.program_id(0)
+    ends = tl.load(table + END * COLUMNS + tl.arange(0, COLUMNS))
+    column = tl.sum((ends <= program).to(tl.int32), axis=0)
+    first = tl.max(tl.where(ends <= program, ends, 0), axis=0)
+    counter = base + _entry(table, STEP, column, COLUMNS)
+    counted = tl.load(counter)
+    if tl.load(skip) != 0.0:
+        if program == first:
+            tl.store(counter, counted - 1.0)
+    else:
+        steps = counted.to(tl.float64)
+        beta1 = _number(table, BETA1, column, COLUMNS)
+        beta2 = _number(table, BETA2, column, COLUMNS)
+        correction1 = 1.0 - tl.exp(steps * tl.log(beta1))
+        correction2 = 1.0 - tl.exp(steps * tl.log(beta2))
+        rate = (_number(table, RATE, column, COLUMNS) / correction1).to(tl.float32)
+        root = tl.sqrt(correction2).to(tl.float32)
+        epsilon = _number(table, EPSILON, column, COLUMNS).to(tl.float32)
+        decay = _number(table, DECAY, column, COLUMNS).to(tl.float32)
+        new1 = (1.0 - beta1).to(tl.float32)
+        new2 = (1.0 - beta2).to(tl.float32)
+        old1 = beta1.to(tl.float32)
+        old2 = beta2.to(tl.float32)
+
+        at = (program - first) * BLOCK + tl.arange(0, BLOCK)
+        inside = at < _entry(table, SIZE, column, COLUMNS)
+        parameters = _place(base, table, PARAMETER, column, COLUMNS) + at
+        means = _place(base, table, MEAN, column, COLUMNS) + at
+        squares = _place(base, table, SQUARE, column, COLUMNS) + at
+        parameter = tl.load(parameters, mask=inside)
+        gradient = tl.load(_place(base, table, GRADIENT, column, COLUMNS) + at, mask=inside)
+        mean = tl.load(means, mask=inside)
+        square = tl.load(squares, mask=inside)
+        gradient += decay * parameter
+        mean = old1 * mean + new1 * gradient
+        square = old2 * square + new2 * gradient * gradient
+        parameter -= rate * mean / (tl.sqrt(square) / root + epsilon)
+        tl.store(parameters, parameter, mask=inside)
+        tl.store(means, mean, mask=inside)
+        tl.store(squares, square, mask=inside)
+
+
+launch = Launcher(adam_kernel)
+
+
+class AdamTable:
+    """The table on one device, and its copy in host memory. Only what has changed since the last step is written."""
+
+    def __init__(self, device: torch.device):
+        on_cuda = device.type == "cuda"
+        self.device = torch.zeros(ROWS, COLUMNS, dtype=torch.int64, device=device)
+        self.host = torch.zeros(ROWS, COLUMNS, dtype=torch.int64, pin_memory=on_cuda)
+        self.rows = self.host.numpy()
+        self.numbers = self.rows.view(np.float64)
+        self.copied = torch.cuda.Event() if on_cuda else None
+        self.never = torch.zeros((), device=device)
+        self.fixed: list[int] = []
+        self.constants: list[tuple] = []
+        self.programs = 0
+
+    def step(self, work: list[Group], skip: Tensor | None) -> bool:
+        """One step, in place, of parameters with gradients whose counters have counted it.
+
+        Args:
+            work: all groups.
+            skip: a number on the device, not 0 to leave everything as it was before; None: do not skip.
+
+        Returns:
+            Whether the kernel could make it: of at most `COLUMNS` tensors, all float32, dense, aligned and on the
+            table's device. If not, nothing has been done.
+        """
+        fixed: list[int] = []
+        gradients: list[int] = []
+        constants: list[tuple] = []
+        aligned = True
+        for group, parameters, states in work:
+            constant = (group["lr"], *group["betas"], group["eps"], group["weight_decay"])
+            for parameter, state in zip(parameters, states, strict=True):
+                mean, square, gradient = state["exp_avg"], state["exp_avg_sq"], parameter.grad
+                fixed += (parameter.data_ptr(), mean.data_ptr(), square.data_ptr(), state["step"].data_ptr())
+                fixed.append(parameter.numel())
+                gradients.append(gradient.data_ptr())
+                aligned = aligned and gradient.is_contiguous() and gradients[-1] % ALIGNMENT == 0
+                constants.append(constant)
+        if self.copied is not None:
+            self.copied.synchronize()  # the copy of the step before, which has long been made
+        if not aligned or (fixed != self.fixed and not self._write_fixed(work, fixed)):
+            return False
+        count, base = len(gradients), work[0][1][0]
+        if constants != self.constants:
+            self.numbers[CONSTANTS, :count] = np.array(constants).T
+            self.constants = constants
+        self.rows[GRADIENT, :count] = (np.array(gradients) - base.data_ptr()) >> 2
+        self.device.copy_(self.host, non_blocking=True)
+        if self.copied is not None:
+            self.copied.record()
+        skip = self.never if skip is None else skip
+        launch((self.programs, 1, 1), base, self.device, skip, BLOCK=BLOCK, COLUMNS=COLUMNS, num_warps=WARPS)
+        for _, parameters, _ in work:  # of which PyTorch cannot know that they have been written to
+            for parameter in parameters:
+                torch.autograd.graph.increment_version(parameter)
+        return True
+
+    def _write_fixed(self, work: list[Group], fixed: list[int]) -> bool:
+        """Write where the tensors lie, as far as that stays from step to step, if the kernel can step them."""
+        self.fixed = []
+        parts = [
+            tensor
+            for _, parameters, states in work
+            for parameter, state in zip(parameters, states, strict=True)
+            for tensor in (parameter, state["exp_avg"], state["exp_avg_sq"])
+        ]
+        if len(fixed) > 5 * COLUMNS or not all(
+            part.dtype == torch.float32
+            and part.device == self.device.device
+            and part.is_contiguous()
+            and part.data_ptr() % ALIGNMENT == 0
+            for part in parts
+        ):
+            return False
+        each = np.array(fixed).reshape(-1, 5).T
+        count, programs = each.shape[1], -(-each[4] // BLOCK)
+        self.rows[END, :count] = np.cumsum(programs)
+        self.rows[END, count:] = np.iinfo(np.int64).max
+        self.rows[SIZE, :count] = each[4]
+        self.rows[FIXED, :count] = (each[:4] - each[0, 0]) >> 2
+        self.fixed, self.constants, self.programs = fixed, [], int(programs.sum())
+        return True

@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The kernel of the growth's statistics in Triton's interpreter against its twin.
+
+Run by kernels/test_interpreted.py in a process of its own: Triton decides when it is imported whether it interprets.
+"""
+
+import pytest
+import quick_interpreter  # noqa: F401
+import torch
+from torch.testing import assert_close
+
+from nrfgs_ns.densification.statistics import add_in_torch
+from nrfgs_ns.densification.statistics_triton import add
+
+
+@pytest.mark.parametrize("names", [("grad2d", "count"), ("grad2d", "count", "radii")])
+@pytest.mark.parametrize("visible", [0, 1, 300])
+def test_the_kernel_adds_what_its_twin_adds(names, visible):
+    torch.manual_seed(0)
+    rows = torch.randperm(400)[:visible].sort().values
+    gradients, radii = torch.randn(visible, 2), torch.randint(1, 100, (visible,), dtype=torch.int32)
+    mine = {name: torch.rand(400) for name in names}
+    theirs = {name: value.clone() for name, value in mine.items()}
+    add(mine["grad2d"], mine["count"], mine.get("radii"), rows, gradients, radii, (400.0, 300.0), 1 / 800.0)
+    add_in_torch(theirs, rows, gradients, radii, (400.0, 300.0), 800.0)
+    for name in names:
+        assert_close(mine[name], theirs[name], rtol=1e-6, atol=0.0)

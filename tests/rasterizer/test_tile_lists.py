@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lists of what each tile draws, on a GPU: gsplat's images and gradients from them. In Triton's interpreter:
+tile_lists_interpreted.py."""
+
+import pytest
+import torch
+from tile_list_cases import assert_lists, splats
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+class TestOnCuda:
+    def test_tiles_list_what_draws_in_them(self):
+        from nrfgs_ns.rasterizer.tile_lists import tile_lists
+
+        of = splats(3000, 300, 200)
+        lists = tile_lists(*(table.cuda() for table in of), 19, 13, 16)
+        assert_lists(*(part.cpu() for part in lists), of, 19, 13, 16)
+
+    @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
+    @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
+    def test_images_and_gradients_are_those_of_gsplats_lists(self, monkeypatch, mode, rasterize_mode):
+        from nrfgs_ns.rasterizer import composite, gsplat_cuda, project
+
+        generator = torch.Generator().manual_seed(0)
+
+        def random(*shape: int) -> torch.Tensor:
+            return torch.randn(*shape, generator=generator).cuda()
+
+        count = 5000
+        tables = [2 * random(count, 3), random(count, 4), (0.7 * random(count, 3) - 3).exp()]
+        tables[0][:, 2] += 6.0
+        tables += [torch.sigmoid(random(count, 3)), torch.sigmoid(2 * random(count) - 1)]
+        view, K = torch.eye(4).cuda()[None], torch.tensor([[[200.0, 0, 150], [0, 200, 100], [0, 0, 1]]]).cuda()
+        upstream = random(1, 200, 300, 3 if mode == "RGB" else 4)
+
+        def render() -> list[torch.Tensor]:
+            means, quats, scales, colors, opacities = leaves = [table.clone().requires_grad_() for table in tables]
+            seen = project(means, quats, scales, view, K, 300, 200, rasterize_mode=rasterize_mode, assume_finite=True)
+            rows = seen.gaussian_ids
+            image, _, info = composite(
+                seen, colors[rows], opacities[rows], render_mode=mode, assume_finite=True,
+                backgrounds=torch.full((1, 3), 0.3).cuda(),
+            )  # fmt: skip
+            image.backward(upstream)
+            return [image.detach(), *(leaf.grad for leaf in leaves)], len(info["flatten_ids"])
+
+        assert gsplat_cuda._GATE.find(torch.device("cuda", 0), torch.device("cuda", 0), lambda: None) is None
+        mine, pairs = render()
+        monkeypatch.setattr(gsplat_cuda, "MOST_TILES", 0)
+        theirs, all_pairs = render()
+        assert pairs < 0.8 * all_pairs
+        torch.testing.assert_close(mine[0], theirs[0], rtol=0, atol=2e-6)
+        for got, expected in zip(mine[1:], theirs[1:], strict=True):
+            assert (got - expected).norm() <= 1e-5 * expected.norm()  # atomics add in any order
