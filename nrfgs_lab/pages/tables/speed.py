@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tables of docs/speed.md."""
 
-from statistics import fmean
+from statistics import fmean, median
 
 from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, mean_of, records
 
@@ -132,3 +132,52 @@ def first_sight() -> str:
         body.append([f"{target} dB, {reached['steps']:,} steps", f"{seconds - before:.1f}", f"{seconds:.1f}"])
         before = seconds
     return grid(["", "seconds", "since the command"], body)
+
+
+PARTS = {
+    "whole": "as it is",
+    "without lists": "gsplat's lists of what tiles draw",
+    "without adam": "torch's fused Adam",
+    "without statistics": "growth's statistics in PyTorch",
+    "without all": "all three",
+}
+
+
+def step_parts() -> str:
+    """What each of the step's own kernels saves: medians over rounds, and the step's range."""
+    body = []
+    for variant, label in PARTS.items():
+        cells = []
+        for method in ("nrfgs", "nrfgs-sh"):
+            rows = _rows(method, variant)
+            cells += [f"{median(row['gpu_ms'] for row in rows):.2f}", spread([row["step_ms"] for row in rows], 1)]
+        body.append([label, *cells])
+    return grid(["", "`nrfgs`: GPU", "step", "`nrfgs-sh`: GPU", "step"], body)
+
+
+def gpu_share(method: str, variant: str, base_method: str, base_variant: str) -> str:
+    """The GPU's time in a step, over another's."""
+    times = [median(row["gpu_ms"] for row in _rows(*one)) for one in ((method, variant), (base_method, base_variant))]
+    return f"{times[0] / times[1]:.2f}"
+
+
+def frames() -> str:
+    """Frames per second of models with about as many splats, in turns: each round."""
+    rows = records("step_parts")["bonsai_250k"]["frames"]
+    body = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row["fps"] for row in rows if row["method"] == method]
+        cells = [", ".join(f"{fps[size]:.0f}" for fps in mine) for size in mine[0]]
+        body.append([f"`{method}`", *cells])
+    return grid(["", "799 x 532", "1080p", "799 x 532, gsplat's lists", "1080p, gsplat's lists"], body)
+
+
+def spread(numbers: list[float], digits: int) -> str:
+    """Median, least and largest."""
+    return f"{median(numbers):.{digits}f} ({min(numbers):.{digits}f} to {max(numbers):.{digits}f})"
+
+
+def _rows(method: str, variant: str) -> list[dict]:
+    """The rounds of a variant of a step."""
+    rows = records("step_parts")["bonsai_250k"]["steps"]
+    return [row for row in rows if (row["method"], row["variant"]) == (method, variant)]
