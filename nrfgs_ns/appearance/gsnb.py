@@ -8,7 +8,7 @@ Seen from the direction d from camera to splat, with coefficients k per splat an
 where B = 16 at degree 3 and both sums have the same 48 coefficients. phi is the Fourier encoding of d with 6 bands,
 two hidden layers of 64 leaky ReLUs, and tanh: 39 -> 64 -> 64 -> 16. rho grows from 0 to 1 over the first 5,000
 steps; the harmonics' degree grows as it does without phi. The encoding keeps d itself: sines and cosines of whole
-multiples of pi cannot tell +x from -x (`raw_direction False` leaves it out). Opacity does not depend on the view. Source: the paper "Gaussian Splatting with
+multiples of pi cannot tell +x from -x. Opacity does not depend on the view. Source: the paper "Gaussian Splatting with
 Neural Basis Extension", called GSNB.
 
 Sizes at the defaults: 48 colour numbers per splat, as with harmonics alone; 7,760 shared weights.
