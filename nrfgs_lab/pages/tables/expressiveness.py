@@ -4,7 +4,6 @@
 from nrfgs_lab.express.report import PAPER, ROWS, SETUPS, change_cells, number
 from nrfgs_lab.pages.tables import grid, records
 
-
 UNTOLD = "sh", "nrf-bounded", "gsnb-small"
 """Variants that the page leaves to the records."""
 

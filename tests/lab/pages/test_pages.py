@@ -161,7 +161,9 @@ def flags(config, prefix: str = "") -> set[str]:
 
 def test_options_that_pages_name_are_there():
     known = set().union(*(flags(method.config) for method in methods()))
-    shown = {flag for path in pages() for flag in re.findall(r"--(pipeline\.[\w.-]*\w)", path.read_text(encoding="utf-8"))}
+    shown = {
+        flag for path in pages() for flag in re.findall(r"--(pipeline\.[\w.-]*\w)", path.read_text(encoding="utf-8"))
+    }
     assert len(shown) > 20
     assert {flag.replace("_", "-") for flag in shown} <= known
 
