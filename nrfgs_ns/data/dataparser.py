@@ -52,6 +52,9 @@ from nrfgs_ns.data.sight import check_sight, in_reach
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.start import with_data_parsers
+
+with_data_parsers()
 
 SPLITS = ("train", "val", "test")
 """nerfstudio's names of the parts of a data set."""

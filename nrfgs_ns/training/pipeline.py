@@ -78,7 +78,9 @@ class NrfgsPipeline(VanillaPipeline):
                 f"pipeline.compact is {config.compact}, but a training does not begin with a compact file. Leave it "
                 "out; --load-dir goes on from a checkpoint."
             )
-        super().__init__(config, device, test_mode, **kwargs)
+        wake = [partial(torch.empty, 1, device=device)] if torch.device(device).type == "cuda" else []
+        with tried_meanwhile(wake, torch.device(device)):  # CUDA starts while the data set is checked
+            super().__init__(config, device, test_mode, **kwargs)
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             trials = self.model.kernel_trials()
