@@ -36,9 +36,8 @@ class ShardingConfig:
     rebalance_at: float = 1.1
     """splats move between devices once one has more than this many times the mean; looked at after each refinement"""
     schedules: Literal["steps", "images"] = "steps"
-    """what step numbers and learning rates mean. steps: what they say; each step sees one image for each device.
-    images: they are one device's; a training sees as many images as there, in fewer and larger steps
-    (docs/many-gpus.md)"""
+    """what step numbers and learning rates are of. steps: of steps, each of which sees one image for each device.
+    images: of one device's training; as many images are seen as there, in fewer steps (docs/many-gpus.md)"""
 
 
 @dataclass
