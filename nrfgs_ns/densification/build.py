@@ -30,7 +30,7 @@ UNREAD = {
     "splatfacto": ("original", "consistent", "mcmc", "splat_budget"),
     "original": (*SPLATFACTOS_THRESHOLDS, "consistent", "mcmc", "splat_budget"),
     "consistent": ("original", "mcmc", "splat_budget"),
-    "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at", "original", "consistent"),
+    "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at", "keep", "original", "consistent"),
 }
 """Options of the model that a strategy does not read, and refuses where they are set."""
 
@@ -56,6 +56,8 @@ def build_densification(config: Any, num_train_images: int, scene_unit: float = 
             f"pipeline.model.opacity_seen_by_densification is {config.opacity_seen_by_densification!r}; "
             "use 'base' or 'peak'."
         )
+    if not 0 < config.keep <= 1:
+        raise InputError(f"pipeline.model.keep is {config.keep}; it must be above 0 and at most 1.")
     _refuse_options(config)
     return makers[config.densification](config, num_train_images, scene_unit)
 
@@ -67,6 +69,7 @@ def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densif
         config.opacity_seen_by_densification or "base",
         scene_unit,
         reset_at_start=True,
+        keep=config.keep,
     )
 
 
@@ -78,6 +81,7 @@ def _consistent(config: Any, num_train_images: int, scene_unit: float) -> Densif
         config.opacity_seen_by_densification or "base",
         scene_unit,
         seed=torch.initial_seed(),
+        keep=config.keep,
     )
 
 
@@ -118,7 +122,7 @@ def _original(config: Any, num_train_images: int, scene_unit: float) -> Densific
         verbose=True,
     )
     return GradientDensification(
-        "original", strategy, config.opacity_seen_by_densification or "base", scene_unit=None, reset_at_start=False
+        "original", strategy, config.opacity_seen_by_densification or "base", scene_unit=None, reset_at_start=False, keep=config.keep
     )
 
 

@@ -90,8 +90,9 @@ class Consistent(GradientDensification):
         opacity_seen: OpacitySeen,
         scene_unit: float,
         seed: int,
+        keep: float = 1.0,
     ):
-        super().__init__("consistent", strategy, opacity_seen, scene_unit, reset_at_start=True)
+        super().__init__("consistent", strategy, opacity_seen, scene_unit, reset_at_start=True, keep=keep)
         self.config, self.seed = config, seed
         self.state |= {VIEWED: 0, FIRST_VIEW: None, SUPPORTED: None}
 

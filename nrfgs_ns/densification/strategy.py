@@ -71,6 +71,17 @@ class TrainingViews(Protocol):
             wrong: error above which a pixel is wrong, as a share of the way from the view's smallest to its largest.
         """
 
+    def changes_without(self, index: int, generator: torch.Generator, passes: int) -> tuple[Tensor, Tensor]:
+        """How much the picture of one view would change without each splat that it sees (`rasterizer.changes_without`).
+
+        Args:
+            index: of the view.
+            generator, passes: of the estimate.
+
+        Returns:
+            Rows of the table, int64 [M], and sums over pixels and channels of the squared change, [M].
+        """
+
 
 class Densification(ABC):
     """What the model asks of a strategy. `state` is all that a continued training needs, and goes into checkpoints."""

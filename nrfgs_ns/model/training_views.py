@@ -10,7 +10,7 @@ from torch import Tensor
 from nrfgs_ns.densification import Seen
 from nrfgs_ns.image import robust
 from nrfgs_ns.image.ssim import photometric_loss
-from nrfgs_ns.rasterizer import contributions
+from nrfgs_ns.rasterizer import changes_without, contributions
 
 
 def wrong_pixels(error: Tensor, counted: Tensor, wrong: float) -> Tensor:
@@ -60,6 +60,26 @@ class ComparedViews:
         pixels, of_those = (area * contributions(view.projection, appearance.opacities, maps)).unbind(dim=-1)
         loss = photometric_loss(rgb * counted, truth * counted, model.config.ssim_lambda)
         return Seen(view.visible, pixels, of_those, loss)
+
+    @torch.no_grad()
+    def changes_without(self, index: int, generator: torch.Generator, passes: int) -> tuple[Tensor, Tensor]:
+        """See `densification.TrainingViews`."""
+        model = self.model
+        camera, batch = self.datamanager.train_view(index)
+        field = model.field
+        view = model.project(camera, field.splats)
+        appearance = field.seen_from(view)
+        outputs, truth = model.against_photograph(camera, batch, view, appearance)
+        changes = changes_without(
+            view.projection,
+            appearance.colors,
+            appearance.opacities,
+            self._counted(outputs["rgb"], truth, model.mask_of(batch))[None],
+            generator,
+            backgrounds=model.background_color.to(model.device)[None],
+            passes=passes,
+        )
+        return view.visible, changes
 
     def _counted(self, rgb: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
         """Which pixels count: bool [H, W, 1]."""
