@@ -285,7 +285,8 @@ def changes_without(
     return total / passes
 
 
-def rasterization(    means: Tensor,
+def rasterization(
+    means: Tensor,
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,

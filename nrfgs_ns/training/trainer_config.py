@@ -76,12 +76,6 @@ class NrfgsTrainerConfig(TrainerConfig):
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise InputError(f"{name} is {value}; it must be zero or positive.")
-        if devices > 1 and self.pipeline.model.densification == "consistent":
-            raise InputError(
-                "pipeline.model.densification is 'consistent', which is for one device: it compares whole pictures "
-                "with their photographs, and here each device has a part of the splats. Use 'splatfacto', 'original' "
-                "or 'mcmc', or --machine.num-devices 1."
-            )
         self._check_thinning(devices)
         scale = self.pipeline.datamanager.camera_res_scale_factor
         if not 0 < scale < math.inf:

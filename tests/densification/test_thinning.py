@@ -10,7 +10,7 @@ from nrfgs_ns.densification import build_densification
 from nrfgs_ns.densification.thinning import ROUNDS, least_missed, missed
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModelConfig
-from nrfgs_ns.model.training_views import ComparedViews
+from nrfgs_ns.model.training_views import TrainingPictures
 from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -52,7 +52,7 @@ def test_the_least_missed_go_in_three_rounds_after_growth(name):
 
 
 def test_rounds_follow_the_pace_and_a_continued_training():
-    """In 6,000 steps at a fifth of the schedule's: 3,000, 3,600, 4,200. What a checkpoint has done is not done again."""
+    """In a fifth of the schedule's steps: 3,000, 3,600, 4,200. What a checkpoint has done is not done again."""
     table = Table(64)
     chosen = thinning(table)
     chosen.reschedule(lambda position: round(position / 5))
@@ -100,7 +100,7 @@ def test_a_view_misses_what_its_picture_shows(training, monkeypatch):
     mask = torch.zeros(36, 48, 1)
     mask[:, 24:] = 1.0
     monkeypatch.setitem(data.cached_train[2], "mask", mask)
-    rows, changes = ComparedViews(model, data).changes_without(2, torch.Generator().manual_seed(1), 50)
+    rows, changes = TrainingPictures(model, data).changes_without(2, torch.Generator().manual_seed(1), 50)
     camera, batch = data.train_view(2)
     view = model.project(camera)
     assert torch.equal(rows, view.visible) and not changes.requires_grad

@@ -42,7 +42,7 @@ def check(name: str, device: str) -> None:
     counted = torch.zeros(*render.shape[:-1], 1, dtype=torch.bool, device=device)
     counted[place] = True
     one = changes_without(projection, colors[:, :1], opacities, counted, generator(device), backgrounds=behind[:, :1])
-    assert_close(one[rows], gone[:, *place, 0], rtol=1e-3, atol=1e-7)
+    assert_close(one[rows], gone[(slice(None), *place, 0)], rtol=1e-3, atol=1e-7)
     counted[:] = True
     many = changes_without(projection, colors, opacities, counted, generator(device), backgrounds=behind, passes=400)
     # What falls below 1/255 is linear no more: a row's share of it is small.
