@@ -13,6 +13,8 @@ size). An image is linear in the opacity that a view shows of a splat, so that s
 The splats that stay make up for those that went in the steps between rounds and after the last one.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -20,16 +22,17 @@ from nrfgs_ns.densification.strategy import TrainingViews
 
 ROUNDS = (1.0, 1.2, 1.4)
 """When splats go, in multiples of the step at which growth ends; at each as large a share of those that are left."""
-PASSES = 4
-"""Times that signs are drawn for each view."""
+DRAWS = 240
+"""Times that signs are drawn for all views together, at least, and at least once for each."""
 
 
 def missed(views: TrainingViews, count: int, device: torch.device) -> Tensor:
     """s_i of all splats, [N]; 0 for what no training view shows."""
     total = torch.zeros(count, device=device)
     generator = torch.Generator(device).manual_seed(torch.initial_seed())
+    passes = math.ceil(DRAWS / max(len(views), 1))
     for index in range(len(views)):
-        rows, changes = views.changes_without(index, generator, PASSES)
+        rows, changes = views.changes_without(index, generator, passes)
         total.index_add_(0, rows, changes)
     return total
 

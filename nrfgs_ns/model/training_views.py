@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What training views say of the splats that they see, for strategies that ask."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.image import robust
+from nrfgs_ns.model.renderer import View
 from nrfgs_ns.rasterizer import changes_without
 
 
@@ -34,22 +38,23 @@ class TrainingPictures:
         field = model.field
         view = model.project(camera, field.splats)
         appearance = field.seen_from(view)
-        outputs, truth = model.against_photograph(camera, batch, view, appearance)
         changes = changes_without(
             view.projection,
             appearance.colors,
             appearance.opacities,
-            self._counted(outputs["rgb"], truth, model.mask_of(batch))[None],
+            self._counted(camera, batch, view, appearance)[None],
             generator,
             backgrounds=model.background_color.to(model.device)[None],
             passes=passes,
         )
         return view.visible, changes
 
-    def _counted(self, rgb: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
+    def _counted(self, camera: Cameras, batch: Mapping[str, Any], view: View, appearance: SplatAppearance) -> Tensor:
         """Which pixels count: bool [H, W, 1]."""
-        model = self.model
-        counted = torch.ones_like(rgb[..., :1], dtype=torch.bool) if mask is None else mask
+        model, mask = self.model, self.model.mask_of(batch)
+        size = (view.projection.height, view.projection.width, 1)
+        counted = torch.ones(size, dtype=torch.bool, device=model.device) if mask is None else mask
         if model.trimming is not None and model.schedule_step >= robust.FIRST_STEP:
-            counted = counted & (model.trimming.kept(rgb, truth) > 0.5)
+            outputs, truth = model.against_photograph(camera, batch, view, appearance)
+            counted = counted & (model.trimming.kept(outputs["rgb"], truth) > 0.5)
         return counted

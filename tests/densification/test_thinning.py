@@ -9,6 +9,7 @@ from torch.testing import assert_close
 from nrfgs_ns.densification import build_densification
 from nrfgs_ns.densification.thinning import ROUNDS, least_missed, missed
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.robust import Trimming
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.model.training_views import TrainingPictures
 from nrfgs_ns.training.run import parse
@@ -116,6 +117,23 @@ def test_a_view_misses_what_its_picture_shows(training, monkeypatch):
             expected.append(((fewer - whole)[:, 24:]).square().sum())
     assert_close(changes[most], torch.stack(expected), rtol=0.5, atol=0)
     assert_close(changes[most].sum(), torch.stack(expected).sum(), rtol=0.15, atol=0)
+
+
+def test_what_the_robust_loss_leaves_out_is_not_missed(training, monkeypatch):
+    """Pixels with residuals above 0.02 do not count."""
+    model, data = training.pipeline.model, training.pipeline.datamanager
+
+    def changes():
+        return TrainingPictures(model, data).changes_without(3, torch.Generator().manual_seed(1), 20)[1]
+
+    all_pixels, trimming = changes(), Trimming(0.5)
+    trimming.histogram[:20] = 1.0
+    monkeypatch.setattr(model, "trimming", trimming)
+    monkeypatch.setattr(model, "_scheduled", 1000)
+    before = trimming.histogram.clone()
+    fewer = changes()
+    assert 0 < fewer.sum() < 0.9 * all_pixels.sum()
+    assert torch.equal(trimming.histogram, before)
 
 
 @pytest.mark.parametrize("keep", [0.0, 1.5, float("nan")])
