@@ -20,7 +20,7 @@ from torch import Tensor
 
 from nrfgs_ns.densification.strategy import TrainingViews
 
-ROUNDS = (1.0, 1.2, 1.4)
+ROUNDS = (1.0, 1.1, 1.2, 1.3, 1.4, 1.5)
 """When splats go, in multiples of the step at which growth ends; at each as large a share of those that are left."""
 DRAWS = 240
 """Times that signs are drawn for all views together, at least, and at least once for each."""

@@ -104,7 +104,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """which opacity makes a splat die when it depends on the view. base: the stored one. peak: the largest that a view
     since the last refinement would show. None: peak for mcmc, base for the others"""
     keep: float = 1.0
-    """share of the splats that is left once growth has ended, at stop_split_at: those go, in three rounds, that the
+    """share of the splats that is left once growth has ended, at stop_split_at: those go, in six rounds, that the
     training views would miss least (docs/bench.md). 1: all"""
     original: OriginalDensification = field(default_factory=OriginalDensification)
     """thresholds of the densification 'original'"""
