@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 
-Strategy = Literal["splatfacto", "original", "consistent", "mcmc"]
+Strategy = Literal["splatfacto", "original", "mcmc"]
 OpacitySeen = Literal["base", "peak"]
 
 CHANGE = "opacity_change"
@@ -44,19 +44,6 @@ def seen_with(stored: Tensor, change: Tensor) -> Tensor:
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
 
 
-class Seen(NamedTuple):
-    """What one training view says of the M splats that it sees."""
-
-    rows: Tensor
-    """of the table, int64 [M]"""
-    pixels: Tensor
-    """how much of the picture each is, alpha T summed over pixels, in pixels of the photograph, [M]"""
-    wrong: Tensor
-    """the same over wrong pixels alone, [M]"""
-    loss: Tensor
-    """the view's photometric loss, a scalar"""
-
-
 class Shown(NamedTuple):
     """What the views of a step have shown."""
 
@@ -74,12 +61,15 @@ class TrainingViews(Protocol):
     def __len__(self) -> int:
         """How many there are."""
 
-    def look(self, index: int, wrong: float) -> Seen:
-        """Compare one view with its photograph.
+    def changes_without(self, index: int, generator: torch.Generator, passes: int) -> tuple[Tensor, Tensor]:
+        """How much the picture of one view would change without each splat that it sees (`rasterizer.changes_without`).
 
         Args:
             index: of the view.
-            wrong: error above which a pixel is wrong, as a share of the way from the view's smallest to its largest.
+            generator, passes: of the estimate.
+
+        Returns:
+            Rows of the table, int64 [M], and sums over pixels and channels of the squared change, [M].
         """
 
 
@@ -109,7 +99,7 @@ class Densification(ABC):
         """Tell the strategy where the training cameras are, [V, 3], before the first step."""
 
     def see_training_views(self, views: TrainingViews) -> None:  # noqa: B027  (only some strategies look at them)
-        """Give the strategy what it may ask of the training views while it refines, before the first step."""
+        """Give the strategy what it may ask of the training views, before the first step."""
 
     def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
         """Look at a training view before the loss goes backward.

@@ -31,7 +31,6 @@ from nrfgs_ns.appearance.field import BaseField, Field
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import (
-    ConsistentDensification,
     Densification,
     McmcDensification,
     OpacitySeen,
@@ -49,7 +48,8 @@ from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_con
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.pinhole import FixedPinholes, Pinhole, pinhole
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
-from nrfgs_ns.model.training_views import ComparedViews
+from nrfgs_ns.model.retired import RETIRED
+from nrfgs_ns.model.training_views import TrainingPictures
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.rasterizer import load_kernels
@@ -89,17 +89,18 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     warmup_lr: float = 1e-3
     """learning rate of the warm-up's Adam"""
     densification: Strategy = "splatfacto"
-    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. consistent: splatfacto's, where
-    several training views agree. mcmc: 3DGS-MCMC, up to splat_budget"""
+    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
+    splat_budget"""
     splat_budget: int = 1_000_000
     """mcmc: the number of splats that it grows to and keeps"""
     opacity_seen_by_densification: OpacitySeen | None = None
     """which opacity makes a splat die. base: the stored one. peak: the largest that a view since the last refinement
     would show. None: peak for mcmc, base for the others"""
+    keep: float = 1.0
+    """share of the splats that is left once growth has ended, at stop_split_at: those go, in six rounds, that the
+    training views would miss least (docs/bench.md). 1: all"""
     original: OriginalDensification = field(default_factory=OriginalDensification)
     """thresholds of the densification 'original'"""
-    consistent: ConsistentDensification = field(default_factory=ConsistentDensification)
-    """what the densification 'consistent' adds to splatfacto's rules"""
     mcmc: McmcDensification = field(default_factory=McmcDensification)
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
@@ -120,6 +121,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
         state["head_from"] = state["head_from"] or 0.0  # None: by the number of views
         state["few_views"] = "auto" if state["few_views"] == "on" else state["few_views"]
         self.__dict__.update(state)
+        self.densification = RETIRED.get(self.densification, self.densification)
 
 
 class NrfgsModel(SplatfactoModel):
@@ -516,7 +518,7 @@ class NrfgsModel(SplatfactoModel):
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
         self.densification.see_cameras(centers)
-        self.densification.see_training_views(ComparedViews(self, attributes.pipeline.datamanager))
+        self.densification.see_training_views(TrainingPictures(self, attributes.pipeline.datamanager))
         self.camera_spacing = camera_spacing(centers)
         sigma = self.noise_factor * self.camera_spacing / math.sqrt(3.0)
         self.view_noise = ViewNoise(sigma, self.view_noise.seed)
@@ -690,6 +692,7 @@ class NrfgsModel(SplatfactoModel):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         written_by = state.get("densification", "splatfacto")  # older checkpoints do not say
+        written_by = RETIRED.get(written_by, written_by)
         if written_by != self.densification.name:
             raise InputError(
                 f"The checkpoint was trained with --pipeline.model.densification {written_by}, this model with "
