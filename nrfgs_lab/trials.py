@@ -186,12 +186,15 @@ def train_and_measure(trial: Trial, scenes: Path, folder: Path, end: float) -> d
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         trainer.save_checkpoint = lambda step: None
-        iteration, start = trainer.train_iteration, time.time()
+        iteration, looked = trainer.train_iteration, {}
 
         def in_time(step: int):
             if step % CHECKED_EVERY == 0:
                 now, left = time.time(), trainer.config.max_num_iterations - step
-                if now > end or step > 0 and now + left * (now - start) / step * SURE > end:
+                looked[step] = now
+                done = step - CHECKED_EVERY  # the first steps compile
+                rate = (now - looked[CHECKED_EVERY]) / done if done > 0 else 0.0
+                if now + SURE * rate * left > end:
                     raise TimeoutError(f"no time after {step} steps")
             return iteration(step)
 
