@@ -11,6 +11,8 @@ from nrfgs_lab.pages.tables.readme import FIELD, HARMONICS, HOST, LONG, SHRUNK, 
 
 BASE = "harmonics: shrinkage"
 STORED = ", shrinkage of what is stored"
+OLDER = " *"
+"""Mark of what an earlier version trained."""
 TRIED = {
     "field: trust": "**`nrfgs`**",
     "field: trust, late start": "asked from 0.3 of the training on",
@@ -62,20 +64,23 @@ def _mean(runs: Iterable[dict[str, Any]], metric: str) -> float | None:
     return fmean(fmean(value) if isinstance(value, list) else value for value in values) if values else None
 
 
-def _cell(runs: list[dict[str, Any]], best: dict[str, float]) -> str:
+def _cell(runs: list[dict[str, Any]], best: dict[str, float], version: set[str]) -> str:
     if not runs:
         return "-"
     values = []
     for metric, form in (("psnr", ".2f"), ("ssim", ".3f"), ("flip", ".3f")):
         value = _mean(runs, metric)
         values.append("-" if value is None else bold(format(value, form), value == best[metric]))
-    seeds = f" ({len(runs)})" if len(runs) > 1 else ""
-    return f"{' / '.join(values)}, {_mean(runs, 'splats') / 1000:.0f}k{seeds}"
+    splats = _mean(runs, "splats")
+    text = " / ".join(values) + ("" if splats is None else f", {splats / 1000:.0f}k")
+    text += f" ({len(runs)})" if len(runs) > 1 else ""
+    return text + (OLDER if any(one.get("machine", {}).get("source") not in version for one in runs) else "")
 
 
 def test_views() -> str:
     """PSNR / SSIM / FLIP and splats on test views."""
     names = FIELD, SHRUNK, HARMONICS, LONG, HOST
+    version = {one["machine"]["source"] for scene in TRAINING_VIEWS for one in runs_of(scene, FIELD)}
     body = []
     for scene, views in TRAINING_VIEWS.items():
         found = [runs_of(scene, name) for name in names]
@@ -83,7 +88,7 @@ def test_views() -> str:
             metric: choose((value for runs in found if (value := _mean(runs, metric)) is not None), default=0.0)
             for metric, choose in (("psnr", max), ("ssim", max), ("flip", min))
         }
-        body.append([scene, str(views), *(_cell(runs, best) for runs in found)])
+        body.append([scene, str(views), *(_cell(runs, best, version) for runs in found)])
     head = "`nrfgs`", "harmonics, same steps and shrinkage", "without shrinkage", "`nrfgs-sh`", "splatfacto"
     return grid(["", "views", *head], body)
 
