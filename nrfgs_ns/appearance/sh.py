@@ -6,7 +6,7 @@
 with L growing by one every `degree_interval` steps up to `degree`. Opacity does not depend on the view.
 """
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -52,6 +52,10 @@ class SphericalHarmonics(AppearanceHead):
 
     def set_step(self, step: int) -> None:
         self.active_degree = min(step // self.config.degree_interval, self.config.degree)
+
+    @property
+    def phase(self) -> Hashable:
+        return self.active_degree
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         directions = splats["means"].index_select(0, visible) - camera_centers

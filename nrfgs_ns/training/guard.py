@@ -146,9 +146,12 @@ class Guard:
             self.settle()
 
     def _out_of_sight(self) -> bool:
-        """Whether nothing has been visible in the last `PATIENCE` steps. The host knows how many rows there were."""
-        rows = getattr(self.model, "info", {}).get("gaussian_ids")
-        self.blind_steps = self.blind_steps + 1 if rows is not None and len(rows) == 0 else 0
+        """Whether nothing has been visible in the last `PATIENCE` steps. The host knows how many rows there were, or
+        where all splats have one (`step_graph.py`) how many pairs of splats and tiles."""
+        info = getattr(self.model, "info", {})
+        rows = info.get("gaussian_ids")
+        blind = rows is not None and (len(rows) == 0 or info.get("pairs") == 0)
+        self.blind_steps = self.blind_steps + 1 if blind else 0
         return self.blind_steps >= PATIENCE
 
     def _share(self, verdict: Verdict) -> Verdict:
