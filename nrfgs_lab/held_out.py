@@ -3,12 +3,15 @@
 
     python -m nrfgs_lab.held_out make SCENES OUT [OFFSET] [NAME ...]
     python -m nrfgs_lab.held_out report results/held-out.json
+    python -m nrfgs_lab.held_out effects results/held-out.json
     python -m nrfgs_lab.held_out test-views results/captures.json
 
 `make` writes, for captures with a transforms.json that names its split, data sets of their training views alone at half
 the size, every eighth of which is held out as a test view (from the OFFSET-th on, 4 unless said otherwise).
 `report` prints the tables of docs/captures.md: each trial against the harmonics that were trained with the same
-densification, steps and held-out views. `test-views` prints what trainings at full size have on test views.
+densification, steps and held-out views. `effects` prints what each factor of the screening designs does: sixteen
+trainings a capture that turn nine factors on and off in a balanced way say as much of each factor as if it alone had
+been turned. `test-views` prints what trainings at full size have on test views.
 """
 
 import json
@@ -19,6 +22,7 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from nrfgs_ns.errors import InputError
@@ -138,6 +142,40 @@ def report(file: Path) -> str:
         ]
         lines.append(f"| {trial} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+TELLING = 0.7
+"""dB that a held-out view may differ from what is expected before it counts less: one that fails would decide all."""
+
+
+def effects(records: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
+    """What each factor does to held-out views: least squares with a level for each view and an effect for each factor.
+
+    Args:
+        records: of one head, with "factors" (names of those that are on), "scene", "offset" and "per_image".
+
+    Returns:
+        factor -> its effect on PSNR in dB (errors beyond `TELLING` count by their length, not by their square: Huber)
+        and on SSIM.
+    """
+    factors = sorted({factor for one in records for factor in one["factors"]})
+    views = sorted({(one["scene"], one["offset"], view[0]) for one in records for view in one["per_image"]})
+    place = {view: len(factors) + number for number, view in enumerate(views)}
+    rows, values = [], []
+    for one in records:
+        for name, psnr, ssim, *_ in one["per_image"]:
+            row = np.zeros(len(factors) + len(views))
+            row[: len(factors)] = [factor in one["factors"] for factor in factors]
+            row[place[one["scene"], one["offset"], name]] = 1.0
+            rows.append(row)
+            values.append((psnr, ssim))
+    design, (psnr, ssim) = np.array(rows), np.array(values).T
+    weights = np.ones(len(psnr))
+    for _ in range(50):
+        solution = np.linalg.lstsq(design * weights[:, None], psnr * weights, rcond=None)[0]
+        weights = np.sqrt(TELLING / np.maximum(np.abs(psnr - design @ solution), TELLING))
+    of_ssim = np.linalg.lstsq(design, ssim, rcond=None)[0]
+    return {name: (solution[number], of_ssim[number]) for number, name in enumerate(factors)}
 
 
 METRICS = {"psnr": ".2f", "ssim": ".4f", "ms_ssim": ".4f", "flip": ".4f", "train_psnr": ".2f"}

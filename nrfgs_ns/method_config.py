@@ -35,6 +35,9 @@ know_callers_quickly()  # plugins are loaded right before nerfstudio asks
 HALF_A_SPACING = 0.5
 """Noise on where the field is asked from, in distances between neighbouring training cameras (docs/captures.md)."""
 
+SHRINKAGE = 3.0
+"""Weight of mean opacity and mean size in the loss, divided by the square of the number of training views."""
+
 
 def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str, Any]:
     """Adam at learning rate `lr`, decaying exponentially to `lr_final` over the training if that is given."""
@@ -103,7 +106,7 @@ nrfgs = preset(
     "nrfgs",
     method("nrfgs", NrfConfig(), "", latents=adam(0.0025), field=adam(5e-3, lr_final=5e-4)),
     "Gaussian splatting with a neural residual field for view-dependent colour and opacity.",
-    model={"view_noise": HALF_A_SPACING},
+    model={"view_noise": HALF_A_SPACING, "head_from": None, "few_views": "auto", "shrinkage": SHRINKAGE},
     max_num_iterations=0,
 )
 
@@ -121,7 +124,7 @@ nrfgs_best = preset(
     "nrfgs-best",
     nrfgs,
     "nrfgs in 30,000 steps with the densification of 3DGS: more splats, more time, more detail (docs/trade-off.md).",
-    model={"densification": "original"},
+    model={"densification": "original", "shrinkage": 0.0},
     max_num_iterations=STEPS,
     average_steps=AVERAGED,
 )

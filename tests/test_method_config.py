@@ -99,7 +99,12 @@ def test_everything_else_is_splatfactos(name):
         ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200}),
         (
             "nrfgs-best",
-            {"max_num_iterations": 30_000, "average_steps": 200, "pipeline.model.densification": "original"},
+            {
+                "max_num_iterations": 30_000,
+                "average_steps": 200,
+                "pipeline.model.densification": "original",
+                "pipeline.model.shrinkage": 0.0,
+            },
         ),
     ],
 )

@@ -33,7 +33,8 @@ INTRODUCTION = """# Options
 Written by `python -m nrfgs_lab.pages.options`, from the configurations themselves: what this package adds to
 nerfstudio's options, or presets in its own way. All of nerfstudio's and splatfacto's are there too, in `ns-train nrfgs
 --help`. Underscores and hyphens are the same. A scene unit is what the cameras fill: they lie within [-1, 1]. Defaults
-are `nrfgs`'s; of the other heads' methods `view-noise` is 0, `max-num-iterations` 30,000 and `average-steps` 0.
+are `nrfgs`'s; of the other heads' methods `view-noise`, `head-from` and `shrinkage` are 0, `few-views` is off,
+`max-num-iterations` 30,000 and `average-steps` 0.
 """
 UNSAID = "none", "required", "False"
 """Defaults that a list of options does not tell."""

@@ -67,6 +67,10 @@ class AppearanceHeadConfig:
     def validate(self) -> None:
         """Raise ValueError, naming the field and the fix, if a value cannot work."""
 
+    def for_few_views(self) -> "AppearanceHeadConfig":
+        """The configuration for a capture of few views, without what they cannot tell."""
+        return self
+
     def require(self, holds: bool, name: str, needed: str) -> None:
         """Raise ValueError naming field `name`, its value and what is `needed`, unless the condition holds."""
         if not holds:

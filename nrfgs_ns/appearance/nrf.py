@@ -19,7 +19,7 @@ all at the default sizes. Without the split there is one branch of twice the wid
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import torch
@@ -73,6 +73,10 @@ class NrfConfig(AppearanceHeadConfig):
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"
     """what the fused kernels round the factors of matrix products to; sums are always float32. PyTorch's path ignores
     it."""
+
+    def for_few_views(self) -> "NrfConfig":
+        """One band, and opacity that does not change with the view: an opacity for each view is a geometry for each."""
+        return replace(self, num_bands=1, opacity_residual=False)
 
     def validate(self) -> None:
         self.require(self.latent_dim >= 1, "latent_dim", "at least 1")

@@ -156,6 +156,17 @@ def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
     return Field(head, {**field.splats, "latents": reduced.to(latents.dtype)})
 
 
+def with_components(field: Field, columns: Tensor) -> Field:
+    """Only these components of the latents [R], of which there is at least one; the others are 0 for every splat."""
+    size = field.head.config.latent_dim
+    changed = []
+    for _, branch in _branches(field.head):
+        w1, b1, w2, b2 = layers(branch)
+        changed.append((torch.cat([w1[:, :size][:, columns], w1[:, size:]], dim=1), b1, w2, b2))
+    head = _build(field.head, {"latent_dim": len(columns)}, *_pair(changed))
+    return Field(head, {**field.splats, "latents": field.splats["latents"][:, columns]})
+
+
 def with_diffuse(field: Field, diffuse: Tensor, features_dc: Tensor, opacities: Tensor) -> Field:
     """Some splats without residual.
 

@@ -13,10 +13,10 @@ from torch import Tensor
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.compact.encode import COLUMNS, FORMAT, GROUPS
+from nrfgs_ns.compact.encode import FORMAT, GROUPS
 from nrfgs_ns.compact.format import LARGEST_RATIO, SMALL, read_container
 from nrfgs_ns.compact.quantise import Grid, from_morton, from_smallest_three
-from nrfgs_ns.compact.tables import splats_of
+from nrfgs_ns.compact.tables import COLUMNS, splats_of
 from nrfgs_ns.errors import InputError
 
 MOST_BANDS = 16

@@ -19,7 +19,7 @@ from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.compact.format import Table
 from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.compact.quantise import MOST_BITS, Grid, morton
-from nrfgs_ns.compact.tables import steps_of, tables_of
+from nrfgs_ns.compact.tables import COLUMNS, steps_of, tables_of
 from nrfgs_ns.errors import InputError
 
 FORMAT = "nrfgs-compact"
@@ -30,8 +30,6 @@ LARGEST_HALF = 6e4
 LARGEST_CODE = 2**30
 """Whole numbers are cut off here: nothing that a splat has is a thousand million steps from 0."""
 GROUPS = ("view", DIFFUSE)
-COLUMNS = ("opacities", "scales", "colors", "turns")
-"""Tables whose columns, behind the one that says which splats are diffuse, are the stream "splats" of version 2."""
 
 
 def encode(

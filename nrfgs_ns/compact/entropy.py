@@ -11,6 +11,8 @@ The coder is range ANS (Duda, arXiv 1311.2540) with states of 32 bits and words 
 quick in numpy. docs/compact-format.md has the stream, byte by byte.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 Array = np.ndarray
@@ -34,6 +36,8 @@ BITS_OF_A_FREQUENCY = 10
 """What a frequency adds to a stream, about."""
 ACTIVITY = 4
 """Neighbours whose tokens say how large a residual is going to be."""
+LARGEST_SHARE = 16
+MOST_ACTIVITY = ACTIVITY * LARGEST_SHARE * (TOKENS - 1)
 SHIFT = 8
 """Bits behind the point of a prediction's weights."""
 PREDICTORS = 6
@@ -175,22 +179,26 @@ def _fitted_contexts(tokens: Array, column: int, real: Array) -> tuple[list[int]
     matrix = np.stack([np.ones_like(own), *neighbours])[:, real].astype(np.float64)
     gram = matrix @ matrix.T
     fit = np.linalg.solve(gram + 1e-6 * np.eye(5) * (1 + np.trace(gram)), matrix @ own[real].astype(np.float64))[1:]
-    shares = np.rint(16 * fit.clip(0, None) / max(fit.max(), 1e-9)).clip(0, 16).astype(np.int64)
+    shares = np.rint(LARGEST_SHARE * fit.clip(0, None) / max(fit.max(), 1e-9)).astype(np.int64).clip(0, LARGEST_SHARE)
     activity = sum(share * values for share, values in zip(shares, neighbours, strict=True))
-    thresholds, least = np.zeros(0, dtype=np.int64), np.inf
-    levels = activity[real]
-    for count in CONTEXTS if len(levels) else ():
-        tried = np.unique(np.quantile(levels, np.arange(1, count) / count, method="higher")).astype(np.int64)
-        tried = tried[tried > levels.min()]
-        bits = _bits(own[real], np.searchsorted(tried, levels, side="right"), len(tried) + 1)
+    counts = np.bincount((activity * TOKENS + own)[real], minlength=(MOST_ACTIVITY + 1) * TOKENS)
+    counts = counts.reshape(MOST_ACTIVITY + 1, TOKENS)
+    levels = np.flatnonzero(counts.any(axis=1))
+    below = np.concatenate([np.zeros((1, TOKENS), dtype=np.int64), np.cumsum(counts[levels], axis=0)])
+    share = below.sum(axis=1) / max(below[-1].sum(), 1)
+    firsts, least = [0], np.inf
+    for count in CONTEXTS:
+        tried = np.unique(np.searchsorted(share[:-1], np.arange(count) / count)) if len(levels) else np.zeros(1, int)
+        tried = tried[tried < max(len(levels), 1)]
+        bits = _bits(np.diff(below[[*tried, len(levels)]], axis=0))
         if bits < least:
-            thresholds, least = tried, bits
+            firsts, least = tried, bits
+    thresholds = levels[firsts[1:]]
     return shares.tolist(), thresholds.tolist(), np.searchsorted(thresholds, activity, side="right")
 
 
-def _bits(tokens: Array, contexts: Array, count: int) -> float:
-    """About what tokens cost in their contexts, and the contexts' frequencies."""
-    counts = np.bincount(contexts * TOKENS + tokens, minlength=count * TOKENS).reshape(count, TOKENS)
+def _bits(counts: Array) -> float:
+    """About what tokens cost that occur so often in each context [K, TOKENS], and the contexts' frequencies."""
     totals = counts.sum(axis=1, keepdims=True).clip(1)
     entropy = -(counts * np.log2(np.where(counts > 0, counts / totals, 1.0))).sum()
     return float(entropy + BITS_OF_A_FREQUENCY * (counts > 0).sum())
@@ -286,15 +294,12 @@ def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
         for step in range(lanes.steps):
             count = lanes.active(step)
             x = state[:count]
-            if part.thresholds.size:
-                likely = activity[step] + share_1 * token_1 + share_2 * token_2
-                context = part.thresholds.searchsorted(likely[:count], side="right") << PRECISION
-            else:
-                context = 0
             slot = x & mask
-            token = part.lookup.take(context + slot)
-            entry = (context >> PRECISION) * TOKENS + token
-            x = part.frequencies.take(entry) * (x >> PRECISION) + slot - part.starts.take(entry)
+            if part.contexts > 1:
+                likely = activity[step] + share_1 * token_1 + share_2 * token_2
+                slot += part.first_slot.take(likely[:count])
+            token = part.tokens.take(slot)
+            x = part.frequencies.take(slot) * (x >> PRECISION) + part.offsets.take(slot)
             x, at = _refilled(x, words, at)
             unsigned = token
             if token.max(initial=0) >= DIRECT:
@@ -336,16 +341,21 @@ def _refilled(x: Array, words: Array, at: int) -> tuple[Array, int]:
     return x, end
 
 
-class _Column:
-    """What a model says of a column."""
+class _Column(NamedTuple):
+    """What a model says of a column. A slot is a context's number, times 2^PRECISION, and a state's low bits."""
 
     signed: bool
     weights: list[int]
     shares: list[int]
-    thresholds: Array
-    lookup: Array
+    contexts: int
+    first_slot: Array
+    """of the context, by activity"""
+    tokens: Array
+    """by slot"""
     frequencies: Array
-    starts: Array
+    """of the slot's token"""
+    offsets: Array
+    """how far the slot is from its token's first one"""
 
 
 class _Model:
@@ -366,24 +376,34 @@ class _Model:
         return found
 
     def column(self) -> _Column:
-        column = _Column()
-        column.signed = bool(self.take(1)[0])
-        column.weights = self.take(1 + PREDICTORS).tolist()
-        column.shares = self.take(ACTIVITY).tolist()
-        (count,) = self.take(1)
-        if not 0 <= count < MOST_CONTEXTS or max(map(abs, column.weights)) > LARGEST_WEIGHT:
+        signed = bool(self.take(1)[0])
+        weights = self.take(1 + PREDICTORS).tolist()
+        shares = self.take(ACTIVITY).tolist()
+        (count,) = self.take(1).tolist()
+        if not 0 <= count < MOST_CONTEXTS or max(map(abs, weights)) > LARGEST_WEIGHT:
             raise BadStream("its model has too many contexts, or a weight that is too large")
-        column.thresholds = self.take(int(count)).copy()
-        if (np.diff(column.thresholds) <= 0).any() or not all(0 <= share <= 16 for share in column.shares):
+        thresholds = self.take(count)
+        if (np.diff(thresholds) <= 0).any() or not all(0 <= share <= LARGEST_SHARE for share in shares):
             raise BadStream("its model's contexts are in no order")
-        column.frequencies = np.zeros((count + 1, TOKENS), dtype=np.int64)
-        for frequencies in column.frequencies:
+        table = np.zeros((count + 1, TOKENS), dtype=np.int64)
+        for frequencies in table:
             first, used = self.take(2).tolist()
             if not (0 <= first and 0 < used and first + used <= TOKENS):
                 raise BadStream("its model has tokens that are none")
             frequencies[first : first + used] = self.take(used)
-        if (column.frequencies < 0).any() or (column.frequencies.sum(axis=1) != 1 << PRECISION).any():
+        if (table < 0).any() or (table.sum(axis=1) != 1 << PRECISION).any():
             raise BadStream("its model's frequencies do not add up")
-        column.starts = np.cumsum(column.frequencies, axis=1) - column.frequencies
-        column.lookup = np.concatenate([np.repeat(np.arange(TOKENS), row) for row in column.frequencies])
-        return column
+        starts = np.cumsum(table, axis=1) - table
+        tokens = np.repeat(np.tile(np.arange(TOKENS), count + 1), table.ravel())
+        slots = np.arange(len(tokens)) & ((1 << PRECISION) - 1)
+        contexts = np.searchsorted(thresholds, np.arange(MOST_ACTIVITY + 1), side="right")
+        return _Column(
+            signed,
+            weights,
+            shares,
+            count + 1,
+            contexts << PRECISION,
+            tokens,
+            np.repeat(table.ravel(), table.ravel()),
+            slots - np.repeat(starts.ravel(), table.ravel()),
+        )

@@ -7,8 +7,9 @@ x then costs
 
     -log2 P(x),    P(x) = sum_k w_k (F((x + step/2 - m - m_k) / b_k) - F((x - step/2 - m - m_k) / b_k)),
 
-F the logistic function: a mixture of three, each column its own, about a mean m that is linear in the row's earlier
-columns. Nothing of this is in a file: what a coder counts there is close to it.
+F the logistic function: a mixture of two, each column its own, about a mean m that is linear in the row before, the one
+before that, and the row's earlier columns; its widths b_k grow with how far the neighbours were from their means. That
+is what the coder of a file expects a number by (`entropy.py`), but nothing of this is in a file.
 """
 
 import math
@@ -17,14 +18,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
-PARTS = 3
-"""Logistics in a column's mixture."""
+WIDTHS = (-2.0, -0.3)
+"""Logarithms of the logistics' widths to begin with, in standard deviations of the column."""
+SEEN = 0.3
+"""Added to how far neighbours were off, in usual widths."""
 NARROWEST = 0.05
 """Of a logistic, in steps: narrower ones cost nothing less."""
 
 
-class Coded(nn.Module):
-    """A table whose values and steps are learnt for what they cost.
+class Rounded(nn.Module):
+    """A table whose values, and whose steps, are learnt.
 
     Args:
         values: [N, C].
@@ -33,27 +36,13 @@ class Coded(nn.Module):
 
     def __init__(self, values: Tensor, steps: Tensor):
         super().__init__()
-        columns = values.shape[1]
         self.values = nn.Parameter(values.clone())
         self.log_steps = nn.Parameter(steps.log())
-        spread = values.std(dim=0, correction=0).clamp_min(steps) if len(values) else steps
-        self.centers = nn.Parameter(
-            values.mean(dim=0)[:, None].repeat(1, PARTS) if len(values) else spread[:, None] * 0
-        )
-        widths = spread.log()[:, None] + torch.tensor([-2.5, -1.0, 0.5], device=values.device)
-        self.log_widths = nn.Parameter(widths)
-        self.log_shares = nn.Parameter(torch.zeros(columns, PARTS, device=values.device))
-        self.slopes = nn.Parameter(torch.zeros(columns, columns, device=values.device))
 
     @property
     def steps(self) -> Tensor:
         """[C]"""
         return self.log_steps.exp()
-
-    @property
-    def density(self) -> list[nn.Parameter]:
-        """What only `bits` reads."""
-        return [self.centers, self.log_widths, self.log_shares, self.slopes]
 
     def forward(self, rounded: bool) -> Tensor:
         """The table as a file would give it back: rounded, or with noise instead. [N, C]"""
@@ -66,11 +55,46 @@ class Coded(nn.Module):
             off = torch.rand_like(self.values) - 0.5
         return self.values + steps * off
 
-    def bits(self, values: Tensor) -> Tensor:
-        """What values, as `forward` gives them, cost together: a scalar."""
-        steps = self.steps[:, None]
-        widths = self.log_widths.exp().clamp_min(NARROWEST * steps.detach())
-        from_center = (values - values @ self.slopes.tril(-1).T)[..., None] - self.centers
+
+class Density(nn.Module):
+    """How likely the numbers of a table are, column by column, beside their neighbours.
+
+    Args:
+        values: of the table, to begin with; a row lies next to the one before it. [N, C]
+    """
+
+    def __init__(self, values: Tensor):
+        super().__init__()
+        columns = values.shape[1]
+        spread = values.std(dim=0, correction=0) if len(values) else values.new_zeros(columns)
+        widths = spread.clamp_min(1e-6).log()[:, None] + values.new_tensor(WIDTHS)
+        mean = values.mean(dim=0) if len(values) else values.new_zeros(columns)
+        self.centers = nn.Parameter(mean[:, None].repeat(1, len(WIDTHS)))
+        self.log_widths = nn.Parameter(widths)
+        self.log_shares = nn.Parameter(torch.zeros_like(widths))
+        self.of_left = nn.Parameter(values.new_zeros(columns, columns))
+        self.of_left_before = nn.Parameter(values.new_zeros(columns, columns))
+        self.of_before = nn.Parameter(values.new_zeros(2, columns))
+        self.activity = nn.Parameter(values.new_zeros(4, columns))
+        self.growth = nn.Parameter(values.new_zeros(columns))
+
+    def bits(self, values: Tensor, steps: Tensor) -> Tensor:
+        """What values [N, C] cost together where steps [C] tell them apart: a scalar."""
+        before, before_2 = _earlier(values, 1), _earlier(values, 2)
+        mean = values @ self.of_left.tril(-1).T + before @ self.of_left_before.tril(-1).T
+        residuals = values - (mean + self.of_before[0] * before + self.of_before[1] * before_2)
+
+        # How far the neighbours were off, in usual widths; no gradient makes them be off by less for it.
+        usual = self.log_widths.detach().mean(dim=-1).exp().maximum(steps.detach())
+        off = residuals.detach().abs() / usual
+        left, left_2 = (nn.functional.pad(off, (k, 0))[:, : off.shape[1]] for k in (1, 2))
+        shares = self.activity.softmax(dim=0)
+        seen = shares[0] * _earlier(off, 1) + shares[1] * _earlier(off, 2) + shares[2] * left + shares[3] * left_2
+        grown = (self.growth * torch.log(seen + SEEN))[..., None]
+
+        steps = steps[:, None]
+        widths = (self.log_widths + grown).exp().maximum(NARROWEST * steps.detach())
+        from_center = residuals[..., None] - self.centers
         upper, lower = (from_center + 0.5 * steps) / widths, (from_center - 0.5 * steps) / widths
         # F(a) - F(b) = F(a) F(-b) (1 - exp(b - a)), which does not vanish in the tails.
         inside = logsigmoid(upper) + logsigmoid(-lower) + torch.log(-torch.expm1(-steps / widths))
@@ -78,10 +102,14 @@ class Coded(nn.Module):
         return -logs.sum() / math.log(2.0)
 
 
-class CodedPlaces(Coded):
-    """Means: a place costs what tells its cell from all others, whatever the density; halving a step costs a bit."""
+def _earlier(values: Tensor, count: int) -> Tensor:
+    """Rows [N, C] `count` rows later; the first ones are 0."""
+    return nn.functional.pad(values, (0, 0, count, 0))[: len(values)]
 
-    def bits(self, values: Tensor) -> Tensor:
-        extent = (values.detach().amax(dim=0) - values.detach().amin(dim=0)).clamp_min(1e-30)
-        cells = (extent.log() - self.log_steps).sum() / math.log(2.0)
-        return len(values) * (cells - math.log2(max(len(values), 1)) + 1.0 / math.log(2.0))
+
+def bits_of_places(means: Tensor, steps: Tensor) -> Tensor:
+    """What means [N, 3] cost together where steps [3] tell them apart, a scalar: their cells are told from all others
+    of their box, in any order. Halving a step costs a bit, wherever the means are."""
+    extent = (means.detach().amax(dim=0) - means.detach().amin(dim=0)).clamp_min(1e-30)
+    cells = (extent.log() - steps.log()).sum() / math.log(2.0)
+    return len(means) * (cells - math.log2(max(len(means), 1)) + 1.0 / math.log(2.0))

@@ -20,6 +20,8 @@ from nrfgs_ns.appearance.head import SH_C0, base_colors
 from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.compact.quantise import nearest_turn
 
+COLUMNS = ("opacities", "scales", "colors", "turns")
+"""Tables of all splats, beside the means, in the order of a file."""
 SMALLEST_W2 = 1e-6
 """Of a rotation, w squared: x, y and z may be rounded beyond unit length."""
 

@@ -6,20 +6,22 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from time import perf_counter
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.finetune import fine_tune
-from nrfgs_ns.compact.format import Table, write_container
+from nrfgs_ns.compact.finetune import fine_tune, prepared
+from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
@@ -40,18 +42,27 @@ def export_compact(
     """See `nrfgs export --help`."""
     check_options(options)
     pipeline = load_model(load_config, "test")
-    field, threshold = chosen_field(pipeline, load_config, options)
+    chosen = choose(pipeline, load_config, options)
     model = pipeline.model
-    header, streams = encoded(pipeline, field, options)
+    begin = perf_counter()
+    field, steps = trained_for_the_file(pipeline, chosen, options)
+    trained = perf_counter()
+    header, streams = encode(field, options.precision, rendered(model), steps)
     size = write_container(output, header, streams)
+    written = perf_counter()
+    decode(output)
+    seconds = {"finetune": trained - begin, "encode": written - trained, "decode": perf_counter() - written}
     count = sum(header["splats"].values())
     config = write_config(load_config, output)
     numbers = {
         "splats": model.num_points,
         "written": count,
         "view_dependent": header["splats"]["view"],
-        "rank": field.head.config.latent_dim,
-        "threshold": threshold if threshold != float("inf") else None,
+        "rank": header["head"]["config"]["latent_dim"],
+        "threshold": chosen.threshold if chosen.threshold != float("inf") else None,
+        "finetune": options.finetune,
+        "rate": options.rate if options.finetune else None,
+        "seconds": seconds,
         "bytes": size,
         "ply_bytes": PLY_BYTES * count,
         "ply_ratio": PLY_BYTES * count / size,
@@ -77,12 +88,29 @@ def export_compact(
         write_whole(report, json.dumps(numbers, indent=1) + "\n")
 
 
-def encoded(pipeline, field: Field, options: CompactOptions) -> tuple[dict[str, Any], dict[str, np.ndarray | Table]]:
-    """Header and streams of a field, trained for the file if that is asked for."""
-    model = pipeline.model
-    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
+class Chosen(NamedTuple):
+    """What of a model is written."""
+
+    field: Field
+    threshold: float
+    """residuals below so many 8-bit steps are dropped; 0 for none"""
+    weight: Tensor
+    """what each splat contributes to the training views, pixels. [N]"""
+
+
+def rendered(model) -> dict[str, Any]:
+    """What decides a picture beside the field, for a file's header."""
+    return {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
+
+
+def trained_for_the_file(
+    pipeline, chosen: Chosen, options: CompactOptions
+) -> tuple[Field, dict[str, np.ndarray] | None]:
+    """The chosen field after the fine-tune that the options ask for, and the steps on which it lies; without one, the
+    field as it is."""
     if options.finetune == 0:
-        return encode(field, options.precision, render)
+        return chosen.field, None
+    model = pipeline.model
     centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
     noise = ViewNoise(model.config.view_noise * camera_spacing(centers) / math.sqrt(3.0), torch.initial_seed())
     columns = TextColumn("Training for the file {task.description}"), BarColumn(), TimeRemainingColumn()
@@ -93,8 +121,9 @@ def encoded(pipeline, field: Field, options: CompactOptions) -> tuple[dict[str, 
             progress.update(task, completed=step, description=f"({bits / 8e6:.2f} MB)")
 
         next_view = pipeline.datamanager.next_train
+        field = prepared(chosen.field, chosen.weight, options.rate)
         tuned = fine_tune(model, field, next_view, noise, options.finetune, options.rate, options.precision, tell)
-    return encode(tuned.field, options.precision, render, tuned.steps)
+    return tuned.field, tuned.steps
 
 
 def check_options(options: CompactOptions) -> None:
@@ -110,8 +139,9 @@ def check_options(options: CompactOptions) -> None:
             raise InputError(f"--compact.{name} is {value}; it must be zero or positive.")
 
 
-def chosen_field(pipeline, load_config: Path, options: CompactOptions) -> tuple[Field, float]:
-    """The field to write, slimmed as the options say, and the threshold below which residuals were dropped."""
+def choose(pipeline, load_config: Path, options: CompactOptions) -> Chosen:
+    """The field to write, slimmed as the options say. A fine-tune finds out by itself what is not worth its bytes:
+    before it, nothing is left out that the options do not name."""
     model, data = pipeline.model, pipeline.datamanager
     if not isinstance(model.head, NeuralResidualField):
         raise InputError(
@@ -121,6 +151,9 @@ def chosen_field(pipeline, load_config: Path, options: CompactOptions) -> tuple[
     size = model.head.config.latent_dim
     if options.rank is not None and not 1 <= options.rank <= size:
         raise InputError(f"--compact.rank is {options.rank}; this model's latents have ranks 1 to {size}.")
+    threshold, rank = options.threshold, options.rank
+    if options.finetune > 0:
+        threshold, rank = threshold or 0.0, rank or size
     with torch.no_grad():
         field = model.field.detached()
         images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
@@ -138,11 +171,11 @@ def chosen_field(pipeline, load_config: Path, options: CompactOptions) -> tuple[
                 seen,
                 views,
                 views.psnr(field) - options.budget,
-                options.threshold,
-                options.rank,
+                threshold,
+                rank,
                 lambda what: progress.update(task, description=f"Without {what}", advance=1),
             )
-    return slimmed.field, slimmed.threshold
+    return Chosen(slimmed.field, slimmed.threshold, seen.weight)
 
 
 def photographs_of(model, files: Sequence[Path], chosen: Sequence[int]) -> list[int | None]:

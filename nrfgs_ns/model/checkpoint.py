@@ -24,6 +24,12 @@ def reduced_config(config: AppearanceHeadConfig, state: Mapping[str, Any]) -> Ap
     return replace(config, **found) if is_this_head else config
 
 
+def differences(config: AppearanceHeadConfig, other: AppearanceHeadConfig) -> dict[str, Any]:
+    """The options in which another configuration of the same head differs from one, as `reduced_config` wants them."""
+    names = [one.name for one in fields(config)]
+    return {name: getattr(other, name) for name in names if getattr(other, name) != getattr(config, name)}
+
+
 def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
     """Refuse a checkpoint that this model cannot hold.
 

@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import BaseField, Field
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import (
@@ -45,7 +45,7 @@ from nrfgs_ns.image import robust, ssim
 from nrfgs_ns.image.metrics import ImageMetrics
 from nrfgs_ns.image.photograph import Part, PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
-from nrfgs_ns.model.checkpoint import check_compatible, reduced_config
+from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.pinhole import FixedPinholes, Pinhole, pinhole
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
@@ -56,6 +56,12 @@ from nrfgs_ns.rasterizer import load_kernels
 
 LOOK = "NRFGS_LOOK"
 """Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
+HEAD_FROM = 0.3
+"""Share of a training after which the head learns, where that is chosen."""
+FEW_VIEWS = 30
+"""Fewer training views are few."""
+NOISE_OF_FEW_VIEWS = 2.0
+"""How many times as long the noise is then."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
 
@@ -71,6 +77,17 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     view_noise: float = 0.0
     """in training the head sees each splat from a camera centre of its own, moved by noise this many times as long as
     neighbouring training cameras are apart (docs/captures.md). 0: from the camera's"""
+    head_from: float | None = 0.0
+    """share of the training after which the head is asked and learns. Until then splats have their base colours and
+    opacities, so that what these can explain is theirs and not the head's (docs/captures.md). None: 0.3 where schedules
+    are stretched to the training's steps, 0 otherwise"""
+    few_views: Literal["auto", "on", "off"] = "off"
+    """what few views cannot tell is left out of the head, and view_noise is twice as long (docs/captures.md). auto:
+    with fewer than 30 training views"""
+    shrinkage: float = 0.0
+    """weight, in the loss, of the mean opacity and of the mean standard deviation in scene units, divided by the square
+    of the number of training views: what few views need becomes faint and small. mcmc has its own instead
+    (docs/captures.md)"""
     warmup_steps: int | None = None
     """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
     A head that adds nothing from the start skips them."""
@@ -125,6 +142,10 @@ class NrfgsModel(SplatfactoModel):
     camera_spacing: float = 0.0
     """world units between neighbouring training cameras; 0 until a training begins"""
     _scheduled: int | None = None
+    head_has_begun: bool = False
+    """whether the head has learnt in a step of this training, or of the one that it goes on from"""
+    head_rests: bool = False
+    """whether the head is left out of the present step"""
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
@@ -135,7 +156,12 @@ class NrfgsModel(SplatfactoModel):
             )
         self.scene_unit: float = (self.kwargs.get("metadata") or {}).get("scene_unit", 1.0)
         """World units in a scene unit; lengths in the configuration are in scene units."""
-        self.head = self.config.appearance.setup(self.scene_unit)
+        appearance = self.config.appearance
+        if self.has_few_views:
+            appearance.validate()
+            appearance = appearance.for_few_views()
+            self.reduced_head = differences(self.config.appearance, appearance)
+        self.head = appearance.setup(self.scene_unit)
         self.config.sh_degree = self.head.sh_degree
         self.gauss_params = torch.nn.ParameterDict(self._initial_splats())
         self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
@@ -155,13 +181,28 @@ class NrfgsModel(SplatfactoModel):
             else get_color(self.config.background_color)
         )
         self.densification = self._strategy()
-        if not self.config.view_noise >= 0.0:
-            raise InputError(f"pipeline.model.view_noise is {self.config.view_noise}; it must be zero or positive.")
+        for name in ("view_noise", "shrinkage"):
+            if not getattr(self.config, name) >= 0:
+                raise InputError(f"pipeline.model.{name} is {getattr(self.config, name)}; it must be zero or positive.")
+        if not 0 <= (self.config.head_from or 0.0) < 1:
+            raise InputError(f"pipeline.model.head_from is {self.config.head_from}; it must be at least 0 and below 1.")
         self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
 
     def _strategy(self) -> Densification:
         """What makes splats come and go."""
         return build_densification(self.config, self.num_train_data, self.scene_unit)
+
+    @property
+    def has_few_views(self) -> bool:
+        """Whether the head is the one for few views."""
+        if self.config.few_views not in ("auto", "on", "off"):
+            raise InputError(f"pipeline.model.few_views is {self.config.few_views!r}; use 'auto', 'on' or 'off'.")
+        return self.config.few_views == "on" or self.config.few_views == "auto" and self.num_train_data < FEW_VIEWS
+
+    @property
+    def noise_factor(self) -> float:
+        """Length of the noise on where the head is asked from, in spacings of the training cameras."""
+        return self.config.view_noise * (NOISE_OF_FEW_VIEWS if self.has_few_views else 1.0)
 
     def _initial_splats(self) -> dict[str, Parameter]:
         """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
@@ -350,9 +391,12 @@ class NrfgsModel(SplatfactoModel):
         return self.photograph.names.index(name) if name else None
 
     def _as_learnt(self, field: Field) -> Field:
-        """The field as its head is asked about it in this step (`view_noise.py`); outside of training, the field."""
+        """The field as its head is asked about it in this step; outside of training, the field. Before `head_from` the
+        head is not asked; then it is under noise (`view_noise.py`)."""
         if not self.training:
             return field
+        if self.head_rests:
+            return BaseField(*field)
         return field._replace(splats=self.view_noise.moved(field.splats, self.step))
 
     def _finish_for_training(self, outputs: dict[str, Tensor], camera: Cameras, background: Tensor) -> None:
@@ -475,7 +519,7 @@ class NrfgsModel(SplatfactoModel):
         self.densification.see_cameras(centers)
         self.densification.see_training_views(ComparedViews(self, attributes.pipeline.datamanager))
         self.camera_spacing = camera_spacing(centers)
-        sigma = self.config.view_noise * self.camera_spacing / math.sqrt(3.0)
+        sigma = self.noise_factor * self.camera_spacing / math.sqrt(3.0)
         self.view_noise = ViewNoise(sigma, self.view_noise.seed)
 
         def before_first_step(step: int) -> None:
@@ -504,6 +548,19 @@ class NrfgsModel(SplatfactoModel):
         """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
         self._scheduled = step
 
+    def begin_step(self, share: float, is_stretched: bool) -> None:
+        """A training step begins.
+
+        Args:
+            share: of the training that is over, in [0, 1].
+            is_stretched: whether its schedules are stretched to its steps.
+        """
+        begins = self.config.head_from
+        if begins is None:
+            begins = HEAD_FROM if is_stretched else 0.0
+        self.head_has_begun = self.head_has_begun or share >= begins  # and goes on in a longer training
+        self.head_rests = not self.head_has_begun
+
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
         self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
@@ -522,13 +579,23 @@ class NrfgsModel(SplatfactoModel):
             self.camera_optimizer.get_loss_dict(losses)
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
-            losses |= self.densification.regularisation(self.gauss_params)
+            losses |= self.densification.regularisation(self.gauss_params) | self.shrinking()
             if self.photograph is not None and self.photograph.has_penalty and self.step % 10 == 0:
                 losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")
         return losses
+
+    def shrinking(self) -> dict[str, Tensor]:
+        """What `shrinkage` adds to the loss."""
+        weight = self.config.shrinkage / max(self.num_train_data, 1) ** 2
+        if weight == 0.0 or self.config.densification == "mcmc":
+            return {}
+        return {
+            "shrink_opacities": weight * torch.sigmoid(self.gauss_params["opacities"]).mean(),
+            "shrink_scales": weight / self.scene_unit * self.gauss_params["scales"].exp().mean(),
+        }
 
     def photometric_loss(self, outputs, batch) -> Tensor:
         """Splatfacto's loss of an image against its photograph, a scalar."""
@@ -624,6 +691,7 @@ class NrfgsModel(SplatfactoModel):
             "head": self.head.name,
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
+            "head_has_begun": self.head_has_begun,
         }
         if self.reduced_head is not None:
             state["capacity"] = {"head": self.reduced_head}
@@ -637,6 +705,7 @@ class NrfgsModel(SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
+        self.head_has_begun = state.get("head_has_begun", True)  # older checkpoints do not say: it did at once
         if "pace" in state:  # of version 0.1.0
             state = {**state, "schedule_step": int(state["pace"]["position"])}
         if "schedule_step" in state:

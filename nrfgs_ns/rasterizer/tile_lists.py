@@ -134,7 +134,7 @@ def list_kernel(
     PAIRS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr,
 ):  # fmt: skip
     """The tile and the splat of each pair, splats in `order`. Pairs beyond the last, and those that rounding has left
-    without a tile, get the tile behind the last."""
+    without a tile, get a tile below the image."""
     at = tl.program_id(0) * PAIRS + tl.arange(0, PAIRS)
     valid = at < pairs
     real = at < tl.load(ends + (count - 1))
@@ -151,7 +151,8 @@ def list_kernel(
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
     left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
     left_over = tl.where(real, at - begin, -1).to(tl.int32)  # tiles of the splat before the pair's, in rows to come
-    tile = tl.zeros((PAIRS,), tl.int32) + width * height
+    # One tile of them all would keep its program busy for longer than the image takes: they are dealt to a row of tiles.
+    tile = width * height + at % width
     row = top
     while tl.max(tl.where(row < bottom, left_over, -1), axis=0) >= 0:
         first, end = _columns(row, x, y, a, b, c, bound, det, left, right, SIDE)

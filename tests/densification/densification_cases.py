@@ -133,7 +133,8 @@ def strategy(name: str, images: int = 8, **options):
 
 def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **model) -> list[str]:
     """ns-train's command line: refinement every 4th step."""
-    options = {"densification": densification, "warmup-length": 2, "refine-every": 4, "num-downscales": 0, **model}
+    options = {"densification": densification, "warmup-length": 2, "refine-every": 4, "num-downscales": 0}
+    options |= {"few-views": "off", **model}
     if densification in ("splatfacto", "consistent"):
         options |= {"densify-grad-thresh": 1e-6, "reset-alpha-every": 6}
     words = [word for name, value in options.items() for word in (f"--pipeline.model.{name}", str(value))]

@@ -19,6 +19,7 @@ COMMON = {
     "--pipeline.model.num-downscales": 0,
     "--pipeline.model.background-color": "black",
     "--pipeline.model.appearance.output-init": "default",
+    "--pipeline.model.few-views": "off",
     "--pipeline.model.view-noise": 0,  # one device draws other numbers than two
 }
 PLAIN = {"--pipeline.model.opacity-seen-by-densification": "peak"}

@@ -59,7 +59,7 @@ def test_losses(results):
     for name in alone["losses"][0]:
         mine, theirs = torch.stack([part["losses"][name] for part in (first, second)]), alone["losses"]
         theirs = torch.stack([losses[name] for losses in theirs])
-        if name.startswith("mcmc") or name == "scale_reg":  # a mean over splats: each device has its part
+        if name.startswith(("mcmc", "shrink")) or name == "scale_reg":  # a mean over splats: each device has its part
             mine, theirs = mine.mean(), theirs.mean()
         agree(name, mine, theirs)
 

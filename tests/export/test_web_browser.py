@@ -225,6 +225,7 @@ def demo(tiny_scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     options = {
         "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.few-views": "off",
         "--pipeline.model.refine-every": 20,
         "--pipeline.model.warmup-length": 20,
         "--pipeline.model.rasterize-mode": "antialiased",

@@ -15,7 +15,11 @@ from typing import Any
 FILE = Path(__file__).resolve().parents[2] / "results" / "smoke.json"
 METHODS = "nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"
 STEPS = 300
-PLAIN = {"--pipeline.model.num-downscales": 0}
+PLAIN = {
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.few-views": "off",
+    "--pipeline.model.shrinkage": 0,
+}
 SMALL = {**PLAIN, "--pipeline.datamanager.camera-res-scale-factor": 0.125}
 """Options of the cases on real captures."""
 

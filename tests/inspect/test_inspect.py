@@ -25,6 +25,7 @@ LOUD = {
     "--pipeline.model.appearance.output-init": "default",
     "--pipeline.model.appearance.latent-dim": 6,
     "--pipeline.model.warmup-steps": 0,
+    "--pipeline.model.few-views": "off",
 }
 
 

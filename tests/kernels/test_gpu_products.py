@@ -28,6 +28,7 @@ def model_with_something_to_show(device: str, scene: Path, out: Path):
     """A model in evaluation mode whose field is drawn at random, the same on every device; and its cameras."""
     config = parse(["nrfgs", "--data", str(scene), "--output-dir", str(out), "--machine.device-type", device])
     config.pipeline.model.background_color = "black"
+    config.pipeline.model.few_views = "off"
     config.pipeline.model.appearance.precision = "fp32"  # as on the CPU
     torch.manual_seed(0)
     pipeline = config.pipeline.setup(device=device, test_mode="val")
@@ -94,6 +95,8 @@ def exported_files(device: str, scene: Path, out: Path) -> dict[str, dict]:
     args = ["nrfgs", "--data", scene, "--output-dir", out, "--max-num-iterations", STEPS, "--vis", "tensorboard"]
     args += ["--machine.device-type", device, "--logging.profiler", "none", "--logging.local-writer.enable", False]
     args += [
+        "--pipeline.model.few-views",
+        "off",
         "--pipeline.model.num-downscales",
         0,
         "--steps-per-eval-image",

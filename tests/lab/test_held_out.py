@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from nrfgs_lab.held_out import against_harmonics, held_out, make, report, test_views
+from nrfgs_lab.held_out import against_harmonics, effects, held_out, make, report, test_views
 from nrfgs_ns.errors import InputError
 
 test_views.__test__ = False  # not a test
@@ -58,6 +58,24 @@ def test_gains_are_taken_view_by_view_within_a_group():
         one("field", "a", [["y", 31.0, 0.8, 0.9], ["x", 24.0, 0.6, 0.7]]),
     ]
     assert against_harmonics(records)["a, from 4: field"]["s"] == pytest.approx((2.5, 0.1, 2))
+
+
+def test_effects_of_factors_are_told_apart_and_a_view_that_fails_does_not_decide():
+    gain = {"a": (0.3, 0.01), "b": (-0.2, 0.02), "c": (0.0, -0.01)}
+    records = []
+    for number in range(8):
+        on = [name for bit, name in enumerate("abc") if number >> bit & 1]
+        views = [
+            [name, 20.0 + level + sum(gain[f][0] for f in on), 0.5 + sum(gain[f][1] for f in on), None]
+            for level, name in enumerate("xyz")
+        ]
+        records.append(dict(factors=on, scene="s", offset=(number ^ number >> 1) & 1, per_image=views))
+    found = effects(records)
+    assert found == {name: pytest.approx(value, abs=1e-9) for name, value in gain.items()}
+
+    records[3]["per_image"][1][1] -= 10.0
+    found = effects(records)
+    assert all(found[name][0] == pytest.approx(value[0], abs=0.15) for name, value in gain.items())
 
 
 def test_the_repository_s_study_is_reported():

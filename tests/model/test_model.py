@@ -26,7 +26,8 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 @pytest.fixture
 def build(tiny_scene, tmp_path):
     def pipeline(method="nrfgs", *options, data=tiny_scene):
-        config = parse([method, "--data", str(data), "--output-dir", str(tmp_path / "out"), *map(str, options)])
+        words = ["--data", data, "--output-dir", tmp_path / "out", "--pipeline.model.few-views", "off", *options]
+        config = parse([method, *map(str, words)])
         torch.manual_seed(0)
         return config.pipeline.setup(device="cpu", test_mode="val")
 

@@ -12,7 +12,11 @@ from torch.testing import assert_close
 
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing, distinct_places
 
-NRFGS = {"--pipeline.model.num-downscales": 0, "--pipeline.model.warmup-length": 2, "--pipeline.model.refine-every": 4}
+NRFGS = {
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.warmup-length": 2,
+    "--pipeline.model.refine-every": 4,
+}
 
 
 def ring(count: int, radius: float = 1.0) -> torch.Tensor:

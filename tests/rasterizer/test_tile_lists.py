@@ -49,7 +49,8 @@ class TestOnCuda:
         mine, pairs = render()
         monkeypatch.setattr(gsplat_cuda, "MOST_TILES", 0)
         theirs, all_pairs = render()
-        assert pairs < 0.8 * all_pairs
+        # gsplat 1.5.3's rectangles list fewer tiles than 1.4.0's squares.
+        assert pairs < (0.9 if gsplat_cuda.HAS_BATCHES else 0.8) * all_pairs
         torch.testing.assert_close(mine[0], theirs[0], rtol=0, atol=2e-6)
         for got, expected in zip(mine[1:], theirs[1:], strict=True):
             assert (got - expected).norm() <= 1e-5 * expected.norm()  # atomics add in any order

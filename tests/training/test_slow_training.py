@@ -14,8 +14,8 @@ import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, command_line, trained
+from smoke_runs import PLAIN, after_one_step, bound, cases, gain_bound
 from smoke_runs import STEPS as SHORT
-from smoke_runs import after_one_step, bound, cases, gain_bound
 
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.checkpoint_files import find, read_latest
@@ -23,7 +23,7 @@ from nrfgs_ns.training.run import evaluate, train
 
 
 def psnr(method: str, data: Path, out: Path, steps: int, *options: dict) -> float:
-    args = command_line(method, data, out, steps, {"--pipeline.model.num-downscales": 0}, *options)
+    args = command_line(method, data, out, steps, PLAIN, *options)
     return evaluate(trained(args), out / f"{method}.json")["psnr"]
 
 

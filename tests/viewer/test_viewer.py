@@ -65,6 +65,7 @@ def build(tiny_scene, tmp_path):
 
     def pipeline(method="nrfgs", *options):
         config = parse([method, "--data", str(tiny_scene), "--output-dir", str(tmp_path), *map(str, options)])
+        config.pipeline.model.few_views = "off"
         torch.manual_seed(0)
         pipeline = config.pipeline.setup(device="cpu", test_mode="val")
         give_it_something_to_show(pipeline.model)
@@ -414,6 +415,7 @@ def watched_training(scene, out, each_step, **more) -> dict:
         "--pipeline.model.densify-grad-thresh": 1e-6,
         "--pipeline.model.resolution-schedule": 9,
         "--pipeline.model.num-downscales": 1,
+        "--pipeline.model.few-views": "off",
         **more,
     }
     words = [str(word) for option in options.items() for word in option]

@@ -11,7 +11,7 @@ TRAINING_VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "ca
 FIELD, HARMONICS, LONG = "nrfgs", "nrfgs-sh, nrfgs's steps", "nrfgs-sh"
 
 
-def _runs(scene: str, name: str) -> list[dict[str, Any]]:
+def runs_of(scene: str, name: str) -> list[dict[str, Any]]:
     """The trainings of a capture, as results/captures.json has them, by seed."""
     found = [one for one in records("captures").values() if (one.get("scene"), one.get("name")) == (scene, name)]
     if not found and (scene, name) == ("bonsai", HARMONICS):
@@ -27,10 +27,10 @@ def captures() -> str:
     """`nrfgs` as it comes beside harmonics with the same steps and mean, on test views."""
     body = []
     for scene, views in TRAINING_VIEWS.items():
-        field, harmonics, long = (_runs(scene, name) for name in (FIELD, HARMONICS, LONG))
+        field, harmonics, long = (runs_of(scene, name) for name in (FIELD, HARMONICS, LONG))
         if not field or not harmonics:
             continue
-        gains = _gains(field, harmonics)
+        gains = view_gains(field, harmonics)
         psnr = [fmean(one["psnr"] for one in runs) for runs in (field, harmonics)]
         ssim = [fmean(one["ssim"] for one in runs) for runs in (field, harmonics)]
         splats = [fmean(one["splats"] for one in runs) for runs in (field, harmonics)]
@@ -49,7 +49,7 @@ def captures() -> str:
     return grid([*head, "gain in the median view, dB", "better in", "splats"], body)
 
 
-def _gains(field: list[dict[str, Any]], harmonics: list[dict[str, Any]]) -> list[float]:
+def view_gains(field: list[dict[str, Any]], harmonics: list[dict[str, Any]]) -> list[float]:
     """Decibels by which the field is above harmonics in each test view, in the mean of the seeds that both have."""
     seeds = {one["seed"] for one in field} & {one["seed"] for one in harmonics}
     views: dict[str, list[list[float]]] = defaultdict(lambda: [[], []])

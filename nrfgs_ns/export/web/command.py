@@ -19,7 +19,15 @@ from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.compact import PLY_BYTES, check_options, chosen_field, measure_file, write_config
+from nrfgs_ns.export.compact import (
+    PLY_BYTES,
+    check_options,
+    choose,
+    measure_file,
+    rendered,
+    trained_for_the_file,
+    write_config,
+)
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.web.options import WebOptions
 from nrfgs_ns.export.web.page import page
@@ -69,9 +77,9 @@ def export_web(
             f"--load-config {load_config}: the field's weights fill {vectors} vectors of a shader, and some phones "
             f"have room for {MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
         )
-    field, threshold = chosen_field(pipeline, load_config, options)
-    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
-    header, streams = encode(field, options.precision, render)
+    chosen = choose(pipeline, load_config, options)
+    field, steps = trained_for_the_file(pipeline, chosen, options)
+    header, streams = encode(field, options.precision, rendered(model), steps)
     about, poster = surroundings(pipeline)
     with TemporaryDirectory() as temporary:
         file = Path(temporary) / SCENE
@@ -104,8 +112,8 @@ def export_web(
             "splats": model.num_points,
             "written": count,
             "view_dependent": header["splats"]["view"],
-            "rank": field.head.config.latent_dim,
-            "threshold": threshold if threshold != float("inf") else None,
+            "rank": header["head"]["config"]["latent_dim"],
+            "threshold": chosen.threshold if chosen.threshold != float("inf") else None,
             "bytes": size,
             "scene_bytes": scene_bytes,
             "ply_bytes": PLY_BYTES * count,

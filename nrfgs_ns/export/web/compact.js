@@ -236,7 +236,7 @@ function readRotations(largest, codes, bits, table, first, n) {
 
 // ---- coded tables: rANS in lanes, as docs/compact-format.md has it. Whole numbers alone, so that every reader agrees.
 
-const PRECISION = 14, LOWEST = 1 << 16, DIRECT = 32, TOKENS = 140;
+const PRECISION = 14, LOWEST = 1 << 16, DIRECT = 32, TOKENS = 140, MOST_ACTIVITY = 4 * 16 * 139;
 
 // The columns of a table [C, n]: Int32Array where they are signed, Uint32Array where they are not.
 function decodeTable(body, C, n) {
@@ -284,6 +284,12 @@ function decodeTable(body, C, n) {
       }
       if (sum !== 1 << PRECISION) throw broken();
     }
+    const context = new Uint32Array(MOST_ACTIVITY + 1);  // its number times 2^PRECISION, by activity
+    for (let a = 0, k = 0; a <= MOST_ACTIVITY; a++) {
+      while (k < thresholds.length && thresholds[k] <= a) k++;
+      context[a] = k << PRECISION;
+    }
+    if (shares.some((share) => share < 0 || share > 16)) throw broken();
     const [w0, w1, w2, w3, w4, w5, w6] = weights, [s1, s2, s3, s4] = shares;
     const own = tokens[c % 3], out = signed ? new Int32Array(n) : new Uint32Array(n);
     const left = c > 0 ? columns[c - 1] : zeros, left2 = c > 1 ? columns[c - 2] : zeros;
@@ -294,16 +300,19 @@ function decodeTable(body, C, n) {
       let most = 0;
       for (let l = 0, i = t; l < active; l++, i += S) {
         const activity = s1 * (t > 0 ? own[i - 1] : 0) + s2 * (t > 1 ? own[i - 2] : 0) + s3 * near[i] + s4 * near2[i];
-        let k = 0;
-        while (k < thresholds.length && thresholds[k] <= activity) k++;
-        let x = state[l];
-        const slot = x & ((1 << PRECISION) - 1), token = lookup[(k << PRECISION) + slot];
-        x = frequencies[k * TOKENS + token] * (x >>> PRECISION) + slot - starts[k * TOKENS + token];
-        state[l] = x < LOWEST ? x * LOWEST + word() : x;
-        own[i] = token;
+        const k = context[activity], x = state[l], slot = x & ((1 << PRECISION) - 1), token = lookup[k + slot];
+        const entry = (k >>> PRECISION) * TOKENS + token;
+        const rest = frequencies[entry] * (x >>> PRECISION) + slot - starts[entry];
+        if (rest < LOWEST) {
+          state[l] = (rest << 16) | body[at] | (body[at + 1] << 8);
+          at += 2;
+        } else {
+          state[l] = rest;
+        }
+        own[i] = out[i] = token;
         if (token > most) most = token;
       }
-      for (let l = 0, i = t; l < active; l++, i += S) out[i] = own[i];
+      if (at > body.length) throw broken();
       if (most >= DIRECT) {
         for (const shift of (most - DIRECT >> 2) + 3 > 16 ? [0, 16] : [0]) {
           for (let l = 0, i = t; l < active; l++, i += S) {

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a training on a GPU has done before its first step."""
+
+import gc
+
+import pytest
+from short_trainings import command_line
+
+from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.training.run import parse
+
+pytestmark = pytest.mark.gpu
+
+
+def tried() -> dict[str, set]:
+    """What has been found out about kernels, by their name."""
+    return {one.what: set(one) for one in gc.get_objects() if type(one) is Gate and one}
+
+
+def test_no_kernel_is_left_to_the_first_steps(tiny_scene, tmp_path):
+    trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, 3)).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    before = tried()
+    assert {"The field", "SSIM"} <= before.keys()
+    trainer.train()
+    assert tried() == before
