@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tables of docs/speed.md."""
 
-from statistics import fmean
+from statistics import fmean, median
 
 from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, mean_of, records
 
@@ -109,3 +109,41 @@ def cpu_rasterizer() -> str:
         for name, one in results.items()
     ]
     return grid(["splats, image", "forward + backward (ms)", "times faster than the loop", "peak MiB"], body)
+
+
+def step_parts() -> str:
+    """What each of the step's own kernels saves: medians and ranges over rounds."""
+    rows = records("step_parts")["bonsai_250k"]["steps"]
+    body = []
+    for method, variant in dict.fromkeys((row["method"], row["variant"]) for row in rows):
+        mine = [row for row in rows if (row["method"], row["variant"]) == (method, variant)]
+        step, gpu = ([row[key] for row in mine] for key in ("step_ms", "gpu_ms"))
+        launches = f"{median(row['launches'] for row in mine):.0f}"
+        body.append([f"`{method}`", variant, spread(step, 2), f"{median(gpu):.2f}", launches])
+    return grid(["", "", "step", "of it GPU", "launches"], body)
+
+
+def step_share(method: str, variant: str, base_method: str, base_variant: str, key: str = "step_ms") -> str:
+    """A step's median time over another's."""
+    rows = records("step_parts")["bonsai_250k"]["steps"]
+    times = [
+        median(row[key] for row in rows if (row["method"], row["variant"]) == one)
+        for one in ((method, variant), (base_method, base_variant))
+    ]
+    return f"{times[0] / times[1]:.2f}"
+
+
+def frames() -> str:
+    """Frames per second of models with as many splats, in turns: medians and ranges over rounds."""
+    rows = records("step_parts")["bonsai_250k"]["frames"]
+    body = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row["fps"] for row in rows if row["method"] == method]
+        body.append([f"`{method}`", *(spread([fps[size] for fps in mine], 0) for size in mine[0])])
+    head = ["", "799 x 532", "1080p", "799 x 532, gsplat's lists", "1080p, gsplat's lists"]
+    return grid(head, body)
+
+
+def spread(numbers: list[float], digits: int) -> str:
+    """Median, least and largest."""
+    return f"{median(numbers):.{digits}f} ({min(numbers):.{digits}f} to {max(numbers):.{digits}f})"
