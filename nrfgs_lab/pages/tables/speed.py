@@ -111,39 +111,50 @@ def cpu_rasterizer() -> str:
     return grid(["splats, image", "forward + backward (ms)", "times faster than the loop", "peak MiB"], body)
 
 
+PARTS = {
+    "whole": "as it is",
+    "without lists": "gsplat's lists of what tiles draw",
+    "without adam": "torch's fused Adam",
+    "without statistics": "growth's statistics in PyTorch",
+    "without all": "all three",
+}
+
+
 def step_parts() -> str:
-    """What each of the step's own kernels saves: medians and ranges over rounds."""
-    rows = records("step_parts")["bonsai_250k"]["steps"]
+    """What each of the step's own kernels saves: medians over rounds, and the step's range."""
     body = []
-    for method, variant in dict.fromkeys((row["method"], row["variant"]) for row in rows):
-        mine = [row for row in rows if (row["method"], row["variant"]) == (method, variant)]
-        step, gpu = ([row[key] for row in mine] for key in ("step_ms", "gpu_ms"))
-        launches = f"{median(row['launches'] for row in mine):.0f}"
-        body.append([f"`{method}`", variant, spread(step, 2), f"{median(gpu):.2f}", launches])
-    return grid(["", "", "step", "of it GPU", "launches"], body)
+    for variant, label in PARTS.items():
+        cells = []
+        for method in ("nrfgs", "nrfgs-sh"):
+            rows = _rows(method, variant)
+            cells += [f"{median(row['gpu_ms'] for row in rows):.2f}", spread([row["step_ms"] for row in rows], 1)]
+        body.append([label, *cells])
+    return grid(["", "`nrfgs`: GPU", "step", "`nrfgs-sh`: GPU", "step"], body)
 
 
-def step_share(method: str, variant: str, base_method: str, base_variant: str, key: str = "step_ms") -> str:
-    """A step's median time over another's."""
-    rows = records("step_parts")["bonsai_250k"]["steps"]
-    times = [
-        median(row[key] for row in rows if (row["method"], row["variant"]) == one)
-        for one in ((method, variant), (base_method, base_variant))
-    ]
+def gpu_share(method: str, variant: str, base_method: str, base_variant: str) -> str:
+    """The GPU's time in a step, over another's."""
+    times = [median(row["gpu_ms"] for row in _rows(*one)) for one in ((method, variant), (base_method, base_variant))]
     return f"{times[0] / times[1]:.2f}"
 
 
 def frames() -> str:
-    """Frames per second of models with as many splats, in turns: medians and ranges over rounds."""
+    """Frames per second of models with about as many splats, in turns: each round."""
     rows = records("step_parts")["bonsai_250k"]["frames"]
     body = []
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row["fps"] for row in rows if row["method"] == method]
-        body.append([f"`{method}`", *(spread([fps[size] for fps in mine], 0) for size in mine[0])])
-    head = ["", "799 x 532", "1080p", "799 x 532, gsplat's lists", "1080p, gsplat's lists"]
-    return grid(head, body)
+        cells = [", ".join(f"{fps[size]:.0f}" for fps in mine) for size in mine[0]]
+        body.append([f"`{method}`", *cells])
+    return grid(["", "799 x 532", "1080p", "799 x 532, gsplat's lists", "1080p, gsplat's lists"], body)
 
 
 def spread(numbers: list[float], digits: int) -> str:
     """Median, least and largest."""
     return f"{median(numbers):.{digits}f} ({min(numbers):.{digits}f} to {max(numbers):.{digits}f})"
+
+
+def _rows(method: str, variant: str) -> list[dict]:
+    """The rounds of a variant of a step."""
+    rows = records("step_parts")["bonsai_250k"]["steps"]
+    return [row for row in rows if (row["method"], row["variant"]) == (method, variant)]
