@@ -144,6 +144,8 @@ def report(file: Path) -> str:
     return "\n".join(lines)
 
 
+RUNS = 16
+"""Trainings of a screening of one head on one capture."""
 TELLING = 0.7
 """dB that a held-out view may differ from what is expected before it counts less: one that fails would decide all."""
 
@@ -178,6 +180,20 @@ def effects(records: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
     return {name: (solution[number], of_ssim[number]) for number, name in enumerate(factors)}
 
 
+def screening(file: Path) -> str:
+    """What each factor of the screening does, for each head and capture that has all its trainings."""
+    groups: dict[tuple[str, str], list] = defaultdict(list)
+    for one in json.loads(file.read_text(encoding="utf-8"))["records"].values():
+        if one.get("study") == "screening":
+            groups[one["head"], one["scene"]].append(one)
+    lines = []
+    for (head, scene), runs in sorted(groups.items()):
+        if len(runs) >= RUNS:
+            lines.append(f"{head}, {scene}, {len(runs)} trainings: effect in dB, in SSIM x 1000")
+            lines += [f"  {name:28s} {psnr:+.2f} {1000 * ssim:+.1f}" for name, (psnr, ssim) in effects(runs).items()]
+    return "\n".join(lines)
+
+
 METRICS = {"psnr": ".2f", "ssim": ".4f", "ms_ssim": ".4f", "flip": ".4f", "train_psnr": ".2f"}
 """What `test-views` prints, and how."""
 
@@ -210,4 +226,4 @@ if __name__ == "__main__":
     if verb == "make":
         make(Path(words[0]), Path(words[1]), int(words[2]) if len(words) > 2 else 4, words[3:] or None)
     else:
-        print({"report": report, "test-views": test_views}[verb](Path(words[0])))
+        print({"report": report, "effects": screening, "test-views": test_views}[verb](Path(words[0])))

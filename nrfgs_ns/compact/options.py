@@ -15,7 +15,7 @@ class CompactOptions:
 
     finetune: Annotated[int, tyro.conf.arg(aliases=("--finetune",))] = 0
     """steps in which the model is trained on for the file: tables that cost less, and how finely each is rounded"""
-    rate: float = 2.5e-5
+    rate: float = 1e-4
     """with finetune: how much of the training's loss a byte for each splat is worth. More: a smaller file"""
     rank: int | None = None
     """numbers in a latent. None: as few as the budget allows"""

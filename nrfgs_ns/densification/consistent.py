@@ -48,7 +48,7 @@ class ConsistentDensification:
 
     views: int = 10
     """training views that a refinement looks at"""
-    wrong: float = 0.05
+    wrong: float = 0.1
     """error above which a pixel is wrong, in [0, 1]: that of the view's smallest to its largest"""
     grow_pixels: float = 0.2
     """splats with more wrong pixels of the photographs than that, in the mean over the views, may grow. More: fewer

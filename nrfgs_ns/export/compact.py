@@ -112,7 +112,7 @@ def trained_for_the_file(
         return chosen.field, None
     model = pipeline.model
     centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
-    noise = ViewNoise(model.config.view_noise * camera_spacing(centers) / math.sqrt(3.0), torch.initial_seed())
+    noise = ViewNoise(model.noise_factor * camera_spacing(centers) / math.sqrt(3.0), torch.initial_seed())
     columns = TextColumn("Training for the file {task.description}"), BarColumn(), TimeRemainingColumn()
     with Progress(*columns, console=CONSOLE, transient=True) as progress:
         task = progress.add_task("", total=options.finetune)

@@ -60,6 +60,8 @@ HEAD_FROM = 0.3
 """Share of a training after which the head learns, where that is chosen."""
 FEW_VIEWS = 30
 """Fewer training views are few."""
+MANY_VIEWS = 100
+"""From so many on the head begins at once, where that is chosen, and nothing shrinks."""
 NOISE_OF_FEW_VIEWS = 2.0
 """How many times as long the noise is then."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
@@ -80,14 +82,14 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     head_from: float | None = 0.0
     """share of the training after which the head is asked and learns. Until then splats have their base colours and
     opacities, so that what these can explain is theirs and not the head's (docs/captures.md). None: 0.3 where schedules
-    are stretched to the training's steps, 0 otherwise"""
+    are stretched to the training's steps and training views are fewer than 100, 0 otherwise"""
     few_views: Literal["auto", "on", "off"] = "off"
     """what few views cannot tell is left out of the head, and view_noise is twice as long (docs/captures.md). auto:
     with fewer than 30 training views"""
     shrinkage: float = 0.0
     """weight, in the loss, of the mean opacity and of the mean standard deviation in scene units, divided by the square
-    of the number of training views: what few views need becomes faint and small. mcmc has its own instead
-    (docs/captures.md)"""
+    of the number of training views, if they are fewer than 100: what few views need becomes faint and small. mcmc has
+    its own instead (docs/captures.md)"""
     warmup_steps: int | None = None
     """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
     A head that adds nothing from the start skips them."""
@@ -557,7 +559,7 @@ class NrfgsModel(SplatfactoModel):
         """
         begins = self.config.head_from
         if begins is None:
-            begins = HEAD_FROM if is_stretched else 0.0
+            begins = HEAD_FROM if is_stretched and self.num_train_data < MANY_VIEWS else 0.0
         self.head_has_begun = self.head_has_begun or share >= begins  # and goes on in a longer training
         self.head_rests = not self.head_has_begun
 
@@ -590,7 +592,7 @@ class NrfgsModel(SplatfactoModel):
     def shrinking(self) -> dict[str, Tensor]:
         """What `shrinkage` adds to the loss."""
         weight = self.config.shrinkage / max(self.num_train_data, 1) ** 2
-        if weight == 0.0 or self.config.densification == "mcmc":
+        if weight == 0.0 or self.num_train_data >= MANY_VIEWS or self.config.densification == "mcmc":
             return {}
         return {
             "shrink_opacities": weight * torch.sigmoid(self.gauss_params["opacities"]).mean(),

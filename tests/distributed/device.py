@@ -20,9 +20,10 @@ COMMON = {
     "--pipeline.model.background-color": "black",
     "--pipeline.model.appearance.output-init": "default",
     "--pipeline.model.few-views": "off",
+    "--pipeline.model.shrinkage": 0,
     "--pipeline.model.view-noise": 0,  # one device draws other numbers than two
 }
-PLAIN = {"--pipeline.model.opacity-seen-by-densification": "peak"}
+PLAIN = {"--pipeline.model.opacity-seen-by-densification": "peak", "--pipeline.model.shrinkage": 3}
 RICH = {
     "--pipeline.model.densification": "mcmc",
     "--pipeline.model.rasterize-mode": "antialiased",

@@ -78,13 +78,12 @@ def test_both_devices_report_what_one_process_would(two_devices):
     """The same splats in the same order, up to float32: 1e-4 of a metric is 100 times what rounding may do to a mean
     over pixels, and less than a thousandth of what one missing shard would."""
     (first, alone), (second,) = (torch.load(two_devices / f"scores-{rank}.pt") for rank in (0, 1))
-    # The colour fit sums over all pixels in float64, in an order that depends on where memory begins; in float32,
-    # a colour may differ by one unit, 6e-8, and so may a mean of them.
-    assert {name: value for name, value in first.items() if not name.startswith("cc_")} == {
-        name: value for name, value in second.items() if not name.startswith("cc_")
-    }
+    # A device asks its head about a splat once for each camera, in two rows of one table. Vectorised functions round
+    # the last rows of a table otherwise than those before: one unit of an opacity, 3e-8, was seen, 4e-7 of a pixel.
+    assert first.keys() == second.keys()
     assert first == pytest.approx(second, rel=1e-6)
-    assert first["splats"] == alone["splats"] and first["parameter_bytes"] == alone["parameter_bytes"]
+    for name in ("splats", "parameter_bytes"):
+        assert first[name] == second[name] == alone[name], name
     assert first.keys() == alone.keys() >= {"psnr", "ssim", "l1"}
     for name in ("psnr", "ssim", "l1"):
         assert first[name] == pytest.approx(alone[name], rel=1e-4), name

@@ -226,6 +226,7 @@ def demo(tiny_scene, tmp_path_factory):
     options = {
         "--pipeline.model.num-downscales": 0,
         "--pipeline.model.few-views": "off",
+        "--pipeline.model.shrinkage": 0,
         "--pipeline.model.refine-every": 20,
         "--pipeline.model.warmup-length": 20,
         "--pipeline.model.rasterize-mode": "antialiased",

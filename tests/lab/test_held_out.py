@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from nrfgs_lab.held_out import against_harmonics, effects, held_out, make, report, test_views
+from nrfgs_lab.held_out import against_harmonics, effects, held_out, make, report, screening, test_views
 from nrfgs_ns.errors import InputError
 
 test_views.__test__ = False  # not a test
@@ -81,6 +81,8 @@ def test_effects_of_factors_are_told_apart_and_a_view_that_fails_does_not_decide
 def test_the_repository_s_study_is_reported():
     table = report(STUDY)
     assert "splatfacto, 6,000 steps, from 4: noise 0.5" in table and "bonsai" in table
+    table = screening(STUDY)
+    assert "harmonics, fern, 18 trainings" in table and "no opacity residual          +0.25" in table
 
 
 def test_test_views_are_means_over_seeds(tmp_path):

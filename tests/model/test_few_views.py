@@ -46,6 +46,14 @@ def test_a_head_that_learns_goes_on_in_a_longer_training(tiny_scene, tmp_path, n
     assert not trainer.pipeline.model.head_rests
 
 
+def test_many_views_have_no_late_start_and_no_shrinkage(tiny_scene, tmp_path, no_cuda, monkeypatch):
+    monkeypatch.setattr("nrfgs_ns.model.model.MANY_VIEWS", 8)
+    trainer = ready(tiny_scene, tmp_path, 5, {"--schedule-steps": 50})
+    trainer.train_iteration(0)
+    assert trainer.pipeline.model.num_train_data == 8
+    assert not trainer.pipeline.model.head_rests and trainer.pipeline.model.shrinking() == {}
+
+
 def test_it_rests_by_itself_where_schedules_are_stretched(tiny_scene, tmp_path, no_cuda):
     for stretched, rests in (({}, False), ({"--schedule-steps": 50}, True)):
         trainer = ready(tiny_scene, tmp_path, 5, stretched)

@@ -52,6 +52,8 @@ def training(tiny_scene, tmp_path_factory):
         "--steps-per-save": 30,
         "--logging.profiler": "none",
         "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.few-views": "off",
+        "--pipeline.model.shrinkage": 0,
         "--pipeline.model.refine-every": 20,
         "--pipeline.model.warmup-length": 20,
         "--optimizers.field.optimizer.lr": 0.05,  # something to show after a few steps

@@ -24,3 +24,18 @@ def prepared() -> str:
             error = f"{record['mean_reprojection_error_px']:.2f} px"
             body.append([name, registered, pairs, f"{record['points']:,}", error, seconds])
     return grid(["", "registered", "pairs", "points", "mean reprojection error", "CPU seconds"], body)
+
+
+def loading() -> str:
+    """What reading 2,000 photographs takes."""
+    study = records("loading")
+    names = {
+        "nerfstudio, float32": "nerfstudio's default",
+        "nerfstudio, uint8": "nerfstudio, bytes",
+        "memory": "here, in memory",
+        "files, made": "here, in files that are made",
+        "files, found": "here, in files that are there",
+    }
+    body = [[label, f"{study['ways'][name]['peak_bytes'] / 1e9:.2f} GB"] for name, label in names.items()]
+    count = study["ways"]["memory"]["photographs"]
+    return grid([f"{count:,} photographs, {study['decoded_bytes'] / 1e9:.2f} GB of bytes", "peak"], body)

@@ -111,6 +111,29 @@ def cpu_rasterizer() -> str:
     return grid(["splats, image", "forward + backward (ms)", "times faster than the loop", "peak MiB"], body)
 
 
+def first_sight() -> str:
+    """From the command to a picture that is worth looking at."""
+    record = records("first_sight")["nrfgs-fast"]
+    stages = {
+        "imported": "imports, the command line",
+        "data set checked": "data set checked",
+        "model made": "first splats",
+        "images read": "images read",
+        "photographs compared": "photographs compared",
+        "step 0": "kernels compiled, first step",
+    }
+    body, before = [], 0.0
+    for name, label in stages.items():
+        seconds = record["stages"][name]
+        body.append([label, f"{seconds - before:.1f}", f"{seconds:.1f}"])
+        before = seconds
+    for target, reached in record["reached"].items():
+        seconds = reached["seconds"]
+        body.append([f"{target} dB, {reached['steps']:,} steps", f"{seconds - before:.1f}", f"{seconds:.1f}"])
+        before = seconds
+    return grid(["", "seconds", "since the command"], body)
+
+
 PARTS = {
     "whole": "as it is",
     "without lists": "gsplat's lists of what tiles draw",

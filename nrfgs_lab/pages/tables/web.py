@@ -28,11 +28,25 @@ def page() -> str:
     return grid([f"{export['splats']:,} splats", ""], rows)
 
 
-def bonsai(what: str) -> str:
-    """Splats, or megabytes, of bonsai's file."""
-    one = records("compact")["full-bonsai"]
-    return {
-        "splats": f"{one['splats']:,}",
-        "file": f"{one['bytes'] / 1e6:.1f}",
-        "ply": f"{one['ply_bytes'] / 1e6:.1f}",
-    }[what]
+def bonsai() -> str:
+    """The page of bonsai, on a GPU."""
+    study = records("web")
+    export = study["bonsai-export"]
+    gpus = study["bonsai-gpu-gl-egl"], study["bonsai-gpu-vulkan"]
+
+    def megabytes(size: int) -> str:
+        return f"{size / 1e6:.1f} MB"
+
+    width, height = gpus[0]["size"]
+    frames = (f"{1 / one['seconds_per_picture']:.0f}" for one in gpus)
+    load = (f"{one['seconds_to_load']:.1f} s" for one in gpus)
+    exact = study["bonsai-chromium"]["psnr"]
+    rows = [
+        ["the page, and the scene in it", f"{megabytes(export['bytes'])}, {megabytes(export['scene_bytes'])}"],
+        ["3DGS's PLY of as many splats", megabytes(export["ply_bytes"])],
+        ["what the scene in the page loses on the test views", f"{export['loss_db']:.3f} dB"],
+        ["page against our renderer, three places; SwiftShader", f"{min(exact):.1f} to {max(exact):.1f} dB"],
+        [f"pictures a second, {width} x {height}, H200; OpenGL, Vulkan", ", ".join(frames)],
+        ["from the address to the first whole picture", ", ".join(load)],
+    ]
+    return grid([f"`bonsai`, {export['splats']:,} splats", ""], rows)
