@@ -64,6 +64,8 @@ class StepParts:
     """JSON file of the results"""
     methods: tuple[str, ...] = ("nrfgs", "nrfgs-sh")
     """methods that densify as splatfacto does"""
+    variants: tuple[str, ...] = tuple(VARIANTS)
+    """what is timed of a step"""
     splats: int = 250_000
     """of each method; fewer, if it has fewer after `grow` steps"""
     grow: int = 1500
@@ -99,7 +101,7 @@ class StepParts:
 
     def measure(self, method: str) -> tuple[list[dict[str, Any]], tuple[Any, dict[str, list]]]:
         """Train a method and time its variants; the model is there afterwards, with test cameras by their size."""
-        variants = list(VARIANTS.items())
+        variants = [(name, VARIANTS[name]) for name in self.variants]
         length = 5 + self.steps + self.traced + 1  # the first few of a variant are not timed
         begin = self.grow + self.settle
         args = [method, "--max-num-iterations", str(begin + length * len(variants) + 1), "--vis", "tensorboard"]

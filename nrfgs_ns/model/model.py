@@ -589,14 +589,15 @@ class NrfgsModel(SplatfactoModel):
             self.watched_image = batch.get("image_idx")
         return losses
 
-    def shrinking(self) -> dict[str, Tensor]:
-        """What `shrinkage` adds to the loss."""
+    def shrinking(self, splats: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+        """What `shrinkage` adds to the loss. `splats`: another table than the model's."""
+        splats = self.gauss_params if splats is None else splats
         weight = self.config.shrinkage / max(self.num_train_data, 1) ** 2
         if weight == 0.0 or self.num_train_data >= MANY_VIEWS or self.config.densification == "mcmc":
             return {}
         return {
-            "shrink_opacities": weight * torch.sigmoid(self.gauss_params["opacities"]).mean(),
-            "shrink_scales": weight / self.scene_unit * self.gauss_params["scales"].exp().mean(),
+            "shrink_opacities": weight * torch.sigmoid(splats["opacities"]).mean(),
+            "shrink_scales": weight / self.scene_unit * splats["scales"].exp().mean(),
         }
 
     def photometric_loss(self, outputs, batch) -> Tensor:

@@ -216,8 +216,8 @@ class FixedRoom:
 
     def __init__(self, pairs: int, device: torch.device):
         self.pairs = pairs
-        self.counted = torch.zeros(2, dtype=torch.int64, device=device)
-        """of the last image, and the most of any"""
+        self.counted = torch.full((2,), -1, dtype=torch.int64, device=device)
+        """of the last image, and the most of any; -1: none has been made"""
 
     def send(self, total: Tensor) -> None:
         """Keep the number of pairs [1], on the GPU."""
@@ -272,7 +272,6 @@ def tile_lists(
         width, height: of the image, in tiles; with the row below it has at most 2^15.
         side: of a tile, in pixels.
         colors: leave out the splats of which one of these, [M, D], or another number is not finite.
-
         room: make room for so many pairs, and send home how many there are; None: wait for their number.
 
     Returns:

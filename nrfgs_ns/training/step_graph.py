@@ -17,11 +17,11 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.func import functional_call
 
 from nrfgs_ns.data.checks import warn
-from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import composite_view, project_view
 
@@ -44,33 +44,40 @@ class StepGraphs:
     def __init__(self, model, datamanager):
         self.model = model
         self.datamanager = datamanager
-        self._graphs: dict[tuple[int, int], _StepGraph] = {}
+        self._graphs: dict[tuple, _StepGraph] = {}
         self._of: list[Any] = []
-        self._how: list[Any] = []
+        self._how: dict[str, Any] = {}
         self._pairs_for_each = 0.0
         """the most pairs of a view, for each splat, at this resolution"""
         self._given_up = False
+        self._has_said_why = False
 
     def take(self, step: int, batch: Mapping[str, Any]) -> bool:
-        """Whether this step can be a graph's."""
+        """Whether this step can be a graph's. What keeps all of a training's from it is said once."""
         model = self.model
-        return (
-            not self._given_up
-            and model.device.type == "cuda"
-            and step > 0  # in the first step PyTorch makes what the optimisers keep
-            and model.densification.takes_all_rows
-            and not (model.config.use_scale_regularization and step % 10 == 0)
-            and not model.config.use_bilateral_grid
-            and not model.config.output_depth_during_training
-            and model.photograph is None
-            and model.trimming is None
-            and model.num_diffuse == 0
-            and model.camera_optimizer.config.mode == "off"
-            and "mask" not in batch
-            and batch["image"].shape[-1] == 3
-            and batch["image"].dtype == torch.uint8
-            and (batch["image"].shape[:2] in self._graphs or len(self._graphs) < MOST_SIZES)
+        if self._given_up or model.device.type != "cuda" or model.num_points == 0:
+            return False
+        if (obstacle := self._obstacle()) is not None:
+            if not self._has_said_why:
+                CONSOLE.print(f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}.")
+                self._has_said_why = True
+            return False
+        regularised = model.config.use_scale_regularization and step % 10 == 0
+        return not regularised and (_kind(batch) in self._graphs or len(self._graphs) < MOST_SIZES)
+
+    def _obstacle(self) -> str | None:
+        """What of the training's options a graph does not know."""
+        model = self.model
+        obstacles = (
+            ("the densification looks at what views show", not model.densification.takes_all_rows),
+            ("photographs' exposures are learnt", model.photograph is not None),
+            ("the robust loss chooses pixels", model.trimming is not None),
+            ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
+            ("bilateral grids are learnt", model.config.use_bilateral_grid),
+            ("depth is rendered", model.config.output_depth_during_training),
+            ("some splats are diffuse", model.densification.diffuse is not None),
         )
+        return next((what for what, there in obstacles if there), None)
 
     def losses(
         self, camera: Cameras, batch: Mapping[str, Any], step: int
@@ -89,32 +96,43 @@ class StepGraphs:
             reason = next(iter(str(error).splitlines()), "")
             warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
             return None
-        loss = graph.run(model.pinhole(camera), batch["image"], step)
+        losses = graph.run(model.pinhole(camera), batch, step)
         model.info = {**graph.info, "pairs": graph.last_pairs}
-        model.watched = {"the rendered image": graph.outputs["rgb"], "loss main_loss": loss.detach()}
+        watched = {
+            "the rendered image": graph.outputs["rgb"],
+            **{f"loss {name}": loss for name, loss in losses.items()},
+        }
+        model.watched = {name: value.detach() for name, value in watched.items()}
         model.watched_image = batch.get("image_idx")
-        return dict(graph.outputs), {"main_loss": loss}
+        return dict(graph.outputs), losses
 
     def _is_new(self) -> bool:
         """Whether a step is another than the one before, and none that has been recorded: splats have come or gone,
         pixels are others, or the head or the densification does something else."""
         model = self.model
         now = [*model.gauss_params.values(), model.head, *model.head.parameters()]
-        how = [model.head.phase, model.densification.rests_at(model.step), model._get_downscale_factor()]
+        how = {
+            "places": [value.data_ptr() for value in now if isinstance(value, Tensor)],
+            "head": (model.head.phase, model.head_rests),
+            "densification": model.densification.rests_at(model.step),
+            "downscale": model._get_downscale_factor(),
+        }
         same = len(now) == len(self._of) and all(a is b for a, b in zip(now, self._of, strict=True))
         if same and how == self._how:
             return False
         self._see_pairs()
-        if how[-1:] != self._how[-1:]:
+        if how["downscale"] != self._how.get("downscale"):
             self._pairs_for_each = 0.0
-        self._graphs.clear()
+        if self._graphs:
+            self._graphs.clear()
+            torch.cuda.empty_cache()  # a graph's memory is no other's before
         self._of, self._how = now, how
         return True
 
     def _graph_for(self, camera: Cameras, batch: Mapping[str, Any]) -> _StepGraph:
         """The graph of a photograph's size, recorded if there is none."""
         model = self.model
-        size = tuple(batch["image"].shape[:2])
+        size = _kind(batch)
         if size in self._graphs and not self._graphs[size].had_room():
             self._see_pairs()
             del self._graphs[size]
@@ -122,7 +140,7 @@ class StepGraphs:
             if self._pairs_for_each == 0.0:
                 self._pairs_for_each = self._most_pairs() / model.num_points
             room = int(MORE_ROOM * self._pairs_for_each * model.num_points) + 1
-            self._graphs[size] = _StepGraph(model, model.pinhole(camera), batch["image"], room)
+            self._graphs[size] = _StepGraph(model, model.pinhole(camera), batch, room)
         return self._graphs[size]
 
     def _see_pairs(self) -> None:
@@ -132,18 +150,29 @@ class StepGraphs:
 
     @torch.no_grad()
     def _most_pairs(self) -> int:
-        """The most pairs of views that are evenly taken from all."""
-        from nrfgs_ns.rasterizer.tile_lists import room_on
+        """The most pairs of views that are evenly taken from all.
 
-        model, most = self.model, 0
-        count = len(self.datamanager.train_dataset)
-        field = model.field
+        Raises:
+            RuntimeError: another than the kernels of `tile_lists.py` lists what tiles draw.
+        """
+        from nrfgs_ns.rasterizer.tile_lists import FixedRoom
+
+        model, count = self.model, len(self.datamanager.train_dataset)
+        field, room = model.field, FixedRoom(1, model.device)
         for index in range(0, count, max(count // VIEWS_ASKED, 1)):
             camera, _ = self.datamanager.train_view(index)
             view = model.project(camera, field.splats)
-            composite_view(view, field.seen_from(view), torch.zeros(3, device=model.device), with_depth=False)
-            most = max(most, room_on(model.device).needed())
+            with room.in_use():
+                composite_view(view, field.seen_from(view), torch.zeros(3, device=model.device), with_depth=False)
+        _, most = room.counted.tolist()
+        if most < 0:
+            raise RuntimeError("gsplat lists what tiles draw, and the host waits for its lists")
         return most
+
+
+def _kind(batch: Mapping[str, Any]) -> tuple:
+    """What of a photograph decides which graph it can be given to."""
+    return tuple(batch["image"].shape), "mask" in batch
 
 
 class _StepGraph:
@@ -151,21 +180,21 @@ class _StepGraph:
 
     Args:
         model: an NrfgsModel in training.
-        seen_from, photograph: some camera, and its photograph, bytes [H, W, 3].
+        seen_from, batch: some camera, and its photograph and mask as the datamanager gives them.
         pairs: room for pairs.
     """
 
-    def __init__(self, model, seen_from: Pinhole, photograph: Tensor, pairs: int):
+    def __init__(self, model, seen_from: Pinhole, batch: Mapping[str, Any], pairs: int):
         from nrfgs_ns.rasterizer.tile_lists import FixedRoom
 
         self.model, self.count = model, model.num_points
         self.parameters = {f"splats.{name}": value for name, value in model.gauss_params.items()}
         self.parameters |= {f"head.{name}": value for name, value in model.head.named_parameters()}
-        self.device = device = photograph.device
+        self.device = device = model.device
         self.seen_from = seen_from._replace(
             viewmat=seen_from.viewmat.clone(), K=seen_from.K.clone(), center=seen_from.center.clone()
         )
-        self.photograph = photograph.clone()
+        self.batch = {name: batch[name].to(device, copy=True) for name in ("image", "mask") if name in batch}
         self.room = FixedRoom(pairs, device)
         self._counted = torch.ones(2, dtype=torch.int64, pin_memory=True)
         self._arrived = torch.cuda.Event()
@@ -211,25 +240,20 @@ class _StepGraph:
         weights = {name: leaves[f"head.{name}"] for name, _ in model.head.named_parameters()}
         with torch.enable_grad(), self.room.in_use():
             view = project_view(splats, self.seen_from, model.projecting._replace(every_row=True))
-            asked = model.view_noise.moved_by(splats, self.noise)
-            appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
+            if model.head_rests:
+                appearance = model.head.base_appearance(splats, view.visible)
+            else:
+                asked = model.view_noise.moved_by(splats, self.noise)
+                appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
             background = model._get_background_color()
-            outputs, info = composite_view(
-                view,
-                appearance,
-                background,
-                with_depth=False,
-                absgrad=model.densification.needs_absgrad(model.step),
-                assume_finite=True,
-            )
+            outputs, info = model.composite(view, appearance, background)
+            outputs["background"] = background
             model.densification.pre_backward(model.step, info, appearance.opacities, splats["opacities"])
-            truth = model.truth_of({"image": self.photograph}, background)
-            loss = photometric_loss(outputs["rgb"], truth, model.config.ssim_lambda)
-            loss.backward()
+            losses = {"main_loss": model.photometric_loss(outputs, self.batch), **model.shrinking(splats)}
+            sum(losses.values()).backward()
         self.gradients = {name: leaf.grad for name, leaf in leaves.items()}
-        self.outputs = {name: outputs[name].detach() for name in ("rgb", "accumulation")}
-        self.outputs["background"] = background
-        self.loss = loss.detach()
+        self.outputs = {name: value.detach() for name, value in outputs.items()}
+        self.losses = {name: loss.detach() for name, loss in losses.items()}
         self.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in info.items()}
         for name in ("grad", "absgrad") if info["means2d"].retains_grad else ():
             gradient = getattr(info["means2d"], name, None)
@@ -247,24 +271,27 @@ class _StepGraph:
         self._arrived.synchronize()
         return int(self._counted[1])
 
-    def run(self, seen_from: Pinhole, photograph: Tensor, step: int) -> Tensor:
-        """The loss, whose gradients are ready to be handed out; `outputs` and `info` are this step's."""
+    def run(self, seen_from: Pinhole, batch: Mapping[str, Any], step: int) -> dict[str, Tensor]:
+        """The losses; the gradients of their sum are handed out when that is differentiated. `outputs` and `info` are
+        this step's."""
         for name, parameter in self.parameters.items():
             if parameter.grad is not None and parameter.grad is self.gradients[name]:  # kept to be added to
                 parameter.grad = parameter.grad.clone()
         for name in ("viewmat", "K", "center"):
             getattr(self.seen_from, name).copy_(getattr(seen_from, name))
-        self.photograph.copy_(photograph)
+        for name, values in self.batch.items():
+            values.copy_(batch[name], non_blocking=True)
         if self.noise is not None:
             self.model.view_noise.generator(self.device, step)
         self.graph.replay()
         self._counted.copy_(self.room.counted, non_blocking=True)
         self._arrived.record()
-        return _Ready.apply(self.loss, self, self.parameters["splats.means"])
+        ready = _Ready.apply(self.losses["main_loss"], self, self.parameters["splats.means"])
+        return {**self.losses, "main_loss": ready}
 
 
 class _Ready(torch.autograd.Function):
-    """A loss whose gradients have been computed with it. It is differentiated as it is: nothing else is in the sum."""
+    """A loss whose gradients, and those of what is added to it, have been computed with it."""
 
     @staticmethod
     def forward(ctx, loss: Tensor, graph: _StepGraph, _: Tensor) -> Tensor:

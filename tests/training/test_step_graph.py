@@ -30,8 +30,9 @@ def build(tiny_scene, tmp_path):
 
 
 def begin(pipeline, step: int) -> None:
-    """What the trainer does before a step, with the same random numbers each time."""
+    """What the trainer does before a step, with the same random numbers each time. The head begins at step 50."""
     pipeline.model.step_cb(Optimizers({}, {}), step)
+    pipeline.model.head_rests = step < 50
     torch.manual_seed(step)
     for parameter in pipeline.model.parameters():
         parameter.grad = None
@@ -42,7 +43,7 @@ def eager(pipeline, step: int, view: int) -> tuple:
     begin(pipeline, step)
     camera, batch = pipeline.datamanager.train_view(view)
     outputs = pipeline.model.get_outputs(camera)
-    loss = pipeline.model.get_loss_dict(outputs, batch)["main_loss"]
+    loss = sum(pipeline.model.get_loss_dict(outputs, batch).values())
     loss.backward()
     return loss.detach(), outputs["rgb"].detach(), gradients(pipeline)
 
@@ -54,7 +55,7 @@ def recorded(pipeline, graphs, step: int, view: int) -> tuple | None:
     done = graphs.losses(camera, batch, step) if graphs.take(step, batch) else None
     if done is None:
         return None
-    (loss,) = done[1].values()
+    loss = sum(done[1].values())
     loss.backward()
     return loss.detach(), done[0]["rgb"].clone(), gradients(pipeline)
 
@@ -79,13 +80,25 @@ def assert_same(got, expected) -> None:
         assert (got[2][name] - gradient).norm() <= 1e-4 * gradient.norm() + 1e-9, name
 
 
+@pytest.mark.parametrize(
+    "option", ["use-bilateral-grid True", "robust-loss 0.1", "densification mcmc", "camera-optimizer.mode SO3xR3"]
+)
+def test_what_is_not_recorded_is_said_once(build, option, capsys, monkeypatch):
+    name, value = option.split()
+    pipeline, graphs = build("cpu", "nrfgs", f"--pipeline.model.{name}", value)
+    batch = pipeline.datamanager.train_view(0)[1]
+    monkeypatch.setattr(type(pipeline.model), "device", torch.device("cuda"))
+    assert not any(graphs.take(step, batch) for step in (1, 2))
+    assert capsys.readouterr().out.count("not recorded") == 1
+
+
 def test_a_cpu_makes_steps_as_ever(build):
     pipeline, graphs = build("cpu")
     assert not graphs.take(5, pipeline.datamanager.train_view(0)[1])
 
 
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-best"])
-@pytest.mark.parametrize("step", [100, 20_000], ids=["growing", "at rest"])
+@pytest.mark.parametrize("step", [10, 100, 20_000], ids=["head rests", "growing", "at rest"])
 class TestOnCuda:
     pytestmark = gpu
 
