@@ -4,12 +4,13 @@
 import gc
 
 import pytest
+import torch
 from short_trainings import command_line
 
 from nrfgs_ns.kernels.trial import Gate
 from nrfgs_ns.training.run import parse
 
-pytestmark = pytest.mark.gpu
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 
 
 def tried() -> dict[str, set]:
