@@ -57,7 +57,7 @@ class StepGraphs:
         model = self.model
         if self._given_up or model.device.type != "cuda" or model.num_points == 0:
             return False
-        if (obstacle := self._obstacle()) is not None:
+        if (obstacle := self._obstacle(batch)) is not None:
             if not self._has_said_why:
                 CONSOLE.print(f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}.")
                 self._has_said_why = True
@@ -65,12 +65,14 @@ class StepGraphs:
         regularised = model.config.use_scale_regularization and step % 10 == 0
         return not regularised and (_kind(batch) in self._graphs or len(self._graphs) < MOST_SIZES)
 
-    def _obstacle(self) -> str | None:
+    def _obstacle(self, batch: Mapping[str, Any]) -> str | None:
         """What of the training's options a graph does not know."""
         model = self.model
+        exposed = model.photograph is not None
         obstacles = (
             ("the densification looks at what views show", not model.densification.takes_all_rows),
-            ("photographs' exposures are learnt", model.photograph is not None),
+            ("lenses are learnt", exposed and model.photograph.has_penalty),
+            ("exposures of transparent photographs are learnt", exposed and batch["image"].shape[-1] == 4),
             ("the robust loss chooses pixels", model.trimming is not None),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
             ("bilateral grids are learnt", model.config.use_bilateral_grid),
@@ -96,7 +98,7 @@ class StepGraphs:
             reason = next(iter(str(error).splitlines()), "")
             warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
             return None
-        losses = graph.run(model.pinhole(camera), batch, step)
+        losses = graph.run(model.pinhole(camera), batch, camera.metadata["cam_idx"], step)
         model.info = {**graph.info, "pairs": graph.last_pairs}
         watched = {
             "the rendered image": graph.outputs["rgb"],
@@ -201,6 +203,8 @@ class _StepGraph:
         self._arrived.record()
         self.last_pairs = 1
         """of the step before, as far as the host has learnt"""
+        self.shot = None if model.photograph is None else model.photograph.shots.detach()[:1].clone()
+        """the numbers of the step's photograph, [1, R], if they are learnt; a graph cannot choose a row by itself"""
         noise = model.view_noise
         self.noise = None if noise.sigma == 0.0 else noise.generator(device, 0)
 
@@ -238,6 +242,10 @@ class _StepGraph:
         leaves = {name: value.detach().requires_grad_() for name, value in self.parameters.items()}
         splats = {name: leaves[f"splats.{name}"] for name in model.gauss_params}
         weights = {name: leaves[f"head.{name}"] for name, _ in model.head.named_parameters()}
+        shot = look = None
+        if self.shot is not None:
+            shot = self.shot.detach().requires_grad_()
+            look = lambda rgb: functional_call(model.photograph, {"shots": shot}, (rgb, 0))  # noqa: E731
         with torch.enable_grad(), self.room.in_use():
             view = project_view(splats, self.seen_from, model.projecting._replace(every_row=True))
             if model.head_rests:
@@ -246,12 +254,22 @@ class _StepGraph:
                 asked = model.view_noise.moved_by(splats, self.noise)
                 appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
             background = model._get_background_color()
-            outputs, info = model.composite(view, appearance, background)
+            outputs, info = composite_view(
+                view,
+                appearance,
+                background,
+                with_depth=False,
+                absgrad=model.densification.needs_absgrad(model.step),
+                assume_finite=True,
+                look=look,
+            )
             outputs["background"] = background
             model.densification.pre_backward(model.step, info, appearance.opacities, splats["opacities"])
             losses = {"main_loss": model.photometric_loss(outputs, self.batch), **model.shrinking(splats)}
             sum(losses.values()).backward()
         self.gradients = {name: leaf.grad for name, leaf in leaves.items()}
+        if shot is not None:
+            self.shot_gradient = shot.grad
         self.outputs = {name: value.detach() for name, value in outputs.items()}
         self.losses = {name: loss.detach() for name, loss in losses.items()}
         self.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in info.items()}
@@ -271,7 +289,7 @@ class _StepGraph:
         self._arrived.synchronize()
         return int(self._counted[1])
 
-    def run(self, seen_from: Pinhole, batch: Mapping[str, Any], step: int) -> dict[str, Tensor]:
+    def run(self, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> dict[str, Tensor]:
         """The losses; the gradients of their sum are handed out when that is differentiated. `outputs` and `info` are
         this step's."""
         for name, parameter in self.parameters.items():
@@ -283,7 +301,13 @@ class _StepGraph:
             values.copy_(batch[name], non_blocking=True)
         if self.noise is not None:
             self.model.view_noise.generator(self.device, step)
+        if self.shot is not None:
+            self.shot.copy_(self.model.photograph.shots.detach()[index : index + 1])
         self.graph.replay()
+        if self.shot is not None:
+            shots = self.parameters["photograph.shots"] = self.model.photograph.shots
+            self.gradients["photograph.shots"] = torch.zeros_like(shots)
+            self.gradients["photograph.shots"][index] = self.shot_gradient[0]
         self._counted.copy_(self.room.counted, non_blocking=True)
         self._arrived.record()
         ready = _Ready.apply(self.losses["main_loss"], self, self.parameters["splats.means"])

@@ -128,6 +128,19 @@ class TestOnCuda:
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+def test_a_photographs_exposure_is_learnt_the_same(build):
+    pipeline, graphs = build("cuda", "nrfgs", "--pipeline.model.photographs", "on")
+    with torch.no_grad():
+        pipeline.model.photograph.shots.normal_(0.0, 0.1)
+    recorded(pipeline, graphs, 100, 0)
+    for view in (0, 3, 5):
+        expected = eager(pipeline, 100 + view, view)
+        assert "photograph.shots" in expected[2]
+        assert_same(recorded(pipeline, graphs, 100 + view, view), expected)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
 def test_a_training_learns_the_same(tiny_scene, tmp_path, monkeypatch):
     """With refinements, resets and three resolutions on the way."""
     psnr = []
