@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_opacities
-from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
+from nrfgs_ns.appearance.spherical_harmonics import eval_sh, kernels_run_on, num_bases
 
 
 @dataclass
@@ -49,6 +49,9 @@ class SphericalHarmonics(AppearanceHead):
         """Coefficients: "features_dc" [N, 3], and the higher degrees' "features_rest" [N, (degree + 1)^2 - 1, 3]."""
         rest = torch.zeros(len(rgb), num_bases(self.config.degree) - 1, 3, device=rgb.device)
         return {**super().splat_params(rgb), "features_rest": rest}
+
+    def try_kernels(self, device: torch.device) -> None:
+        kernels_run_on(device)
 
     def set_step(self, step: int) -> None:
         self.active_degree = min(step // self.config.degree_interval, self.config.degree)
