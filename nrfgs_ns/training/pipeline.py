@@ -69,7 +69,7 @@ class NrfgsPipeline(VanillaPipeline):
     images_per_step: int = 1
     """images for which a step counts in the schedules (`distributed.schedules`)"""
     graphs: StepGraphs | None = None
-    """steps that are made in one launch, where they can be"""
+    """what makes steps in one launch, where it can; the trainer's"""
     steps_per_log: int = 1
     """steps between two at which metrics are taken"""
 
@@ -90,9 +90,6 @@ class NrfgsPipeline(VanillaPipeline):
                 self.datamanager.load_all_images()
                 photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
-            scaler = kwargs.get("grad_scaler")  # none where nobody trains
-            if kwargs.get("world_size", 1) == 1 and scaler is not None and not scaler.is_enabled():
-                self.graphs = StepGraphs(self.model, self.datamanager)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
             self.model.fit_on(self.datamanager.train_dataset.cameras)
 
@@ -123,7 +120,7 @@ class NrfgsPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int):
         """Nerfstudio's step, whose metrics are taken only when they are logged."""
         camera, batch = self.datamanager.next_train(step)
-        done = self.graphs.losses(camera, batch, step) if self.graphs and self.graphs.take(step, batch) else None
+        done = None if self.graphs is None else self.graphs.losses(camera, batch, step)
         outputs = self._model(camera) if done is None else done[0]
         metrics = self.model.get_metrics_dict(outputs, batch) if step % self.steps_per_log == 0 else {}
         losses = self.model.get_loss_dict(outputs, batch, metrics) if done is None else done[1]

@@ -39,11 +39,11 @@ class StepGraphs:
     Args:
         model: an NrfgsModel.
         datamanager: of its training.
+        guard: of its training, which is asked about the step before, once, before each step is computed.
     """
 
-    def __init__(self, model, datamanager):
-        self.model = model
-        self.datamanager = datamanager
+    def __init__(self, model, datamanager, guard):
+        self.model, self.datamanager, self.guard = model, datamanager, guard
         self._graphs: dict[tuple, _StepGraph] = {}
         self._of: list[Any] = []
         self._how: dict[str, Any] = {}
@@ -52,7 +52,7 @@ class StepGraphs:
         self._given_up = False
         self._has_said_why = False
 
-    def take(self, step: int, batch: Mapping[str, Any]) -> bool:
+    def _takes(self, step: int, batch: Mapping[str, Any]) -> bool:
         """Whether this step can be a graph's. What keeps all of a training's from it is said once."""
         model = self.model
         if self._given_up or model.device.type != "cuda" or model.num_points == 0:
@@ -85,20 +85,25 @@ class StepGraphs:
         self, camera: Cameras, batch: Mapping[str, Any], step: int
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]] | None:
         """Outputs and losses as of the model, and the gradients of the losses' sum to all parameters, when that is
-        differentiated. None: the step is the first of its kind, or cannot be recorded; then none is taken any more."""
-        model = self.model
-        if self._is_new():
+        differentiated. None: the step is the first of its kind, or cannot be recorded.
+
+        Raises:
+            TrainingStopped: the step before was condemned.
+        """
+        if not self._takes(step, batch) or self._is_new():
+            self.guard.settle()
             return None
-        try:
-            graph = self._graph_for(camera, batch)
-        except Exception as error:
-            self._given_up = True
-            self._graphs.clear()
-            torch.cuda.empty_cache()
-            reason = next(iter(str(error).splitlines()), "")
-            warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
+        model, kind = self.model, _kind(batch)
+        now = model.pinhole(camera), batch, camera.metadata["cam_idx"], step
+        graph = self._graphs.get(kind)
+        if graph is not None:
+            graph.prepare(*now)
+        self.guard.settle()  # everything is ready, so that the GPU need not wait for what the host does
+        if graph is None or not graph.had_room():
+            graph = self._record(kind, *now)
+        if graph is None:
             return None
-        losses = graph.run(model.pinhole(camera), batch, camera.metadata["cam_idx"], step)
+        losses = graph.run()
         model.info = {**graph.info, "pairs": graph.last_pairs}
         watched = {
             "the rendered image": graph.outputs["rgb"],
@@ -131,19 +136,26 @@ class StepGraphs:
         self._of, self._how = now, how
         return True
 
-    def _graph_for(self, camera: Cameras, batch: Mapping[str, Any]) -> _StepGraph:
-        """The graph of a photograph's size, recorded if there is none."""
-        model = self.model
-        size = _kind(batch)
-        if size in self._graphs and not self._graphs[size].had_room():
-            self._see_pairs()
-            del self._graphs[size]
-        if size not in self._graphs:
+    def _record(
+        self, kind: tuple, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int
+    ) -> _StepGraph | None:
+        """A graph for this kind of photograph, ready for a step. None, and no graph from now on, where that fails."""
+        self._see_pairs()
+        self._graphs.pop(kind, None)
+        try:
             if self._pairs_for_each == 0.0:
-                self._pairs_for_each = self._most_pairs() / model.num_points
-            room = int(MORE_ROOM * self._pairs_for_each * model.num_points) + 1
-            self._graphs[size] = _StepGraph(model, model.pinhole(camera), batch, room)
-        return self._graphs[size]
+                self._pairs_for_each = self._most_pairs() / self.model.num_points
+            room = int(MORE_ROOM * self._pairs_for_each * self.model.num_points) + 1
+            graph = self._graphs[kind] = _StepGraph(self.model, seen_from, batch, room)
+            graph.prepare(seen_from, batch, index, step)
+        except Exception as error:
+            self._given_up = True
+            self._graphs.clear()
+            torch.cuda.empty_cache()
+            reason = next(iter(str(error).splitlines()), "")
+            warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
+            return None
+        return graph
 
     def _see_pairs(self) -> None:
         """Learn from the graphs that there are how many pairs views have."""
@@ -289,25 +301,29 @@ class _StepGraph:
         self._arrived.synchronize()
         return int(self._counted[1])
 
-    def run(self, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> dict[str, Tensor]:
-        """The losses; the gradients of their sum are handed out when that is differentiated. `outputs` and `info` are
-        this step's."""
+    def prepare(self, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
+        """Take a step's camera, its photograph, which is training photograph `index`, and its noise."""
         for name, parameter in self.parameters.items():
             if parameter.grad is not None and parameter.grad is self.gradients[name]:  # kept to be added to
                 parameter.grad = parameter.grad.clone()
-        for name in ("viewmat", "K", "center"):
-            getattr(self.seen_from, name).copy_(getattr(seen_from, name))
+        mine, now = self.seen_from, seen_from
+        torch._foreach_copy_([mine.viewmat, mine.K, mine.center], [now.viewmat, now.K, now.center])
         for name, values in self.batch.items():
             values.copy_(batch[name], non_blocking=True)
         if self.noise is not None:
             self.model.view_noise.generator(self.device, step)
         if self.shot is not None:
+            self.index = index
             self.shot.copy_(self.model.photograph.shots.detach()[index : index + 1])
+
+    def run(self) -> dict[str, Tensor]:
+        """The losses; the gradients of their sum are handed out when that is differentiated. `outputs` and `info` are
+        this step's."""
         self.graph.replay()
         if self.shot is not None:
             shots = self.parameters["photograph.shots"] = self.model.photograph.shots
             self.gradients["photograph.shots"] = torch.zeros_like(shots)
-            self.gradients["photograph.shots"][index] = self.shot_gradient[0]
+            self.gradients["photograph.shots"][self.index] = self.shot_gradient[0]
         self._counted.copy_(self.room.counted, non_blocking=True)
         self._arrived.record()
         ready = _Ready.apply(self.losses["main_loss"], self, self.parameters["splats.means"])

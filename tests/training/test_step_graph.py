@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A step as one CUDA graph computes what its kernels compute one after the other. `pytest -m gpu`."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from nerfstudio.engine.optimizers import Optimizers
@@ -28,7 +30,7 @@ def build(tiny_scene, tmp_path):
         built.model.view_noise.sigma = 0.01
         # Splats start round, and turning a round splat changes nothing: its quaternion's gradient is rounding alone.
         built.model.gauss_params["scales"].data += 0.5 * torch.randn(built.model.num_points, 3).to(device)
-        return built, StepGraphs(built.model, built.datamanager)
+        return built, StepGraphs(built.model, built.datamanager, SimpleNamespace(settle=lambda: None))
 
     return pipeline
 
@@ -56,7 +58,7 @@ def recorded(pipeline, graphs, step: int, view: int) -> tuple | None:
     """The same as a graph; None if it is not taken."""
     begin(pipeline, step)
     camera, batch = pipeline.datamanager.train_view(view)
-    done = graphs.losses(camera, batch, step) if graphs.take(step, batch) else None
+    done = graphs.losses(camera, batch, step)
     if done is None:
         return None
     loss = sum(done[1].values())
@@ -92,13 +94,13 @@ def test_what_is_not_recorded_is_said_once(build, option, capsys, monkeypatch):
     pipeline, graphs = build("cpu", "nrfgs", f"--pipeline.model.{name}", value)
     batch = pipeline.datamanager.train_view(0)[1]
     monkeypatch.setattr(type(pipeline.model), "device", torch.device("cuda"))
-    assert not any(graphs.take(step, batch) for step in (1, 2))
+    assert not any(graphs._takes(step, batch) for step in (1, 2))
     assert capsys.readouterr().out.count("not recorded") == 1
 
 
 def test_a_cpu_makes_steps_as_ever(build):
     pipeline, graphs = build("cpu")
-    assert not graphs.take(5, pipeline.datamanager.train_view(0)[1])
+    assert not graphs._takes(5, pipeline.datamanager.train_view(0)[1])
 
 
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-best"])
@@ -151,7 +153,7 @@ def test_a_training_learns_the_same(tiny_scene, tmp_path, monkeypatch):
     for taken in (True, False):
         with monkeypatch.context() as only:
             if not taken:
-                only.setattr(StepGraphs, "take", lambda *_: False)
+                only.setattr(StepGraphs, "_takes", lambda *_: False)
             args = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path / str(taken))]
             args += ["--max-num-iterations", "600", "--schedule-steps", "30000", "--vis", "tensorboard"]
             args += ["--steps-per-eval-image", "100000", "--steps-per-eval-all-images", "100000"]
