@@ -276,7 +276,9 @@ class _StepGraph:
                 look=look,
             )
             outputs["background"] = background
-            model.densification.pre_backward(model.step, info, appearance.opacities, splats["opacities"])
+            stored = torch.sigmoid(splats["opacities"]).flatten()  # what nobody is shown otherwise
+            shown = torch.where(info["radii"] > 0, appearance.opacities, stored)
+            model.densification.pre_backward(model.step, info, shown, splats["opacities"])
             losses = {"main_loss": model.photometric_loss(outputs, self.batch), **model.shrinking(splats)}
             sum(losses.values()).backward()
         self.gradients = {name: leaf.grad for name, leaf in leaves.items()}
