@@ -100,12 +100,12 @@ class GradientDensification(Densification):
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
 
     def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
+        super().pre_backward(step, info, opacities, logits)
         if step < self.strategy.refine_stop_iter:
-            super().pre_backward(step, info, opacities, logits)
             info["means2d"].retain_grad()
 
     def post_backward(self, step, info, splats, optimizers) -> None:
-        strategy = self.strategy
+        strategy, self.shown = self.strategy, None
         if step < strategy.refine_stop_iter:
             self._take_statistics(info, len(splats["means"]))
             if step == 0 and not self.reset_at_start:
