@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers of docs/comparison.md."""
 
-from statistics import fmean
+from collections import defaultdict
+from collections.abc import Iterable
+from statistics import fmean, median
 
-from nrfgs_lab.bench.table import Row, ranks
-from nrfgs_lab.pages.tables import BY_NAME, bench_rows, bold, grid, mean_of, records, signed
+from nrfgs_lab.bench.table import Row, average, ranks
+from nrfgs_lab.pages.tables import BY_NAME, bench_grid, bench_rows, bold, grid, mean_of, records, signed
+from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS
 
 METHODS = ["3DGS", "VDGS", "GSNB", "SG", "NRF-GS"]
 PARTS = {
@@ -84,3 +87,148 @@ def stored_opacity(splats: str) -> str:
     """PSNR of the field on bonsai where all of MCMC's rules go by the stored opacity."""
     record = records("comparison")[f"stored-opacity/NRF-GS-mcmc@{splats}-bonsai-42"]
     return f"{record['measured']['test']['psnr']:.1f}"
+
+
+# One protocol as near to the paper's as the host comes.
+
+OF_THE_PAPER = {"3DGS": None, "VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
+"""The paper's figures of bonsai: decibels over 3DGS, and splats in multiples of 3DGS's."""
+PAPER_ROWS = {"3DGS": "3DGS", "VDGS_no_resets": "VDGS", "VDGS": "VDGS", "GSNB": "GSNB", "NRF-GS": "NRF-GS"}
+"""Runs of docs/bench/paper.yaml -> the paper's methods."""
+PAPER_LABELS = {"VDGS_no_resets": "VDGS, no resets as its authors", "VDGS": "VDGS, resets as the others"}
+
+
+def paper() -> str:
+    """Gains and splats beside the paper's."""
+    rows = {run: row for (_, _, run), row in bench_rows("paper").items()}
+    base, body = rows["3DGS"], []
+    for run, method in PAPER_ROWS.items():
+        if run not in rows:
+            continue
+        row, told = rows[run], OF_THE_PAPER[method]
+        gain = signed(mean_of(row, "PSNR") - mean_of(base, "PSNR"), 2)
+        share = f"{mean_of(row, 'splats') / mean_of(base, 'splats'):.2f}"
+        cells = [row.text(BY_NAME[name]) for name in ("PSNR", "SSIM", "splats")]
+        ours = [gain, share] if row is not base else ["", ""]
+        theirs = [f"{told[0]:+.2f}", f"{told[1]:.2f}"] if told else ["", ""]
+        body.append([PAPER_LABELS.get(run, run), *cells, ours[0], theirs[0], ours[1], theirs[1]])
+    return grid(
+        ["", "PSNR", "SSIM", "splats", "over 3DGS, dB", "in the paper", "splats / 3DGS's", "in the paper"], body
+    )
+
+
+# Every capture.
+
+DEFAULT = "default"
+BASE = {"NRF-GS_base": "NRF-GS, `base`", "VDGS_base": "VDGS, `base`"}
+
+
+def _shared(strategy: str, runs: Iterable[str]) -> list[str]:
+    """The captures of which all these runs have records."""
+    rows = bench_rows("methods")
+    return [scene for scene in TRAINING_VIEWS if all(_place(scene, strategy, run) in rows for run in runs)]
+
+
+def _place(scene: str, strategy: str, run: str) -> tuple[str, str, str]:
+    return scene, "own" if run == DEFAULT else strategy, run
+
+
+def every(strategy: str, *more: str) -> str:
+    """PSNR, SSIM and splats of each method on each capture."""
+    rows, body = bench_rows("methods"), []
+    runs = [*METHODS, *more]
+    for scene, views in TRAINING_VIEWS.items():
+        found = {run: rows[place] for run in runs if (place := _place(scene, strategy, run)) in rows}
+        if not found:
+            continue
+        best = [
+            {list(found)[n] for n, rank in ranks(list(found.values()), one).items() if rank == 1}
+            for one in (PSNR, SSIM)
+        ]
+        cells = []
+        for run in runs:
+            if run not in found:
+                cells.append("not run")
+                continue
+            row = found[run]
+            psnr = bold(f"{mean_of(row, 'PSNR'):.2f}", run in best[0])
+            ssim = bold(f"{mean_of(row, 'SSIM'):.3f}", run in best[1])
+            seeds = f" ({len(row.records)})" if len(row.records) > 1 else ""
+            cells.append(f"{psnr}, {ssim}, {mean_of(row, 'splats') / 1000:.0f}k{seeds}")
+        body.append([f"{scene}, {views}", *cells])
+    return grid(["capture, views", *(BASE.get(run, run) for run in runs)], body)
+
+
+def averages() -> str:
+    """Every metric in the mean over the captures that all methods have."""
+    groups = []
+    for strategy, title in (("original", "3DGS's rules"), ("mcmc@150000", "150,000 splats (MCMC)")):
+        runs = [*METHODS, DEFAULT] if strategy == "original" else METHODS
+        scenes = _shared(strategy, runs)
+        rows = bench_rows("methods")
+        if len(scenes) > 1:
+            means = [(run, average([_first(rows[_place(scene, strategy, run)]) for scene in scenes])) for run in runs]
+            groups.append((f"{title}, {len(scenes)} captures", means))
+    return bench_grid(groups, ["PSNR", "SSIM", "MS-SSIM", "FLIP", "L1", "splats", "MB", "gap"])
+
+
+def _first(row: Row) -> Row:
+    """The same with its first seed alone, so that captures weigh alike."""
+    seed = min(row.records)
+    return Row(row.scene, row.run, row.strategy, {seed: row.records[seed]}).fill()
+
+
+def ahead(strategy: str, run: str, base: str) -> str:
+    """On how many captures a run is above another in its median test view, and by how much in the median capture."""
+    gains = list(median_gains(strategy, run, base).values())
+    return f"{sum(gain > 0 for gain in gains)} of {len(gains)} captures, by {signed(median(gains))}"
+
+
+def median_gains(strategy: str, run: str, base: str) -> dict[str, float]:
+    """Capture -> decibels by which a run is above another in the median test view, in the mean of seeds of both."""
+    rows = bench_rows("methods")
+    return {
+        scene: _median_gain(rows[_place(scene, strategy, run)], rows[_place(scene, strategy, base)])
+        for scene in _shared(strategy, (run, base))
+    }
+
+
+def _median_gain(row: Row, base: Row) -> float:
+    seeds = row.records.keys() & base.records.keys()
+    gains = defaultdict(list)
+    for seed in seeds:
+        views = [
+            {v["image"]: v["psnr"] for v in one.records[seed]["measured"]["test"]["per_image"]} for one in (row, base)
+        ]
+        for image, psnr in views[0].items():
+            gains[image].append(psnr - views[1][image])
+    return median(map(fmean, gains.values()))
+
+
+# How the heads' settings were chosen.
+
+TRIALS = {"third": "a third of its rate", "triple": "three times its rate", "shrinkage": "shrinkage"}
+
+
+def heads() -> str:
+    """What each trial gains over the head's own setting in the median held-out view: mean over captures, and each."""
+    body = []
+    for head in ("SH", "VDGS", "GSNB", "SG", "NRF"):
+        gains = {trial: trial_gains(head, trial) for trial in TRIALS}
+        cells = [
+            f"{signed(fmean(g.values()), 2)} ({', '.join(signed(x, 2) for x in g.values())})" if g else "-"
+            for g in gains.values()
+        ]
+        body.append([head, *cells])
+    return grid(["head", *TRIALS.values()], body)
+
+
+def trial_gains(head: str, trial: str) -> dict[str, float]:
+    """Capture -> decibels over the head's own setting in the median held-out view."""
+    rows = bench_rows("heads")
+    found = {}
+    for scene in TRAINING_VIEWS:
+        pair = [rows.get((scene, "original", name)) for name in (f"{head}_{trial}", head)]
+        if all(pair):
+            found[scene] = _median_gain(*pair)
+    return found
