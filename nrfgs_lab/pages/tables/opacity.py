@@ -6,7 +6,6 @@ from nrfgs_lab.pages.tables import grid, records
 SEEN = {
     "base": ("the field", "stored"),
     "peak": ("the field", "shown"),
-    "logit": ("residual on the logit", "stored"),
     "SH": ("3DGS", "stored"),
 }
 BOUNDS = "straight-through", "clamp", "smooth", "logit"
@@ -23,10 +22,10 @@ def pruning() -> str:
             rows = [found[name] for name in (f"{run}-original-{scene}-{seed}" for seed in seeds) if name in found]
             cells = [" / ".join(form.format(row[key]) for row in rows) for key, form in FORMS.items()]
             body.append([scene if scene == "bonsai" else "fox, small", label, seen, *cells])
-    return grid(["", "", "pruned by", "splats", "PSNR", "SSIM", "PSNR right after a reset"], body)
+    return grid(["", "", "pruned by", "splats", "PSNR", "PSNR right after a reset"], body)
 
 
-FORMS = {"splats": "{:,}", "psnr": "{:.2f}", "ssim": "{:.4f}", "psnr_after_reset": "{:.2f}"}
+FORMS = {"splats": "{:,}", "psnr": "{:.2f}", "psnr_after_reset": "{:.2f}"}
 
 
 def mcmc(run: str) -> str:
