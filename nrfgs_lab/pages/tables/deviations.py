@@ -29,3 +29,16 @@ def worth(change: str, base: str, scene: str = "bonsai") -> str:
     psnr = [{seed: one["measured"]["test"]["psnr"] for seed, one in row.records.items()} for row in (changed, plain)]
     gains = [signed(psnr[0][seed] - psnr[1][seed], 2) for seed in sorted(psnr[0].keys() & psnr[1].keys())]
     return f"{', '.join(gains)} dB, {mean_of(changed, 'splats') / mean_of(plain, 'splats'):.2f} times the splats"
+
+
+def noise() -> str:
+    """Decibels between two trainings of one setting with one seed, of each head that has both."""
+    twice = {"3DGS": "SH", "VDGS": "VDGS", "GSNB": "GSNB", "NRF": "NRF"}
+    pairs = [
+        (bench_rows("deviations")["bonsai", "original", a], bench_rows("heads")["bonsai", "original", b])
+        for a, b in twice.items()
+    ]
+    apart = [
+        abs(a.records[42]["measured"]["test"]["psnr"] - b.records[42]["measured"]["test"]["psnr"]) for a, b in pairs
+    ]
+    return f"{min(apart):.2f} to {max(apart):.2f} dB"
