@@ -3,11 +3,13 @@
 
 from collections import defaultdict
 from collections.abc import Iterable
+from functools import cache
 from statistics import fmean, median
+from typing import Any
 
 from nrfgs_lab.bench.table import Row, average, ranks
 from nrfgs_lab.pages.tables import BY_NAME, bench_grid, bench_rows, bold, grid, mean_of, records, signed
-from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS
+from nrfgs_lab.pages.tables.readme import FIELD, TRAINING_VIEWS, runs_of
 
 METHODS = ["3DGS", "VDGS", "GSNB", "SG", "NRF-GS"]
 PARTS = {
@@ -120,13 +122,35 @@ def paper() -> str:
 # Every capture.
 
 DEFAULT = "default"
+STEPS = 10_000
+"""Of all trainings; the default makes more for `bonsai`."""
 BASE = {"NRF-GS_base": "NRF-GS, `base`", "VDGS_base": "VDGS, `base`"}
+
+
+@cache
+def _rows() -> dict[tuple[str, str, str], Row]:
+    """(scene, strategy, run) -> row, of all captures under every strategy; the default as docs/captures.md has it."""
+    rows = {**bench_rows("methods"), **bench_rows("budgets")}
+    for scene in TRAINING_VIEWS:
+        made = {one["seed"]: _as_benchmarked(one) for one in runs_of(scene, FIELD) if one["made_steps"] == STEPS}
+        if made:
+            rows[scene, "own", DEFAULT] = Row(scene, DEFAULT, "own", made).fill()
+    return rows
+
+
+def _as_benchmarked(one: dict[str, Any]) -> dict[str, Any]:
+    """A record of results/captures.json as `nrfgs bench` would have written it."""
+    views = [{"image": image, "psnr": psnr} for image, psnr, *_ in one["per_image"]]
+    test = {name: one[name] for name in ("psnr", "ssim", "ms_ssim")} | {"per_image": views}
+    test["flip"] = fmean(one["flip"]) if one.get("flip") else None
+    measured = {"test": test, "train": {"psnr": one["train_psnr"]}}
+    measured |= {"splats": one["splats"], "parameter_bytes": one["splats_bytes"]}
+    return {"jobs": 2, "machine": one["machine"], "train": {}, "measured": measured}
 
 
 def _shared(strategy: str, runs: Iterable[str]) -> list[str]:
     """The captures of which all these runs have records."""
-    rows = bench_rows("methods")
-    return [scene for scene in TRAINING_VIEWS if all(_place(scene, strategy, run) in rows for run in runs)]
+    return [scene for scene in TRAINING_VIEWS if all(_place(scene, strategy, run) in _rows() for run in runs)]
 
 
 def _place(scene: str, strategy: str, run: str) -> tuple[str, str, str]:
@@ -135,11 +159,11 @@ def _place(scene: str, strategy: str, run: str) -> tuple[str, str, str]:
 
 def every(strategy: str, *more: str) -> str:
     """PSNR, SSIM and splats of each method on each capture."""
-    rows, body = bench_rows("methods"), []
+    rows, body = _rows(), []
     runs = [*METHODS, *more]
     for scene, views in TRAINING_VIEWS.items():
         found = {run: rows[place] for run in runs if (place := _place(scene, strategy, run)) in rows}
-        if not found:
+        if not found.keys() - {DEFAULT}:
             continue
         best = [
             {list(found)[n] for n, rank in ranks(list(found.values()), one).items() if rank == 1}
@@ -163,11 +187,11 @@ def averages() -> str:
     """Every metric in the mean over the captures that all methods have."""
     groups = []
     for strategy, title in (("original", "3DGS's rules"), ("mcmc@150000", "150,000 splats (MCMC)")):
-        runs = [*METHODS, DEFAULT] if strategy == "original" else METHODS
-        scenes = _shared(strategy, runs)
-        rows = bench_rows("methods")
+        scenes, rows = _shared(strategy, METHODS), _rows()
         if len(scenes) > 1:
-            means = [(run, average([_first(rows[_place(scene, strategy, run)]) for scene in scenes])) for run in runs]
+            means = [
+                (run, average([_first(rows[_place(scene, strategy, run)]) for scene in scenes])) for run in METHODS
+            ]
             groups.append((f"{title}, {len(scenes)} captures", means))
     return bench_grid(groups, ["PSNR", "SSIM", "MS-SSIM", "FLIP", "L1", "splats", "MB", "gap"])
 
@@ -186,7 +210,7 @@ def ahead(strategy: str, run: str, base: str) -> str:
 
 def median_gains(strategy: str, run: str, base: str) -> dict[str, float]:
     """Capture -> decibels by which a run is above another in the median test view, in the mean of seeds of both."""
-    rows = bench_rows("methods")
+    rows = _rows()
     return {
         scene: _median_gain(rows[_place(scene, strategy, run)], rows[_place(scene, strategy, base)])
         for scene in _shared(strategy, (run, base))
