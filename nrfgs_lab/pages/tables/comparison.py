@@ -12,47 +12,19 @@ from nrfgs_lab.pages.tables import BY_NAME, bench_grid, bench_rows, bold, grid, 
 from nrfgs_lab.pages.tables.readme import FIELD, TRAINING_VIEWS, runs_of
 
 METHODS = ["3DGS", "VDGS", "GSNB", "SG", "NRF-GS"]
-PARTS = {
-    "no_split": "- its split",
-    "no_opacity": "- its opacity residual",
-    "no_distance": "- its distance",
-    "NRF-GS_logit": "- residual on the logit instead",
-}
-RULES = {"original": "3DGS's rules", "mcmc@150000": "150,000 splats (MCMC)", "mcmc@300000": "300,000 splats (MCMC)"}
 PSNR, SSIM = BY_NAME["PSNR"], BY_NAME["SSIM"]
-
-
-def methods() -> str:
-    """PSNR and SSIM of every method, and of the field without its parts."""
-    rows = bench_rows("comparison")
-    body = []
-    for scene in ("bonsai", "goldcape"):
-        best = {}
-        for rule in RULES:
-            compared = [rows[scene, rule, run] for run in METHODS]
-            best[rule] = [
-                {compared[n].run for n, rank in ranks(compared, one).items() if rank == 1} for one in (PSNR, SSIM)
-            ]
-        for run in [*METHODS, *PARTS]:
-            cells = [_cell(rows.get((scene, rule, run)), *best[rule]) for rule in RULES]
-            splats = mean_of(rows[scene, "original", run], "splats")
-            body.append([scene, PARTS.get(run, run), f"{splats / 1000:.0f}k", *cells])
-    return grid(["", "", "splats, 3DGS's rules", *RULES.values()], body)
-
-
-def _cell(row: Row | None, best_psnr: set[str], best_ssim: set[str]) -> str:
-    """PSNR with its deviation, and SSIM; the best method's bold."""
-    if row is None:
-        return "not run"
-    psnr = bold(row.text(PSNR), row.run in best_psnr)
-    ssim = bold(f"{mean_of(row, 'SSIM'):.4f}", row.run in best_ssim)
-    return f"{psnr}, {ssim}" + (" (one seed)" if len(row.records) == 1 else "")
 
 
 def gain(scene: str, rule: str, run: str, base: str) -> str:
     """Decibels by which a run is above another, in the mean of their seeds."""
     rows = bench_rows("comparison")
     return signed(mean_of(rows[scene, rule, run], "PSNR") - mean_of(rows[scene, rule, base], "PSNR"))
+
+
+def ssim(scene: str, rule: str, run: str, base: str) -> str:
+    """The same of SSIM."""
+    rows = bench_rows("comparison")
+    return signed(mean_of(rows[scene, rule, run], "SSIM") - mean_of(rows[scene, rule, base], "SSIM"), 3)
 
 
 def gains(scene: str, rule: str, run: str, base: str, without: str = "") -> str:
@@ -95,28 +67,31 @@ def stored_opacity(splats: str) -> str:
 
 OF_THE_PAPER = {"3DGS": None, "VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
 """The paper's figures of bonsai: decibels over 3DGS, and splats in multiples of 3DGS's."""
-PAPER_ROWS = {"3DGS": "3DGS", "VDGS_no_resets": "VDGS", "VDGS": "VDGS", "GSNB": "GSNB", "NRF-GS": "NRF-GS"}
-"""Runs of docs/bench/paper.yaml -> the paper's methods."""
-PAPER_LABELS = {"VDGS_no_resets": "VDGS, no resets as its authors", "VDGS": "VDGS, resets as the others"}
 
 
 def paper() -> str:
-    """Gains and splats beside the paper's."""
-    rows = {run: row for (_, _, run), row in bench_rows("paper").items()}
-    base, body = rows["3DGS"], []
-    for run, method in PAPER_ROWS.items():
-        if run not in rows:
-            continue
-        row, told = rows[run], OF_THE_PAPER[method]
-        gain = signed(mean_of(row, "PSNR") - mean_of(base, "PSNR"), 2)
-        share = f"{mean_of(row, 'splats') / mean_of(base, 'splats'):.2f}"
-        cells = [row.text(BY_NAME[name]) for name in ("PSNR", "SSIM", "splats")]
-        ours = [gain, share] if row is not base else ["", ""]
-        theirs = [f"{told[0]:+.2f}", f"{told[1]:.2f}"] if told else ["", ""]
-        body.append([PAPER_LABELS.get(run, run), *cells, ours[0], theirs[0], ours[1], theirs[1]])
+    """Gains and splats on bonsai beside the paper's: in its protocol, and in that of the claims."""
+    places = [("paper", "its protocol, one seed"), ("comparison", "the claims' protocol, two seeds")]
+    body = []
+    for run, told in OF_THE_PAPER.items():
+        cells = []
+        for study, _ in places:
+            rows = {name: row for (scene, rule, name), row in bench_rows(study).items() if (scene, rule) == PLACE}
+            row, base = rows.get(run), rows["3DGS"]
+            if row is None:
+                cells.append("not run")
+                continue
+            cells.append(f"{mean_of(row, 'PSNR'):.2f}, {mean_of(row, 'splats') / 1000:.0f}k")
+            if row is not base:
+                gain = signed(mean_of(row, "PSNR") - mean_of(base, "PSNR"), 2)
+                cells[-1] += f": {gain}, {mean_of(row, 'splats') / mean_of(base, 'splats'):.2f}"
+        body.append([run, *cells, f"{told[0]:+.2f}, {told[1]:.2f}" if told else ""])
     return grid(
-        ["", "PSNR", "SSIM", "splats", "over 3DGS, dB", "in the paper", "splats / 3DGS's", "in the paper"], body
+        ["PSNR, splats: gain over 3DGS, share of its splats", *(title for _, title in places), "the paper"], body
     )
+
+
+PLACE = "bonsai", "original"
 
 
 # Every capture.
