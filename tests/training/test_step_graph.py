@@ -44,21 +44,21 @@ def begin(pipeline, step: int) -> None:
         parameter.grad = None
 
 
-def eager(pipeline, step: int, view: int) -> tuple:
+def eager(pipeline, step: int, view: int, **more: torch.Tensor) -> tuple:
     """Loss, image and gradients of a step, kernel by kernel."""
     begin(pipeline, step)
     camera, batch = pipeline.datamanager.train_view(view)
     outputs = pipeline.model.get_outputs(camera)
-    loss = sum(pipeline.model.get_loss_dict(outputs, batch).values())
+    loss = sum(pipeline.model.get_loss_dict(outputs, batch | more).values())
     loss.backward()
     return loss.detach(), outputs["rgb"].detach(), gradients(pipeline)
 
 
-def recorded(pipeline, graphs, step: int, view: int) -> tuple | None:
+def recorded(pipeline, graphs, step: int, view: int, **more: torch.Tensor) -> tuple | None:
     """The same as a graph; None if it is not taken."""
     begin(pipeline, step)
     camera, batch = pipeline.datamanager.train_view(view)
-    done = graphs.losses(camera, batch, step)
+    done = graphs.losses(camera, batch | more, step)
     if done is None:
         return None
     loss = sum(done[1].values())
@@ -143,6 +143,19 @@ def test_a_photographs_exposure_is_learnt_the_same(build):
         expected = eager(pipeline, 100 + view, view)
         assert "photograph.shots" in expected[2]
         assert_same(recorded(pipeline, graphs, 100 + view, view), expected)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+def test_each_photograph_has_its_mask(build):
+    pipeline, graphs = build("cuda", "nrfgs")
+    height, width = pipeline.datamanager.train_view(0)[1]["image"].shape[:2]
+    recorded(pipeline, graphs, 100, 0)
+    for view in (0, 3, 5):
+        mask = torch.rand(height, width, 1, generator=torch.Generator().manual_seed(view)) < 0.7
+        expected = eager(pipeline, 100 + view, view, mask=mask)
+        assert_same(recorded(pipeline, graphs, 100 + view, view, mask=mask), expected)
+    assert (expected[0] - eager(pipeline, 105, 5)[0]).abs() > 1e-3
 
 
 @pytest.mark.gpu
