@@ -3,7 +3,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, MutableMapping
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -44,6 +44,17 @@ def seen_with(stored: Tensor, change: Tensor) -> Tensor:
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
 
 
+class Shown(NamedTuple):
+    """What the views of a step have shown."""
+
+    rows: Tensor
+    """splats, int64 [M]; one that several cameras see is there several times"""
+    opacities: Tensor
+    """theirs, from there, [M] in [0, 1]"""
+    cameras: int
+    """number of cameras"""
+
+
 class TrainingViews(Protocol):
     """What the strategy may ask of a training."""
 
@@ -72,6 +83,7 @@ class Densification(ABC):
     def __init__(self, opacity_seen: OpacitySeen):
         self.opacity_seen = opacity_seen
         self.state = {CHANGE: None} if opacity_seen == "peak" else {}
+        self.shown: Shown | None = None
 
     @property
     def diffuse(self) -> Tensor | None:
@@ -81,6 +93,13 @@ class Densification(ABC):
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
+        return False
+
+    takes_all_rows: bool = False
+    """Whether it may be given rows of splats that are not visible, of radius 0, and adds nothing to the loss."""
+
+    def rests_at(self, step: int) -> bool:
+        """Whether it looks at nothing in this step."""
         return False
 
     def see_cameras(self, centers: Tensor) -> None:  # noqa: B027  (only some strategies measure by the cameras)
@@ -98,6 +117,7 @@ class Densification(ABC):
             opacities: what the head said, [M] in [0, 1], before antialiasing compensation.
             logits: the stored opacities of all splats, as logits [N, 1].
         """
+        self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
         if self.opacity_seen == "peak":
             rows, logits = info["gaussian_ids"], logits.detach()
             if self.state[CHANGE] is None:
@@ -122,6 +142,21 @@ class Densification(ABC):
             splats: the table; entries are replaced.
             optimizers: one for each entry, under its name, each with one parameter group; others are left alone.
         """
+
+    def mean_opacity(self, logits: Tensor) -> Tensor:
+        """The splats' mean opacity for the loss, a scalar: as the step's cameras are shown them, stored otherwise.
+
+        If it were that of the stored ones alone, a head that adds to them would be paid for making them small, and
+        would add the more.
+
+        Args:
+            logits: stored opacities [N, 1].
+        """
+        stored = torch.sigmoid(logits).flatten()
+        if self.shown is None:
+            return stored.mean()
+        rows, opacities, cameras = self.shown
+        return stored.mean() + (opacities - stored[rows]).sum() / (cameras * len(stored))
 
     def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Terms that the strategy adds to the loss, by name."""

@@ -39,6 +39,7 @@ from nrfgs_ns.training.pace import (
     steps_for,
 )
 from nrfgs_ns.training.progress import ProgressLine
+from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.training.stopping import (
     StopRequest,
     command_to_go_on,
@@ -119,6 +120,8 @@ class NrfgsTrainer(Trainer):
             self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last step that was made"""
+        if self.world_size == 1 and not self.grad_scaler.is_enabled():
+            self.pipeline.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
         if comms.is_main_process():
             self._tell_what_was_chosen()
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
@@ -144,10 +147,10 @@ class NrfgsTrainer(Trainer):
                 f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
             )
         if model.view_noise.sigma > 0.0:
-            chosen.append(f"the head sees each splat from about {model.noise_factor:g} of that beside the camera")
-        if model.has_few_views and model.reduced_head:
-            options = ", ".join(f"{name} {value}" for name, value in model.reduced_head.items())
-            chosen.append(f"views are few, so the head has {options}")
+            chosen.append(f"the head sees each splat from about {model.noise_factor:.2g} of that beside the camera")
+        if model.trust < 1.0 and model.reduced_head:
+            options = ", ".join(f"{name} {value:.2g}" for name, value in model.reduced_head.items())
+            chosen.append(f"they trust it with {model.trust:.2g}, so that it has {options}")
         if chosen:
             apart = model.camera_spacing / model.scene_unit
             CONSOLE.print(
@@ -315,7 +318,7 @@ class NrfgsTrainer(Trainer):
         if pace is not None:
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
-        model.begin_step(step / self.total_steps if pace is None else pace.position / pace.length, pace is not None)
+        model.begin_step(step / self.total_steps if pace is None else pace.position / pace.length)
         with self._last_good_state_on_disk():
             self.guard.begin(step, self.optimizers)
             loss, losses, metrics = super().train_iteration(step)
