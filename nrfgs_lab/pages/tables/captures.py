@@ -110,3 +110,10 @@ def gaps() -> str:
         body.append([scene, str(views), *cells])
     names = "over harmonics with shrinkage, dB", "SSIM x 1000", "over `nrfgs-sh`", "over splatfacto"
     return grid(["", "views", *names, "gap, `nrfgs`", "gap, harmonics"], body)
+
+
+def many() -> str:
+    """What trust and shrinkage cost a capture of many views."""
+    found = [runs_of("bonsai", name)[0] for name in (FIELD, "nrfgs, noise alone")]
+    with_them, without = (f"{one['psnr']:.2f} dB with {one['splats'] / 1000:.0f}k splats" for one in found)
+    return f"{with_them}; an earlier version with noise alone {without}"
