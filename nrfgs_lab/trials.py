@@ -90,7 +90,9 @@ class Trials:
         for gpu in slots:
             # A new process reads it before it looks for a GPU.
             os.environ["CUDA_VISIBLE_DEVICES"] = gpu
-            processes.append(context.Process(target=work, args=(waiting, results, self.scenes, end), daemon=True))
+            processes.append(
+                context.Process(target=quiet_worker, args=(waiting, results, self.scenes, end), daemon=True)
+            )
             processes[-1].start()
         while any(process.is_alive() for process in processes) or not results.empty():
             try:
@@ -130,6 +132,14 @@ def read_plan(file: Path) -> list[Trial]:
     return trials
 
 
+def quiet_worker(*args: Any) -> None:
+    """`work`, as all that a process does."""
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    CONSOLE.quiet = True
+    work(*args)
+
+
 def work(waiting, results, scenes: Path, end: float) -> None:
     """Take trainings from a queue while there is time.
 
@@ -140,9 +150,7 @@ def work(waiting, results, scenes: Path, end: float) -> None:
         end: time.time() after which nothing may run.
     """
     import torch
-    from nerfstudio.utils.rich_utils import CONSOLE
 
-    CONSOLE.quiet = True
     while True:
         try:
             trial = waiting.get(timeout=1.0)
