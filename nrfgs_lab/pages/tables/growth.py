@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of thinning in docs/bench.md: which splats may go once growth has ended, and what that costs or gains."""
+"""The tables of docs/fewer-splats.md: which splats may go once growth has ended, and what that costs or gains."""
 
 from statistics import fmean, median
 from typing import Any
@@ -10,18 +10,11 @@ ON_BONSAI = {
     "splatfacto": "`splatfacto`",
     "splatfacto, gradient 1.6e-3": "`densify-grad-thresh` doubled",
     "consistent": "growth that several views confirm (FastGS's rule)",
-    "keep 0.5, by the largest share": "`keep 0.5`, three rounds, by the largest share of a view's pixels",
-    "keep 0.5, by shares": "the same, by the shares of all views",
-    "keep 0.5, at once": "`keep 0.5` in one round",
-    "keep 0.5, three rounds": "in three rounds",
-    "keep 0.5": "in six rounds",
-    "keep 0.35, from growth on": "`keep 0.35` in five, the first two while splats grow",
-    "keep 0.35, three rounds": "`keep 0.35` in three rounds",
+    "keep 0.5, at once": "`keep 0.5`, in one round",
+    "keep 0.5": "`keep 0.5`",
+    "keep 0.35, three rounds": "`keep 0.35`, in three rounds",
     "4e-4": "`densify-grad-thresh` halved",
-    "4e-4, keep 0.25": "halved, `keep 0.25`",
     "4e-4, keep 0.2": "halved, `keep 0.2`",
-    "4e-4, keep 0.13, from growth on": "halved, `keep 0.13` in seven rounds, the first three while splats grow",
-    "3e-4, keep 0.15": "3e-4, `keep 0.15`",
 }
 """Trials, and what they are called."""
 FULL = {"splatfacto": "`nrfgs`", "4e-4, keep 0.2": "`densify-grad-thresh` halved, `keep 0.2`"}
@@ -29,8 +22,6 @@ MEASURES = {"psnr": 2, "ssim": 4, "train_s": 0}
 """Numbers of a record, and their places."""
 FEW = {
     "keep 0.5, three rounds": "`keep 0.5`, three rounds",
-    "keep 0.5, three rounds, without the best view": "the same; the view that misses a splat most does not count",
-    "without splats of one view": "without splats that are one view's alone",
     "4e-4, keep 0.5": "`densify-grad-thresh` halved, `keep 0.5`",
     "4e-4, keep 0.25": "halved, `keep 0.25`",
 }
