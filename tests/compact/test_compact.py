@@ -26,12 +26,14 @@ from nrfgs_ns.appearance.reduce import latent_basis, with_diffuse, with_rank
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode, wide_enough
 from nrfgs_ns.compact.entropy import encode_table
+from nrfgs_ns.compact.finetune import Gated, without_them
 from nrfgs_ns.compact.format import Table, read_container, write_container
 from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.compact.quantise import Grid, from_morton, nearest_turn
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.training.run import evaluate, parse, train
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -367,6 +369,26 @@ def test_a_model_is_trained_for_the_file(exported, tmp_path):
         tyro.cli(Export, args=[*words, "--finetune", "-1"]).main()
 
 
+def test_what_a_splat_is_worth_is_what_pictures_lose_without_it(exported):
+    pipeline = load_model(exported[0], "test")
+    model, one = pipeline.model, pipeline.model.field.detached()
+    camera, batch = pipeline.datamanager.next_train(0)
+    model.train()
+    model.config.background_color = "black"
+    torch.manual_seed(0)
+    growth, _ = without_them(model, one, [(camera, batch)] * 200)
+
+    @torch.no_grad()
+    def error(gates):
+        outputs, _ = model.render(one, camera, Gated(one, gates))
+        return float((outputs["rgb"] - model.truth_of(batch, outputs["background"])).square().sum())
+
+    ones = torch.ones(len(growth))
+    found = torch.tensor([error(ones.index_fill(0, row, 0.0)) for row in growth.argsort()[[0, 1, -3, -2, -1]]])
+    found = found / error(ones) - 1.0
+    assert_close(growth.sort().values[[0, 1, -3, -2, -1]], found, rtol=0.1, atol=0.02 * float(found.max()))
+
+
 def test_what_training_expects_is_what_a_file_has(tmp_path):
     torch.manual_seed(0)
     values = torch.distributions.Laplace(0.0, torch.tensor([0.1, 1.0, 3.0])).sample((20_000,))
@@ -374,14 +396,14 @@ def test_what_training_expects_is_what_a_file_has(tmp_path):
     optimizer = torch.optim.Adam(density.parameters(), lr=0.02)
     for _ in range(150):
         optimizer.zero_grad()
-        density.bits(table(rounded=True), table.steps).backward()
+        density.bits(table(rounded=True), table.steps).sum().backward()
         optimizer.step()
     with torch.no_grad():
         rounded = table(rounded=True)
-        expected = float(density.bits(rounded, table.steps)) / 8
+        expected = float(density.bits(rounded, table.steps).sum()) / 8
         codes = (rounded / table.steps).round().long().numpy()
         means = Rounded(torch.rand(20_000, 3) * torch.tensor([1.0, 5.0, 0.2]), torch.full((3,), 1e-3))
-        of_places = float(bits_of_places(means(rounded=True), means.steps)) / 8
+        of_places = 20_000 * float(bits_of_places(means(rounded=True), means.steps)) / 8
     _, words = encode_table(codes.T)
     assert expected == pytest.approx(len(words), rel=0.02)
     one = field(1)
