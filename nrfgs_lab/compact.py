@@ -123,13 +123,13 @@ def transformed(config: Path, ply: Path, suffix: str) -> dict[str, Any]:
     subprocess.run([TOOL, "-w", "-g", "cpu", ply, small], check=True, stdout=sys.stderr)
     encode_seconds = perf_counter() - begin
     subprocess.run([TOOL, "-w", small, back], check=True, stdout=sys.stderr)
-    version = subprocess.run([TOOL, "--version"], check=True, capture_output=True, text=True).stdout.split()[-1]
+    said = subprocess.run([TOOL, "--version"], check=True, capture_output=True, text=True)
     pipeline = load_model(config, "test")
     model, splats = pipeline.model, Y_DOWN.inverse.moved(read_splats(back))
     splats = type(splats)(*(value.to(model.device) for value in splats))
     how = model.background_color, model.config.rasterize_mode, model.scene_unit
     return {
-        "version": version,
+        "version": (said.stdout + said.stderr).strip(),
         "written": len(splats.means),
         "bytes": small.stat().st_size,
         "seconds": {"encode": encode_seconds},
