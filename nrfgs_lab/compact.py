@@ -9,7 +9,7 @@
 `trade` trains the capture as `nrfgs` does, and writes it as compact files trained at each of --rates, as those of
 versions 1 and 2 without a fine-tune, as a PLY file, and as what splat-transform makes of that, where it is installed:
 its SOG and its SPZ. Records of OUT that are there already are not made again. All PSNR is that of the test views, of
-files that are read back. OUT/files has the files.
+files that are read back. They are left in --work.
 """
 
 import json
@@ -48,6 +48,8 @@ class Trade:
     """the capture"""
     out: Annotated[Path, tyro.conf.Positional]
     """folder for the records"""
+    work: Path = Path("outputs/compact")
+    """folder for the training and the files"""
     rates: tuple[float, ...] = RATES
     """of the fine-tunes"""
     steps: int = 4000
@@ -62,7 +64,7 @@ class Trade:
         from nrfgs_ns.export.compact import export_compact
         from nrfgs_ns.export.ply import export_ply
 
-        files = self.out / "files"
+        files = self.work / "files"
         files.mkdir(parents=True, exist_ok=True)
         name = f"{self.data.name}-{{}}".format
         config = Path(self.record(name("model"), self.trained)["train"]["config_path"])
@@ -91,7 +93,7 @@ class Trade:
         return json.loads(path.read_text(encoding="utf-8"))
 
     def trained(self, _: Path) -> dict[str, Any]:
-        args = ["nrfgs", "--data", str(self.data), "--output-dir", str(self.out / "outputs"), "--machine.seed", "42"]
+        args = ["nrfgs", "--data", str(self.data), "--output-dir", str(self.work), "--machine.seed", "42"]
         args += ["--vis", "tensorboard", "--steps-per-eval-all-images", "1000000", *shlex.split(self.options)]
         return {"machine": machine(), "train": asdict(train([*args, "nrfgs-data"]))}
 

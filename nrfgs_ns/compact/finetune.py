@@ -36,9 +36,11 @@ RATES = {"means": 1.6e-6, "turns": 5e-4, "scales": 2e-3, "opacities": 1e-2, "col
 STEPS_RATE, DENSITY_RATE, FIELD_RATE = 3e-2, 2e-2, 5e-4
 PRUNINGS = (0.05, 0.15, 0.25, 0.35)
 """When splats go, in shares of the steps."""
-WORTH = 0.3
-"""What a splat's bytes cost, over what the loss may grow without it: what it leaves is learnt anew by its neighbours,
-but they may go, too."""
+WORTH = 0.1
+"""What a splat's bytes cost, over what the loss grows without it alone: far below 1, because those that hide behind
+each other go together."""
+GROWTH = 2.0
+"""Of it from one pruning to the next: those that matter least go first, and the others learn to stand in for them."""
 LAST = 0.03
 """Of the learning rates, at the end; they fall by a cosine."""
 
@@ -212,7 +214,7 @@ def fine_tune(
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: LAST + (1 - LAST) * 0.5 * (1 + np.cos(np.pi * min(step / steps, 1.0)))
     )
-    prunings = {round(share * steps) for share in PRUNINGS}
+    prunings = {round(share * steps): WORTH / GROWTH**k for k, share in enumerate(reversed(PRUNINGS))}
     was_training = model.training
     model.train()
     try:
@@ -220,7 +222,7 @@ def fine_tune(
             if step in prunings:
                 with torch.no_grad():
                     tables = coded(rounded=True)
-                    dear = coded.bits(tables) * (WORTH * rate / (BYTE * count))
+                    dear = coded.bits(tables) * (prunings[step] * rate / (BYTE * count))
                 growth, loss = without_them(model, Field(head, coded.splats(tables)), map(next_view, range(views)))
                 # The training's loss is about the root of the squared error.
                 coded.keep(0.5 * loss * growth > dear, optimizer)
