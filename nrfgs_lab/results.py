@@ -3,6 +3,7 @@
 
     python -m nrfgs_lab.results pack OUT results/NAME.json       # all records and tables of a study's folder
     python -m nrfgs_lab.results unpack results/NAME.json OUT     # the folder again: `nrfgs bench` reports from it
+    python -m nrfgs_lab.results lines OUT.jsonl results/NAME.json  # what `nrfgs_lab.trials` wrote, added to the file
 
 {"study": NAME, "records": {path without .json: record}, "texts": {path: lines}}, a line for each record. Numbers are
 kept to seven significant digits, as many as float32 has. Figures and the tables of other formats are not kept: the
@@ -55,6 +56,15 @@ def pack(folder: Path, file: Path) -> None:
     write(file, records, texts)
 
 
+def lines(source: Path, file: Path) -> None:
+    """Add trials to a study's file, which need not be there; of trials of one name, scene and seed the last stays."""
+    content = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {"records": {}}
+    for line in source.read_text(encoding="utf-8").splitlines():
+        one = json.loads(line)
+        content["records"]["{name}/{scene}-{seed}".format(**one)] = one
+    write(file, dict(sorted(content["records"].items())), content.get("texts"))
+
+
 def write(file: Path, records: dict[str, Any], texts: dict[str, list[str]] | None = None) -> None:
     """Write a study's file; its name is the study's."""
 
@@ -76,4 +86,4 @@ def unpack(file: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    {"pack": pack, "unpack": unpack}[sys.argv[1]](*map(Path, sys.argv[2:]))
+    {"pack": pack, "unpack": unpack, "lines": lines}[sys.argv[1]](*map(Path, sys.argv[2:]))

@@ -25,8 +25,9 @@ PRIVATE = {
         "_train_complete_viewer",
         "_update_viewer_state",
     ),
-    # Who called it is asked slowly (training/start.py).
+    # Who called it is asked slowly, and the compiler imported early (start.py).
     "nerfstudio.configs.external_methods": ("inspect",),
+    "nerfstudio.utils.misc": ("torch_compile",),
     # Seeds as ns-train seeds.
     "nerfstudio.scripts.train": ("_set_random_seed",),
     # Images are kept where there is room for them; a dataset knows its files; what undistorts a photograph.

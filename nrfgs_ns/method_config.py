@@ -23,14 +23,14 @@ from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.start import with_methods
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS
 from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
 from nrfgs_ns.training.progress import ProgressLineConfig
-from nrfgs_ns.training.start import know_callers_quickly
 from nrfgs_ns.training.trainer_config import AVERAGED, NrfgsTrainerConfig
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
-know_callers_quickly()  # plugins are loaded right before nerfstudio asks
+with_methods()
 
 HALF_A_SPACING = 0.5
 """Noise on where the field is asked from, in distances between neighbouring training cameras (docs/captures.md)."""

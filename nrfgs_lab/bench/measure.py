@@ -5,7 +5,8 @@
 and takes its frames per second without waiting for the GPU. Here one piece of code looks at the renderings of all.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -14,6 +15,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
 
+from nrfgs_lab.flip import flip
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.image.metrics import METRIC_NAMES, ImageMetrics
 
@@ -26,17 +28,19 @@ FULL_HD = 1920, 1080
 
 
 @torch.no_grad()
-def measure(config_path: Path, train_views: int) -> dict[str, Any]:
+def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str, Any]:
     """Load the last checkpoint of a training and measure it at full resolution.
 
     Args:
         config_path: the config.yml that the training saved.
         train_views: of how many training images, evenly spaced among all; 0 leaves them out.
+        timed: whether frames per second are taken; they say little on a GPU that others use, too.
 
     Returns:
         "test" and "train" (null without views), each with the means of psnr, ssim, ms_ssim, l1, lpips (null where it
-        cannot be had), of the same colour-corrected (cc_psnr, ...), and "per_image"; "fps" at the photographs' size and
-        "fps_1080p" (null on a CPU); "splats", of which "diffuse" have no residual; "parameter_bytes" (what a renderer
+        cannot be had), of the same colour-corrected (cc_psnr, ...), and "per_image"; "test" has flip, too (null
+        without the package `flip-evaluator`). "fps" at the photographs' size and "fps_1080p" (null on a CPU), both null
+        if not timed; "splats", of which "diffuse" have no residual; "parameter_bytes" (what a renderer
         needs); "checkpoint_bytes" (the file, with the optimisers' moments).
     """
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
@@ -45,7 +49,9 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
     metrics = ImageMetrics()
     test = data.fixed_indices_eval_dataloader
     names = [Path(name).name for name in data.eval_dataset.image_filenames]
-    result: dict[str, Any] = {"test": over_views(model, metrics, zip(names, test, strict=True)), "train": None}
+    has_flip = find_spec("flip_evaluator") is not None
+    views = zip(names, test, strict=True)
+    result: dict[str, Any] = {"test": over_views(model, metrics, views, flip if has_flip else None), "train": None}
     if train_views > 0:
         images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
         cameras = data.train_dataset.cameras
@@ -56,9 +62,9 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
     cameras = [camera for camera, _ in test]
     return {
         **result,
-        "fps": frames_per_second(model, cameras),
+        "fps": frames_per_second(model, cameras) if timed else None,
         "fps_1080p": frames_per_second(model, [at_size(camera, *FULL_HD) for camera in cameras])
-        if model.device.type == "cuda"
+        if timed and model.device.type == "cuda"
         else None,
         "splats": int(model.num_points),
         "diffuse": getattr(model, "num_diffuse", 0),
@@ -68,8 +74,12 @@ def measure(config_path: Path, train_views: int) -> dict[str, Any]:
     }
 
 
-def over_views(model, metrics: ImageMetrics, views: Iterable) -> dict[str, Any]:
-    """Means and each image's values over (name, (camera, batch))."""
+def over_views(model, metrics: ImageMetrics, views: Iterable, flip: Callable | None = None) -> dict[str, Any]:
+    """Means and each image's values over (name, (camera, batch)).
+
+    Args:
+        flip: prediction, truth and mask as arrays -> FLIP, if it is wanted; it takes a second for each view.
+    """
     per_image = []
     for name, (camera, batch) in views:
         outputs = model.get_outputs_for_camera(camera)
@@ -78,9 +88,12 @@ def over_views(model, metrics: ImageMetrics, views: Iterable) -> dict[str, Any]:
         truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
         mask = batch["mask"].to(model.device).float() >= 0.5 if "mask" in batch else None
         per_image.append({"image": name, **metrics(outputs["rgb"], truth, mask)})
+        if flip is not None:
+            inside = None if mask is None else mask[..., 0].numpy(force=True)
+            per_image[-1]["flip"] = flip(outputs["rgb"].numpy(force=True), truth.numpy(force=True), inside)
     means = {}
-    for metric in METRIC_NAMES:
-        values = [image[metric] for image in per_image if image[metric] is not None]
+    for metric in (*METRIC_NAMES, "flip"):
+        values = [image[metric] for image in per_image if image.get(metric) is not None]
         means[metric] = sum(values) / len(values) if values else None
     return {**means, "per_image": per_image}
 

@@ -46,7 +46,7 @@ def run(job: Job) -> None:
             record = train_or_continue(job, work)
             config = Path(record.config_path)
             results = evaluate(config, work / "eval.json", work / "pictures")
-            measured = measure(config, job.train_views)
+            measured = measure(config, job.train_views, timed=job.jobs == 1)
         content = {
             "identity": job.identity,
             "machine": machine(),

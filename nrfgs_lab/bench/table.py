@@ -54,6 +54,7 @@ COLUMNS = (
     Column("SSIM", _measured("test", "ssim"), "{:.4f}", better=1),
     Column("MS-SSIM", _measured("test", "ms_ssim"), "{:.4f}", better=1),
     Column("LPIPS", _measured("test", "lpips"), "{:.4f}", better=-1),
+    Column("FLIP", _measured("test", "flip"), "{:.4f}", better=-1),
     Column("L1", _measured("test", "l1"), "{:.4f}", better=-1),
     Column("PSNR", _measured("test", "psnr"), "{:.2f}", better=1),
     Column("cc PSNR", _measured("test", "cc_psnr"), "{:.2f}", better=1),
@@ -306,7 +307,7 @@ def as_csv(rows: list[Row]) -> str:
 
 PER_VIEW = {
     **{"PSNR": "psnr", "SSIM": "ssim", "MS-SSIM": "ms_ssim", "LPIPS": "lpips", "L1": "l1"},
-    **{"cc PSNR": "cc_psnr", "cc SSIM": "cc_ssim"},
+    **{"FLIP": "flip", "cc PSNR": "cc_psnr", "cc SSIM": "cc_ssim"},
 }
 """Column -> its key in a view's measurement."""
 

@@ -30,12 +30,13 @@ APPEARANCE = "pipeline.model.appearance."
 
 INTRODUCTION = """# Options
 
-Written by `python -m nrfgs_lab.pages.options`, from the configurations themselves: what this package adds to
-nerfstudio's options, or presets in its own way. All of nerfstudio's and splatfacto's are there too, in `ns-train nrfgs
---help`. Underscores and hyphens are the same. A scene unit is what the cameras fill: they lie within [-1, 1]. Defaults
+What this package adds to nerfstudio's options, or presets in its own way; all are in `ns-train nrfgs --help`.
+Written by `python -m nrfgs_lab.pages.options` from the configurations. Cameras lie within [-1, 1] scene units. Defaults
 are `nrfgs`'s; of the other heads' methods `view-noise`, `head-from` and `shrinkage` are 0, `few-views` is off,
 `max-num-iterations` 30,000 and `average-steps` 0.
 """
+RULES = "original", "consistent", "mcmc"
+"""Densification strategies with options of their own."""
 UNSAID = "none", "required", "False"
 """Defaults that a list of options does not tell."""
 HOST = "`--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
@@ -123,6 +124,8 @@ def page() -> str:
     options = list(own_options(first.config))
     heads = [option for option in options if option.flag.startswith(APPEARANCE)]
     model = [option for option in options if option.flag.startswith(MODEL) and option not in heads]
+    rules = {name: [one for one in model if one.flag.startswith(f"{MODEL}{name}.")] for name in RULES}
+    model = [option for option in model if option not in sum(rules.values(), [])]
     rest = [option._replace(flag=f"--{option.flag}") for option in options if not option.flag.startswith(MODEL)]
     data = [option._replace(flag=f"--{option.flag}") for option in own_options(NrfgsDataParserConfig())]
     parts = [
@@ -131,6 +134,7 @@ def page() -> str:
         table(heads, APPEARANCE),
         "## All methods: the model\n",
         table(model, MODEL),
+        _of_rules(rules),
         "## All methods: training\n",
         table([option for option in rest if ".dataparser." not in option.flag]),
         HOST,
@@ -152,6 +156,15 @@ def page() -> str:
         summary, *_ = inspect.getdoc(entry_point.load()).splitlines()
         lines.append(f"| `nrfgs {name}` | {linked(summary)} |")
     return "\n".join([*parts, *lines]) + "\n"
+
+
+def _of_rules(rules: dict[str, list[Option]]) -> str:
+    """The options of densification strategies, in a sentence; `--help` explains each."""
+    parts = []
+    for name, options in rules.items():
+        shown = (f"`{one.flag.removeprefix(f'{MODEL}{name}.')}` {_shown(one.default)}" for one in options)
+        parts.append(f"`--{MODEL}{name}.`: {', '.join(shown)}")
+    return f"Thresholds of the strategies ([bench.md](bench.md#densification-strategies)): {'. '.join(parts)}.\n"
 
 
 def _listed(rows: list[tuple[str, Iterator[Option], str]]) -> str:

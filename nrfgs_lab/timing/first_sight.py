@@ -6,7 +6,7 @@
 starts `ns-train` with the words behind the dashes in a process of its own, and tells when it has imported, read the
 images, made its first step, and when the mean PSNR of all test views has reached each target. Looking costs time, which
 is not counted; it is done twice a second (--every). The training ends with the last target, unless it is to go on
-(--whole).
+(--whole); of one that comes to its end, the end is told, too.
 """
 
 import argparse
@@ -65,6 +65,7 @@ def child() -> None:
     targets = [float(word) for word in os.environ[TARGETS].split()]
     reached: dict[str, Any] = {}
     curve: list[list[float]] = []
+    end: dict[str, Any] = {}
     last = [0.0]
     clock.after(NrfgsDatamanager, "__init__", "data set checked")
     clock.after(pipeline.VanillaPipeline, "__init__", "model made")
@@ -82,8 +83,12 @@ def child() -> None:
         return result
 
     def look(self: NrfgsTrainer, step: int) -> None:
-        if clock.now() - last[0] < every or len(reached) == len(targets):
-            return
+        if clock.now() - last[0] >= every and len(reached) < len(targets):
+            measure(self, step)
+        if len(reached) == len(targets) and not whole:
+            self.stop_training = True
+
+    def measure(self: NrfgsTrainer, step: int) -> dict[str, float]:
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         start = last[0] = clock.now()
@@ -99,13 +104,13 @@ def child() -> None:
         known = [value for value in values if value is not None]
         mean = sum(known) / len(known)
         curve.append([round(start, 2), step + 1, round(mean, 3)])
+        found = {"seconds": round(start, 2), "steps": step + 1, "psnr": mean}
         for target in targets:
             if mean >= target:
-                reached.setdefault(f"{target:g}", {"seconds": round(start, 2), "steps": step + 1, "psnr": mean})
+                reached.setdefault(f"{target:g}", found)
         clock.looked += clock.now() - start
         write_whole(Path(os.environ[RECORD]), json.dumps(content()))
-        if len(reached) == len(targets) and not whole:
-            self.stop_training = True
+        return found
 
     def content() -> dict[str, Any]:
         peak = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else None
@@ -114,10 +119,17 @@ def child() -> None:
             "stages": clock.stages,
             "reached": reached,
             "curve": curve,
+            "end": end,
             "seconds_of_looking": round(clock.looked, 2),
             "peak_host_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
             "peak_device_bytes": peak,
         }
+
+    mean_of = NrfgsTrainer.take_the_mean
+
+    def take_the_mean(self: NrfgsTrainer) -> None:
+        mean_of(self)
+        end.update(measure(self, self._made), splats=self.pipeline.model.num_points)
 
     def save_checkpoint(self: NrfgsTrainer, step: int) -> None:
         pass  # what is measured ends before the first one that counts
@@ -129,6 +141,7 @@ def child() -> None:
         look(self, step)
 
     NrfgsTrainer.train_iteration, NrfgsTrainer.eval_iteration = train_iteration, eval_iteration
+    NrfgsTrainer.take_the_mean = take_the_mean
     if not whole:
         NrfgsTrainer.save_checkpoint = save_checkpoint
     train.entrypoint()
@@ -156,7 +169,7 @@ def main() -> None:
     subprocess.run([sys.executable, "-c", code, *options.words], env=environment, check=True)
     found = {"args": options.words, **json.loads(options.record.read_text(encoding="utf-8"))}
     write_whole(options.record, json.dumps(found, indent=1) + "\n")
-    print(json.dumps({name: found[name] for name in ("stages", "reached")}, indent=1))
+    print(json.dumps({name: found[name] for name in ("stages", "reached", "end")}, indent=1))
 
 
 if __name__ == "__main__":

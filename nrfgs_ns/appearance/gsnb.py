@@ -40,6 +40,8 @@ class GsnbConfig(ShConfig):
     """the head class that this configuration builds"""
     num_bands: int = 6
     """Fourier bands of the view direction."""
+    raw_direction: bool = True
+    """whether the direction itself stands beside its bands; its reference has the bands alone, 36 inputs"""
     hidden_width: int = 64
     """units of each of the basis network's two hidden layers."""
     ramp_steps: int = 5000
@@ -67,7 +69,7 @@ class NeuralBasis(SphericalHarmonics):
         self.ramp = 1.0
         """rho: how much of the learnt basis counts."""
         self.basis = nn.Sequential(
-            nn.Linear(3 + 6 * config.num_bands, config.hidden_width),
+            nn.Linear(3 * config.raw_direction + 6 * config.num_bands, config.hidden_width),
             nn.LeakyReLU(),
             nn.Linear(config.hidden_width, config.hidden_width),
             nn.LeakyReLU(),
@@ -82,7 +84,8 @@ class NeuralBasis(SphericalHarmonics):
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         means = splats["means"].index_select(0, visible)
         directions = unit_vectors(means - camera_centers, self.config.distance_eps * self.scene_unit)
-        learnt = self.basis(torch.cat(fourier_bands(directions, self.config.num_bands), dim=-1))  # [M, B]
+        inputs = torch.cat(fourier_bands(directions, self.config.num_bands), dim=-1)
+        learnt = self.basis(inputs if self.config.raw_direction else inputs[:, 3:])  # [M, B]
         coefficients = self.coefficients(splats, visible)
         colors = eval_sh(self.active_degree, directions, coefficients)
         colors = colors + self.ramp * (learnt[..., None] * coefficients).sum(dim=1)

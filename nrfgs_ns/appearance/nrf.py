@@ -62,9 +62,9 @@ class NrfConfig(AppearanceHeadConfig):
     """start of the output layers. zero: the residual is exactly nothing. default: torch's uniform, as in the paper, to
     be quieted by the warm-up."""
     opacity_bound: OpacityBound = "straight-through"
-    """how base + residual is brought back into [0, 1]. clamp: no gradient beyond the ends. straight-through: the
-    gradient ignores the clamp, so that a splat can come back (measured in docs/opacity.md). logit: the residual
-    is added to the logit. smooth: a clamp with round corners."""
+    """how base + residual is brought back into [0, 1] (docs/opacity.md). clamp: no gradient beyond the ends.
+    straight-through: the gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with
+    round corners."""
     geometry_gradient: bool = True
     """let direction and distance send gradients to the means and the camera."""
     implementation: Literal["auto", "torch", "fused"] = "auto"

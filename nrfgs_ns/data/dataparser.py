@@ -52,6 +52,9 @@ from nrfgs_ns.data.sight import check_sight, in_reach
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.start import with_data_parsers
+
+with_data_parsers()
 
 SPLITS = ("train", "val", "test")
 """nerfstudio's names of the parts of a data set."""
@@ -77,10 +80,9 @@ class NrfgsDataParserConfig(NerfstudioDataParserConfig):
     _target: type = field(default_factory=lambda: NrfgsDataParser)
     """target class to instantiate"""
     eval_mode: Literal["interior", "interval", "fraction", "filename", "all"] = "interior"
-    """How to split where the data set names no split. interior: every eval_interval-th image by name is for
-    testing, beginning in the middle of the first eval_interval. interval: beginning with the first, as in the
-    literature. fraction: train_split_fraction of them train. filename: by train or eval in the name. all: every image
-    is both."""
+    """How to split where the data set names no split. interior: every eval_interval-th image by name is for testing,
+    from the middle of the first eval_interval on. interval: from the first image on. fraction: train_split_fraction
+    train. filename: by train or eval in the name. all: every image is both."""
     load_3D_points: bool = True
     """Whether to start from the points of the data set (ply_file_path, or else colmap/sparse/0)."""
 

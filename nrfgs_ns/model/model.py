@@ -77,22 +77,20 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
     view_noise: float = 0.0
-    """in training the head sees each splat from a camera centre of its own, moved by noise this many times as long as
-    neighbouring training cameras are apart (docs/captures.md). 0: from the camera's"""
+    """in training the head sees each splat from a camera centre moved by noise this many times as long as neighbouring
+    training cameras are apart (docs/captures.md)"""
     head_from: float | None = 0.0
-    """share of the training after which the head is asked and learns. Until then splats have their base colours and
-    opacities, so that what these can explain is theirs and not the head's (docs/captures.md). None: 0.3 where schedules
-    are stretched to the training's steps and training views are fewer than 100, 0 otherwise"""
+    """share of the training after which the head is asked and learns (docs/captures.md). None: 0.3 where schedules are
+    stretched to the training's steps and training views are fewer than 100, 0 otherwise"""
     few_views: Literal["auto", "on", "off"] = "off"
     """what few views cannot tell is left out of the head, and view_noise is twice as long (docs/captures.md). auto:
     with fewer than 30 training views"""
     shrinkage: float = 0.0
-    """weight, in the loss, of the mean opacity and of the mean standard deviation in scene units, divided by the square
-    of the number of training views, if they are fewer than 100: what few views need becomes faint and small. mcmc has
-    its own instead (docs/captures.md)"""
+    """weight of the mean opacity and of the mean standard deviation (scene units) in the loss, divided by the square of
+    the number of training views, if they are fewer than 100. mcmc has its own instead (docs/captures.md)"""
     warmup_steps: int | None = None
-    """steps before training in which the head's shared weights learn to add nothing. None: one for each training view.
-    A head that adds nothing from the start skips them."""
+    """steps before training in which a head that adds something at its start learns to add nothing. None: one for each
+    training view"""
     warmup_lr: float = 1e-3
     """learning rate of the warm-up's Adam"""
     densification: Strategy = "splatfacto"
@@ -101,8 +99,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     splat_budget: int = 1_000_000
     """mcmc: the number of splats that it grows to and keeps"""
     opacity_seen_by_densification: OpacitySeen | None = None
-    """which opacity makes a splat die when it depends on the view. base: the stored one. peak: the largest that a view
-    since the last refinement would show. None: peak for mcmc, base for the others"""
+    """which opacity makes a splat die. base: the stored one. peak: the largest that a view since the last refinement
+    would show. None: peak for mcmc, base for the others"""
     original: OriginalDensification = field(default_factory=OriginalDensification)
     """thresholds of the densification 'original'"""
     consistent: ConsistentDensification = field(default_factory=ConsistentDensification)
@@ -110,8 +108,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     mcmc: McmcDensification = field(default_factory=McmcDensification)
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
-    """whether each photograph's exposure and white balance are learnt. auto: where EXIF says that exposure varies, or
-    where photographs disagree by more than their places explain; a line in the log says why"""
+    """whether each photograph's exposure and white balance are learnt. auto: where EXIF or the photographs themselves
+    say that they vary; a line in the log says why"""
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
     robust_loss: float = 0.0

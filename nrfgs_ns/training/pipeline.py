@@ -36,9 +36,8 @@ class ShardingConfig:
     rebalance_at: float = 1.1
     """splats move between devices once one has more than this many times the mean; looked at after each refinement"""
     schedules: Literal["steps", "images"] = "steps"
-    """what step numbers and learning rates mean. steps: what they say; each step sees one image for each device.
-    images: they are one device's; a training sees as many images as there, in fewer and larger steps
-    (docs/many-gpus.md)"""
+    """what step numbers and learning rates are of. steps: of steps, each of which sees one image for each device.
+    images: of one device's training; as many images are seen as there, in fewer steps (docs/many-gpus.md)"""
 
 
 @dataclass
@@ -78,7 +77,9 @@ class NrfgsPipeline(VanillaPipeline):
                 f"pipeline.compact is {config.compact}, but a training does not begin with a compact file. Leave it "
                 "out; --load-dir goes on from a checkpoint."
             )
-        super().__init__(config, device, test_mode, **kwargs)
+        wake = [partial(torch.empty, 1, device=device)] if torch.device(device).type == "cuda" else []
+        with tried_meanwhile(wake, torch.device(device)):  # CUDA starts while the data set is checked
+            super().__init__(config, device, test_mode, **kwargs)
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             trials = self.model.kernel_trials()

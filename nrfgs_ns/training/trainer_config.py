@@ -38,14 +38,13 @@ class NrfgsTrainerConfig(TrainerConfig):
     """training steps. 0: chosen, 120 for each training view but at least 10,000 and at most 30,000, with all schedules
     stretched to them (docs/captures.md)"""
     time_budget: float | None = None
-    """minutes that training may take, from the first step to the end of the last. As many steps are made as fit, and
-    all schedules are stretched to them. None: max_num_iterations steps"""
+    """minutes that the steps may take together: as many are made as fit, with all schedules stretched to them"""
     schedule_steps: int | None = None
-    """steps that learning rates, resolution, harmonics and densification are laid out for; they are stretched to the
-    steps that are made. None: not stretched, or with a time budget laid out for max_num_iterations"""
+    """steps that schedules are laid out for; they are stretched to the steps that are made. None: not stretched, or
+    with a time budget laid out for max_num_iterations"""
     average_steps: int | None = None
-    """the trained model is the mean of its parameters over the last so many steps, at most over those since splats came
-    or went. 0: the last step's numbers. None: 200 where the number of steps is chosen, 0 otherwise"""
+    """the trained model is the mean of its parameters over the last so many steps. 0: the last step's numbers. None:
+    200 where the number of steps is chosen, 0 otherwise"""
 
     def setup(self, **kwargs) -> Trainer:
         """The trainer; for several devices, the one that spreads the splats over them (`distributed`).

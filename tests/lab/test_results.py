@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nrfgs_lab.flip import flip
-from nrfgs_lab.results import pack, unpack
+from nrfgs_lab.results import lines, pack, unpack
 from nrfgs_ns.errors import InputError
 
 
@@ -30,6 +30,15 @@ def test_a_folder_comes_back(tmp_path):
     assert found["train"]["splats"] == [[0, 0], [500, 5000], [1000, 10000], [1149, 7]]
     assert found["eval"] == {"psnr": 0.3333333} and found["splats"] == 123456789
     assert found["measured"]["test"]["per_image"] == [{"image": "a.png", "psnr": 30.12346}]
+
+
+def test_lines_of_trials_join_a_study(tmp_path):
+    one = {"name": "a", "scene": "s", "seed": 42, "psnr": 30.123456789}
+    (tmp_path / "out.jsonl").write_text(json.dumps(one) + "\n" + json.dumps({**one, "seed": 43}) + "\n")
+    for _ in range(2):
+        lines(tmp_path / "out.jsonl", tmp_path / "study.json")
+    found = json.loads((tmp_path / "study.json").read_text())["records"]
+    assert list(found) == ["a/s-42", "a/s-43"] and found["a/s-42"]["psnr"] == 30.12346
 
 
 def test_without_the_package_the_message_says_what_to_install(monkeypatch):

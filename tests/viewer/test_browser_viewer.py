@@ -76,33 +76,33 @@ def test_every_mode_of_a_running_training(browser, training):
 
     # What is on the screen is some steps old: the viewer does not render each, and not the last.
     page.show(BASE)
-    stale = page.settled()
+    stale = page.sharp()
     page.show(FULL)
-    pictures = {FULL: page.settled(unlike=stale)}
+    pictures = {FULL: page.sharp(unlike=stale)}
     for mode, before in zip(MODES[1:], MODES, strict=False):
         page.show(mode)
-        pictures[mode] = page.settled(unlike=pictures[before])
+        pictures[mode] = page.sharp(unlike=pictures[before])
     for one, other in combinations(MODES, 2):
         assert different(pictures[one], pictures[other]), (one, other)
 
     page.show(FULL)
-    assert not different(page.settled(unlike=pictures[DEPTH]), pictures[FULL])
+    assert not different(page.sharp(unlike=pictures[DEPTH]), pictures[FULL])
     page.set_gain(0)
-    assert not different(page.settled(unlike=pictures[FULL]), pictures[BASE])
+    assert not different(page.sharp(unlike=pictures[FULL]), pictures[BASE])
     page.set_gain(2)
-    doubled = page.settled(unlike=pictures[BASE])
+    doubled = page.sharp(unlike=pictures[BASE])
     assert different(doubled, pictures[FULL])
     page.set_gain(1)
-    page.settled(unlike=doubled)
+    page.sharp(unlike=doubled)
 
     page.show("residual")
-    page.settled(unlike=pictures[FULL])
+    page.sharp(unlike=pictures[FULL])
     page.control("Freeze view").check()
-    page.settled()
+    page.sharp()
     page.turn()
-    frozen = page.settled(unlike=pictures["residual"])
+    frozen = page.sharp(unlike=pictures["residual"])
     page.control("Freeze view").uncheck()
-    page.settled(unlike=frozen)
+    page.sharp(unlike=frozen)
 
     page.page.get_by_text("Resume Training").click()
     deadline = time.time() + PATIENCE

@@ -15,3 +15,8 @@ FORMS = {
 def number(part: str, key: str) -> str:
     """A number of the walk."""
     return FORMS[f"{part} {key}"].format(records("newcomer")["newcomer"][part][key])
+
+
+def minutes() -> str:
+    """What the walk took, with the start-up of each command."""
+    return f"{records('newcomer')['newcomer']['seconds'] / 60:.1f}"

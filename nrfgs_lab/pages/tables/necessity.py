@@ -12,8 +12,8 @@ MODELS = {
 }
 PARTS = (
     *("high branch", "low branch", "opacity residual", "distance"),
-    *("latent rank 2", "latent rank 4", "latent rank 8"),
-    *("residuals below 0.5 steps", "residuals below 8 steps", "all residuals"),
+    *("latent rank 2", "latent rank 8"),
+    *("residuals below 8 steps", "all residuals"),
 )
 
 

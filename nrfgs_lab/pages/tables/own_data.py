@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of docs/own-data.md."""
+"""The table and the numbers of docs/own-data.md."""
 
 from nrfgs_lab.pages.tables import grid, records
 
@@ -27,15 +27,7 @@ def prepared() -> str:
 
 
 def loading() -> str:
-    """What reading 2,000 photographs takes."""
-    study = records("loading")
-    names = {
-        "nerfstudio, float32": "nerfstudio's default",
-        "nerfstudio, uint8": "nerfstudio, bytes",
-        "memory": "here, in memory",
-        "files, made": "here, in files that are made",
-        "files, found": "here, in files that are there",
-    }
-    body = [[label, f"{study['ways'][name]['peak_bytes'] / 1e9:.2f} GB"] for name, label in names.items()]
-    count = study["ways"]["memory"]["photographs"]
-    return grid([f"{count:,} photographs, {study['decoded_bytes'] / 1e9:.2f} GB of bytes", "peak"], body)
+    """The most that a process had for itself while it read photographs."""
+    ways = {"memory": "in memory", "files, made": "with files", "nerfstudio, float32": "with nerfstudio's default"}
+    peaks = {name: records("loading")["ways"][name]["peak_bytes"] / 1e9 for name in ways}
+    return ", ".join(f"{peaks[name]:.2f} GB {words}" for name, words in ways.items())

@@ -60,6 +60,12 @@ def view_gains(field: list[dict[str, Any]], harmonics: list[dict[str, Any]]) -> 
     return [fmean(ours) - fmean(theirs) for ours, theirs in views.values() if ours and theirs]
 
 
+def gain(scene: str) -> str:
+    """What the field gains on a capture over harmonics with the same steps, and in how many test views."""
+    gains = view_gains(*(runs_of(scene, name) for name in (FIELD, HARMONICS)))
+    return f"{signed(median(gains))} dB in the median view, better in {sum(one > 0 for one in gains)} of {len(gains)}"
+
+
 def preset(run: str, column: str) -> str:
     """A number of a training of bonsai."""
     row = next(row for (scene, _, name), row in bench_rows("presets").items() if (scene, name) == ("bonsai", run))

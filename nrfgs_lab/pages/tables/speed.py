@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tables of docs/speed.md."""
 
-from statistics import fmean, median
+from statistics import median
 
 from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, mean_of, records
 
@@ -13,7 +13,6 @@ TRAININGS = {
 }
 VARIANTS = {
     "fused bf16": "the field (bf16, the default)",
-    "fused tf32": "the field (tf32)",
     "fused fp32": "the field (fp32)",
     "torch": "the field in PyTorch",
     "sh head": "spherical harmonics (gsplat's kernel)",
@@ -43,15 +42,6 @@ def ratio(what: str, run: str, base: str) -> str:
     return f"{mean_of(rows[run], what) / mean_of(rows[base], what):.2f}"
 
 
-def under_the_papers_rules() -> str:
-    """Seconds and frames of whole trainings of bonsai under 3DGS's rules."""
-    body = []
-    for (_, _, run), row in bench_rows("comparison", "timed").items():
-        cells = [row.text(BY_NAME[name]) for name in ("splats", "time s", "FPS", "FPS 1080p", "peak MB")]
-        body.append([run, *cells])
-    return grid(["bonsai, 3DGS's rules", "splats", "train s", "FPS, 799 x 532", "FPS, 1080p", "peak MB"], body)
-
-
 def heads() -> str:
     """Milliseconds of the GPU for each head, forward and backward."""
     times = records("head_gpu")["head_gpu_all"]["times"]
@@ -71,29 +61,14 @@ def head_share() -> str:
     return f"{found['fused bf16']['gpu_ms'] / found['sh head']['gpu_ms']:.2f}"
 
 
-def steps() -> str:
-    """A step of 300,000 random splats, in parts."""
-    runs = records("step_profile")["step_profile_300k"]["runs"]
-    body = []
-    for method in ("nrfgs-sh", "nrfgs"):
-        mine = [one for one in runs if one["method"] == method]
-        parts = ("forward", "loss", "backward", "optimizers", "callbacks")
-        host = [f"{fmean(one['host_ms'][part] for one in mine):.2f}" for part in parts]
-        step, gpu = (fmean(one[key] for one in mine) for key in ("step_ms", "gpu_ms"))
-        body.append(
-            [f"`{method}`", f"{step:.2f}", f"{gpu:.2f}", f"{fmean(one['launches'] for one in mine):.0f}", *host]
-        )
-    head = ["", "step", "of it GPU", "launches", "host: forward", "loss", "backward", "optimisers", "callbacks"]
-    return grid(head, body)
+def error(variant: str, what: str) -> str:
+    """Relative error of a variant of the field against float64."""
+    (found,) = (one for one in records("head_gpu")["head_gpu_all"]["errors"] if one["variant"] == variant)
+    return f"{found[what]:.0e}"
 
 
-def errors() -> str:
-    """Relative errors of the kernels against float64."""
-    body = [
-        [one["variant"], *(f"{one[key]:.0e}" for key in ("colors", "opacities", "d means", "d latents", "d weights"))]
-        for one in records("head_gpu")["head_gpu_all"]["errors"]
-    ]
-    return grid(["", "colours", "opacities", "gradients: means", "latents", "weights"], body)
+CPU = "20000x256x256", "200000x800x600", "200000x1600x1200", "fox trained"
+"""Cases of the CPU's rasterizer that the page has."""
 
 
 def cpu_rasterizer() -> str:
@@ -107,6 +82,7 @@ def cpu_rasterizer() -> str:
             f"{one['peak_memory_mib']:.0f}",
         ]
         for name, one in results.items()
+        if name in CPU
     ]
     return grid(["splats, image", "forward + backward (ms)", "times faster than the loop", "peak MiB"], body)
 

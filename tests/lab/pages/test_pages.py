@@ -22,7 +22,7 @@ from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, pag
 from nrfgs_lab.pages.tables import pages
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.cli import commands
+from nrfgs_ns.cli import chosen, commands
 from nrfgs_ns.training import run
 from nrfgs_ns.training.run import evaluate, parse, train
 from nrfgs_ns.viewer.pictures import modes
@@ -106,6 +106,32 @@ def test_the_command_line_has_them(words):
             assert inner[-1].lower() in {flag.lower() for flag in known}, option.flag
 
 
+def help_of(*words: str) -> str:
+    """What `nrfgs WORDS --help` prints."""
+    screen = io.StringIO()
+    with contextlib.redirect_stdout(screen), pytest.raises(SystemExit):
+        chosen([*words, "--help"])
+    return screen.getvalue()
+
+
+SCREEN = 24
+"""Lines of a small terminal."""
+
+
+def test_help_fits_a_screen_before_the_list_of_options():
+    assert len(help_of().splitlines()) <= 2 * SCREEN  # which has a line or three for each command
+    for name in commands():
+        before, found, _ = help_of(name).partition("\n options ")
+        assert found and len(before.splitlines()) <= SCREEN, name
+
+
+def test_help_claims_no_decibels():
+    """What something is worth stands in a page, beside its record."""
+    words = [help_of(name) for name in commands()]
+    words += [option.text for method in methods() for option in own_options(method.config)]
+    assert [text for text in words if re.search(r"\d dB|decibels? (better|worse|more|less)", text)] == []
+
+
 ROOT = Path(__file__).resolve().parents[3]
 DOCS = ROOT / "docs"
 
@@ -120,6 +146,26 @@ def test_the_page_has_the_commands_that_were_run():
     assert f"{record['eval']['psnr']:.2f}" in page and f"{record['export']['loss_db']:.2f}" in page
     pictures = re.findall(r"\]\((images/\S+)\)", page)
     assert len(pictures) == 4 and all((DOCS / picture).is_file() for picture in pictures)
+
+
+def flags(config, prefix: str = "") -> set[str]:
+    """Every option of a configuration and of those inside it, and what they are inside of."""
+    found = set()
+    for field in dataclasses.fields(config):
+        name, value = prefix + field.name.replace("_", "-"), getattr(config, field.name)
+        found.add(name)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            found |= flags(value, f"{name}.")
+    return found
+
+
+def test_options_that_pages_name_are_there():
+    known = set().union(*(flags(method.config) for method in methods()))
+    shown = {
+        flag for path in pages() for flag in re.findall(r"--(pipeline\.[\w.-]*\w)", path.read_text(encoding="utf-8"))
+    }
+    assert len(shown) > 20
+    assert {flag.replace("_", "-") for flag in shown} <= known
 
 
 def commands_shown() -> list[str]:
