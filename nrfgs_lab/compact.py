@@ -2,18 +2,19 @@
 """What a scene costs in a file, and what the file loses: results/compact.json.
 
     python -m nrfgs_lab.compact trade SCENES/bonsai OUT         # the same for goldcape and fox; a GPU
+    python -m nrfgs_lab.compact trade HELD_OUT/bonsai/dev0.json OUT --no-others --settings WORTH=0.3      # a setting
     python -m nrfgs_lab.compact speed FILE.nrf OUT/speed.json   # encoding, and decoding in Python and in Chromium
     python -m nrfgs_lab.results pack OUT results/compact.json
     python -m nrfgs_lab.pages.tables.compact_format             # the figure
 
-`trade` trains the capture as `nrfgs` does, and writes it as compact files trained at each of --rates, as those of
+`trade` trains the capture, and writes it as compact files trained at each of --rates, as those of
 versions 1 and 2 without a fine-tune, as a PLY file, and as what splat-transform makes of that, where it is installed:
 its SOG and its SPZ. Records of OUT that are there already are not made again. All PSNR is that of the test views, of
-files that are read back. They are left in --work.
+files that are read back. They are left in --work. Settings are chosen on training views that are held out
+(`nrfgs_lab.held_out make`).
 """
 
 import json
-import shlex
 import shutil
 import subprocess
 import sys
@@ -28,6 +29,7 @@ import tyro
 
 from nrfgs_lab.compact_1 import encode_1
 from nrfgs_lab.pages.browser import chromium
+from nrfgs_ns.compact import finetune
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
@@ -56,8 +58,10 @@ class Trade:
     """of each fine-tune"""
     others: bool = True
     """also write what is not trained for the file"""
-    options: str = ""
-    """options of ns-train"""
+    method: str = "nrfgs"
+    """that trains"""
+    settings: tuple[str, ...] = ()
+    """NAME=VALUE, in JSON: other values of constants in nrfgs_ns/compact/finetune.py"""
 
     def main(self) -> None:
         from nrfgs_ns.export.command import PlyOptions
@@ -66,7 +70,13 @@ class Trade:
 
         files = self.work / "files"
         files.mkdir(parents=True, exist_ok=True)
-        name = f"{self.data.name}-{{}}".format
+        name = (f"{self.data.name}" if self.data.is_dir() else f"held-out-{self.data.parent.name}") + "-{}"
+        name = name.format
+        for setting in self.settings:
+            key, value = setting.split("=")
+            if not hasattr(finetune, key):
+                raise InputError(f"--settings {setting}: nrfgs_ns/compact/finetune.py has no {key}.")
+            setattr(finetune, key, json.loads(value))
         config = Path(self.record(name("model"), self.trained)["train"]["config_path"])
 
         def tuned(rate: float) -> Any:
@@ -74,7 +84,7 @@ class Trade:
             return lambda report: export_compact(config, files / f"{report.stem}.nrf", options, True, report)
 
         for rate in self.rates:
-            self.record(name(f"rate-{rate:g}"), tuned(rate))
+            self.record(name("-".join([f"rate-{rate:g}", *self.settings])), tuned(rate))
         if not self.others:
             return
         plain = files / f"{name('version-2')}.nrf"
@@ -93,8 +103,8 @@ class Trade:
         return json.loads(path.read_text(encoding="utf-8"))
 
     def trained(self, _: Path) -> dict[str, Any]:
-        args = ["nrfgs", "--data", str(self.data), "--output-dir", str(self.work), "--machine.seed", "42"]
-        args += ["--vis", "tensorboard", "--steps-per-eval-all-images", "1000000", *shlex.split(self.options)]
+        args = [self.method, "--data", str(self.data), "--output-dir", str(self.work), "--machine.seed", "42"]
+        args += ["--vis", "tensorboard", "--steps-per-eval-all-images", "1000000"]
         return {"machine": machine(), "train": asdict(train([*args, "nrfgs-data"]))}
 
 
