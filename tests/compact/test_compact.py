@@ -26,7 +26,7 @@ from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode, wide_enough
 from nrfgs_ns.compact.entropy import encode_table
-from nrfgs_ns.compact.finetune import Gated, without_them
+from nrfgs_ns.compact.finetune import CodedSplats, Gated, without_them
 from nrfgs_ns.compact.format import Table, read_container, write_container
 from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.compact.quantise import Grid, from_morton, nearest_turn
@@ -362,6 +362,30 @@ def test_what_a_splat_is_worth_is_what_pictures_lose_without_it(exported):
     found = torch.tensor([error(ones.index_fill(0, row, 0.0)) for row in growth.argsort()[[0, 1, -3, -2, -1]]])
     found = found / error(ones) - 1.0
     assert_close(growth.sort().values[[0, 1, -3, -2, -1]], found, rtol=0.1, atol=0.02 * float(found.max()))
+
+
+def test_splats_that_go_take_what_an_optimizer_knows_of_them_along():
+    coded = CodedSplats(field().splats, Precision())
+    names = list(coded.tables)
+    optimizer = torch.optim.Adam([{"params": [coded.tables[name].values]} for name in names])
+    tables = coded(rounded=True)
+    (coded.bits(tables).sum() + tables["means"].sum()).backward()
+    optimizer.step()
+    before = {name: table.values for name, table in coded.tables.items()}
+    seen = {name: optimizer.state[value]["exp_avg"] for name, value in before.items()}
+    diffuse, kept = coded.diffuse, torch.arange(60) % 3 > 0
+    coded.keep(kept, optimizer)
+    assert torch.equal(coded.diffuse, diffuse[kept])
+    for name, table in coded.tables.items():
+        rows = kept[~diffuse] if name == "latents" else kept
+        assert torch.equal(table.values, before[name][rows])
+        assert torch.equal(optimizer.state[table.values]["exp_avg"], seen[name][rows])
+    bits = coded.bits(coded(rounded=True))
+    assert bits.shape == (40,) and coded.splats(coded(rounded=True))["means"].shape == (40, 3)
+    optimizer.zero_grad()
+    bits.sum().backward()
+    optimizer.step()
+    assert not torch.equal(coded.tables["scales"].values, before["scales"][kept])
 
 
 def test_what_training_expects_is_what_a_file_has(tmp_path):

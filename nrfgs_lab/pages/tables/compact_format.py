@@ -4,6 +4,7 @@
 python -m nrfgs_lab.pages.tables.compact_format        # writes docs/images/compact-trade.png
 """
 
+import re
 from typing import Any
 
 from nrfgs_lab.pages.tables import ROOT, grid, records, signed
@@ -56,12 +57,22 @@ def at(scene: str, what: str, value: str) -> str:
     return f"{np.interp(float(value), loss, size):.1f}"
 
 
-def model(scene: str, what: str) -> str:
-    """PSNR, splats or steps of a scene's model."""
-    train = records("compact")[f"{scene}-model"]["train"]
-    if what == "PSNR":
-        return f"{reports(scene)['version-2']['psnr_model']:.2f}"
-    return f"{train['splats'][-1][1] if what == 'splats' else train['steps']:,}"
+def steps() -> str:
+    """Of the captures' fine-tunes."""
+    (found,) = {one["finetune"] for scene in CAPTURES for one in reports(scene).values() if one.get("finetune")}
+    return f"{found:,}"
+
+
+def held_out() -> str:
+    """A row for each fine-tune that was tried on held-out views: rate, steps and settings that are not the default."""
+    rows = []
+    for name, one in records("compact").items():
+        if "held-out-bonsai-rate" in name:
+            _, settings = re.fullmatch(r".*-rate-([\d.e]+?(?:e-\d+)?)((?:-[A-Z]+=.*)?)", name).groups()
+            how = settings.lstrip("-").replace("-", ", ") or "as it is"
+            size, lost = f"{one['bytes'] / 1e6:.2f}", signed(-one["loss_db"], 2)
+            rows.append([f"{one['rate']:g}", f"{one['finetune']:,}", how, f"{one['written']:,}", size, lost])
+    return grid(["rate", "steps", "settings", "splats", "MB", "dB against the model"], sorted(rows))
 
 
 def seconds(name: str, what: str) -> str:
