@@ -19,6 +19,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
@@ -60,6 +61,8 @@ class Trade:
     """also write what is not trained for the file"""
     method: str = "nrfgs"
     """that trains"""
+    sog_iterations: int = 10
+    """of splat-transform, to find SOG's palette"""
     settings: tuple[str, ...] = ()
     """NAME=VALUE, in JSON: other values of constants in nrfgs_ns/compact/finetune.py"""
 
@@ -87,13 +90,20 @@ class Trade:
             self.record(name("-".join([f"rate-{rate:g}", *self.settings])), tuned(rate))
         if not self.others:
             return
-        plain = files / f"{name('version-2')}.nrf"
-        self.record(name("version-2"), lambda report: export_compact(config, plain, CompactOptions(), True, report))
-        self.record(name("version-1"), lambda report: version_1(config, files / f"{report.stem}.nrf"))
         ply = files / f"{name('ply')}.ply"
         self.record(name("ply"), lambda report: export_ply(config, ply, PlyOptions(), True, report))
-        for suffix in ("sog", "spz") if shutil.which(TOOL) else ():
-            self.record(name(suffix), lambda _, suffix=suffix: transformed(config, ply, suffix))
+        suffixes = [suffix for suffix in ("spz", "sog") if shutil.which(TOOL)]
+        with ThreadPoolExecutor() as pool:  # minutes on a CPU
+            there = [(self.out / f"{name(suffix)}.json").exists() for suffix in suffixes]
+            todo = [suffix for suffix, done in zip(suffixes, there, strict=True) if not done]
+            running = {suffix: pool.submit(converted, ply, suffix, self.sog_iterations) for suffix in todo}
+            plain = files / f"{name('version-2')}.nrf"
+            self.record(name("version-2"), lambda report: export_compact(config, plain, CompactOptions(), True, report))
+            self.record(name("version-1"), lambda report: version_1(config, files / f"{report.stem}.nrf"))
+            for suffix, made in running.items():
+                self.record(
+                    name(suffix), lambda _, made=made: {**made.result(), **measured(config, ply, made.result())}
+                )
 
     def record(self, name: str, make: Callable[[Path], dict[str, Any] | None]) -> dict[str, Any]:
         """The record of a name: what `make` returns, or writes to the path that it is given."""
@@ -124,29 +134,37 @@ def version_1(config: Path, path: Path) -> dict[str, Any]:
     return {"bytes": size, "seconds": seconds, **measure_file(pipeline, write_config(config, path))}
 
 
-def transformed(config: Path, ply: Path, suffix: str) -> dict[str, Any]:
-    """The record of what splat-transform makes of a PLY file; its pictures are those of what it makes back of that."""
+def converted(ply: Path, suffix: str, sog_iterations: int) -> dict[str, Any]:
+    """What splat-transform makes of a PLY file, and back."""
+    small = ply.with_suffix(f".{suffix}")
+    begin = perf_counter()
+    options = ["-w", "-g", "cpu", "-i", str(sog_iterations)]
+    subprocess.run([TOOL, *options, ply, small], check=True, stdout=sys.stderr)
+    seconds = {"encode": perf_counter() - begin}
+    subprocess.run([TOOL, "-w", small, ply.with_suffix(f".{suffix}.ply")], check=True, stdout=sys.stderr)
+    said = subprocess.run([TOOL, "--version"], check=True, capture_output=True, text=True)
+    version = (said.stdout + said.stderr).strip()
+    return {
+        "file": small.name,
+        "version": version,
+        "options": options,
+        "bytes": small.stat().st_size,
+        "seconds": seconds,
+    }
+
+
+def measured(config: Path, ply: Path, made: dict[str, Any]) -> dict[str, Any]:
+    """The record of what splat-transform made of a PLY file; its pictures are those of the PLY that it made back."""
     from nrfgs_ns.export.frames import Y_DOWN
     from nrfgs_ns.export.loading import load_model, measure_loss
     from nrfgs_ns.export.ply import read_splats, render_splats
 
-    small, back = ply.with_suffix(f".{suffix}"), ply.with_suffix(f".{suffix}.ply")
-    begin = perf_counter()
-    subprocess.run([TOOL, "-w", "-g", "cpu", ply, small], check=True, stdout=sys.stderr)
-    encode_seconds = perf_counter() - begin
-    subprocess.run([TOOL, "-w", small, back], check=True, stdout=sys.stderr)
-    said = subprocess.run([TOOL, "--version"], check=True, capture_output=True, text=True)
     pipeline = load_model(config, "test")
-    model, splats = pipeline.model, Y_DOWN.inverse.moved(read_splats(back))
+    model, splats = pipeline.model, Y_DOWN.inverse.moved(read_splats(ply.with_name(made["file"] + ".ply")))
     splats = type(splats)(*(value.to(model.device) for value in splats))
     how = model.background_color, model.config.rasterize_mode, model.scene_unit
-    return {
-        "version": (said.stdout + said.stderr).strip(),
-        "written": len(splats.means),
-        "bytes": small.stat().st_size,
-        "seconds": {"encode": encode_seconds},
-        **measure_loss(pipeline, lambda camera: {"file": render_splats(splats, camera, *how)}),
-    }
+    loss = measure_loss(pipeline, lambda camera: {"file": render_splats(splats, camera, *how)})
+    return {**made, "written": len(splats.means), **loss}
 
 
 @dataclass
