@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choosing settings without looking at test views.
 
-    python -m nrfgs_lab.held_out make SCENES OUT [OFFSET] [NAME ...]
+    python -m nrfgs_lab.held_out make SCENES OUT [OFFSET[/VIEWS]] [NAME ...]
     python -m nrfgs_lab.held_out report results/held-out.json
     python -m nrfgs_lab.held_out effects results/held-out.json
     python -m nrfgs_lab.held_out test-views results/captures.json
 
 `make` writes, for captures with a transforms.json that names its split, data sets of their training views alone at half
-the size, every eighth of which is held out as a test view (from the OFFSET-th on, 4 unless said otherwise).
+the size, every eighth of which is held out as a test view (from the OFFSET-th on, 4 unless said otherwise); with VIEWS
+so many of the others, evenly spaced, are left.
 `report` prints the tables of docs/captures.md: each trial against the harmonics that were trained with the same
 densification, steps and held-out views. `effects` prints what each factor of the screening designs does: sixteen
 trainings a capture that turn nine factors on and off in a balanced way say as much of each factor as if it alone had
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 
 EVERY = 8
@@ -39,7 +41,7 @@ def held_out(names: list[str], offset: int) -> list[str]:
     return names[offset::6] if len(names) < 30 and len(chosen) < 3 else chosen
 
 
-def make(scenes: Path, out: Path, offset: int = 4, names: list[str] | None = None) -> None:
+def make(scenes: Path, out: Path, offset: int = 4, names: list[str] | None = None, views: int | None = None) -> None:
     """Write the data sets.
 
     Args:
@@ -47,6 +49,7 @@ def make(scenes: Path, out: Path, offset: int = 4, names: list[str] | None = Non
         out: folder for theirs.
         offset: first of the held-out views among the training views in the order of their names.
         names: captures; None for all.
+        views: how many of the others stay training views; None: all.
 
     Raises:
         InputError: a capture names no training views.
@@ -54,10 +57,10 @@ def make(scenes: Path, out: Path, offset: int = 4, names: list[str] | None = Non
     for file in sorted(scenes.glob("*/transforms.json")):
         if names and file.parent.name not in names:
             continue
-        _make_one(file, out / file.parent.name, offset)
+        _make_one(file, out / file.parent.name, offset, views)
 
 
-def _make_one(file: Path, out: Path, offset: int) -> None:
+def _make_one(file: Path, out: Path, offset: int, views: int | None) -> None:
     meta = json.loads(file.read_text(encoding="utf-8"))
     if not meta.get("train_filenames"):
         raise InputError(f"{file} has no train_filenames. Write a capture that names its split (nrfgs prepare does).")
@@ -77,7 +80,8 @@ def _make_one(file: Path, out: Path, offset: int) -> None:
         name: meta[name] * down for name in ("fl_y", "cy")
     }
     meta |= {"w": size[0], "h": size[1], "frames": frames, "test_filenames": aside, "val_filenames": aside}
-    meta["train_filenames"] = [frame["file_path"] for frame in frames if frame["file_path"] not in aside]
+    left = [frame["file_path"] for frame in frames if frame["file_path"] not in aside]
+    meta["train_filenames"] = [left[i] for i in evenly_spaced(len(left), views or len(left))]
     (out / "transforms.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
     if "ply_file_path" in meta:
         shutil.copy(file.parent / meta["ply_file_path"], out / meta["ply_file_path"])
@@ -224,6 +228,7 @@ def test_views(file: Path) -> str:
 if __name__ == "__main__":
     verb, *words = sys.argv[1:]
     if verb == "make":
-        make(Path(words[0]), Path(words[1]), int(words[2]) if len(words) > 2 else 4, words[3:] or None)
+        first, _, kept = (words[2] if len(words) > 2 else "4").partition("/")
+        make(Path(words[0]), Path(words[1]), int(first), words[3:] or None, int(kept) if kept else None)
     else:
         print({"report": report, "effects": screening, "test-views": test_views}[verb](Path(words[0])))

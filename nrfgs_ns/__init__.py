@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 MOVED = {
     "nrfgs_ns.capacity": None,
     "nrfgs_ns.capacity.config": "nrfgs_ns.model.retired",
+    "nrfgs_ns.densification.consistent": "nrfgs_ns.model.retired",
     "nrfgs_ns.diffuse_splats": "nrfgs_ns.model.retired",
     "nrfgs_ns.distributed.config": "nrfgs_ns.training.pipeline",
     "nrfgs_ns.pipeline": "nrfgs_ns.training.pipeline",

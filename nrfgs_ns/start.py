@@ -5,6 +5,7 @@ Nerfstudio imports this package twice: for its data parsers, when most is yet to
 before it asks for external ones and reads the command line.
 """
 
+import atexit
 import functools
 import gc
 import sys
@@ -18,15 +19,21 @@ from nerfstudio.utils import misc
 
 def with_data_parsers() -> None:
     """Make what nerfstudio imports next come sooner."""
-    gc.freeze()  # modules stay: the collector need not walk through them again and again
+    _leave_modules_alone()
+    atexit.register(gc.unfreeze)  # what is frozen is not taken down in order at the end, and Triton's bindings complain
     if not hasattr(misc.torch_compile, "__wrapped__"):
         misc.torch_compile = _compile_when_called(misc.torch_compile)
 
 
 def with_methods() -> None:
     """Make what nerfstudio does before it reads the command line come sooner."""
-    gc.freeze()
+    _leave_modules_alone()
     external_methods.inspect = SimpleNamespace(stack=_names_of_callers)
+
+
+def _leave_modules_alone() -> None:
+    """They stay: the collector need not walk through what has been imported again and again."""
+    gc.freeze()
 
 
 def _compile_when_called(torch_compile: Callable) -> Callable:

@@ -15,6 +15,7 @@ import yaml
 
 import nrfgs_ns
 from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.densification import build_densification
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.ply import read_splats
@@ -91,6 +92,19 @@ def test_they_go_on(saved, tmp_path):
     if name in RESUMED:
         assert results["psnr"] == pytest.approx(RESUMED[name], abs=0.01)
     assert results["psnr"] > PSNR[name] and results["parameter_bytes"] == BYTES[name]
+
+
+def test_a_strategy_that_is_no_more_is_the_one_that_it_was_made_of(started_in, monkeypatch):
+    monkeypatch.chdir(started_in)
+    path = Path("outputs") / "whole" / "nrfgs" / "before" / "config.yml"
+    text = path.read_text()
+    old = "consistent: !!python/object:nrfgs_ns.densification.consistent.ConsistentDensification\n      views: 10\n"
+    assert "    densification: splatfacto\n" in text
+    model = yaml.load(
+        text.replace("    densification: splatfacto\n", f"    {old}    densification: consistent\n"), Loader=yaml.Loader
+    ).pipeline.model
+    assert model.densification == "splatfacto"
+    assert build_densification(model, 8).name == "splatfacto"
 
 
 @pytest.mark.parametrize("name", nrfgs_ns.MOVED)

@@ -66,7 +66,7 @@ class Bench:
     runs: tuple[str, ...] = ()
     """runs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
     strategies: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--protocols"])] = ()
-    """densification: splatfacto, original, consistent, mcmc, mcmc@BUDGET, own"""
+    """densification: splatfacto, original, mcmc, mcmc@BUDGET, own"""
     seeds: tuple[int, ...] = ()
     """--machine.seed of each repetition"""
     steps: int | None = None

@@ -84,7 +84,7 @@ class Spec:
     scenes: list[Scene]
     """data sets"""
     strategies: list[str] = field(default_factory=lambda: [OWN])
-    """densification: splatfacto, original, consistent, mcmc, mcmc@BUDGET, or own for no option at all"""
+    """densification: splatfacto, original, mcmc, mcmc@BUDGET, or own for no option at all"""
     seeds: list[int] = field(default_factory=lambda: [42])
     """--machine.seed of each repetition"""
     steps: int = 30_000
@@ -265,7 +265,7 @@ def strategy_options(strategy: str) -> list[str]:
     name, at, budget = strategy.partition("@")
     if strategy == OWN:
         return []
-    known = ("splatfacto", "original", "consistent", "mcmc")
+    known = ("splatfacto", "original", "mcmc")
     good = name in known and (not at or (name == "mcmc" and budget.isdigit()))
     _require(good, f"strategy {strategy!r} is unknown; use {', '.join(known)}, mcmc@BUDGET or own.")
     return [DENSIFICATION, name, *(["--pipeline.model.splat-budget", budget] if at else [])]

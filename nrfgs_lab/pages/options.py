@@ -35,7 +35,7 @@ Written by `python -m nrfgs_lab.pages.options` from the configurations. Cameras 
 are `nrfgs`'s; of the other heads' methods `view-noise`, `head-from` and `shrinkage` are 0, `few-views` is off,
 `max-num-iterations` 30,000 and `average-steps` 0.
 """
-RULES = "original", "consistent", "mcmc"
+RULES = "original", "mcmc"
 """Densification strategies with options of their own."""
 UNSAID = "none", "required", "False"
 """Defaults that a list of options does not tell."""

@@ -67,8 +67,8 @@ class AppearanceHeadConfig:
     def validate(self) -> None:
         """Raise ValueError, naming the field and the fix, if a value cannot work."""
 
-    def for_few_views(self) -> "AppearanceHeadConfig":
-        """The configuration for a capture of few views, without what they cannot tell."""
+    def trusted(self, share: float) -> "AppearanceHeadConfig":
+        """The configuration of a head that the capture trusts with a share, in (0, 1], of what it may do."""
         return self
 
     def require(self, holds: bool, name: str, needed: str) -> None:

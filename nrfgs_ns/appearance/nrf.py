@@ -74,9 +74,9 @@ class NrfConfig(AppearanceHeadConfig):
     """what the fused kernels round the factors of matrix products to; sums are always float32. PyTorch's path ignores
     it."""
 
-    def for_few_views(self) -> "NrfConfig":
-        """One band, and opacity that does not change with the view: an opacity for each view is a geometry for each."""
-        return replace(self, num_bands=1, opacity_residual=False)
+    def trusted(self, share: float) -> "NrfConfig":
+        """Opacity that changes less with the view: an opacity for each view is a geometry for each."""
+        return replace(self, opacity_scale=share * self.opacity_scale) if self.opacity_residual else self
 
     def validate(self) -> None:
         self.require(self.latent_dim >= 1, "latent_dim", "at least 1")

@@ -3,9 +3,6 @@
 
 from typing import Any
 
-import torch
-
-from nrfgs_ns.densification.consistent import Consistent
 from nrfgs_ns.densification.gradient import GradientDensification, OriginalDensification, PruneBySeenOpacity
 from nrfgs_ns.densification.mcmc import Mcmc
 from nrfgs_ns.densification.strategy import Densification
@@ -23,14 +20,13 @@ SPLATFACTOS_THRESHOLDS = (
     "split_screen_size",
     "stop_screen_size_at",
 )
-"""Options of the model that only the strategies `splatfacto` and `consistent` read."""
-READ_BY = {"original": "original", "consistent": "consistent", "mcmc": "mcmc", "splat_budget": "mcmc"}
+"""Options of the model that only the strategy `splatfacto` reads."""
+READ_BY = {"original": "original", "mcmc": "mcmc", "splat_budget": "mcmc"}
 """Options of the model that one of the others alone reads -> which."""
 UNREAD = {
-    "splatfacto": ("original", "consistent", "mcmc", "splat_budget"),
-    "original": (*SPLATFACTOS_THRESHOLDS, "consistent", "mcmc", "splat_budget"),
-    "consistent": ("original", "mcmc", "splat_budget"),
-    "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at", "original", "consistent"),
+    "splatfacto": ("original", "mcmc", "splat_budget"),
+    "original": (*SPLATFACTOS_THRESHOLDS, "mcmc", "splat_budget"),
+    "mcmc": (*SPLATFACTOS_THRESHOLDS, "reset_alpha_every", "stop_split_at", "keep", "original"),
 }
 """Options of the model that a strategy does not read, and refuses where they are set."""
 
@@ -46,7 +42,7 @@ def build_densification(config: Any, num_train_images: int, scene_unit: float = 
     Raises:
         InputError: an option is out of range, or belongs to another strategy.
     """
-    makers = {"splatfacto": _splatfacto, "original": _original, "consistent": _consistent, "mcmc": _mcmc}
+    makers = {"splatfacto": _splatfacto, "original": _original, "mcmc": _mcmc}
     if config.densification not in makers:
         raise InputError(
             f"pipeline.model.densification is {config.densification!r}; use one of {', '.join(map(repr, makers))}."
@@ -56,33 +52,14 @@ def build_densification(config: Any, num_train_images: int, scene_unit: float = 
             f"pipeline.model.opacity_seen_by_densification is {config.opacity_seen_by_densification!r}; "
             "use 'base' or 'peak'."
         )
+    if not 0 < config.keep <= 1:
+        raise InputError(f"pipeline.model.keep is {config.keep}; it must be above 0 and at most 1.")
     _refuse_options(config)
     return makers[config.densification](config, num_train_images, scene_unit)
 
 
 def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densification:
-    return GradientDensification(
-        "splatfacto",
-        _splatfactos_rules(config, num_train_images),
-        config.opacity_seen_by_densification or "base",
-        scene_unit,
-        reset_at_start=True,
-    )
-
-
-def _consistent(config: Any, num_train_images: int, scene_unit: float) -> Densification:
-    config.consistent.check()
-    return Consistent(
-        config.consistent,
-        _splatfactos_rules(config, num_train_images),
-        config.opacity_seen_by_densification or "base",
-        scene_unit,
-        seed=torch.initial_seed(),
-    )
-
-
-def _splatfactos_rules(config: Any, num_train_images: int) -> PruneBySeenOpacity:
-    return PruneBySeenOpacity(
+    strategy = PruneBySeenOpacity(
         prune_opa=config.cull_alpha_thresh,
         grow_grad2d=config.densify_grad_thresh,
         grow_scale3d=config.densify_size_thresh,
@@ -98,6 +75,14 @@ def _splatfactos_rules(config: Any, num_train_images: int) -> PruneBySeenOpacity
         absgrad=config.use_absgrad,
         revised_opacity=False,
         verbose=True,
+    )
+    return GradientDensification(
+        "splatfacto",
+        strategy,
+        config.opacity_seen_by_densification or "base",
+        scene_unit,
+        reset_at_start=True,
+        keep=config.keep,
     )
 
 
@@ -118,7 +103,12 @@ def _original(config: Any, num_train_images: int, scene_unit: float) -> Densific
         verbose=True,
     )
     return GradientDensification(
-        "original", strategy, config.opacity_seen_by_densification or "base", scene_unit=None, reset_at_start=False
+        "original",
+        strategy,
+        config.opacity_seen_by_densification or "base",
+        scene_unit=None,
+        reset_at_start=False,
+        keep=config.keep,
     )
 
 

@@ -10,11 +10,14 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
+from nrfgs_ns.densification import thinning
 from nrfgs_ns.densification.statistics import take_statistics
-from nrfgs_ns.densification.strategy import Densification, OpacitySeen, Strategy
+from nrfgs_ns.densification.strategy import Densification, OpacitySeen, Strategy, TrainingViews
 
 EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
+THINNED = "thinned"
+"""Name in the strategy's `state`: rounds of thinning that are done."""
 STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop_iter")
 """What begins or ends by step number in gsplat's strategy."""
 
@@ -64,6 +67,7 @@ class GradientDensification(Densification):
         opacity_seen: which opacity pruning looks at. A reset always acts on the stored one.
         scene_unit: world units in a scene unit, which sizes are measured in; None: in extents of the cameras.
         reset_at_start: reset opacities at step 0, too, as gsplat 1.4 does; 3DGS counts its steps from 1.
+        keep: share of the splats that is left when growth has ended (`thinning.py`), in (0, 1].
     """
 
     def __init__(
@@ -73,6 +77,7 @@ class GradientDensification(Densification):
         opacity_seen: OpacitySeen,
         scene_unit: float | None,
         reset_at_start: bool,
+        keep: float = 1.0,
     ):
         super().__init__(opacity_seen)
         self.name = name
@@ -80,6 +85,8 @@ class GradientDensification(Densification):
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
         self.reset_at_start = reset_at_start
+        self.keep, self.state[THINNED] = keep, 0
+        self.rounds = self._rounds(round)
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
         if opacity_seen == "peak":
             strategy.seen_opacity = self.seen_opacity
@@ -93,12 +100,12 @@ class GradientDensification(Densification):
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
 
     def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
+        super().pre_backward(step, info, opacities, logits)
         if step < self.strategy.refine_stop_iter:
-            super().pre_backward(step, info, opacities, logits)
             info["means2d"].retain_grad()
 
     def post_backward(self, step, info, splats, optimizers) -> None:
-        strategy = self.strategy
+        strategy, self.shown = self.strategy, None
         if step < strategy.refine_stop_iter:
             self._take_statistics(info, len(splats["means"]))
             if step == 0 and not self.reset_at_start:
@@ -109,6 +116,22 @@ class GradientDensification(Densification):
                 reset_opa(splats, optimizers, self.state, value=2.0 * strategy.prune_opa)
         if step % strategy.reset_every == 0 or self._refines(step):
             self.forget_views()
+        done = self.state[THINNED]
+        if self.keep < 1.0 and done < len(self.rounds) and step >= self.rounds[done]:
+            self._thin(step, splats, optimizers)
+            self.state[THINNED] += 1
+
+    def see_training_views(self, views: TrainingViews) -> None:
+        self.views = views
+
+    def _thin(self, step: int, splats, optimizers) -> None:
+        """A round of thinning (`thinning.py`)."""
+        gone = thinning.least_missed(
+            thinning.missed(self.views, len(splats["means"]), splats["means"].device), self.keep
+        )
+        remove(splats, optimizers, self.state, gone)
+        if self.strategy.verbose:
+            print(f"Step {step}: {int(gone.sum())} GSs thinned. Now having {len(splats['means'])} GSs.")
 
     def _take_statistics(self, info: Mapping[str, Any], count: int) -> None:
         """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side."""
@@ -133,11 +156,16 @@ class GradientDensification(Densification):
                 state[name].zero_()
         torch.cuda.empty_cache()
 
+    def _rounds(self, step_at: Callable[[float], int]) -> list[int]:
+        """The steps at which splats are thinned."""
+        return [step_at(times * self.bounds["refine_stop_iter"]) for times in thinning.ROUNDS]
+
     def _grow(self, step: int, splats, optimizers) -> tuple[int, int]:
         """Grow by gsplat's rules; how many were duplicated, and how many split."""
         return self.strategy._grow_gs(splats, optimizers, self.state, step)
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
+        self.rounds = self._rounds(step_at)
         for name, step in self.bounds.items():
             setattr(self.strategy, name, step_at(step) if step > 0 else step)
 

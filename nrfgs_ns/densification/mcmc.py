@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,17 +31,6 @@ class McmcDensification:
     """weight of the mean standard deviation, in scene units, in the loss"""
 
 
-class Shown(NamedTuple):
-    """What the views of a step have shown."""
-
-    rows: Tensor
-    """splats, int64 [M]; one that several cameras see is there several times"""
-    opacities: Tensor
-    """theirs, from there, [M] in [0, 1]"""
-    cameras: int
-    """number of cameras"""
-
-
 class Mcmc(Densification):
     """Relocation, growth to a budget, and noise (`relocation.py`).
 
@@ -54,9 +42,9 @@ class Mcmc(Densification):
             gets is computed from the stored opacities.
         scene_unit: world units in a scene unit.
 
-    The mean opacity in the loss is that of what the step's cameras are shown, with the stored opacities of all else. If
-    it were that of the stored ones alone, a head that adds to them would be paid for making them small: splats that
-    every view shows would count as dead, and the noise, made for splats that nobody sees, would shake them.
+    The mean opacity in the loss is that of what the step's cameras are shown (`mean_opacity`). If it were that of the
+    stored ones alone, splats that every view shows would count as dead, too, and the noise, made for splats that nobody
+    sees, would shake them.
     """
 
     name = "mcmc"
@@ -73,14 +61,9 @@ class Mcmc(Densification):
         super().__init__(opacity_seen)
         if opacity_seen == "peak":
             self.state[CHANGE_BEFORE] = None
-        self.shown: Shown | None = None
         self.scene_unit = scene_unit
         self.config, self.budget, self.start, self.every = config, budget, start, every
         self.stop, self.bounds = config.stop_at, (start, config.stop_at)
-
-    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        super().pre_backward(step, info, opacities, logits)
-        self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
 
     @torch.no_grad()
     def post_backward(self, step, info, splats, optimizers) -> None:
@@ -120,12 +103,7 @@ class Mcmc(Densification):
         self.start, self.stop = (step_at(step) for step in self.bounds)
 
     def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        base = torch.sigmoid(splats["opacities"]).flatten()
-        mean = base.mean()
-        if self.shown is not None:
-            rows, opacities, cameras = self.shown
-            mean = mean + (opacities - base[rows]).sum() / (cameras * len(base))
         return {
-            "mcmc_opacity_reg": self.config.opacity_regularisation * mean,
+            "mcmc_opacity_reg": self.config.opacity_regularisation * self.mean_opacity(splats["opacities"]),
             "mcmc_scale_reg": self.config.scale_regularisation * splats["scales"].exp().mean() / self.scene_unit,
         }

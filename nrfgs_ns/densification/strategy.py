@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 
-Strategy = Literal["splatfacto", "original", "consistent", "mcmc"]
+Strategy = Literal["splatfacto", "original", "mcmc"]
 OpacitySeen = Literal["base", "peak"]
 
 CHANGE = "opacity_change"
@@ -44,17 +44,15 @@ def seen_with(stored: Tensor, change: Tensor) -> Tensor:
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
 
 
-class Seen(NamedTuple):
-    """What one training view says of the M splats that it sees."""
+class Shown(NamedTuple):
+    """What the views of a step have shown."""
 
     rows: Tensor
-    """of the table, int64 [M]"""
-    pixels: Tensor
-    """how much of the picture each is, alpha T summed over pixels, in pixels of the photograph, [M]"""
-    wrong: Tensor
-    """the same over wrong pixels alone, [M]"""
-    loss: Tensor
-    """the view's photometric loss, a scalar"""
+    """splats, int64 [M]; one that several cameras see is there several times"""
+    opacities: Tensor
+    """theirs, from there, [M] in [0, 1]"""
+    cameras: int
+    """number of cameras"""
 
 
 class TrainingViews(Protocol):
@@ -63,12 +61,15 @@ class TrainingViews(Protocol):
     def __len__(self) -> int:
         """How many there are."""
 
-    def look(self, index: int, wrong: float) -> Seen:
-        """Compare one view with its photograph.
+    def changes_without(self, index: int, generator: torch.Generator, passes: int) -> tuple[Tensor, Tensor]:
+        """How much the picture of one view would change without each splat that it sees (`rasterizer.changes_without`).
 
         Args:
             index: of the view.
-            wrong: error above which a pixel is wrong, as a share of the way from the view's smallest to its largest.
+            generator, passes: of the estimate.
+
+        Returns:
+            Rows of the table, int64 [M], and sums over pixels and channels of the squared change, [M].
         """
 
 
@@ -82,6 +83,7 @@ class Densification(ABC):
     def __init__(self, opacity_seen: OpacitySeen):
         self.opacity_seen = opacity_seen
         self.state = {CHANGE: None} if opacity_seen == "peak" else {}
+        self.shown: Shown | None = None
 
     @property
     def diffuse(self) -> Tensor | None:
@@ -97,7 +99,7 @@ class Densification(ABC):
         """Tell the strategy where the training cameras are, [V, 3], before the first step."""
 
     def see_training_views(self, views: TrainingViews) -> None:  # noqa: B027  (only some strategies look at them)
-        """Give the strategy what it may ask of the training views while it refines, before the first step."""
+        """Give the strategy what it may ask of the training views, before the first step."""
 
     def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
         """Look at a training view before the loss goes backward.
@@ -108,6 +110,7 @@ class Densification(ABC):
             opacities: what the head said, [M] in [0, 1], before antialiasing compensation.
             logits: the stored opacities of all splats, as logits [N, 1].
         """
+        self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
         if self.opacity_seen == "peak":
             rows, logits = info["gaussian_ids"], logits.detach()
             if self.state[CHANGE] is None:
@@ -132,6 +135,21 @@ class Densification(ABC):
             splats: the table; entries are replaced.
             optimizers: one for each entry, under its name, each with one parameter group; others are left alone.
         """
+
+    def mean_opacity(self, logits: Tensor) -> Tensor:
+        """The splats' mean opacity for the loss, a scalar: as the step's cameras are shown them, stored otherwise.
+
+        If it were that of the stored ones alone, a head that adds to them would be paid for making them small, and
+        would add the more.
+
+        Args:
+            logits: stored opacities [N, 1].
+        """
+        stored = torch.sigmoid(logits).flatten()
+        if self.shown is None:
+            return stored.mean()
+        rows, opacities, cameras = self.shown
+        return stored.mean() + (opacities - stored[rows]).sum() / (cameras * len(stored))
 
     def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Terms that the strategy adds to the loss, by name."""

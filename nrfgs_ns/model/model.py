@@ -31,7 +31,6 @@ from nrfgs_ns.appearance.field import BaseField, Field
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import (
-    ConsistentDensification,
     Densification,
     McmcDensification,
     OpacitySeen,
@@ -49,21 +48,16 @@ from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_con
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.pinhole import FixedPinholes, Pinhole, pinhole
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
-from nrfgs_ns.model.training_views import ComparedViews
+from nrfgs_ns.model.retired import RETIRED
+from nrfgs_ns.model.training_views import TrainingPictures
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.rasterizer import load_kernels
 
 LOOK = "NRFGS_LOOK"
 """Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
-HEAD_FROM = 0.3
-"""Share of a training after which the head learns, where that is chosen."""
-FEW_VIEWS = 30
-"""Fewer training views are few."""
-MANY_VIEWS = 100
-"""From so many on the head begins at once, where that is chosen, and nothing shrinks."""
-NOISE_OF_FEW_VIEWS = 2.0
-"""How many times as long the noise is then."""
+PRIOR_VIEWS = 20
+"""So many training views are half of what a head needs: `few_views` trusts it by that."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
 
@@ -79,32 +73,34 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     view_noise: float = 0.0
     """in training the head sees each splat from a camera centre moved by noise this many times as long as neighbouring
     training cameras are apart (docs/captures.md)"""
-    head_from: float | None = 0.0
-    """share of the training after which the head is asked and learns (docs/captures.md). None: 0.3 where schedules are
-    stretched to the training's steps and training views are fewer than 100, 0 otherwise"""
-    few_views: Literal["auto", "on", "off"] = "off"
-    """what few views cannot tell is left out of the head, and view_noise is twice as long (docs/captures.md). auto:
-    with fewer than 30 training views"""
+    head_from: float = 0.0
+    """share of the training after which the head is asked and learns. Until then splats have their base colours and
+    opacities"""
+    few_views: Literal["auto", "off"] = "off"
+    """auto: V training views trust the head with V / (V + 20), by which view_noise is longer and its opacity residual
+    smaller (docs/captures.md)"""
     shrinkage: float = 0.0
-    """weight of the mean opacity and of the mean standard deviation (scene units) in the loss, divided by the square of
-    the number of training views, if they are fewer than 100. mcmc has its own instead (docs/captures.md)"""
+    """weight, in the loss, of the mean opacity and of the mean standard deviation in scene units, divided by the square
+    of the number of training views: what few views need becomes faint and small. mcmc has its own instead
+    (docs/captures.md)"""
     warmup_steps: int | None = None
     """steps before training in which a head that adds something at its start learns to add nothing. None: one for each
     training view"""
     warmup_lr: float = 1e-3
     """learning rate of the warm-up's Adam"""
     densification: Strategy = "splatfacto"
-    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. consistent: splatfacto's, where
-    several training views agree. mcmc: 3DGS-MCMC, up to splat_budget"""
+    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
+    splat_budget"""
     splat_budget: int = 1_000_000
     """mcmc: the number of splats that it grows to and keeps"""
     opacity_seen_by_densification: OpacitySeen | None = None
     """which opacity makes a splat die. base: the stored one. peak: the largest that a view since the last refinement
     would show. None: peak for mcmc, base for the others"""
+    keep: float = 1.0
+    """share of the splats that is left once growth has ended, at stop_split_at: those go, in six rounds, that the
+    training views would miss least (docs/bench.md). 1: all"""
     original: OriginalDensification = field(default_factory=OriginalDensification)
     """thresholds of the densification 'original'"""
-    consistent: ConsistentDensification = field(default_factory=ConsistentDensification)
-    """what the densification 'consistent' adds to splatfacto's rules"""
     mcmc: McmcDensification = field(default_factory=McmcDensification)
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
@@ -120,8 +116,12 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Be what a config.yml says; that of an older version has fewer options."""
-        self.__dict__.update({**vars(type(self)()), **state})
+        """Be what a config.yml says; that of an older version has fewer options, or values that are no more."""
+        state = {**vars(type(self)()), **state}
+        state["head_from"] = state["head_from"] or 0.0  # None: by the number of views
+        state["few_views"] = "auto" if state["few_views"] == "on" else state["few_views"]
+        self.__dict__.update(state)
+        self.densification = RETIRED.get(self.densification, self.densification)
 
 
 class NrfgsModel(SplatfactoModel):
@@ -157,10 +157,10 @@ class NrfgsModel(SplatfactoModel):
         self.scene_unit: float = (self.kwargs.get("metadata") or {}).get("scene_unit", 1.0)
         """World units in a scene unit; lengths in the configuration are in scene units."""
         appearance = self.config.appearance
-        if self.has_few_views:
+        if self.trust < 1.0:
             appearance.validate()
-            appearance = appearance.for_few_views()
-            self.reduced_head = differences(self.config.appearance, appearance)
+            appearance = appearance.trusted(self.trust)
+            self.reduced_head = differences(self.config.appearance, appearance) or None
         self.head = appearance.setup(self.scene_unit)
         self.config.sh_degree = self.head.sh_degree
         self.gauss_params = torch.nn.ParameterDict(self._initial_splats())
@@ -184,7 +184,7 @@ class NrfgsModel(SplatfactoModel):
         for name in ("view_noise", "shrinkage"):
             if not getattr(self.config, name) >= 0:
                 raise InputError(f"pipeline.model.{name} is {getattr(self.config, name)}; it must be zero or positive.")
-        if not 0 <= (self.config.head_from or 0.0) < 1:
+        if not 0 <= self.config.head_from < 1:
             raise InputError(f"pipeline.model.head_from is {self.config.head_from}; it must be at least 0 and below 1.")
         self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
 
@@ -193,16 +193,17 @@ class NrfgsModel(SplatfactoModel):
         return build_densification(self.config, self.num_train_data, self.scene_unit)
 
     @property
-    def has_few_views(self) -> bool:
-        """Whether the head is the one for few views."""
-        if self.config.few_views not in ("auto", "on", "off"):
-            raise InputError(f"pipeline.model.few_views is {self.config.few_views!r}; use 'auto', 'on' or 'off'.")
-        return self.config.few_views == "on" or self.config.few_views == "auto" and self.num_train_data < FEW_VIEWS
+    def trust(self) -> float:
+        """How far the training views trust the head, in (0, 1]."""
+        if self.config.few_views not in ("auto", "off"):
+            raise InputError(f"pipeline.model.few_views is {self.config.few_views!r}; use 'auto' or 'off'.")
+        views = self.num_train_data
+        return views / (views + PRIOR_VIEWS) if self.config.few_views == "auto" and views > 0 else 1.0
 
     @property
     def noise_factor(self) -> float:
         """Length of the noise on where the head is asked from, in spacings of the training cameras."""
-        return self.config.view_noise * (NOISE_OF_FEW_VIEWS if self.has_few_views else 1.0)
+        return self.config.view_noise / self.trust
 
     def _initial_splats(self) -> dict[str, Parameter]:
         """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
@@ -517,7 +518,7 @@ class NrfgsModel(SplatfactoModel):
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
         self.densification.see_cameras(centers)
-        self.densification.see_training_views(ComparedViews(self, attributes.pipeline.datamanager))
+        self.densification.see_training_views(TrainingPictures(self, attributes.pipeline.datamanager))
         self.camera_spacing = camera_spacing(centers)
         sigma = self.noise_factor * self.camera_spacing / math.sqrt(3.0)
         self.view_noise = ViewNoise(sigma, self.view_noise.seed)
@@ -548,17 +549,9 @@ class NrfgsModel(SplatfactoModel):
         """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
         self._scheduled = step
 
-    def begin_step(self, share: float, is_stretched: bool) -> None:
-        """A training step begins.
-
-        Args:
-            share: of the training that is over, in [0, 1].
-            is_stretched: whether its schedules are stretched to its steps.
-        """
-        begins = self.config.head_from
-        if begins is None:
-            begins = HEAD_FROM if is_stretched and self.num_train_data < MANY_VIEWS else 0.0
-        self.head_has_begun = self.head_has_begun or share >= begins  # and goes on in a longer training
+    def begin_step(self, share: float) -> None:
+        """A training step begins, when this share of the training, in [0, 1], is over."""
+        self.head_has_begun = self.head_has_begun or share >= self.config.head_from  # and goes on in a longer training
         self.head_rests = not self.head_has_begun
 
     def step_post_backward(self, step: int) -> None:
@@ -590,10 +583,10 @@ class NrfgsModel(SplatfactoModel):
     def shrinking(self) -> dict[str, Tensor]:
         """What `shrinkage` adds to the loss."""
         weight = self.config.shrinkage / max(self.num_train_data, 1) ** 2
-        if weight == 0.0 or self.num_train_data >= MANY_VIEWS or self.config.densification == "mcmc":
+        if weight == 0.0 or self.config.densification == "mcmc":
             return {}
         return {
-            "shrink_opacities": weight * torch.sigmoid(self.gauss_params["opacities"]).mean(),
+            "shrink_opacities": weight * self.densification.mean_opacity(self.gauss_params["opacities"]),
             "shrink_scales": weight / self.scene_unit * self.gauss_params["scales"].exp().mean(),
         }
 
@@ -699,6 +692,7 @@ class NrfgsModel(SplatfactoModel):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         written_by = state.get("densification", "splatfacto")  # older checkpoints do not say
+        written_by = RETIRED.get(written_by, written_by)
         if written_by != self.densification.name:
             raise InputError(
                 f"The checkpoint was trained with --pipeline.model.densification {written_by}, this model with "

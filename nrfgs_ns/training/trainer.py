@@ -144,10 +144,10 @@ class NrfgsTrainer(Trainer):
                 f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
             )
         if model.view_noise.sigma > 0.0:
-            chosen.append(f"the head sees each splat from about {model.noise_factor:g} of that beside the camera")
-        if model.has_few_views and model.reduced_head:
-            options = ", ".join(f"{name} {value}" for name, value in model.reduced_head.items())
-            chosen.append(f"views are few, so the head has {options}")
+            chosen.append(f"the head sees each splat from about {model.noise_factor:.2g} of that beside the camera")
+        if model.trust < 1.0 and model.reduced_head:
+            options = ", ".join(f"{name} {value:.2g}" for name, value in model.reduced_head.items())
+            chosen.append(f"they trust it with {model.trust:.2g}, so that it has {options}")
         if chosen:
             apart = model.camera_spacing / model.scene_unit
             CONSOLE.print(
@@ -315,7 +315,7 @@ class NrfgsTrainer(Trainer):
         if pace is not None:
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
-        model.begin_step(step / self.total_steps if pace is None else pace.position / pace.length, pace is not None)
+        model.begin_step(step / self.total_steps if pace is None else pace.position / pace.length)
         with self._last_good_state_on_disk():
             self.guard.begin(step, self.optimizers)
             loss, losses, metrics = super().train_iteration(step)

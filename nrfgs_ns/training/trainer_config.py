@@ -13,6 +13,7 @@ from pkgutil import resolve_name
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from nrfgs_ns.densification.thinning import ROUNDS
 from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.cpu_command import ten_minute_command
@@ -74,12 +75,7 @@ class NrfgsTrainerConfig(TrainerConfig):
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise InputError(f"{name} is {value}; it must be zero or positive.")
-        if devices > 1 and self.pipeline.model.densification == "consistent":
-            raise InputError(
-                "pipeline.model.densification is 'consistent', which is for one device: it compares whole pictures "
-                "with their photographs, and here each device has a part of the splats. Use 'splatfacto', 'original' "
-                "or 'mcmc', or --machine.num-devices 1."
-            )
+        self._check_thinning(devices)
         scale = self.pipeline.datamanager.camera_res_scale_factor
         if not 0 < scale < math.inf:
             raise InputError(f"pipeline.datamanager.camera_res_scale_factor is {scale}; it must be positive.")
@@ -88,6 +84,25 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"pipeline.model.warmup_steps is {warmup}; it must be zero or positive.")
         if self.load_dir is not None:
             checkpoint_files.checkpoints_in(self.load_dir)
+
+    def _check_thinning(self, devices: int) -> None:
+        """Raise InputError where splats are to go that will not."""
+        model = self.pipeline.model
+        if model.keep == 1.0 or model.densification == "mcmc":  # which refuses it itself
+            return
+        if devices > 1:
+            raise InputError(
+                f"pipeline.model.keep is {model.keep}, which is for one device: it compares whole pictures, and here "
+                "each device has a part of the splats. Use 1, or --machine.num-devices 1."
+            )
+        length = self.schedule_steps or self.max_num_iterations or STEPS
+        last = ROUNDS[-1] * model.stop_split_at
+        if last >= length:
+            raise InputError(
+                f"pipeline.model.keep is {model.keep}, but the last splats go at step {last:.0f} of {length}: "
+                f"pipeline.model.stop_split_at is {model.stop_split_at}. Make that smaller, or stretch the schedule to "
+                f"the training with --schedule-steps {STEPS}."
+            )
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
         """The configuration with what is left open chosen: steps, schedules and mean of a training on one device."""

@@ -19,6 +19,7 @@ from viser.transforms import SO3
 
 from nrfgs_ns.viewer.pictures import FULL, LEGENDS, Shown, modes, offered_components, picture
 from nrfgs_ns.viewer.server import protect
+from nrfgs_ns.viewer.start import open_sooner
 
 if TYPE_CHECKING:
     from nrfgs_ns.model.model import NrfgsModel
@@ -42,6 +43,7 @@ class ViewerPanel(ViewerControl):
 
     def __init__(self, model: "NrfgsModel"):
         protect()
+        open_sooner()
         self.model = model
         self.background: Tensor | None = None
         """the viewer's background colour, [3]"""

@@ -8,11 +8,11 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from torch.nn import Parameter
 
-from nrfgs_ns.densification import Seen, build_densification
+from nrfgs_ns.densification import build_densification
 from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.run import parse
 
-STRATEGIES = ("splatfacto", "original", "consistent", "mcmc")
+STRATEGIES = ("splatfacto", "original", "mcmc")
 REFINES = 1000
 """A step at which every strategy refines by default: more than 8 images + 100 steps after the reset at 0."""
 
@@ -76,8 +76,6 @@ class Table:
     ) -> None:
         """One training step; the splats in `seen` have the effective opacity `shown`, or what it makes of the stored
         ones, which it is given as heads compute them."""
-        if strategy.name == "consistent" and strategy.views is None:
-            strategy.see_training_views(AllWrong(self))
         info = self.info(gradient)
         rows = info["gaussian_ids"][seen]
         logits = self.splats["opacities"]
@@ -96,37 +94,6 @@ class Table:
         assert torch.isfinite(torch.cat([value.detach().flatten() for value in self.splats.values()])).all()
 
 
-class AllWrong:
-    """Views to which each splat of a table is as wrong as the others: what remains are splatfacto's rules."""
-
-    def __init__(self, table: Table):
-        self.table = table
-
-    def __len__(self) -> int:
-        return 8
-
-    def look(self, index: int, wrong: float) -> Seen:
-        many = torch.full((len(self.table),), 100.0)
-        return Seen(torch.arange(len(self.table)), many, many, torch.tensor(1.0))
-
-
-class Views:
-    """Training views that say of `count` splats what `wrong` [V, count] and `pixels` [V, count] have."""
-
-    def __init__(self, wrong: torch.Tensor, pixels: torch.Tensor | None = None, losses: torch.Tensor | None = None):
-        self.wrong, self.asked = wrong, []
-        self.pixels = torch.ones_like(wrong) if pixels is None else pixels
-        self.losses = torch.ones(len(wrong)) if losses is None else losses
-
-    def __len__(self) -> int:
-        return len(self.wrong)
-
-    def look(self, index: int, wrong: float) -> Seen:
-        self.asked.append(index)
-        rows = self.pixels[index].nonzero()[:, 0]
-        return Seen(rows, self.pixels[index, rows], self.wrong[index, rows], self.losses[index])
-
-
 def strategy(name: str, images: int = 8, **options):
     return build_densification(NrfgsModelConfig(densification=name, **options), images)
 
@@ -135,7 +102,7 @@ def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **mod
     """ns-train's command line: refinement every 4th step."""
     options = {"densification": densification, "warmup-length": 2, "refine-every": 4, "num-downscales": 0}
     options |= {"few-views": "off", **model}
-    if densification in ("splatfacto", "consistent"):
+    if densification == "splatfacto":
         options |= {"densify-grad-thresh": 1e-6, "reset-alpha-every": 6}
     words = [word for name, value in options.items() for word in (f"--pipeline.model.{name}", str(value))]
     words += ["--max-num-iterations", str(steps), "--output-dir", str(out), "--vis", "tensorboard"]

@@ -9,7 +9,6 @@ from densification_cases import REFINES, STRATEGIES, Table, strategy
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import (
-    ConsistentDensification,
     McmcDensification,
     OriginalDensification,
     build_densification,
@@ -133,16 +132,12 @@ def test_constants_are_those_of_the_papers():
         ({"densification": "mcmc", "cull_alpha_thresh": 0.005}, "cull_alpha_thresh"),
         ({"densification": "original", "densify_grad_thresh": 1e-6}, "densify_grad_thresh"),
         ({"densification": "original", "use_absgrad": False}, "use_absgrad"),
+        ({"densification": "mcmc", "keep": 0.5}, "keep has no effect"),
         ({"splat_budget": 200_000}, "splat_budget has no effect with the densification 'splatfacto'"),
         ({"densification": "original", "splat_budget": 200_000}, "splat_budget has no effect"),
         ({"original": OriginalDensification(prune_opacity=0.01)}, "original has no effect"),
         ({"densification": "mcmc", "original": OriginalDensification(prune_opacity=0.01)}, "original has no effect"),
         ({"densification": "original", "mcmc": McmcDensification(stop_at=100)}, "mcmc has no effect"),
-        ({"consistent": ConsistentDensification(views=3)}, "consistent has no effect with the densification 'splatf"),
-        ({"densification": "consistent", "consistent": ConsistentDensification(views=0)}, "consistent.views is 0"),
-        ({"densification": "consistent", "consistent": ConsistentDensification(wrong=1.0)}, "consistent.wrong is 1.0"),
-        ({"densification": "consistent", "consistent": ConsistentDensification(grow_pixels=-1)}, "grow_pixels is -1"),
-        ({"densification": "consistent", "consistent": ConsistentDensification(prune_score=2)}, "prune_score is 2"),
     ],
 )
 def test_options_that_cannot_work_are_refused(options, says):
@@ -155,7 +150,6 @@ def test_options_that_cannot_work_are_refused(options, says):
     [
         {"densification": "original", "original": OriginalDensification(prune_opacity=0.01)},
         {"densification": "mcmc", "mcmc": McmcDensification(stop_at=100), "splat_budget": 7},
-        {"densification": "consistent", "consistent": ConsistentDensification(views=3), "cull_alpha_thresh": 0.05},
     ],
 )
 def test_options_of_the_strategy_itself_are_not_refused(options):

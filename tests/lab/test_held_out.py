@@ -41,6 +41,11 @@ def test_a_made_capture_has_no_test_view_and_the_same_cameras_at_half_the_size(t
         assert image.size == (made["w"], made["h"])
     assert not (tmp_path / "out" / "tiny" / names[0]).exists()
 
+    make(tmp_path / "captures", tmp_path / "thin", offset=2, views=2)
+    thin = json.loads((tmp_path / "thin" / "tiny" / "transforms.json").read_text())
+    left = made["train_filenames"]
+    assert thin == {**made, "train_filenames": [left[0], left[len(left) // 2]]}
+
     (source / "transforms.json").write_text(json.dumps({**whole, "train_filenames": []}))
     with pytest.raises(InputError, match="train_filenames"):
         make(tmp_path / "captures", tmp_path / "out")

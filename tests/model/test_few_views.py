@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What keeps a head from learning few views by heart: a late start, a smaller head, and shrinkage."""
+"""What keeps a head from learning few views by heart: trust by their number, shrinkage, and a late start."""
 
 import pytest
 import torch
@@ -46,38 +46,24 @@ def test_a_head_that_learns_goes_on_in_a_longer_training(tiny_scene, tmp_path, n
     assert not trainer.pipeline.model.head_rests
 
 
-def test_many_views_have_no_late_start_and_no_shrinkage(tiny_scene, tmp_path, no_cuda, monkeypatch):
-    monkeypatch.setattr("nrfgs_ns.model.model.MANY_VIEWS", 8)
-    trainer = ready(tiny_scene, tmp_path, 5, {"--schedule-steps": 50})
-    trainer.train_iteration(0)
-    assert trainer.pipeline.model.num_train_data == 8
-    assert not trainer.pipeline.model.head_rests and trainer.pipeline.model.shrinking() == {}
-
-
-def test_it_rests_by_itself_where_schedules_are_stretched(tiny_scene, tmp_path, no_cuda):
-    for stretched, rests in (({}, False), ({"--schedule-steps": 50}, True)):
-        trainer = ready(tiny_scene, tmp_path, 5, stretched)
-        trainer.train_iteration(0)
-        assert trainer.pipeline.model.head_rests is rests
-
-
 @pytest.mark.parametrize("share", [-0.1, 1.0])
 def test_a_share_out_of_range_is_refused(share, tiny_scene, tmp_path, no_cuda):
     with pytest.raises(InputError, match=f"head_from is {share}"):
         ready(tiny_scene, tmp_path, 1, {"--pipeline.model.head-from": share})
 
 
-def test_few_views_have_a_smaller_head_and_longer_noise(tiny_scene, tmp_path, no_cuda, capsys):
+def test_the_fewer_the_views_the_less_the_head_is_trusted(tiny_scene, tmp_path, no_cuda, capsys):
     model = ready(tiny_scene, tmp_path / "few", 1).pipeline.model
-    assert (model.head.config.num_bands, model.head.config.opacity_residual) == (1, False)
-    assert model.head.high is None and model.noise_factor == 1.0
-    assert "views are few, so the head has num_bands 1, opacity_residual False" in capsys.readouterr().out
+    trust = 8 / 28
+    assert model.num_train_data == 8 and model.trust == trust
+    assert model.head.config == NrfConfig(opacity_scale=trust * 0.2) and model.noise_factor == 0.5 / trust
+    assert "they trust it with 0.29, so that it has opacity_scale 0.057" in capsys.readouterr().out
     model = ready(tiny_scene, tmp_path / "many", 1, {"--pipeline.model.few-views": "off"}).pipeline.model
     assert model.head.config == NrfConfig() and model.noise_factor == 0.5
 
 
 def test_a_checkpoint_keeps_its_head_whatever_the_number_of_views(tiny_scene, tmp_path, no_cuda):
-    for kept, asked in (("on", "off"), ("off", "on")):
+    for kept, asked in (("auto", "off"), ("off", "auto")):
         config = trained(
             command_line("nrfgs", tiny_scene, tmp_path / kept, 2, QUICK, {"--pipeline.model.few-views": kept})
         )
@@ -85,16 +71,39 @@ def test_a_checkpoint_keeps_its_head_whatever_the_number_of_views(tiny_scene, tm
         state = {name.removeprefix("_model."): value for name, value in state.items() if name.startswith("_model.")}
         other = ready(tiny_scene, tmp_path / "other", 1, {"--pipeline.model.few-views": asked}).pipeline.model
         other.load_state_dict(state)
-        assert (other.head.high is None) == (kept == "on")
+        assert (other.head.config.opacity_scale == 0.2) == (kept == "off")
         assert_close(other.head.state_dict()["low.0.weight"], state["head.low.0.weight"])
 
 
-def test_only_a_field_has_less_to_say_of_few_views():
-    few = NrfConfig(latent_dim=8).for_few_views()
-    assert differences(NrfConfig(latent_dim=8), few) == {"num_bands": 1, "opacity_residual": False}
-    told = {"_extra_state": {"capacity": {"head": differences(NrfConfig(latent_dim=8), few)}}}
-    assert reduced_config(NrfConfig(latent_dim=8), told) == few
-    assert ShConfig().for_few_views() == ShConfig()
+@pytest.mark.parametrize("bands", [3, 1])
+def test_a_training_goes_on_with_the_head_that_it_had(bands, tiny_scene, tmp_path, no_cuda, capsys):
+    """Whatever version wrote the checkpoint: one without a head for few views, or one with fewer bands there."""
+    whole = {"--pipeline.model.few-views": "off", "--pipeline.model.appearance.num-bands": bands}
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "old", 2, QUICK, whole))
+    checkpoint = next(models_of(config).glob("*.ckpt"))
+    content = torch.load(checkpoint, weights_only=True)
+    extra = content["pipeline"]["_model._extra_state"]
+    if bands < 3:
+        extra["capacity"] = {"head": {"num_bands": bands}}
+    content["pipeline"]["_extra_state"].pop("checksum")
+    content["training"].pop("options")
+    torch.save(content, checkpoint)
+    trainer = ready(tiny_scene, tmp_path / "new", 4, {"--load-dir": models_of(config)})
+    model = trainer.pipeline.model
+    assert model.head.config == NrfConfig(num_bands=bands)
+    weights = [weight.detach().clone() for weight in model.head.parameters()]
+    trainer.train_iteration(2)
+    assert not any(map(torch.equal, model.head.parameters(), weights)), "the optimiser holds others"
+
+
+def test_only_a_field_can_be_trusted_less():
+    less = NrfConfig(latent_dim=8).trusted(0.5)
+    assert differences(NrfConfig(latent_dim=8), less) == {"opacity_scale": 0.1}
+    told = {"_extra_state": {"capacity": {"head": {"opacity_scale": 0.1}}}}
+    assert reduced_config(NrfConfig(latent_dim=8), told) == less
+    assert ShConfig().trusted(0.5) == ShConfig()
+    alone = NrfConfig(opacity_residual=False)
+    assert alone.trusted(0.5) == alone
 
 
 def test_shrinkage_falls_with_the_square_of_the_number_of_views(tiny_scene, tmp_path, no_cuda):
@@ -103,5 +112,13 @@ def test_shrinkage_falls_with_the_square_of_the_number_of_views(tiny_scene, tmp_
     terms = model.shrinking()
     assert_close(terms["shrink_opacities"], 0.5 / views**2 * torch.sigmoid(table["opacities"]).mean())
     assert_close(terms["shrink_scales"], 0.5 / views**2 * table["scales"].exp().mean() / model.scene_unit)
+    rows = torch.tensor([0, 2])
+    shown = torch.tensor([0.9, 0.8], requires_grad=True)
+    model.densification.pre_backward(10**6, {"gaussian_ids": rows}, shown, table["opacities"])
+    stored = torch.sigmoid(table["opacities"]).flatten()
+    term = model.shrinking()["shrink_opacities"]
+    assert_close(term, 0.5 / views**2 * (stored.sum() - stored[rows].sum() + 1.7) / len(stored))
+    by_logit = torch.autograd.grad(term, table["opacities"])[0].flatten()
+    assert by_logit[1] > 0.0 and by_logit[rows].abs().max() < 1e-9, "a head that adds opacity is paid for it"
     model.config.densification = "mcmc"  # which has terms of its own
     assert model.shrinking() == {}

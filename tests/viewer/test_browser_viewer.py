@@ -73,36 +73,37 @@ def test_every_mode_of_a_running_training(browser, training):
     page.page.get_by_text("Pause Training").click()
     page.hide_cameras()
     at_pause = page.step()
+    page.set_resolution(164)  # so that the full size comes soon behind the small one
 
     # What is on the screen is some steps old: the viewer does not render each, and not the last.
     page.show(BASE)
-    stale = page.sharp()
+    stale = page.settled()
     page.show(FULL)
-    pictures = {FULL: page.sharp(unlike=stale)}
+    pictures = {FULL: page.settled(unlike=stale)}
     for mode, before in zip(MODES[1:], MODES, strict=False):
         page.show(mode)
-        pictures[mode] = page.sharp(unlike=pictures[before])
+        pictures[mode] = page.settled(unlike=pictures[before])
     for one, other in combinations(MODES, 2):
         assert different(pictures[one], pictures[other]), (one, other)
 
     page.show(FULL)
-    assert not different(page.sharp(unlike=pictures[DEPTH]), pictures[FULL])
+    assert not different(page.settled(unlike=pictures[DEPTH]), pictures[FULL])
     page.set_gain(0)
-    assert not different(page.sharp(unlike=pictures[FULL]), pictures[BASE])
+    assert not different(page.settled(unlike=pictures[FULL]), pictures[BASE])
     page.set_gain(2)
-    doubled = page.sharp(unlike=pictures[BASE])
+    doubled = page.settled(unlike=pictures[BASE])
     assert different(doubled, pictures[FULL])
     page.set_gain(1)
-    page.sharp(unlike=doubled)
+    page.settled(unlike=doubled)
 
     page.show("residual")
-    page.sharp(unlike=pictures[FULL])
+    page.settled(unlike=pictures[FULL])
     page.control("Freeze view").check()
-    page.sharp()
+    page.settled()
     page.turn()
-    frozen = page.sharp(unlike=pictures["residual"])
+    frozen = page.settled(unlike=pictures["residual"])
     page.control("Freeze view").uncheck()
-    page.sharp(unlike=frozen)
+    page.settled(unlike=frozen)
 
     page.page.get_by_text("Resume Training").click()
     deadline = time.time() + PATIENCE

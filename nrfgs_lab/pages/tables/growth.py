@@ -1,61 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of growth that several views confirm, in docs/bench.md."""
+"""The tables of thinning in docs/bench.md: which splats may go once growth has ended, and what that costs or gains."""
 
-from collections import defaultdict
 from statistics import fmean, median
 from typing import Any
 
 from nrfgs_lab.pages.tables import grid, records, signed
 
-COUNTED = {"consistent": "of the photograph", "consistent, pixels as rendered": "as rendered"}
-"""Trials, and which pixels they count."""
 ON_BONSAI = {
     "splatfacto": "`splatfacto`",
-    "splatfacto, gradient 1.6e-3": "`splatfacto`, `densify-grad-thresh` doubled",
-    "splatfacto, gradient 2.4e-3": "the same, tripled",
-    "consistent, wrong 0.05": "`consistent`, `wrong` 0.05",
-    "consistent": "`consistent`",
-    "consistent, 0.5 pixels": "`consistent`, `grow-pixels` 0.5",
+    "splatfacto, gradient 1.6e-3": "`densify-grad-thresh` doubled",
+    "consistent": "growth that several views confirm (FastGS's rule)",
+    "keep 0.5, by the largest share": "`keep 0.5`, three rounds, by the largest share of a view's pixels",
+    "keep 0.5, by shares": "the same, by the shares of all views",
+    "keep 0.5, at once": "`keep 0.5` in one round",
+    "keep 0.5, three rounds": "in three rounds",
+    "keep 0.5": "in six rounds",
+    "keep 0.35, from growth on": "`keep 0.35` in five, the first two while splats grow",
+    "keep 0.35, three rounds": "`keep 0.35` in three rounds",
+    "4e-4, keep 0.25, three rounds": "`densify-grad-thresh` halved, `keep 0.25` in three rounds",
 }
 """Trials, and what they are called."""
+FEW = {
+    "keep 0.5, three rounds": "`keep 0.5`, three rounds",
+    "keep 0.5, three rounds, without the best view": "the same; the view that misses a splat most does not count",
+    "without splats of one view": "without splats that are one view's alone",
+}
+SCENES = "castle", "kitchen", "fern", "fox", "goldcape", "caliterra"
+HEADS = {"nrfgs": "field", "nrfgs-sh": "harmonics"}
 
 
-def _trials(trial: str) -> dict[str, dict[Any, dict[str, Any]]]:
-    """Records of the field on held-out training views: scene -> first held-out view -> record."""
-    found: dict[str, dict[Any, dict[str, Any]]] = defaultdict(dict)
-    for one in records("growth").values():
-        if (one["method"], one["trial"]) == ("nrfgs", trial):
-            found[one["scene"]][one["offset"]] = one
-    return found
+def _trial(method: str, trial: str, scene: str) -> dict[str, Any] | None:
+    return records("growth").get(f"{method}/{trial}/{scene}-4")
 
 
 def bonsai() -> str:
-    """What bonsai needs, by the rule that splats grow by."""
+    """Splats, PSNR and SSIM on bonsai, of the field and of harmonics."""
     body = []
     for trial, label in ON_BONSAI.items():
-        one = _trials(trial)["bonsai"][4]
-        body.append([label, f"{one['splats'] / 1000:.0f}k", f"{one['psnr']:.2f}", f"{one['ssim']:.4f}"])
-    return grid(["`bonsai`, held-out views", "splats", "PSNR", "SSIM"], body)
+        cells = []
+        for method in HEADS:
+            one = _trial(method, trial, "bonsai")
+            cells += [""] * 2 if one is None else [_thousands(one), f"{one['psnr']:.2f} / {one['ssim']:.4f}"]
+        body.append([label, *cells])
+    return grid(["`bonsai`, held-out views", "splats", "field", "splats", "harmonics"], body)
 
 
 def captures() -> str:
-    """What the rule gains over splatfacto's on each capture."""
-    base, body, done = _trials("splatfacto"), [], set()
-    for trial, counted in COUNTED.items():
-        for scene, trials in sorted(_trials(trial).items()):
-            if scene in done:
-                continue
-            done.add(scene)
-            pairs = [(one, base[scene][offset]) for offset, one in trials.items()]
-            views = [both for pair in pairs for both in zip(*_by_name(*pair), strict=True)]
-            gains = [new[1] - old[1] for new, old in views]
-            ssim = 1000 * fmean(new[2] - old[2] for new, old in views)
-            ratio = fmean(one["splats"] / other["splats"] for one, other in pairs)
-            cells = [signed(fmean(gains), 2), signed(median(gains), 2), signed(ssim, 1), f"{ratio:.2f}"]
-            body.append([f"`{scene}`", counted, str(len(gains)), *cells])
-    return grid(["", "pixels", "held-out views", "dB, mean", "median", "SSIM x 1000", "splats, ratio"], body)
+    """What trials gain over splatfacto's rules on captures of few views: median dB and mean SSIM."""
+    body = []
+    for method, head in HEADS.items():
+        for trial, label in FEW.items():
+            cells = [_gain(_trial(method, trial, scene), _trial(method, "splatfacto", scene)) for scene in SCENES]
+            body.append([f"{head}: {label}", *cells])
+    return grid(["", *(f"`{scene}`" for scene in SCENES)], body)
 
 
-def _by_name(*found: dict[str, Any]) -> list[list[list]]:
-    """The values of each record's views, in one order."""
-    return [sorted(one["per_image"]) for one in found]
+def _thousands(record: dict[str, Any]) -> str:
+    return f"{record['splats'] / 1000:.0f}k"
+
+
+def _gain(new: dict[str, Any] | None, old: dict[str, Any] | None) -> str:
+    if new is None or old is None:
+        return ""
+    views = list(zip(sorted(new["per_image"]), sorted(old["per_image"]), strict=True))
+    gain = median(one[1] - other[1] for one, other in views)
+    ssim = 1000 * fmean(one[2] - other[2] for one, other in views)
+    return f"{signed(gain, 2)} / {signed(ssim, 1)} / {new['splats'] / old['splats']:.2f}"

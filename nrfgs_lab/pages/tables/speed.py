@@ -110,6 +110,11 @@ def first_sight() -> str:
     return grid(["", "seconds", "since the command"], body)
 
 
+def imports(which: str = "seconds") -> str:
+    """Processor seconds that a nerfstudio command's imports take: as it is, or without what nrfgs_ns/start.py does."""
+    return f"{records('start_up')[which]:.1f}"
+
+
 PARTS = {
     "whole": "as it is",
     "without lists": "gsplat's lists of what tiles draw",

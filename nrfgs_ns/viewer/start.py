@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What makes nerfstudio's viewer open sooner; a training waits for it before its first step.
+
+Nerfstudio decodes all photographs once more, at full size as float32, to show each 100 pixels high where it was taken.
+Viser reads its archive of icons through for every button.
+"""
+
+import functools
+import tarfile
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.viewer.viewer import Viewer
+from torch import Tensor
+from viser import _gui_api, _gui_handles, _icons
+
+from nrfgs_ns.data.pictures import open_picture
+
+SIDE = 100
+"""Pixels of the shorter side as shown."""
+
+
+def open_sooner() -> None:
+    """Open all viewers of this process sooner from now on."""
+    if _gui_api.svg_from_icon is not icon:
+        _gui_api.svg_from_icon = _gui_handles.svg_from_icon = icon
+        Viewer.init_scene = _with_small_photographs(Viewer.init_scene)
+
+
+@functools.cache
+def icon(name: str) -> str:
+    """The SVG of an icon, as `viser._icons.svg_from_icon` gives it."""
+    with _ARCHIVE_LOCK:
+        return _archive().extractfile(f"{name}.svg").read().decode("utf-8")
+
+
+_ARCHIVE_LOCK = threading.Lock()
+
+
+@functools.cache
+def _archive() -> tarfile.TarFile:
+    return tarfile.open(_icons.ICONS_DIR / "tabler-icons.tar")
+
+
+class SmallPhotographs:
+    """Of a data set what the viewer needs: cameras and small photographs.
+
+    Args:
+        dataset: nerfstudio's.
+        read: photographs that have been read, with "image" [H, W, 3 or 4]; None: the files give small ones.
+    """
+
+    def __init__(self, dataset: InputDataset, read: Sequence[Mapping[str, Any]] | None):
+        self.cameras = dataset.cameras
+        self._paths, self._read = dataset.image_filenames, read
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        """A photograph as "image" [h, w, 3], float32 in 0..1, at least SIDE pixels to a side if it has them."""
+        if self._read is not None:
+            image = self._read[index]["image"]
+        else:
+            with open_picture(self._paths[index]) as picture:
+                picture.draft("RGB", (SIDE, SIDE))  # a JPEG has an eighth, a quarter and a half of itself ready
+                image = torch.from_numpy(np.array(picture.convert("RGB")))
+        stride = max(min(image.shape[:2]) // SIDE, 1)
+        small = image[::stride, ::stride, :3].cpu()
+        return {"image": small.float() / 255 if small.dtype == torch.uint8 else small}
+
+
+def _with_small_photographs(init_scene):
+    """Nerfstudio's `Viewer.init_scene`, whose photographs come small."""
+
+    @functools.wraps(init_scene)
+    def init_small_scene(self, train_dataset, *args, **options) -> None:
+        read = vars(self.pipeline.datamanager).get("cached_train")  # read by now, or not at all
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # so little work takes several threads, on a busy machine, ten times as long
+        try:
+            init_scene(self, SmallPhotographs(train_dataset, read), *args, **options)
+        finally:
+            torch.set_num_threads(threads)
+
+    return init_small_scene
