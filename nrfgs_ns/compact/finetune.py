@@ -34,13 +34,12 @@ NOISY = 0.3
 RATES = {"means": 1.6e-6, "turns": 5e-4, "scales": 2e-3, "opacities": 1e-2, "colors": 7e-4, "latents": 4e-3}
 """Learning rates of the tables; the means' in scene units, the latents' in standard deviations of the strongest."""
 STEPS_RATE, DENSITY_RATE, FIELD_RATE = 3e-2, 2e-2, 5e-4
-PRUNINGS = (0.05, 0.15, 0.25, 0.35)
-"""When splats go, in shares of the steps."""
-WORTH = 0.1
-"""What a splat's bytes cost, over what the loss grows without it alone: far below 1, because those that hide behind
-each other go together."""
-GROWTH = 2.0
-"""Of it from one pruning to the next: those that matter least go first, and the others learn to stand in for them."""
+PRUNINGS = (0.08, 0.16, 0.24, 0.32)
+"""When splats go, in shares of the steps. Each time one of so many in the file's order is asked: neighbours, which hide
+behind each other, must not go together."""
+WORTH = 0.5
+"""What a splat's bytes cost, over what the loss grows without it: below 1, because some that hide behind each other go
+together all the same."""
 LAST = 0.03
 """Of the learning rates, at the end; they fall by a cosine."""
 
@@ -214,7 +213,8 @@ def fine_tune(
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: LAST + (1 - LAST) * 0.5 * (1 + np.cos(np.pi * min(step / steps, 1.0)))
     )
-    prunings = {round(share * steps): WORTH / GROWTH**k for k, share in enumerate(reversed(PRUNINGS))}
+    prunings = [round(share * steps) for share in PRUNINGS]
+    turns = torch.arange(count, device=coded.diffuse.device) % max(len(prunings), 1)
     was_training = model.training
     model.train()
     try:
@@ -222,10 +222,12 @@ def fine_tune(
             if step in prunings:
                 with torch.no_grad():
                     tables = coded(rounded=True)
-                    dear = coded.bits(tables) * (prunings[step] * rate / (BYTE * count))
+                    dear = coded.bits(tables) * (WORTH * rate / (BYTE * count))
                 growth, loss = without_them(model, Field(head, coded.splats(tables)), map(next_view, range(views)))
                 # The training's loss is about the root of the squared error.
-                coded.keep(0.5 * loss * growth > dear, optimizer)
+                kept = (turns != prunings.index(step)) | (0.5 * loss * growth > dear)
+                coded.keep(kept, optimizer)
+                turns = turns[kept]
             camera, batch = next_view(step)
             tables = coded(rounded=step >= NOISY * steps)
             splats = coded.splats(tables)
