@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each of the step's own kernels saves, and how a step and a frame of methods compare.
+"""What each of the step's own kernels and its CUDA graph save, and how a step and a frame of methods compare.
 
     python -m nrfgs_lab.timing.step_parts --scene SCENES/bonsai --splats 250000 --out step_parts.json
 
@@ -41,12 +41,16 @@ from nrfgs_ns.training.run import machine, parse
 GATES: dict[str, Gate] = {"lists": gsplat_cuda._GATE, "adam": optimizers._GATE, "statistics": growth._GATE}
 VARIANTS: dict[str, tuple[str, ...]] = {
     "whole": (),
-    "without lists": ("lists",),
-    "without adam": ("adam",),
-    "without statistics": ("statistics",),
-    "without all": tuple(GATES),
+    "without graph": ("graph",),
+    "without graph, lists": ("graph", "lists"),
+    "without graph, adam": ("graph", "adam"),
+    "without graph, statistics": ("graph", "statistics"),
+    "without all": ("graph", *GATES),
+    "at rest: whole": (),
+    "at rest: without graph": ("graph",),
+    "at rest: without all": ("graph", *GATES),
 }
-"""Variants of a step -> the parts that are closed."""
+"""Variants of a step -> the parts that are closed. At rest nothing is remembered for densification."""
 NEVER = 10**9
 
 
@@ -60,6 +64,8 @@ class StepParts:
     """JSON file of the results"""
     methods: tuple[str, ...] = ("nrfgs", "nrfgs-sh")
     """methods that densify as splatfacto does"""
+    variants: tuple[str, ...] = tuple(VARIANTS)
+    """what is timed of a step"""
     splats: int = 250_000
     """of each method; fewer, if it has fewer after `grow` steps"""
     grow: int = 1500
@@ -95,7 +101,7 @@ class StepParts:
 
     def measure(self, method: str) -> tuple[list[dict[str, Any]], tuple[Any, dict[str, list]]]:
         """Train a method and time its variants; the model is there afterwards, with test cameras by their size."""
-        variants = list(VARIANTS.items())
+        variants = [(name, VARIANTS[name]) for name in self.variants]
         length = 5 + self.steps + self.traced + 1  # the first few of a variant are not timed
         begin = self.grow + self.settle
         args = [method, "--max-num-iterations", str(begin + length * len(variants) + 1), "--vis", "tensorboard"]
@@ -110,7 +116,7 @@ class StepParts:
             _set_random_seed(config.machine.seed)
             trainer = config.setup(local_rank=0, world_size=1)
             trainer.setup()
-            model = trainer.pipeline.model
+            model, graphs = trainer.pipeline.model, trainer.pipeline.graphs
             watch: list[Any] = []
 
             def after(step: int) -> None:
@@ -122,7 +128,8 @@ class StepParts:
                     return
                 name, closed = variants[which]
                 if at == 0:
-                    model.densification.strategy.refine_stop_iter = NEVER
+                    model.densification.strategy.refine_stop_iter = 0 if "at rest" in name else NEVER
+                    trainer.pipeline.graphs = None if "graph" in closed else graphs
                     closing.enter_context(shut(closed))
                 if at in (5, 5 + self.steps):
                     torch.cuda.synchronize()
@@ -136,7 +143,7 @@ class StepParts:
                     start, end, traced = watch
                     watch.clear()
                     closing.close()
-                    row = {"variant": name, "splats": model.num_points}
+                    row = {"variant": name, "splats": model.num_points, "recorded": bool(graphs._graphs)}
                     rows.append({**row, "step_ms": 1e3 * (end - start) / self.steps, **kernels(traced, self.traced)})
 
             trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after))
@@ -144,6 +151,7 @@ class StepParts:
                 trainer.train()
         model.eval()
         own = [camera for camera, _ in trainer.pipeline.datamanager.fixed_indices_eval_dataloader]
+        trainer.pipeline.graphs = None
         gc.collect()
         return rows, (model, {"own": own, "1080p": [at_size(camera, *FULL_HD) for camera in own]})
 
@@ -159,7 +167,7 @@ def keep_only(count: int, model: Any, by_group: Mapping[str, torch.optim.Optimiz
 @contextlib.contextmanager
 def shut(names: tuple[str, ...]) -> Iterator[None]:
     """Leave the work of parts with a gate to gsplat or PyTorch."""
-    gates = [GATES[name] for name in names]
+    gates = [GATES[name] for name in names if name in GATES]
     before = [dict(gate) for gate in gates]
     for gate in gates:
         gate.update(dict.fromkeys(gate, "it is measured without"))

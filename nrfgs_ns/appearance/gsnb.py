@@ -18,7 +18,7 @@ its own for the coefficients (0.005, and 0.005 / 20). These are not the colour m
 resolution schedule, loss and rates, and only the basis network has the reference's optimiser, AdamW at 1e-3.
 """
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -80,6 +80,10 @@ class NeuralBasis(SphericalHarmonics):
     def set_step(self, step: int) -> None:
         super().set_step(step)
         self.ramp = min(step / self.config.ramp_steps, 1.0)
+
+    @property
+    def phase(self) -> Hashable:
+        return super().phase, self.ramp
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         means = splats["means"].index_select(0, visible)

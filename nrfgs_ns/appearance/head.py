@@ -11,7 +11,7 @@ Nothing here knows nerfstudio or the rasterizer.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, NamedTuple
 
@@ -145,6 +145,11 @@ class AppearanceHead(nn.Module, ABC):
 
     def set_step(self, step: int) -> None:  # noqa: B027  (most heads have no schedule)
         """Tell the head which training step it is, for heads that grow with training."""
+
+    @property
+    def phase(self) -> Hashable:
+        """What `set_step` has decided: in steps of one phase the head computes the same."""
+        return None
 
     def try_kernels(self, device: torch.device) -> None:  # noqa: B027  (most heads have none)
         """Find out whether the head's own kernels run on a CUDA device, which compiles them: the first step would."""

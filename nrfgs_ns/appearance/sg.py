@@ -17,7 +17,7 @@ height halfway to the next axis, so that neighbours overlap, and 2 % opposite it
 to itself.
 """
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -89,6 +89,10 @@ class SphericalGaussians(AppearanceHead):
 
     def set_step(self, step: int) -> None:
         self.active = step >= self.config.start_step
+
+    @property
+    def phase(self) -> Hashable:
+        return self.active
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         colors = base_colors(splats["features_dc"].index_select(0, visible))

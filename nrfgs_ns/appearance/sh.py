@@ -6,14 +6,14 @@
 with L growing by one every `degree_interval` steps up to `degree`. Opacity does not depend on the view.
 """
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_opacities
-from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
+from nrfgs_ns.appearance.spherical_harmonics import eval_sh, kernels_run_on, num_bases
 
 
 @dataclass
@@ -50,8 +50,15 @@ class SphericalHarmonics(AppearanceHead):
         rest = torch.zeros(len(rgb), num_bases(self.config.degree) - 1, 3, device=rgb.device)
         return {**super().splat_params(rgb), "features_rest": rest}
 
+    def try_kernels(self, device: torch.device) -> None:
+        kernels_run_on(device)
+
     def set_step(self, step: int) -> None:
         self.active_degree = min(step // self.config.degree_interval, self.config.degree)
+
+    @property
+    def phase(self) -> Hashable:
+        return self.active_degree
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         directions = splats["means"].index_select(0, visible) - camera_centers

@@ -19,6 +19,8 @@ import math
 import torch
 from torch import Tensor
 
+from nrfgs_ns.kernels.trial import Gate
+
 
 def num_bases(degree: int) -> int:
     """Harmonics of degree 0..degree."""
@@ -57,7 +59,7 @@ def sh_bases(degree: int, directions: Tensor) -> Tensor:
 def eval_sh(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
     """Sum of harmonics up to `degree`.
 
-    On CUDA this is gsplat's kernel, elsewhere its torch twin above.
+    On CUDA this is a kernel, `harmonics_triton.py`'s or, where Triton does not run, gsplat's; elsewhere the twin above.
 
     Args:
         degree: highest degree used; coefficients beyond it are ignored.
@@ -66,13 +68,44 @@ def eval_sh(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
 
     Returns:
         [M, 3].
+
+    Raises:
+        RuntimeError: a CUDA graph is being recorded, and gsplat's kernel, which it would miss, is all there is.
     """
     if directions.is_cuda:
+        if (
+            directions.dtype == coefficients.dtype == torch.float32
+            and degree <= 3
+            and kernels_run_on(directions.device)
+        ):
+            from nrfgs_ns.appearance.harmonics_triton import Harmonics
+
+            return Harmonics.apply(degree, directions, coefficients)
+        if torch.cuda.is_current_stream_capturing():
+            raise RuntimeError("gsplat's spherical harmonics cannot be recorded")
         from gsplat import spherical_harmonics  # its kernels are compiled at the first call
 
         return spherical_harmonics(degree, directions, coefficients)
     bases = sh_bases(degree, torch.nn.functional.normalize(directions, dim=-1))
     return torch.einsum("mb,mbc->mc", bases, coefficients[:, : num_bases(degree)])
+
+
+_GATE = Gate("Spherical harmonics")
+
+
+def kernels_run_on(device: torch.device) -> bool:
+    """Whether Triton's kernels run on a CUDA device; tried once, which compiles them."""
+    return _GATE.opens(device, device, lambda: _try_kernels(device))
+
+
+def _try_kernels(device: torch.device) -> None:
+    """Compile and run both kernels on one splat, at each degree; raise whatever goes wrong."""
+    from nrfgs_ns.appearance.harmonics_triton import MAX_DEGREE, Harmonics
+
+    direction = torch.ones(1, 3, device=device, requires_grad=True)
+    for degree in range(MAX_DEGREE + 1):
+        coefficients = torch.ones(1, num_bases(MAX_DEGREE), 3, device=device, requires_grad=True)
+        Harmonics.apply(degree, direction, coefficients).sum().backward()
 
 
 def _recurrence(degree_l: int, m: int) -> float:

@@ -95,6 +95,7 @@ class ViewDirectionFactors(SphericalHarmonics):
         )
 
     def try_kernels(self, device: torch.device) -> None:
+        super().try_kernels(device)
         self.grid.try_kernels(device)
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:

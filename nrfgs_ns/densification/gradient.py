@@ -94,6 +94,13 @@ class GradientDensification(Densification):
     def needs_absgrad(self, step: int) -> bool:
         return self.strategy.absgrad and step < self.strategy.refine_stop_iter
 
+    @property
+    def takes_all_rows(self) -> bool:
+        return self.opacity_seen == "base"
+
+    def rests_at(self, step: int) -> bool:
+        return step >= self.strategy.refine_stop_iter
+
     def see_cameras(self, centers: Tensor) -> None:
         if self.measure_by_cameras:
             spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()

@@ -16,7 +16,7 @@ def take_statistics(state: Mapping[str, Tensor], info: Mapping[str, Any], gradie
 
     Args:
         state: "grad2d" and "count" [N], and "radii" [N] if they are wanted: written to.
-        info: the rasterizer's; M rows.
+        info: the rasterizer's; M rows, those of radius 0 of splats that are not visible.
         gradients: of the loss by the rows' centres, in pixels, [M, 2].
     """
     scales = info["width"] / 2.0 * info["n_cameras"], info["height"] / 2.0 * info["n_cameras"]
@@ -42,16 +42,17 @@ def add_in_torch(
 
     Args:
         rows: of the state, [M].
-        radii: in pixels, [M].
+        radii: in pixels, [M]; 0 where a row is not to count.
         scales: what the gradients are multiplied by.
         side: what the radii are divided by.
     """
+    visible = radii > 0
     gradients = gradients.clone()
     gradients[:, 0] *= scales[0]
     gradients[:, 1] *= scales[1]
-    norms = gradients.norm(dim=-1)
+    norms = gradients.norm(dim=-1) * visible
     state["grad2d"].index_add_(0, rows, norms)
-    state["count"].index_add_(0, rows, torch.ones_like(norms))
+    state["count"].index_add_(0, rows, visible.to(norms.dtype))
     if "radii" in state:
         state["radii"][rows] = torch.maximum(state["radii"][rows], radii / side)
 

@@ -17,9 +17,10 @@ def add_kernel(
     sums, counts, largest, rows, gradients, radii, count, scale_x, scale_y, radius_scale,
     BLOCK: tl.constexpr, RADII: tl.constexpr,
 ):  # fmt: skip
-    """Add rows that are all different. Without RADII, `largest` is not touched."""
+    """Add rows that are all different, but those of radius 0. Without RADII, `largest` is not touched."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    valid = at < count
+    radius = tl.load(radii + at, mask=at < count, other=0).to(tl.float32)
+    valid = radius > 0.0
     row = tl.load(rows + at, mask=valid, other=0)
     x = tl.load(gradients + 2 * at, mask=valid, other=0.0) * scale_x
     y = tl.load(gradients + 2 * at + 1, mask=valid, other=0.0) * scale_y
@@ -28,7 +29,7 @@ def add_kernel(
     tl.store(sums + row, sum, mask=valid)
     tl.store(counts + row, seen, mask=valid)
     if RADII:
-        share = tl.load(radii + at, mask=valid, other=0).to(tl.float32) * radius_scale
+        share = radius * radius_scale
         tl.store(largest + row, tl.maximum(tl.load(largest + row, mask=valid, other=0.0), share), mask=valid)
 
 

@@ -95,6 +95,13 @@ class Densification(ABC):
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
         return False
 
+    takes_all_rows: bool = False
+    """Whether it may be given rows of splats that are not visible, of radius 0, and adds nothing to the loss."""
+
+    def rests_at(self, step: int) -> bool:
+        """Whether it looks at nothing in this step."""
+        return False
+
     def see_cameras(self, centers: Tensor) -> None:  # noqa: B027  (only some strategies measure by the cameras)
         """Tell the strategy where the training cameras are, [V, 3], before the first step."""
 

@@ -147,6 +147,7 @@ class ShardedGuard(Guard):
             names=[*verdict.names, ELSEWHERE, ASKED],
             origins=[*verdict.origins, "elsewhere", "elsewhere"],
             tensors=[*verdict.tensors, elsewhere, anywhere[1]],
+            owners=[*verdict.owners, None, None],
             sizes=torch.cat([sizes, elsewhere[None], anywhere[1:]]),
         )
 
@@ -157,9 +158,6 @@ class ShardedGuard(Guard):
 
     def _out_of_sight(self) -> bool:
         return False  # one device's shard may be, and others are not asked
-
-    def _full_name(self, name: str, tensor: Tensor) -> str:
-        return name if name == ELSEWHERE else super()._full_name(name, tensor)
 
     def settle(self) -> None:
         try:

@@ -580,14 +580,15 @@ class NrfgsModel(SplatfactoModel):
             self.watched_image = batch.get("image_idx")
         return losses
 
-    def shrinking(self) -> dict[str, Tensor]:
-        """What `shrinkage` adds to the loss."""
+    def shrinking(self, splats: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+        """What `shrinkage` adds to the loss. `splats`: another table than the model's."""
+        splats = self.gauss_params if splats is None else splats
         weight = self.config.shrinkage / max(self.num_train_data, 1) ** 2
         if weight == 0.0 or self.config.densification == "mcmc":
             return {}
         return {
-            "shrink_opacities": weight * self.densification.mean_opacity(self.gauss_params["opacities"]),
-            "shrink_scales": weight / self.scene_unit * self.gauss_params["scales"].exp().mean(),
+            "shrink_opacities": weight * self.densification.mean_opacity(splats["opacities"]),
+            "shrink_scales": weight / self.scene_unit * splats["scales"].exp().mean(),
         }
 
     def photometric_loss(self, outputs, batch) -> Tensor:

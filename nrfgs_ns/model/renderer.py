@@ -31,6 +31,8 @@ class Projecting(NamedTuple):
     """world units in a scene unit, in which the near plane is 0.01"""
     assume_finite: bool = False
     """do not look for splats that are not finite, which costs a GPU a wait"""
+    every_row: bool = False
+    """rows for splats that are not visible, too, as `rasterizer.project` says"""
 
 
 class View(NamedTuple):
@@ -63,6 +65,7 @@ def project_splats(
         far_plane=FAR_PLANE * projecting.scene_unit,
         rasterize_mode=projecting.rasterize_mode,
         assume_finite=projecting.assume_finite,
+        every_row=projecting.every_row,
     )
 
 

@@ -84,14 +84,22 @@ class ViewNoise:
 
         Args:
             splats: the table; itself is returned if there is no noise.
+            step: training step.
         """
-        if self.sigma == 0.0:
+        return self.moved_by(splats, None if self.sigma == 0.0 else self.generator(splats["means"].device, step))
+
+    def moved_by(self, splats: Mapping[str, Tensor], generator: torch.Generator | None) -> Mapping[str, Tensor]:
+        """The same with the numbers of a generator; None: without noise."""
+        if generator is None:
             return splats
         means = splats["means"]
-        if means.device not in self._generators:
-            self._generators[means.device] = torch.Generator(means.device)
-        # Two odd numbers of 64 bits, so that neighbouring steps and seeds have nothing to do with each other.
-        key = (self.seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9) % 2**63
-        generator = self._generators[means.device].manual_seed(key ^ key >> 31)
         noise = torch.randn(means.shape, generator=generator, device=means.device, dtype=means.dtype)
         return {**splats, "means": torch.add(means, noise, alpha=self.sigma)}
+
+    def generator(self, device: torch.device, step: int) -> torch.Generator:
+        """The generator of a step's noise on a device: the same object in each step."""
+        if device not in self._generators:
+            self._generators[device] = torch.Generator(device)
+        # Two odd numbers of 64 bits, so that neighbouring steps and seeds have nothing to do with each other.
+        key = (self.seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9) % 2**63
+        return self._generators[device].manual_seed(key ^ key >> 31)

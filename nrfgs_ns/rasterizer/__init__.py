@@ -70,6 +70,7 @@ def project(
     rasterize_mode: RasterizeMode = "classic",
     packed: bool = True,
     assume_finite: bool = False,
+    every_row: bool = False,
 ) -> Projection:
     """Find the splats that each camera sees and project them. Differentiable in all tensors but Ks.
 
@@ -89,6 +90,8 @@ def project(
             put different floors into the radius formula, so a small round splat has radius 3 (packed) or 2 (not).
         assume_finite: do not look for splats that are not finite, which costs a GPU a wait. A training need not: its
             guard stops at the first such number.
+        every_row: splats that are not visible are rows, too, of radius 0: then the host need not know how many are. For
+            one camera, on CUDA.
 
     Raises:
         ValueError: a tensor has the wrong shape, or the mode is unknown.
@@ -105,7 +108,14 @@ def project(
         _check_shape(name, tensor, *shape)
     if rasterize_mode not in _RASTERIZE_MODES:
         raise ValueError(f"rasterize_mode must be one of {_RASTERIZE_MODES}, got {rasterize_mode!r}")
-    return _backend(means.device).project(
+    backend = _backend(means.device)
+    if every_row:
+        return backend.project_every_row(
+            means, quats, scales, viewmats, Ks, width, height,
+            near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
+            rasterize_mode=rasterize_mode,
+        )  # fmt: skip
+    return backend.project(
         means,
         quats,
         scales,

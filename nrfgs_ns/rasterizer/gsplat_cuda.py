@@ -83,6 +83,61 @@ def project(
     return Projection(*columns, width=width, height=height, n_cameras=viewmats.shape[0], extents=extents)
 
 
+def project_every_row(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    rasterize_mode: str,
+) -> Projection:
+    """One camera's rows of all splats; those that it does not see have radius 0, and numbers that mean nothing."""
+    rows = fully_fused_projection(
+        means,
+        None,
+        quats,
+        scales,
+        viewmats,
+        Ks,
+        width,
+        height,
+        packed=False,
+        eps2d=eps2d,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        radius_clip=radius_clip,
+        calc_compensations=rasterize_mode == "antialiased",
+    )
+    radii, means2d, depths, conics, compensations = (None if part is None else part.squeeze(0) for part in rows)
+    row = torch.arange(len(means), device=means.device)
+    extents = radii if HAS_BATCHES else None
+    if HAS_BATCHES:
+        radii = radii.amax(dim=-1)
+    else:
+        radii = _packed_radii(radii, conics.detach())
+    return Projection(
+        torch.zeros_like(row), row, radii, means2d, depths, conics, compensations,
+        width=width, height=height, n_cameras=1, extents=extents,
+    )  # fmt: skip
+
+
+def _packed_radii(radii: Tensor, conics: Tensor) -> Tensor:
+    """The radii that gsplat 1.4's packed kernel would have found. Its floor under the difference of a round splat's
+    eigenvalues is another one than its dense kernel's."""
+    a, b, c = conics.unbind(dim=1)
+    det = a * c - b * b
+    middle = 0.5 * (a + c) / det
+    largest = middle + torch.sqrt(torch.clamp_min(middle * middle - 1.0 / det, 0.1))
+    return torch.where(radii > 0, torch.ceil(3.0 * torch.sqrt(largest)), 0.0).to(torch.int32)
+
+
 def _finite(rows: tuple) -> bool:
     """Whether the projected numbers are finite; False also if only their sum is not."""
     _, _, _, means2d, depths, conics, _, _ = rows

@@ -20,6 +20,8 @@ gsplat's to the last tie: 16-bit tile numbers take a quarter of the passes that 
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import ClassVar
 
@@ -66,7 +68,7 @@ def _box(x, y, radii, rows, valid, width, height, SIDE: tl.constexpr, RADII: tl.
     top = tl.minimum(tl.maximum(tl.floor(center_y - reach_y), 0.0), height).to(tl.int32)
     right = tl.minimum(tl.maximum(tl.ceil(center_x + reach_x), 0.0), width).to(tl.int32)
     bottom = tl.minimum(tl.maximum(tl.ceil(center_y + reach_y), 0.0), height).to(tl.int32)
-    return left, top, right, bottom
+    return left, top, right, tl.where(reach_x > 0.0, bottom, top)
 
 
 @triton.jit
@@ -204,7 +206,44 @@ class Room:
 _ROOMS = threading.local()
 
 
-def room_on(device: torch.device) -> Room:
+class FixedRoom:
+    """Room that stays as it is, for a CUDA graph: it can be looked at when the graph has run.
+
+    Args:
+        pairs: how many there is room for.
+        device: the GPU.
+    """
+
+    def __init__(self, pairs: int, device: torch.device):
+        self.pairs = pairs
+        self.counted = torch.full((2,), -1, dtype=torch.int64, device=device)
+        """of the last image, and the most of any; -1: none has been made"""
+
+    def send(self, total: Tensor) -> None:
+        """Keep the number of pairs [1], on the GPU."""
+        self.counted[:1].copy_(total)
+        torch.maximum(self.counted[1:], total, out=self.counted[1:])
+
+    def was_enough(self) -> bool:
+        """Nobody asks yet."""
+        return True
+
+    @contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Let this be the room for the images of this thread."""
+        rooms, device = _ROOMS.__dict__, self.counted.device
+        before = rooms.get(device)
+        rooms[device] = self
+        try:
+            yield
+        finally:
+            if before is None:
+                del rooms[device]
+            else:
+                rooms[device] = before
+
+
+def room_on(device: torch.device) -> Room | FixedRoom:
     """The room on a GPU for the images of this thread: a viewer's are other images than a training's."""
     rooms = _ROOMS.__dict__
     if device not in rooms:
@@ -222,7 +261,7 @@ def tile_lists(
     height: int,
     side: int,
     colors: Tensor | None = None,
-    room: Room | None = None,
+    room: Room | FixedRoom | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Lists of one camera's tiles. All tensors are dense, of M splats that are all visible.
 
@@ -233,7 +272,6 @@ def tile_lists(
         width, height: of the image, in tiles; with the row below it has at most 2^15.
         side: of a tile, in pixels.
         colors: leave out the splats of which one of these, [M, D], or another number is not finite.
-
         room: make room for so many pairs, and send home how many there are; None: wait for their number.
 
     Returns:

@@ -8,7 +8,8 @@ square) condemns the step. What happens then:
 - On a CPU, the numbers are at hand: the training stops before the optimisers step.
 - On a GPU, reading them would make the host wait in every step. Instead the verdict stays on the device, where fused
   Adam reads it (`found_inf`) and leaves parameters and moments as they are. A copy travels to the host meanwhile and is
-  read at the head of the next step, whose projection would wait for the same work anyway. An optimiser that cannot read
+  read before the next step is computed: when all is ready for that, in a step of `step_graph.py`, and at its head in
+  one whose projection would wait for the same work anyway. An optimiser that cannot read
   the verdict on the device is treated as on a CPU, waiting included.
 
 Either way the parameters and moments that are left are those from before the condemned step, and the trainer writes
@@ -72,6 +73,8 @@ class Verdict:
     sizes: Tensor
     """largest absolute values, in host memory once `arrived` has happened"""
     arrived: torch.cuda.Event | None
+    owners: list[Tensor | None]
+    """the parameters whose gradients were looked at"""
 
 
 class Guard:
@@ -96,12 +99,14 @@ class Guard:
         self.check_parameters(optimizers)
 
     def begin(self, step: int, optimizers: LeanOptimizers) -> None:
-        """Head of a training step: learn about the step before, and now and then look at the parameters.
+        """Head of a training step: learn about the step before, unless `step_graph.py` will ask when it has prepared
+        this one, and now and then look at the parameters.
 
         Raises:
             TrainingStopped: the step before was condemned, a parameter is not finite, or nothing is visible any more.
         """
-        self.settle()
+        if self.pipeline.graphs is None or step % PARAMETERS_EVERY == 0:
+            self.settle()
         self.step = step
         if self._out_of_sight():
             raise TrainingStopped(
@@ -124,15 +129,15 @@ class Guard:
         Raises:
             TrainingStopped: on a CPU, if the step is condemned.
         """
-        watched: list[tuple[str, Origin, Tensor]]
-        watched = [(name, "rendering", value) for name, value in self.model.watched.items()]
+        watched: list[tuple[str, Origin, Tensor, Tensor | None]]
+        watched = [(name, "rendering", value, None) for name, value in self.model.watched.items()]
         if not gradients_are_scaled:
             for name, optimizer in optimizers.optimizers.items():
-                gradients = [parameter.grad for parameter in parameters_of(optimizer)]
-                found = [gradient for gradient in gradients if gradient is not None and gradient.numel() > 0]
-                watched += [(name, "gradient", gradient) for gradient in found]
-        names, origins, tensors = [list(column) for column in zip(*watched, strict=True)]
-        own = Verdict(self.step, names, origins, tensors, torch.stack(torch._foreach_norm(tensors, math.inf)), None)
+                found = [one for one in parameters_of(optimizer) if one.grad is not None and one.numel() > 0]
+                watched += [(name, "gradient", parameter.grad, parameter) for parameter in found]
+        names, origins, tensors, owners = [list(column) for column in zip(*watched, strict=True)]
+        sizes = torch.stack(torch._foreach_norm(tensors, math.inf))
+        own = Verdict(self.step, names, origins, tensors, sizes, None, owners)
         self._verdict = self._share(own)
         sizes = self._verdict.sizes
         if not gradients_are_scaled and optimizers.all_fused:
@@ -146,9 +151,12 @@ class Guard:
             self.settle()
 
     def _out_of_sight(self) -> bool:
-        """Whether nothing has been visible in the last `PATIENCE` steps. The host knows how many rows there were."""
-        rows = getattr(self.model, "info", {}).get("gaussian_ids")
-        self.blind_steps = self.blind_steps + 1 if rows is not None and len(rows) == 0 else 0
+        """Whether nothing has been visible in the last `PATIENCE` steps. The host knows how many rows there were, or
+        where all splats have one (`step_graph.py`) how many pairs of splats and tiles."""
+        info = getattr(self.model, "info", {})
+        rows = info.get("gaussian_ids")
+        blind = rows is not None and (len(rows) == 0 or info.get("pairs") == 0)
+        self.blind_steps = self.blind_steps + 1 if blind else 0
         return self.blind_steps >= PATIENCE
 
     def _share(self, verdict: Verdict) -> Verdict:
@@ -177,7 +185,7 @@ class Guard:
         bad = [row for row, size in enumerate(sizes) if not size <= MAX_GRADIENT]
         if bad:
             findings = [
-                Finding(self._full_name(verdict.names[row], verdict.tensors[row]), sizes[row], verdict.tensors[row])
+                Finding(self._full_name(verdict.names[row], verdict.owners[row]), sizes[row], verdict.tensors[row])
                 for row in bad
             ]
             message = report(self.pipeline, verdict.step, findings, MAX_GRADIENT)
@@ -193,11 +201,11 @@ class Guard:
             verdict.arrived.synchronize()
         return verdict.sizes.tolist()
 
-    def _full_name(self, name: str, tensor: Tensor) -> str:
+    def _full_name(self, name: str, owner: Tensor | None) -> str:
         """Of a gradient, known by its optimiser's name only: which parameter's it is."""
-        if name in self.model.watched:
+        if owner is None:
             return name
-        owners = [owner for owner, parameter in self.pipeline.named_parameters() if parameter.grad is tensor]
+        owners = [known for known, parameter in self.pipeline.named_parameters() if parameter is owner]
         if not owners and name in self.model.gauss_params:  # densification has made new parameters since
             owners = [f"gauss_params.{name}"]
         return f"the gradient of {(owners or [name])[0].removeprefix('_model.')}"

@@ -99,7 +99,7 @@ def _cause(pipeline, findings: list[Finding], rows: Tensor) -> str:
             f"the parameter {broken[0]} is not finite. It was loaded or edited so, or an update overflowed: go back to "
             "an older checkpoint, and lower its learning rate if it happens again."
         )
-    if any(name.startswith("loss") for name in names) and "the rendered image" not in names:
+    if "loss main_loss" in names and "the rendered image" not in names:
         return (
             f"the rendering is finite and its loss is not, so the image or mask is broken: {_image(pipeline)}. "
             "Replace or remove it."

@@ -26,6 +26,7 @@ from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, che
 from nrfgs_ns.training.evaluation_table import print_evaluation
 from nrfgs_ns.training.optimizers import try_kernel
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
+from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.panel import ViewerPanel
 
 
@@ -67,6 +68,8 @@ class NrfgsPipeline(VanillaPipeline):
     config: NrfgsPipelineConfig
     images_per_step: int = 1
     """images for which a step counts in the schedules (`distributed.schedules`)"""
+    graphs: StepGraphs | None = None
+    """what makes steps in one launch, where it can; the trainer's"""
     steps_per_log: int = 1
     """steps between two at which metrics are taken"""
 
@@ -117,9 +120,11 @@ class NrfgsPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int):
         """Nerfstudio's step, whose metrics are taken only when they are logged."""
         camera, batch = self.datamanager.next_train(step)
-        outputs = self._model(camera)
+        done = None if self.graphs is None else self.graphs.losses(camera, batch, step)
+        outputs = self._model(camera) if done is None else done[0]
         metrics = self.model.get_metrics_dict(outputs, batch) if step % self.steps_per_log == 0 else {}
-        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
+        losses = self.model.get_loss_dict(outputs, batch, metrics) if done is None else done[1]
+        return outputs, losses, metrics
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

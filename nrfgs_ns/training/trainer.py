@@ -39,6 +39,7 @@ from nrfgs_ns.training.pace import (
     steps_for,
 )
 from nrfgs_ns.training.progress import ProgressLine
+from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.training.stopping import (
     StopRequest,
     command_to_go_on,
@@ -119,6 +120,8 @@ class NrfgsTrainer(Trainer):
             self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last step that was made"""
+        if self.world_size == 1 and not self.grad_scaler.is_enabled():
+            self.pipeline.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
         if comms.is_main_process():
             self._tell_what_was_chosen()
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step

@@ -8,7 +8,7 @@ import pytest
 from interpreted import passes_in_the_interpreter
 
 TESTS = Path(__file__).parents[1]
-FILES = "densification/statistics", "rasterizer/tile_lists", "training/adam"
+FILES = "appearance/harmonics", "densification/statistics", "rasterizer/tile_lists", "training/adam"
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")

@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rendering, loss and gradients of a training step as one CUDA graph.
+
+A step launches a hundred kernels, and the host takes longer to launch them than a GPU takes to run them: 4 ms against
+2 ms at 250,000 splats. Between two refinements each step does the same to the same tensors. So it is recorded once,
+and launched as a whole from then on, with another camera, photograph and noise.
+
+What makes steps differ in size must not be there: all splats have a row, visible or not, and the tiles' lists have room
+for half as many pairs again as any view had lately. Should a view need more, which the host learns a step later, the
+farthest splats were missing from that step, and there is more room from then on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+from torch.func import functional_call
+
+from nrfgs_ns.data.checks import warn
+from nrfgs_ns.model.pinhole import Pinhole
+from nrfgs_ns.model.renderer import composite_view, project_view
+
+MORE_ROOM = 1.5
+"""Room for pairs of splats and tiles, for each that the view with the most has."""
+VIEWS_ASKED = 20
+"""Views that are asked how many pairs they have."""
+MOST_SIZES = 4
+"""Sizes of photographs that are recorded; of others, steps are made one kernel after the other."""
+
+
+class StepGraphs:
+    """The graphs of one training, one for each size of photograph.
+
+    Args:
+        model: an NrfgsModel.
+        datamanager: of its training.
+        guard: of its training, which is asked about the step before, once, before each step is computed.
+    """
+
+    def __init__(self, model, datamanager, guard):
+        self.model, self.datamanager, self.guard = model, datamanager, guard
+        self._graphs: dict[tuple, _StepGraph] = {}
+        self._of: list[Any] = []
+        self._how: dict[str, Any] = {}
+        self._pairs_for_each = 0.0
+        """the most pairs of a view, for each splat, at this resolution"""
+        self._given_up = False
+        self._has_said_why = False
+
+    def _takes(self, step: int, batch: Mapping[str, Any]) -> bool:
+        """Whether this step can be a graph's. What keeps all of a training's from it is said once."""
+        model = self.model
+        if self._given_up or model.device.type != "cuda" or model.num_points == 0:
+            return False
+        if (obstacle := self._obstacle(batch)) is not None:
+            if not self._has_said_why:
+                CONSOLE.print(f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}.")
+                self._has_said_why = True
+            return False
+        regularised = model.config.use_scale_regularization and step % 10 == 0
+        return not regularised and (_kind(batch) in self._graphs or len(self._graphs) < MOST_SIZES)
+
+    def _obstacle(self, batch: Mapping[str, Any]) -> str | None:
+        """What of the training's options a graph does not know."""
+        model = self.model
+        exposed = model.photograph is not None
+        obstacles = (
+            ("the densification looks at what views show", not model.densification.takes_all_rows),
+            ("lenses are learnt", exposed and model.photograph.has_penalty),
+            ("exposures of transparent photographs are learnt", exposed and batch["image"].shape[-1] == 4),
+            ("the robust loss chooses pixels", model.trimming is not None),
+            ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
+            ("bilateral grids are learnt", model.config.use_bilateral_grid),
+            ("depth is rendered", model.config.output_depth_during_training),
+            ("some splats are diffuse", model.densification.diffuse is not None),
+        )
+        return next((what for what, there in obstacles if there), None)
+
+    def losses(
+        self, camera: Cameras, batch: Mapping[str, Any], step: int
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]] | None:
+        """Outputs and losses as of the model, and the gradients of the losses' sum to all parameters, when that is
+        differentiated. None: the step is the first of its kind, or cannot be recorded.
+
+        Raises:
+            TrainingStopped: the step before was condemned.
+        """
+        if not self._takes(step, batch) or self._is_new():
+            self.guard.settle()
+            return None
+        model, kind = self.model, _kind(batch)
+        now = model.pinhole(camera), batch, camera.metadata["cam_idx"], step
+        graph = self._graphs.get(kind)
+        if graph is not None:
+            graph.prepare(*now)
+        self.guard.settle()  # everything is ready, so that the GPU need not wait for what the host does
+        if graph is None or not graph.had_room():
+            graph = self._record(kind, *now)
+        if graph is None:
+            return None
+        losses = graph.run()
+        model.info = {**graph.info, "pairs": graph.last_pairs}
+        watched = {
+            "the rendered image": graph.outputs["rgb"],
+            **{f"loss {name}": loss for name, loss in losses.items()},
+        }
+        model.watched = {name: value.detach() for name, value in watched.items()}
+        model.watched_image = batch.get("image_idx")
+        return dict(graph.outputs), losses
+
+    def _is_new(self) -> bool:
+        """Whether a step is another than the one before, and none that has been recorded: splats have come or gone,
+        pixels are others, or the head or the densification does something else."""
+        model = self.model
+        now = [*model.gauss_params.values(), model.head, *model.head.parameters()]
+        how = {
+            "places": [value.data_ptr() for value in now if isinstance(value, Tensor)],
+            "head": (model.head.phase, model.head_rests),
+            "densification": model.densification.rests_at(model.step),
+            "downscale": model._get_downscale_factor(),
+        }
+        same = len(now) == len(self._of) and all(a is b for a, b in zip(now, self._of, strict=True))
+        if same and how == self._how:
+            return False
+        self._see_pairs()
+        if how["downscale"] != self._how.get("downscale"):
+            self._pairs_for_each = 0.0
+        if self._graphs:
+            self._graphs.clear()
+            torch.cuda.empty_cache()  # a graph's memory is no other's before
+        self._of, self._how = now, how
+        return True
+
+    def _record(
+        self, kind: tuple, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int
+    ) -> _StepGraph | None:
+        """A graph for this kind of photograph, ready for a step. None, and no graph from now on, where that fails."""
+        self._see_pairs()
+        self._graphs.pop(kind, None)
+        try:
+            if self._pairs_for_each == 0.0:
+                self._pairs_for_each = self._most_pairs() / self.model.num_points
+            room = int(MORE_ROOM * self._pairs_for_each * self.model.num_points) + 1
+            graph = self._graphs[kind] = _StepGraph(self.model, seen_from, batch, room)
+            graph.prepare(seen_from, batch, index, step)
+        except Exception as error:
+            self._given_up = True
+            self._graphs.clear()
+            torch.cuda.empty_cache()
+            reason = next(iter(str(error).splitlines()), "")
+            warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
+            return None
+        return graph
+
+    def _see_pairs(self) -> None:
+        """Learn from the graphs that there are how many pairs views have."""
+        for graph in self._graphs.values():
+            self._pairs_for_each = max(self._pairs_for_each, graph.most_pairs() / graph.count)
+
+    @torch.no_grad()
+    def _most_pairs(self) -> int:
+        """The most pairs of views that are evenly taken from all.
+
+        Raises:
+            RuntimeError: another than the kernels of `tile_lists.py` lists what tiles draw.
+        """
+        from nrfgs_ns.rasterizer.tile_lists import FixedRoom
+
+        model, count = self.model, len(self.datamanager.train_dataset)
+        field, room = model.field, FixedRoom(1, model.device)
+        for index in range(0, count, max(count // VIEWS_ASKED, 1)):
+            camera, _ = self.datamanager.train_view(index)
+            view = model.project(camera, field.splats)
+            with room.in_use():
+                composite_view(view, field.seen_from(view), torch.zeros(3, device=model.device), with_depth=False)
+        _, most = room.counted.tolist()
+        if most < 0:
+            raise RuntimeError("gsplat lists what tiles draw, and the host waits for its lists")
+        return most
+
+
+def _kind(batch: Mapping[str, Any]) -> tuple:
+    """What of a photograph decides which graph it can be given to."""
+    return tuple(batch["image"].shape), "mask" in batch
+
+
+class _StepGraph:
+    """One graph, and the tensors that it reads and writes.
+
+    Args:
+        model: an NrfgsModel in training.
+        seen_from, batch: some camera, and its photograph and mask as the datamanager gives them.
+        pairs: room for pairs.
+    """
+
+    def __init__(self, model, seen_from: Pinhole, batch: Mapping[str, Any], pairs: int):
+        from nrfgs_ns.rasterizer.tile_lists import FixedRoom
+
+        self.model, self.count = model, model.num_points
+        self.parameters = {f"splats.{name}": value for name, value in model.gauss_params.items()}
+        self.parameters |= {f"head.{name}": value for name, value in model.head.named_parameters()}
+        self.device = device = model.device
+        self.seen_from = seen_from._replace(
+            viewmat=seen_from.viewmat.clone(), K=seen_from.K.clone(), center=seen_from.center.clone()
+        )
+        self.batch = {name: batch[name].to(device, copy=True) for name in ("image", "mask") if name in batch}
+        self.room = FixedRoom(pairs, device)
+        self._counted = torch.ones(2, dtype=torch.int64, pin_memory=True)
+        self._arrived = torch.cuda.Event()
+        self._arrived.record()
+        self.last_pairs = 1
+        """of the step before, as far as the host has learnt"""
+        self.shot = None if model.photograph is None else model.photograph.shots.detach()[:1].clone()
+        """the numbers of the step's photograph, [1, R], if they are learnt; a graph cannot choose a row by itself"""
+        noise = model.view_noise
+        self.noise = None if noise.sigma == 0.0 else noise.generator(device, 0)
+
+        generators = [torch.cuda.default_generators[device.index], *([] if self.noise is None else [self.noise])]
+        states = [generator.get_state() for generator in generators]
+        self.graph = torch.cuda.CUDAGraph()
+        if self.noise is not None:
+            self.graph.register_generator_state(self.noise)
+        now, aside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+        aside.wait_stream(now)
+        try:
+            with torch.cuda.stream(aside):
+                self._compute()  # what is made or compiled at a first call is there from here on
+                for generator, state in zip(generators, states, strict=True):
+                    generator.set_state(state)
+                self.graph.capture_begin(capture_error_mode="thread_local")  # a viewer's thread may do as it likes
+                try:
+                    self._compute()
+                finally:
+                    self.graph.capture_end()
+        except Exception:
+            for generator, state in zip(generators, states, strict=True):  # they believe that they are recorded
+                generator.graphsafe_set_state(torch.Generator(device).graphsafe_get_state())
+                generator.set_state(state)
+            raise
+        now.wait_stream(aside)
+
+    def _compute(self) -> None:
+        """One step's rendering, loss and gradients, from and to tensors that stay where they are.
+
+        Gradients go to leaves that share the parameters' numbers. The parameters themselves may be held by what an
+        earlier step has left, and would be another stream's.
+        """
+        model = self.model
+        leaves = {name: value.detach().requires_grad_() for name, value in self.parameters.items()}
+        splats = {name: leaves[f"splats.{name}"] for name in model.gauss_params}
+        weights = {name: leaves[f"head.{name}"] for name, _ in model.head.named_parameters()}
+        shot = look = None
+        if self.shot is not None:
+            shot = self.shot.detach().requires_grad_()
+            look = lambda rgb: functional_call(model.photograph, {"shots": shot}, (rgb, 0))  # noqa: E731
+        with torch.enable_grad(), self.room.in_use():
+            view = project_view(splats, self.seen_from, model.projecting._replace(every_row=True))
+            if model.head_rests:
+                appearance = model.head.base_appearance(splats, view.visible)
+            else:
+                asked = model.view_noise.moved_by(splats, self.noise)
+                appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
+            background = model._get_background_color()
+            outputs, info = composite_view(
+                view,
+                appearance,
+                background,
+                with_depth=False,
+                absgrad=model.densification.needs_absgrad(model.step),
+                assume_finite=True,
+                look=look,
+            )
+            outputs["background"] = background
+            stored = torch.sigmoid(splats["opacities"]).flatten()  # what nobody is shown otherwise
+            shown = torch.where(info["radii"] > 0, appearance.opacities, stored)
+            model.densification.pre_backward(model.step, info, shown, splats["opacities"])
+            losses = {"main_loss": model.photometric_loss(outputs, self.batch), **model.shrinking(splats)}
+            sum(losses.values()).backward()
+        self.gradients = {name: leaf.grad for name, leaf in leaves.items()}
+        if shot is not None:
+            self.shot_gradient = shot.grad
+        self.outputs = {name: value.detach() for name, value in outputs.items()}
+        self.losses = {name: loss.detach() for name, loss in losses.items()}
+        self.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in info.items()}
+        for name in ("grad", "absgrad") if info["means2d"].retains_grad else ():
+            gradient = getattr(info["means2d"], name, None)
+            if gradient is not None:  # what is not finite counts as zero in densification's statistics
+                setattr(self.info["means2d"], name, gradient.nan_to_num_(0.0, 0.0, 0.0))
+
+    def had_room(self) -> bool:
+        """Whether the step before had room for all pairs."""
+        self._arrived.synchronize()
+        self.last_pairs = int(self._counted[0])
+        return self.last_pairs <= self.room.pairs
+
+    def most_pairs(self) -> int:
+        """The most pairs of any step."""
+        self._arrived.synchronize()
+        return int(self._counted[1])
+
+    def prepare(self, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
+        """Take a step's camera, its photograph, which is training photograph `index`, and its noise."""
+        for name, parameter in self.parameters.items():
+            if parameter.grad is not None and parameter.grad is self.gradients[name]:  # kept to be added to
+                parameter.grad = parameter.grad.clone()
+        mine, now = self.seen_from, seen_from
+        torch._foreach_copy_([mine.viewmat, mine.K, mine.center], [now.viewmat, now.K, now.center])
+        for name, values in self.batch.items():
+            values.copy_(batch[name], non_blocking=True)
+        if self.noise is not None:
+            self.model.view_noise.generator(self.device, step)
+        if self.shot is not None:
+            self.index = index
+            self.shot.copy_(self.model.photograph.shots.detach()[index : index + 1])
+
+    def run(self) -> dict[str, Tensor]:
+        """The losses; the gradients of their sum are handed out when that is differentiated. `outputs` and `info` are
+        this step's."""
+        self.graph.replay()
+        if self.shot is not None:
+            shots = self.parameters["photograph.shots"] = self.model.photograph.shots
+            self.gradients["photograph.shots"] = torch.zeros_like(shots)
+            self.gradients["photograph.shots"][self.index] = self.shot_gradient[0]
+        self._counted.copy_(self.room.counted, non_blocking=True)
+        self._arrived.record()
+        ready = _Ready.apply(self.losses["main_loss"], self, self.parameters["splats.means"])
+        return {**self.losses, "main_loss": ready}
+
+
+class _Ready(torch.autograd.Function):
+    """A loss whose gradients, and those of what is added to it, have been computed with it."""
+
+    @staticmethod
+    def forward(ctx, loss: Tensor, graph: _StepGraph, _: Tensor) -> Tensor:
+        ctx.graph = graph
+        return loss.clone()
+
+    @staticmethod
+    def backward(ctx, d_loss: Tensor) -> tuple[None, None, None]:
+        for name, parameter in ctx.graph.parameters.items():
+            gradient = ctx.graph.gradients[name]
+            if gradient is not None:
+                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+        return None, None, None

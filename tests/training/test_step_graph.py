@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A step as one CUDA graph computes what its kernels compute one after the other. `pytest -m gpu`."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from nerfstudio.engine.optimizers import Optimizers
+
+from nrfgs_ns.training.run import evaluate, parse, train
+from nrfgs_ns.training.step_graph import StepGraphs
+
+gpu = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels"),
+]
+
+
+@pytest.fixture
+def build(tiny_scene, tmp_path):
+    """The pipeline of a training on a device, at full resolution, and its graphs."""
+
+    def pipeline(device, method="nrfgs", *options):
+        config = parse([method, "--data", str(tiny_scene), "--output-dir", str(tmp_path), *options])
+        config.pipeline.model.num_downscales = 0
+        if not method.endswith("-sh"):
+            config.pipeline.model.appearance.precision = "fp32"  # bf16 makes steps of what is rounded otherwise
+        torch.manual_seed(0)
+        built = config.pipeline.setup(device=device, test_mode="val")
+        built.model.view_noise.sigma = 0.01
+        # Splats start round, and turning a round splat changes nothing: its quaternion's gradient is rounding alone.
+        built.model.gauss_params["scales"].data += 0.5 * torch.randn(built.model.num_points, 3).to(device)
+        return built, StepGraphs(built.model, built.datamanager, SimpleNamespace(settle=lambda: None))
+
+    return pipeline
+
+
+def begin(pipeline, step: int) -> None:
+    """What the trainer does before a step, with the same random numbers each time. The head begins at step 50."""
+    pipeline.model.step_cb(Optimizers({}, {}), step)
+    pipeline.model.head_rests = step < 50
+    torch.manual_seed(step)
+    for parameter in pipeline.model.parameters():
+        parameter.grad = None
+
+
+def eager(pipeline, step: int, view: int, **more: torch.Tensor) -> tuple:
+    """Loss, image and gradients of a step, kernel by kernel."""
+    begin(pipeline, step)
+    camera, batch = pipeline.datamanager.train_view(view)
+    outputs = pipeline.model.get_outputs(camera)
+    loss = sum(pipeline.model.get_loss_dict(outputs, batch | more).values())
+    loss.backward()
+    return loss.detach(), outputs["rgb"].detach(), gradients(pipeline)
+
+
+def recorded(pipeline, graphs, step: int, view: int, **more: torch.Tensor) -> tuple | None:
+    """The same as a graph; None if it is not taken."""
+    begin(pipeline, step)
+    camera, batch = pipeline.datamanager.train_view(view)
+    done = graphs.losses(camera, batch | more, step)
+    if done is None:
+        return None
+    loss = sum(done[1].values())
+    loss.backward()
+    return loss.detach(), done[0]["rgb"].clone(), gradients(pipeline)
+
+
+def gradients(pipeline) -> dict[str, torch.Tensor]:
+    """Copies of all gradients, those on the screen among them, by name."""
+    named = {name: value.grad.clone() for name, value in pipeline.model.named_parameters() if value.grad is not None}
+    info = pipeline.model.info
+    means2d = info["means2d"]
+    if (means2d.is_leaf or means2d.retains_grad) and means2d.grad is not None:
+        named["means2d"] = torch.zeros(pipeline.model.num_points, 2, device=means2d.device)
+        named["means2d"][info["gaussian_ids"]] = means2d.grad
+    return named
+
+
+def assert_same(got, expected) -> None:
+    """Atomics add in any order, and packed and dense kernels round alike but for that."""
+    torch.testing.assert_close(got[0], expected[0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(got[1], expected[1], rtol=0, atol=1e-5)
+    assert got[2].keys() == expected[2].keys()
+    for name, gradient in expected[2].items():
+        assert (got[2][name] - gradient).norm() <= 1e-4 * gradient.norm() + 1e-9, name
+
+
+@pytest.mark.parametrize(
+    "option", ["use-bilateral-grid True", "robust-loss 0.1", "densification mcmc", "camera-optimizer.mode SO3xR3"]
+)
+def test_what_is_not_recorded_is_said_once(build, option, capsys, monkeypatch):
+    name, value = option.split()
+    pipeline, graphs = build("cpu", "nrfgs", f"--pipeline.model.{name}", value)
+    batch = pipeline.datamanager.train_view(0)[1]
+    monkeypatch.setattr(type(pipeline.model), "device", torch.device("cuda"))
+    assert not any(graphs._takes(step, batch) for step in (1, 2))
+    assert capsys.readouterr().out.count("not recorded") == 1
+
+
+def test_a_cpu_makes_steps_as_ever(build):
+    pipeline, graphs = build("cpu")
+    assert not graphs._takes(5, pipeline.datamanager.train_view(0)[1])
+
+
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-best"])
+@pytest.mark.parametrize("step", [10, 100, 20_000], ids=["head rests", "growing", "at rest"])
+class TestOnCuda:
+    pytestmark = gpu
+
+    def test_a_step_is_the_same_recorded(self, build, method, step):
+        pipeline, graphs = build("cuda", method)
+        assert recorded(pipeline, graphs, step, 0) is None  # the first of its kind
+        for view in (0, 3, 5):
+            expected = eager(pipeline, step + view, view)
+            assert_same(recorded(pipeline, graphs, step + view, view), expected)
+        assert not graphs._given_up
+
+    def test_new_splats_and_too_little_room(self, build, method, step):
+        pipeline, graphs = build("cuda", method)
+        model = pipeline.model
+        for _ in range(2):
+            recorded(pipeline, graphs, step, 0)
+        for name, value in model.gauss_params.items():
+            model.gauss_params[name] = torch.nn.Parameter(torch.cat([value, value[:50]]).detach())
+        assert recorded(pipeline, graphs, step, 1) is None
+        assert_same(recorded(pipeline, graphs, step, 1), eager(pipeline, step, 1))
+        (graph,) = graphs._graphs.values()
+        graph.room.pairs = 1
+        assert_same(recorded(pipeline, graphs, step, 2), eager(pipeline, step, 2))
+        assert [graph] != list(graphs._graphs.values())
+        assert not graphs._given_up
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+def test_a_photographs_exposure_is_learnt_the_same(build):
+    pipeline, graphs = build("cuda", "nrfgs", "--pipeline.model.photographs", "on")
+    with torch.no_grad():
+        pipeline.model.photograph.shots.normal_(0.0, 0.1)
+    recorded(pipeline, graphs, 100, 0)
+    for view in (0, 3, 5):
+        expected = eager(pipeline, 100 + view, view)
+        assert "photograph.shots" in expected[2]
+        assert_same(recorded(pipeline, graphs, 100 + view, view), expected)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+def test_each_photograph_has_its_mask(build):
+    pipeline, graphs = build("cuda", "nrfgs")
+    height, width = pipeline.datamanager.train_view(0)[1]["image"].shape[:2]
+    recorded(pipeline, graphs, 100, 0)
+    for view in (0, 3, 5):
+        mask = torch.rand(height, width, 1, generator=torch.Generator().manual_seed(view)) < 0.7
+        expected = eager(pipeline, 100 + view, view, mask=mask)
+        assert_same(recorded(pipeline, graphs, 100 + view, view, mask=mask), expected)
+    assert (expected[0] - eager(pipeline, 105, 5)[0]).abs() > 1e-3
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+def test_a_training_learns_the_same(tiny_scene, tmp_path, monkeypatch):
+    """With refinements, resets and three resolutions on the way."""
+    psnr = []
+    for taken in (True, False):
+        with monkeypatch.context() as only:
+            if not taken:
+                only.setattr(StepGraphs, "_takes", lambda *_: False)
+            args = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path / str(taken))]
+            args += ["--max-num-iterations", "600", "--schedule-steps", "30000", "--vis", "tensorboard"]
+            args += ["--steps-per-eval-image", "100000", "--steps-per-eval-all-images", "100000"]
+            record = train(args)
+            psnr.append(evaluate(record.config_path, tmp_path / "eval.json")["psnr"])
+    assert abs(psnr[0] - psnr[1]) < 0.7  # two trainings of one seed differ by a few tenths
