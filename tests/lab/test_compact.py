@@ -20,8 +20,6 @@ def test_between_two_files_the_trade_is_a_straight_line(monkeypatch):
         "bonsai-version-2": {**one, "bytes": 9_000_000, "loss_db": 0.0},
         "bonsai-rate-0.0001": {**one, "bytes": 5_000_000, "loss_db": 0.1},
         "bonsai-rate-0.001": {**one, "bytes": 2_000_000, "loss_db": 0.7},
-        "held-out-bonsai-rate-0.001-PRUNINGS=[]": {**one, "bytes": 2_500_000, "loss_db": 0.5, "rate": 0.001},
     }
     monkeypatch.setattr(compact_format, "records", lambda study: found)
     assert compact_format.at("bonsai", "loss", "4") == "0.30" and compact_format.at("bonsai", "MB", "0.4") == "3.5"
-    assert "| 0.001 | 2,000 | PRUNINGS=[] | 5 | 2.50 | -0.50 |" in compact_format.held_out()

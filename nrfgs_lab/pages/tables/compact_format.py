@@ -4,7 +4,6 @@
 python -m nrfgs_lab.pages.tables.compact_format        # writes docs/images/compact-trade.png
 """
 
-import re
 from typing import Any
 
 from nrfgs_lab.pages.tables import ROOT, grid, records, signed
@@ -63,16 +62,10 @@ def steps() -> str:
     return f"{found:,}"
 
 
-def held_out() -> str:
-    """A row for each fine-tune that was tried on held-out views: rate, steps and settings that are not the default."""
-    rows = []
-    for name, one in records("compact").items():
-        if "held-out-bonsai-rate" in name:
-            _, settings = re.fullmatch(r".*-rate-([\d.e]+?(?:e-\d+)?)((?:-[A-Z]+=.*)?)", name).groups()
-            how = settings.lstrip("-").replace("-", ", ") or "as it is"
-            size, lost = f"{one['bytes'] / 1e6:.2f}", signed(-one["loss_db"], 2)
-            rows.append([f"{one['rate']:g}", f"{one['finetune']:,}", how, f"{one['written']:,}", size, lost])
-    return grid(["rate", "steps", "settings", "splats", "MB", "dB against the model"], sorted(rows))
+def added(scene: str) -> str:
+    """Per cent of a training's seconds that the longest of its fine-tunes takes."""
+    longest = max(one["seconds"]["finetune"] for one in reports(scene).values() if one.get("finetune"))
+    return f"{100 * longest / records('compact')[f'{scene}-model']['train']['seconds']:.0f} %"
 
 
 def seconds(name: str, what: str) -> str:
