@@ -36,7 +36,7 @@ def captures() -> str:
                     scene if number == 0 else "",
                     LABELS.get(name, name.replace("-", " ")),
                     f"{one['written']:,}" if "written" in one else "",
-                    f"{one['bytes'] / 1e6:.{1 if one['bytes'] > 2e7 else 2}f}",
+                    f"{one['bytes'] / 1e6:.{1 if one['bytes'] > 1e7 else 2}f}",
                     f"{one['psnr_file']:.2f}",
                     signed(-one["loss_db"], 2),
                     f"{seconds['finetune']:.0f}" if one.get("finetune") else "",
@@ -68,10 +68,12 @@ def added(scene: str) -> str:
     return f"{100 * longest / records('compact')[f'{scene}-model']['train']['seconds']:.0f} %"
 
 
-def seconds(name: str, what: str) -> str:
-    """Seconds of a file to write, to read in Python or in Chromium, or its MB."""
+def file(name: str, what: str) -> str:
+    """A number of a file: its MB, decibels that it loses, seconds to write it or to read it in Python or Chromium."""
     one = records("compact")[name]
-    return f"{one['bytes'] / 1e6:.2f}" if what == "MB" else f"{one['seconds'][what]:.1f}"
+    if what in ("MB", "loss"):
+        return f"{one['bytes'] / 1e6 if what == 'MB' else one['loss_db']:.2f}"
+    return f"{one['seconds'][what]:.1f}"
 
 
 def draw() -> None:
@@ -82,7 +84,6 @@ def draw() -> None:
     from matplotlib import pyplot
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    marks = {"version-2": "s", "sog": "^", "spz": "v"}
     with pyplot.rc_context({"font.size": 8}):
         figure, panel = pyplot.subplots(figsize=(5.6, 3.4), dpi=110)
         for number, scene in enumerate(CAPTURES):
@@ -93,12 +94,10 @@ def draw() -> None:
             for name, place in zip(tuned, zip(x, y, strict=True), strict=True):
                 text = name.removeprefix("rate-")
                 panel.annotate(text, place, (4, -8), textcoords="offset points", fontsize=6, color=color)
-            for name, mark in marks.items():
-                if name in every:
-                    panel.plot(every[name]["bytes"] / 1e6, -every[name]["loss_db"], mark, color=color, markersize=4)
+            plain = every["version-2"]
+            panel.plot(plain["bytes"] / 1e6, -plain["loss_db"], "s", color=color, markersize=4)
         panel.axhline(0.0, color="grey", linewidth=0.6)
-        label = "MB (squares: not trained for the file; triangles: PLY as SOG, SPZ)"
-        panel.set(xlabel=label, ylabel="dB against the model", xscale="log")
+        panel.set(xlabel="MB (squares: not trained for the file)", ylabel="dB against the model", xscale="log")
         panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         panel.xaxis.set_major_formatter("{x:g}")
         panel.xaxis.set_minor_formatter(NullFormatter())
