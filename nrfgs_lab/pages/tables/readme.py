@@ -86,9 +86,3 @@ def demo(what: str) -> str:
     found = [record["methods"] for _, record in sorted(records("demo").items())]
     gains = [methods["nrfgs"][part]["psnr"] - methods["nrfgs-sh"][part]["psnr"] for methods in found]
     return ", ".join(signed(gain, 2) for gain in gains)
-
-
-def compact(what: str) -> str:
-    """Size in MB, or loss in dB, of bonsai's compact file."""
-    one = records("compact")["full-bonsai"]
-    return f"{one['bytes'] / 1e6:.1f}" if what == "size" else f"{one['loss_db']:.2f}"
