@@ -17,7 +17,6 @@ from PIL import Image
 from nrfgs_lab.bench.command import Bench
 from nrfgs_lab.bench.data import parser_options
 from nrfgs_lab.bench.spec import (
-    OWN,
     PRESET_STEPS,
     Scene,
     cells_of,
@@ -44,12 +43,12 @@ def spec(**more):
 # The file.
 
 
-@pytest.mark.parametrize("name", ["tiny", "paper", "heads", "deviations", "methods"])
+@pytest.mark.parametrize("name", ["tiny", "paper", "heads", "deviations", "methods", "budgets"])
 def test_shipped_files_are_valid(name):
     plan = make_spec(load_spec(ROOT / "docs" / "bench" / f"{name}.yaml"), name)
     rows, cells = rows_of(plan), cells_of(plan)
     assert len(cells) == len(rows) * len(plan.scenes) * len(plan.seeds)
-    assert {strategy for strategy, _ in rows} - {OWN} == set(plan.strategies)
+    assert {strategy for strategy, _ in rows} == set(plan.strategies)
 
 
 def test_seeds_come_one_after_the_other_and_strategies_together():
