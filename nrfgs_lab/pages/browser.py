@@ -181,6 +181,13 @@ class Page:
                 return now
         raise AssertionError("the picture did not change" if unlike is not None else "no picture came to rest")
 
+    def returns_to(self, picture: np.ndarray) -> None:
+        """Wait until the scene looks like this."""
+        deadline = time.time() + PATIENCE
+        while different(self.shot(), picture):
+            assert time.time() < deadline, "the picture did not come back"
+            time.sleep(0.3)
+
     def sharp(self, unlike: np.ndarray | None = None) -> np.ndarray:
         """The settled picture at its full size: on a slow machine the small one stays for long."""
         wanted = int(self.control("Max res").input_value())

@@ -133,9 +133,8 @@ class GradientDensification(Densification):
 
     def _thin(self, step: int, splats, optimizers) -> None:
         """A round of thinning (`thinning.py`)."""
-        gone = thinning.least_missed(
-            thinning.missed(self.views, len(splats["means"]), splats["means"].device), self.keep
-        )
+        score = thinning.missed(self.views, len(splats["means"]), splats["means"].device)
+        gone = thinning.least_missed(score, self.keep)
         remove(splats, optimizers, self.state, gone)
         if self.strategy.verbose:
             print(f"Step {step}: {int(gone.sum())} GSs thinned. Now having {len(splats['means'])} GSs.")
@@ -152,7 +151,7 @@ class GradientDensification(Densification):
     def _refine(self, step: int, splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
         strategy, state = self.strategy, self.state
-        duplicated, split = self._grow(step, splats, optimizers)
+        duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
         grown = len(splats["means"])
         pruned = strategy._prune_gs(splats, optimizers, state, step)
         if strategy.verbose:
@@ -166,10 +165,6 @@ class GradientDensification(Densification):
     def _rounds(self, step_at: Callable[[float], int]) -> list[int]:
         """The steps at which splats are thinned."""
         return [step_at(times * self.bounds["refine_stop_iter"]) for times in thinning.ROUNDS]
-
-    def _grow(self, step: int, splats, optimizers) -> tuple[int, int]:
-        """Grow by gsplat's rules; how many were duplicated, and how many split."""
-        return self.strategy._grow_gs(splats, optimizers, self.state, step)
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         self.rounds = self._rounds(step_at)

@@ -120,6 +120,30 @@ def test_a_view_misses_what_its_picture_shows(training, monkeypatch):
     assert_close(changes[most].sum(), torch.stack(expected).sum(), rtol=0.15, atol=0)
 
 
+def test_pictures_change_less_without_the_least_missed_than_without_others(training):
+    model, data = training.pipeline.model, training.pipeline.datamanager
+    score = missed(TrainingPictures(model, data), model.num_points, torch.device("cpu"))
+    others = torch.randperm(len(score), generator=torch.Generator().manual_seed(1)) < len(score) // 2
+    least = torch.ones(len(score), dtype=torch.bool).index_fill(
+        0, score.topk(len(score) - int(others.sum())).indices, 0
+    )
+    assert least.sum() == others.sum()
+
+    def change(gone: torch.Tensor) -> float:
+        total = 0.0
+        for index in range(len(data.train_dataset)):
+            camera, batch = data.train_view(index)
+            view = model.project(camera)
+            with torch.no_grad():
+                appearance = model.field.seen_from(view)
+                fewer = appearance._replace(opacities=appearance.opacities * ~gone[view.visible])
+                one, other = (model.against_photograph(camera, batch, view, a)[0]["rgb"] for a in (appearance, fewer))
+            total += (one - other).square().sum().item()
+        return total
+
+    assert change(least) < 0.3 * change(others)
+
+
 def test_what_the_robust_loss_leaves_out_is_not_missed(training, monkeypatch):
     """Pixels with residuals above 0.02 do not count."""
     model, data = training.pipeline.model, training.pipeline.datamanager
