@@ -98,7 +98,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     would show. None: peak for mcmc, base for the others"""
     keep: float = 1.0
     """share of the splats that is left once growth has ended, at stop_split_at: those go, in six rounds, that the
-    training views would miss least (docs/bench.md). 1: all"""
+    training views would miss least (docs/fewer-splats.md). 1: all"""
     original: OriginalDensification = field(default_factory=OriginalDensification)
     """thresholds of the densification 'original'"""
     mcmc: McmcDensification = field(default_factory=McmcDensification)

@@ -2,17 +2,11 @@
 """The numbers of docs/comparison.md."""
 
 from collections import defaultdict
-from collections.abc import Iterable
-from functools import cache
 from statistics import fmean, median
-from typing import Any
 
-from nrfgs_lab.bench.table import Row, average, ranks
-from nrfgs_lab.pages.tables import BY_NAME, bench_grid, bench_rows, bold, grid, mean_of, records, signed
-from nrfgs_lab.pages.tables.readme import FIELD, TRAINING_VIEWS, runs_of
-
-METHODS = ["3DGS", "VDGS", "GSNB", "SG", "NRF-GS"]
-PSNR, SSIM = BY_NAME["PSNR"], BY_NAME["SSIM"]
+from nrfgs_lab.bench.table import Row
+from nrfgs_lab.pages.tables import bench_grid, bench_rows, grid, mean_of, records, signed
+from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS
 
 
 def gain(scene: str, rule: str, run: str, base: str) -> str:
@@ -94,114 +88,34 @@ def paper() -> str:
 PLACE = "bonsai", "original"
 
 
-# Every capture.
-
-DEFAULT = "default"
-STEPS = 10_000
-"""Of all trainings; the default makes more for `bonsai`."""
-BASE = {"NRF-GS_base": "NRF-GS, `base`", "VDGS_base": "VDGS, `base`"}
+# Equal numbers of splats on a capture of few views.
 
 
-@cache
-def _rows() -> dict[tuple[str, str, str], Row]:
-    """(scene, strategy, run) -> row, of all captures under every strategy; the default as docs/captures.md has it."""
-    rows = {**bench_rows("methods"), **bench_rows("budgets")}
-    for scene in TRAINING_VIEWS:
-        made = {one["seed"]: _as_benchmarked(one) for one in runs_of(scene, FIELD) if one["made_steps"] == STEPS}
-        if made:
-            rows[scene, "own", DEFAULT] = Row(scene, DEFAULT, "own", made).fill()
-    return rows
+def fox() -> str:
+    """Every metric of 3DGS and of the paper's field with 150,000 splats of fox."""
+    found = [(run, bench_rows("budgets")["fox", "mcmc@150000", run]) for run in ("3DGS", "NRF-GS")]
+    return bench_grid([("fox", found)], ["PSNR", "SSIM", "MS-SSIM", "FLIP", "L1", "train PSNR", "gap"])
 
 
-def _as_benchmarked(one: dict[str, Any]) -> dict[str, Any]:
-    """A record of results/captures.json as `nrfgs bench` would have written it."""
-    views = [{"image": image, "psnr": psnr} for image, psnr, *_ in one["per_image"]]
-    test = {name: one[name] for name in ("psnr", "ssim", "ms_ssim")} | {"per_image": views}
-    test["flip"] = fmean(one["flip"]) if one.get("flip") else None
-    measured = {"test": test, "train": {"psnr": one["train_psnr"]}}
-    measured |= {"splats": one["splats"], "parameter_bytes": one["splats_bytes"]}
-    return {"jobs": 2, "machine": one["machine"], "train": {}, "measured": measured}
+def fox_views() -> str:
+    """By how much the field is above 3DGS there in the median test view, and in how many views."""
+    base, row = (bench_rows("budgets")["fox", "mcmc@150000", run] for run in ("3DGS", "NRF-GS"))
+    gains = _view_gains(row, base)
+    return (
+        f"{signed(median(gains))} dB in the median test view, ahead in {sum(one > 0 for one in gains)} of {len(gains)}"
+    )
 
 
-def _shared(strategy: str, runs: Iterable[str]) -> list[str]:
-    """The captures of which all these runs have records."""
-    return [scene for scene in TRAINING_VIEWS if all(_place(scene, strategy, run) in _rows() for run in runs)]
-
-
-def _place(scene: str, strategy: str, run: str) -> tuple[str, str, str]:
-    return scene, "own" if run == DEFAULT else strategy, run
-
-
-def every(strategy: str, *more: str) -> str:
-    """PSNR, SSIM and splats of each method on each capture."""
-    rows, body = _rows(), []
-    runs = [*METHODS, *more]
-    for scene, views in TRAINING_VIEWS.items():
-        found = {run: rows[place] for run in runs if (place := _place(scene, strategy, run)) in rows}
-        if not found.keys() - {DEFAULT}:
-            continue
-        best = [
-            {list(found)[n] for n, rank in ranks(list(found.values()), one).items() if rank == 1}
-            for one in (PSNR, SSIM)
-        ]
-        cells = []
-        for run in runs:
-            if run not in found:
-                cells.append("not run")
-                continue
-            row = found[run]
-            psnr = bold(f"{mean_of(row, 'PSNR'):.2f}", run in best[0])
-            ssim = bold(f"{mean_of(row, 'SSIM'):.3f}", run in best[1])
-            seeds = f" ({len(row.records)})" if len(row.records) > 1 else ""
-            cells.append(f"{psnr}, {ssim}, {mean_of(row, 'splats') / 1000:.0f}k{seeds}")
-        body.append([f"{scene}, {views}", *cells])
-    return grid(["capture, views", *(BASE.get(run, run) for run in runs)], body)
-
-
-def averages() -> str:
-    """Every metric in the mean over the captures that all methods have."""
-    groups = []
-    for strategy, title in (("original", "3DGS's rules"), ("mcmc@150000", "150,000 splats (MCMC)")):
-        scenes, rows = _shared(strategy, METHODS), _rows()
-        if len(scenes) > 1:
-            means = [
-                (run, average([_first(rows[_place(scene, strategy, run)]) for scene in scenes])) for run in METHODS
-            ]
-            groups.append((f"{title}, {len(scenes)} captures", means))
-    return bench_grid(groups, ["PSNR", "SSIM", "MS-SSIM", "FLIP", "L1", "splats", "MB", "gap"])
-
-
-def _first(row: Row) -> Row:
-    """The same with its first seed alone, so that captures weigh alike."""
-    seed = min(row.records)
-    return Row(row.scene, row.run, row.strategy, {seed: row.records[seed]}).fill()
-
-
-def ahead(strategy: str, run: str, base: str) -> str:
-    """On how many captures a run is above another in its median test view, and by how much in the median capture."""
-    gains = list(median_gains(strategy, run, base).values())
-    return f"{sum(gain > 0 for gain in gains)} of {len(gains)} captures, by {signed(median(gains))}"
-
-
-def median_gains(strategy: str, run: str, base: str) -> dict[str, float]:
-    """Capture -> decibels by which a run is above another in the median test view, in the mean of seeds of both."""
-    rows = _rows()
-    return {
-        scene: _median_gain(rows[_place(scene, strategy, run)], rows[_place(scene, strategy, base)])
-        for scene in _shared(strategy, (run, base))
-    }
-
-
-def _median_gain(row: Row, base: Row) -> float:
-    seeds = row.records.keys() & base.records.keys()
+def _view_gains(row: Row, base: Row) -> list[float]:
+    """Decibels by which a row is above another in each test view, in the mean of the seeds of both."""
     gains = defaultdict(list)
-    for seed in seeds:
+    for seed in row.records.keys() & base.records.keys():
         views = [
             {v["image"]: v["psnr"] for v in one.records[seed]["measured"]["test"]["per_image"]} for one in (row, base)
         ]
         for image, psnr in views[0].items():
             gains[image].append(psnr - views[1][image])
-    return median(map(fmean, gains.values()))
+    return list(map(fmean, gains.values()))
 
 
 # How the heads' settings were chosen.
@@ -229,5 +143,5 @@ def trial_gains(head: str, trial: str) -> dict[str, float]:
     for scene in TRAINING_VIEWS:
         pair = [rows.get((scene, "original", name)) for name in (f"{head}_{trial}", head)]
         if all(pair):
-            found[scene] = _median_gain(*pair)
+            found[scene] = median(_view_gains(*pair))
     return found

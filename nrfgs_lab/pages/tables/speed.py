@@ -111,7 +111,7 @@ def first_sight() -> str:
         "model made": "first splats",
         "images read": "images read",
         "photographs compared": "photographs compared",
-        "step 0": "kernels compiled, first step",
+        "step 0": "first step",
     }
     body, before = [], 0.0
     for name, label in stages.items():
@@ -123,6 +123,18 @@ def first_sight() -> str:
         body.append([f"{target} dB, {reached['steps']:,} steps", f"{seconds - before:.1f}", f"{seconds:.1f}"])
         before = seconds
     return grid(["", "seconds", "since the command"], body)
+
+
+def seen(step: str) -> str:
+    """PSNR of the first look from a step on."""
+    curve = records("first_sight")["nrfgs-fast"]["curve"]
+    return next(f"{value:.1f}" for _, steps, value in curve if steps >= int(step))
+
+
+def waited_for_kernels() -> str:
+    """Seconds that a first training waits for its kernels, when it has read everything."""
+    stages = records("first_sight")["nrfgs, no compiled kernels, busy host"]["stages"]
+    return f"{stages['set up'] - stages['photographs compared']:.0f}"
 
 
 def imports(which: str = "seconds") -> str:

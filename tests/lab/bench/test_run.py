@@ -106,7 +106,7 @@ def test_killed_in_the_middle_of_ns_eval(tmp_path, monkeypatch, trained):
     forget_other_arguments(tmp_path, job.identity)
     interrupted(tmp_path, 40, reached=40)
     monkeypatch.setattr(bench_run, "evaluate", evaluate)
-    monkeypatch.setattr("nrfgs_lab.bench.measure.measure", lambda config, views: {"test": {}})
+    monkeypatch.setattr("nrfgs_lab.bench.measure.measure", lambda config, views, timed: {"test": {}})
     with pytest.raises(KeyboardInterrupt):
         bench_run.run(job)
     assert not Path(job.record).exists()
