@@ -90,7 +90,9 @@ class Trials:
         for gpu in slots:
             # A new process reads it before it looks for a GPU.
             os.environ["CUDA_VISIBLE_DEVICES"] = gpu
-            processes.append(context.Process(target=work, args=(waiting, results, self.scenes, end), daemon=True))
+            processes.append(
+                context.Process(target=quiet_worker, args=(waiting, results, self.scenes, end), daemon=True)
+            )
             processes[-1].start()
         while any(process.is_alive() for process in processes) or not results.empty():
             try:
@@ -130,6 +132,14 @@ def read_plan(file: Path) -> list[Trial]:
     return trials
 
 
+def quiet_worker(*args: Any) -> None:
+    """`work`, as all that a process does."""
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    CONSOLE.quiet = True
+    work(*args)
+
+
 def work(waiting, results, scenes: Path, end: float) -> None:
     """Take trainings from a queue while there is time.
 
@@ -140,9 +150,7 @@ def work(waiting, results, scenes: Path, end: float) -> None:
         end: time.time() after which nothing may run.
     """
     import torch
-    from nerfstudio.utils.rich_utils import CONSOLE
 
-    CONSOLE.quiet = True
     while True:
         try:
             trial = waiting.get(timeout=1.0)
@@ -186,12 +194,15 @@ def train_and_measure(trial: Trial, scenes: Path, folder: Path, end: float) -> d
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         trainer.save_checkpoint = lambda step: None
-        iteration, start = trainer.train_iteration, time.time()
+        iteration, looked = trainer.train_iteration, {}
 
         def in_time(step: int):
             if step % CHECKED_EVERY == 0:
                 now, left = time.time(), trainer.config.max_num_iterations - step
-                if now > end or step > 0 and now + left * (now - start) / step * SURE > end:
+                looked[step] = now
+                done = step - CHECKED_EVERY  # the first steps compile
+                rate = (now - looked[CHECKED_EVERY]) / done if done > 0 else 0.0
+                if now + SURE * rate * left > end:
                     raise TimeoutError(f"no time after {step} steps")
             return iteration(step)
 

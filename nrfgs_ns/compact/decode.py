@@ -190,6 +190,7 @@ def _coded_splats(header: dict[str, Any], streams: dict[str, np.ndarray], rank: 
         codes[name], first = streams["splats"][first : first + width].T, first + width
     grids = {name: Grid(np.array(grid["low"]), np.array(grid["step"])) for name, grid in header["grids"].items()}
     values = {name: torch.from_numpy(grids[name].values(table.astype(np.float64))) for name, table in codes.items()}
+    values["latents"] = values["latents"].float()  # the largest table by far, and no turns to work out
     splats = splats_of(values, torch.from_numpy(diffuse))
     splats = {name: value if value.dtype == torch.bool else value.float() for name, value in splats.items()}
     for name, value in splats.items():

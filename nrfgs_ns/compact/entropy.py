@@ -302,15 +302,16 @@ def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
             x = part.frequencies.take(slot) * (x >> PRECISION) + part.offsets.take(slot)
             x, at = _refilled(x, words, at)
             unsigned = token
-            if token.max(initial=0) >= DIRECT:
-                large = token - DIRECT
-                spare = np.where(large < 0, 0, (large >> 2) + 3)
-                low = np.zeros_like(token)
+            if (far := (token >= DIRECT).nonzero()[0]).size:
+                large = token[far] - DIRECT
+                spare, low, rest = (large >> 2) + 3, np.zeros_like(large), x[far]
                 for shift in (0, WORD) if spare.max() > WORD else (0,):
                     bits = (spare - shift).clip(0, WORD)
-                    low += (x & ((1 << bits) - 1)) << shift
-                    x, at = _refilled(x >> bits, words, at)
-                unsigned = np.where(large < 0, token, ((4 + (large & 3)) << spare) + low)
+                    low += (rest & ((1 << bits) - 1)) << shift
+                    rest, at = _refilled(rest >> bits, words, at)
+                x[far] = rest
+                unsigned = token.copy()
+                unsigned[far] = ((4 + (large & 3)) << spare) + low
             state[:count] = x
             if part.signed:
                 value = np.zeros(lanes.lanes, dtype=np.int64)

@@ -2,19 +2,20 @@
 """A finished field trained on for the file: tables that cost less, and the steps on which they lie.
 
 The loss is the training's, of pictures drawn from tables as the file would give them back, plus `rate` for each
-byte that a splat is estimated to cost in the mean (`rate.py`). Which splats there are, and which of them are diffuse,
-stays. Before that, splats go whose bytes are worth more than the light that they bring (`prepared`).
+byte that a splat is estimated to cost in the mean (`rate.py`). Which splats are diffuse stays. A few times, splats go
+whose bytes cost more than the pictures would lose without them (`without_them`).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import Field, Sight
+from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
 from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.compact.quantise import MOST_BITS, Grid, morton
@@ -33,24 +34,24 @@ NOISY = 0.3
 RATES = {"means": 1.6e-6, "turns": 5e-4, "scales": 2e-3, "opacities": 1e-2, "colors": 7e-4, "latents": 4e-3}
 """Learning rates of the tables; the means' in scene units, the latents' in standard deviations of the strongest."""
 STEPS_RATE, DENSITY_RATE, FIELD_RATE = 3e-2, 2e-2, 5e-4
-DEAREST = 100.0
-"""Bytes of a splat, about twenty, over how much the loss grows where its light is missing, about a fifth. A splat that
-brings less than this, times the rate, of the mean splat's light is not worth its bytes."""
+PRUNINGS = (0.08, 0.16, 0.24, 0.32)
+"""When splats go, in shares of the steps. Each time one of so many in the file's order is asked: neighbours, which hide
+behind each other, must not go together."""
+WORTH = 0.5
+"""What a splat's bytes cost, over what the loss grows without it: below 1, because some that hide behind each other go
+together all the same."""
 LAST = 0.03
 """Of the learning rates, at the end; they fall by a cosine."""
 
 
-def prepared(field: Field, weight: Tensor, rate: float) -> Field:
-    """A field as a fine-tune begins with it: without splats that are not worth their bytes, and with latents that are
-    their own principal components, so that those that matter little can go.
+def prepared(field: Field, weight: Tensor) -> Field:
+    """A field as a fine-tune begins with it: with latents that are their own principal components, so that those that
+    matter little can go.
 
     Args:
         weight: what each splat contributes to the training views' pixels, >= 0. [N]
-        rate: as for `fine_tune`.
     """
-    kept = (weight >= rate * DEAREST * weight.mean()).nonzero()[:, 0]
-    field = Field(field.head, {name: value[kept] for name, value in field.splats.items()})
-    return with_rank(field, latent_basis(field, weight[kept]), field.head.config.latent_dim)
+    return with_rank(field, latent_basis(field, weight), field.head.config.latent_dim)
 
 
 class CodedSplats(nn.Module):
@@ -89,18 +90,78 @@ class CodedSplats(nn.Module):
         return splats_of(tables, self.diffuse)
 
     def bits(self, tables: Mapping[str, Tensor]) -> Tensor:
-        """What tables, as `forward` gives them, cost: a scalar."""
+        """What each splat costs in tables as `forward` gives them, [N]."""
         steps = {name: table.steps for name, table in self.tables.items()}
-        return (
-            bits_of_places(tables["means"], steps["means"])
-            + self.density.bits(self._row(tables), self._row(steps))
-            + self.density_of_latents.bits(tables["latents"], steps["latents"])
-        )
+        bits = bits_of_places(tables["means"], steps["means"]) + self.density.bits(self._row(tables), self._row(steps))
+        latents = self.density_of_latents.bits(tables["latents"], steps["latents"])
+        return bits.index_add(0, (~self.diffuse).nonzero()[:, 0], latents)
+
+    @torch.no_grad()
+    def keep(self, kept: Tensor, optimizer: torch.optim.Optimizer) -> None:
+        """Let only the splats `kept`, bool [N], remain, and what the optimizer remembers of them."""
+        of_latents, self.diffuse = kept[~self.diffuse], self.diffuse[kept]
+        for group, (name, table) in zip(optimizer.param_groups, self.tables.items(), strict=False):
+            rows, old = of_latents if name == "latents" else kept, table.values
+            state = {
+                key: value[rows] if value.shape == old.shape else value
+                for key, value in optimizer.state.pop(old, {}).items()
+            }
+            table.values = nn.Parameter(old[rows])
+            optimizer.state[table.values], group["params"] = state, [table.values]
 
     @staticmethod
     def _row(tables: Mapping[str, Tensor]) -> Tensor:
         """The columns of all splats beside their means, in the file's order."""
         return torch.cat([tables[name] for name in COLUMNS], dim=-1)
+
+
+class Gated(NamedTuple):
+    """A field whose splats' opacities, as they are seen, are multiplied."""
+
+    field: Field
+    gates: Tensor
+    """[N]"""
+
+    def seen_from(self, view: Sight) -> SplatAppearance:
+        look = self.field.seen_from(view)
+        return look._replace(opacities=look.opacities * self.gates[view.visible])
+
+
+def without_them(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]]) -> tuple[Tensor, float]:
+    """How much larger the squared error of training views is without each splat, the others as they are.
+
+    A pixel is linear in the opacity of each splat alone: taking splat i away takes d_p = dI_p / dg_i from each pixel p,
+    where g_i = 1 multiplies its opacity, and the squared error grows by
+
+        sum_p |d_p|^2 - 2 (I_p - truth_p) d_p.
+
+    The second sum is the error's gradient by g_i. The first is the mean of (d sum_p s_p I_p / dg_i)^2 over signs s_p
+    drawn at random (Hutchinson's estimator), one drawing for each view.
+
+    Args:
+        model: an NrfgsModel in training mode.
+        field: what is drawn.
+        views: training cameras and their photographs.
+
+    Returns:
+        the growth as a share of the squared error [N], and the mean of the training's loss.
+    """
+    count, device = len(field.splats["means"]), field.splats["means"].device
+    growth, error, loss = (torch.zeros(n, device=device) for n in (count, 1, 1))
+    for number, (camera, batch) in enumerate(views, 1):
+        gates = torch.ones(count, device=device, requires_grad=True)
+        outputs, _ = model.render(field, camera, Gated(field, gates))
+        off = outputs["rgb"] - model.truth_of(batch, outputs["background"])
+        if (mask := model.mask_of(batch)) is not None:
+            off = off * mask
+        squared = off.square().sum()
+        signs = torch.empty_like(off).bernoulli_().mul_(2.0).sub_(1.0)
+        (of_error,) = torch.autograd.grad(squared, gates, retain_graph=True)
+        (of_signs,) = torch.autograd.grad((off * signs).sum(), gates)
+        growth += of_signs.square() - of_error
+        error += squared.detach()
+        loss += (model.photometric_loss(outputs, batch).detach() - loss) / number
+    return growth / error, float(loss)
 
 
 @dataclass
@@ -117,6 +178,7 @@ def fine_tune(
     field: Field,
     next_view: Callable[[int], tuple[Any, dict[str, Any]]],
     noise: ViewNoise,
+    views: int,
     steps: int,
     rate: float,
     precision: Precision,
@@ -129,6 +191,7 @@ def fine_tune(
         field: the field to begin with (`prepared`), with a neural residual field's head.
         next_view: a training camera and its photograph for each step.
         noise: on where the head is asked from.
+        views: how many training views tell what a splat is worth.
         steps: how many.
         rate: of the loss, for a byte of each splat.
         precision: the steps of the grids to begin with.
@@ -150,10 +213,21 @@ def fine_tune(
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: LAST + (1 - LAST) * 0.5 * (1 + np.cos(np.pi * min(step / steps, 1.0)))
     )
+    prunings = [round(share * steps) for share in PRUNINGS]
+    turns = torch.arange(count, device=coded.diffuse.device) % max(len(prunings), 1)
     was_training = model.training
     model.train()
     try:
         for step in range(steps):
+            if step in prunings:
+                with torch.no_grad():
+                    tables = coded(rounded=True)
+                    dear = coded.bits(tables) * (WORTH * rate / (BYTE * count))
+                growth, loss = without_them(model, Field(head, coded.splats(tables)), map(next_view, range(views)))
+                # The training's loss is about the root of the squared error.
+                kept = (turns != prunings.index(step)) | (0.5 * loss * growth > dear)
+                coded.keep(kept, optimizer)
+                turns = turns[kept]
             camera, batch = next_view(step)
             tables = coded(rounded=step >= NOISY * steps)
             splats = coded.splats(tables)
@@ -163,13 +237,13 @@ def fine_tune(
             loss = model.photometric_loss(outputs, batch)
             if step % EVERY == 0:
                 bits = coded.bits(tables)
-                loss = loss + EVERY * rate / (BYTE * count) * bits
+                loss = loss + EVERY * rate / (BYTE * count) * bits.sum()
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
             schedule.step()
             if step % TOLD == 0:
-                on_step(step, float(bits.detach()))
+                on_step(step, float(bits.detach().sum()))
     finally:
         model.train(was_training)
     with torch.no_grad():

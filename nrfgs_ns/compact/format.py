@@ -50,7 +50,7 @@ CODINGS = ("xz", "rans")
 CODED = ("int16", "int32", "uint32")
 """Types of coded tables."""
 LARGEST_RATIO = 32
-"""Times its own size that a file may unpack to. Those of results/compact.json unpack to 1.4 to 2.6 times theirs."""
+"""Times its own size that a file may unpack to. Those of results/compact.json unpack to at most ten times theirs."""
 SMALL = 2**24
 """Bytes that any file may unpack to."""
 MOST_AXES = 4

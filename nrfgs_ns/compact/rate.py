@@ -79,7 +79,7 @@ class Density(nn.Module):
         self.growth = nn.Parameter(values.new_zeros(columns))
 
     def bits(self, values: Tensor, steps: Tensor) -> Tensor:
-        """What values [N, C] cost together where steps [C] tell them apart: a scalar."""
+        """What each row of values [N, C] costs where steps [C] tell them apart, [N]."""
         before, before_2 = _earlier(values, 1), _earlier(values, 2)
         mean = values @ self.of_left.tril(-1).T + before @ self.of_left_before.tril(-1).T
         residuals = values - (mean + self.of_before[0] * before + self.of_before[1] * before_2)
@@ -99,7 +99,7 @@ class Density(nn.Module):
         # F(a) - F(b) = F(a) F(-b) (1 - exp(b - a)), which does not vanish in the tails.
         inside = logsigmoid(upper) + logsigmoid(-lower) + torch.log(-torch.expm1(-steps / widths))
         logs = torch.logsumexp(inside + self.log_shares.log_softmax(dim=-1), dim=-1)
-        return -logs.sum() / math.log(2.0)
+        return -logs.sum(dim=-1) / math.log(2.0)
 
 
 def _earlier(values: Tensor, count: int) -> Tensor:
@@ -108,8 +108,8 @@ def _earlier(values: Tensor, count: int) -> Tensor:
 
 
 def bits_of_places(means: Tensor, steps: Tensor) -> Tensor:
-    """What means [N, 3] cost together where steps [3] tell them apart, a scalar: their cells are told from all others
+    """What each of N means [N, 3] costs where steps [3] tell them apart, a scalar: their cells are told from all others
     of their box, in any order. Halving a step costs a bit, wherever the means are."""
     extent = (means.detach().amax(dim=0) - means.detach().amin(dim=0)).clamp_min(1e-30)
     cells = (extent.log() - steps.log()).sum() / math.log(2.0)
-    return len(means) * (cells - math.log2(max(len(means), 1)) + 1.0 / math.log(2.0))
+    return cells - math.log2(max(len(means), 1)) + 1.0 / math.log(2.0)

@@ -121,8 +121,8 @@ def trained_for_the_file(
             progress.update(task, completed=step, description=f"({bits / 8e6:.2f} MB)")
 
         next_view = pipeline.datamanager.next_train
-        field = prepared(chosen.field, chosen.weight, options.rate)
-        tuned = fine_tune(model, field, next_view, noise, options.finetune, options.rate, options.precision, tell)
+        field, steps = prepared(chosen.field, chosen.weight), options.finetune
+        tuned = fine_tune(model, field, next_view, noise, len(centers), steps, options.rate, options.precision, tell)
     return tuned.field, tuned.steps
 
 

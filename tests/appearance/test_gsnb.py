@@ -34,6 +34,7 @@ def test_sizes():
     head = GsnbConfig().setup()
     assert shared_weights(head) == (39 * 64 + 64) + (64 * 64 + 64) + (64 * 16 + 16) == 7760
     assert numbers_per_splat(head) == 48
+    assert shared_weights(GsnbConfig(raw_direction=False).setup()) == 7760 - 3 * 64
 
 
 @pytest.mark.parametrize("step, ramp", [(3000, 0.6), (5000, 1.0), (30_000, 1.0)])
@@ -74,13 +75,14 @@ def test_learnt_functions_use_the_coefficients_of_degrees_that_are_still_off():
     assert (splats["features_rest"].grad[visible] != 0).any(dim=0).all()
 
 
-def test_opposite_directions_along_an_axis_are_told_apart():
+@pytest.mark.parametrize("raw", [True, False])
+def test_opposite_directions_along_an_axis_are_told_apart_by_the_direction_itself(raw):
     """sin(pi d) and cos(pi d) and all higher bands agree at d = +x and d = -x."""
-    head = awake(GsnbConfig(degree=0))
+    head = awake(GsnbConfig(degree=0, raw_direction=raw))
     splats, visible, _ = scene(head, count=3)
     splats["means"].zero_()
     x = torch.tensor([2.0, 0, 0], dtype=torch.double)
-    assert not torch.allclose(head(splats, visible, x).colors, head(splats, visible, -x).colors)
+    assert torch.allclose(head(splats, visible, x).colors, head(splats, visible, -x).colors) != raw
 
 
 @pytest.mark.parametrize(

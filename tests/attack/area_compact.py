@@ -20,8 +20,8 @@ def written(version: int = 2) -> bytes:
     import tempfile
 
     import torch
-    from compact_1 import encode_1
 
+    from nrfgs_lab.compact_1 import encode_1
     from nrfgs_ns.appearance.field import Field
     from nrfgs_ns.appearance.nrf import NrfConfig
     from nrfgs_ns.compact.encode import encode

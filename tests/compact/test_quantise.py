@@ -3,10 +3,10 @@
 
 import numpy as np
 import pytest
-from compact_1 import grid_with_bits, grid_with_step, narrowest, smallest_three
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nrfgs_lab.compact_1 import grid_with_bits, grid_with_step, narrowest, smallest_three
 from nrfgs_ns.compact.quantise import NEAR, OCTAHEDRAL, from_morton, from_smallest_three, matrix, morton, nearest_turn
 
 

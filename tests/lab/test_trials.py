@@ -33,7 +33,7 @@ def test_a_plan_is_read_in_its_order(tmp_path):
             read_plan(file)
 
 
-def test_trainings_follow_each_other_and_one_that_fails_ends_no_other(tiny_scene, tmp_path, no_cuda):
+def test_trainings_follow_each_other_and_one_that_fails_ends_no_other(tiny_scene, no_cuda, monkeypatch):
     trials = [
         Trial("field", "nrfgs", tiny_scene.name, 42, 3, OPTIONS),
         Trial("broken", "nrfgs", "no such scene", 42, 3),
@@ -45,4 +45,7 @@ def test_trainings_follow_each_other_and_one_that_fails_ends_no_other(tiny_scene
         assert record["made_steps"] == 3 and record["splats"] > 0
         assert len(record["per_image"]) == len(record["flip"]) > 0
         assert record["psnr"] == pytest.approx(sum(view[1] for view in record["per_image"]) / len(record["per_image"]))
+    monkeypatch.setattr("nrfgs_lab.trials.CHECKED_EVERY", 1)
+    long = Trial("long", "nrfgs-sh", tiny_scene.name, 7, 10**6, OPTIONS)
+    assert "no time after 2 steps" in done([long], tiny_scene.parent, time.time() + 60)[long.key]["left"]
     assert done(trials[:1], tiny_scene.parent, time.time() - 1)[trials[0].key]["left"] == "no time"

@@ -6,174 +6,114 @@ from collections.abc import Iterable
 from statistics import fmean, median
 from typing import Any
 
-from nrfgs_lab.held_out import effects
 from nrfgs_lab.pages.tables import bold, grid, records
-from nrfgs_lab.pages.tables.readme import FIELD, HARMONICS, LONG, TRAINING_VIEWS, runs_of, view_gains
+from nrfgs_lab.pages.tables.readme import FIELD, HARMONICS, HOST, LONG, SHRUNK, TRAINING_VIEWS, runs_of, view_gains
 
-SHRUNK = "nrfgs-sh, nrfgs's steps and shrinkage"
-EXPOSURE_LEARNT = " *"
-"""Mark of trainings that learnt each photograph's exposure, as an earlier rule had it."""
-SMALL = "late start, no opacity residual, one band, noise 1"
-SHOWN = {
-    "field: plain": "field: noise 0.5",
-    "field: late start": "and late start",
-    "field: late start, no opacity residual": "and no opacity residual",
-    f"field: {SMALL}": "and one band, noise 1",
-    f"field: {SMALL}, shrinkage 0.15 / V": "and shrinkage 0.15 / V",
-    "harmonics: shrinkage 0.15 / V": "harmonics, shrinkage 0.15 / V",
+BASE = "harmonics: shrinkage"
+STORED = ", shrinkage of what is stored"
+OLDER = " *"
+"""Mark of what an earlier version trained."""
+TRIED = {
+    "field: trust": "**`nrfgs`**",
+    "field: trust, late start": "asked from 0.3 of the training on",
+    "field: trust, one band": "one band",
+    "field: whole": "u = 1",
+    f"field: trust{STORED}": "shrinkage of stored opacity",
+    f"field: whole{STORED}": "u = 1, shrinkage of stored opacity",
+    f"field: whole, late start{STORED}": "the same, asked from 0.3 on",
+    f"field: whole, noise by each splat's angle between views{STORED}": "u = 1, stored, noise by each splat's angles",
+    f"field: whole, a tenth of the noise from anywhere{STORED}": "u = 1, stored, a tenth of the noise far",
+    "field: rules at 30 and 100 views": "below 30 views one band, fixed opacity, asked from 0.3 on",
 }
-"""Rows of the second table of held-out views, by the names of their trials."""
-
-
-def held_out(**wanted: Any) -> list[dict[str, Any]]:
-    """The records of held-out views with these entries."""
-    found = records("held-out").values()
-    return [one for one in found if all(one.get(name) == value for name, value in wanted.items())]
-
-
-def gain(decibels: float, ssim: float) -> str:
-    """A difference: dB / thousandths of SSIM."""
-    return f"{decibels:+.2f} / {1000 * ssim:+.0f}"
+"""Rows of the table of held-out views, by the names of their trials."""
 
 
 def trials() -> str:
-    """How many trainings and settings there were."""
-    found = records("held-out").values()
-    count = {head: len({_setting(one) for one in found if _head(one) == head}) for head in ("field", "harmonics")}
-    return (
-        f"{len(found)} trainings: {count['field']} settings of the field, {count['harmonics']} of harmonics, which had "
-        "fewer before the screening and as many in it"
-    )
+    """How many trainings on held-out views there were."""
+    return str(sum(len(records(study)) for study in ("held-out", "held-out-trials")))
 
 
-def _head(one: dict[str, Any]) -> str:
-    return "harmonics" if one["method"] == "nrfgs-sh" else "field"
-
-
-def _setting(one: dict[str, Any]) -> str:
-    return str((one["group"].split(",")[0], one["steps"], one["settings"], one.get("experiment")))
-
-
-def screening() -> str:
-    """What each factor does to held-out views of fern."""
-    body = []
-    for head in ("field", "harmonics"):
-        found = effects(held_out(study="screening", head=head, scene="fern"))
-        body += [[head, factor, gain(*found[factor])] for factor in sorted(found, key=found.get, reverse=True)]
-    return grid(["", "factor", "effect"], body)
-
-
-def together() -> str:
-    """What is gained over harmonics as they were, on held-out views."""
-    runs = held_out(group="splatfacto")
-    base = {
-        (one["scene"], one["offset"], view[0]): view
-        for one in runs
-        for view in one["per_image"]
-        if one["trial"] == "harmonics: plain"
-    }
-    gains, left = defaultdict(list), {}
+def tried() -> str:
+    """What settings gain over harmonics with shrinkage on held-out views: median dB / mean SSIM x 1000."""
+    runs = list(records("held-out-trials").values())
+    base = {(one["scene"], view[0]): view for one in runs if one["name"] == BASE for view in one["per_image"]}
+    gains: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for one in runs:
-        left.setdefault(one["scene"], TRAINING_VIEWS[one["scene"]] - len(one["per_image"]))
         for name, psnr, ssim, *_ in one["per_image"]:
-            if (truth := base.get((one["scene"], one["offset"], name))) is not None:
-                gains[one["trial"], one["scene"]].append((psnr - truth[1], ssim - truth[2]))
-    scenes = [scene for scene in TRAINING_VIEWS if any(key[1] == scene for key in gains)]
+            if (truth := base.get((one["scene"], name))) is not None:
+                gains[one["name"], one["scene"].split("/", 1)[1]].append((psnr - truth[1], ssim - truth[2]))
+    scenes = [scene for scene in ("32/bonsai", "64/bonsai", *TRAINING_VIEWS) if ("field: trust", scene) in gains]
     body = []
-    for trial, label in SHOWN.items():
+    for trial, label in TRIED.items():
         views = [gains[trial, scene] for scene in scenes]
-        body.append([label, *(gain(median(a for a, _ in v), fmean(b for _, b in v)) if v else "" for v in views)])
-    return grid(["", *(f"{scene} ({left[scene]})" for scene in scenes)], body)
+        if any(views):
+            body.append([label, *map(_gain, views)])
+    head = (f"bonsai, {scene.split('/')[0]} views" if "/" in scene else scene for scene in scenes)
+    return grid(["", *head], body)
 
 
-def halves() -> str:
-    """Held-out views of bonsai after trainings with all, half and a quarter of the other views."""
-    groups = {
-        "splatfacto": "all",
-        "splatfacto, every second view": "half",
-        "splatfacto, every fourth view": "a quarter",
-    }
-    names = {
-        "field: late start": "field: noise 0.5, late start",
-        "field: late start, no opacity residual": "and no opacity residual",
-        f"field: {SMALL}": "and one band, noise 1",
-        "field: late start, shrinkage 0.15 / V": "noise 0.5, late start, shrinkage 0.15 / V",
-    }
-    body = []
-    for trial, label in names.items():
-        cells = []
-        for group in groups:
-            runs = [one for one in held_out(scene="bonsai", trial=trial) if one["group"] == group]
-            runs = [one for one in runs if one["study"] == "together"]
-            cells.append(f"{runs[-1]['psnr']:.2f} / {runs[-1]['ssim']:.3f}" if runs else "")
-        body.append([label, *cells])
-    return grid(["PSNR / SSIM", *groups.values()], body)
+def _gain(views: list[tuple[float, float]]) -> str:
+    """Of PSNR, the median; of SSIM, the mean; and the number of views."""
+    if not views:
+        return ""
+    return f"{median(a for a, _ in views):+.2f} / {1000 * fmean(b for _, b in views):+.0f} ({len(views)})"
 
 
 def _mean(runs: Iterable[dict[str, Any]], metric: str) -> float | None:
-    values = [one[metric] for one in runs if one.get(metric)]
+    values = [one[metric] for one in runs if one.get(metric) and one[metric] != [None] * len(one["per_image"])]
     return fmean(fmean(value) if isinstance(value, list) else value for value in values) if values else None
 
 
-def _best(found: list[list[dict[str, Any]]]) -> dict[str, float]:
-    """The best mean of each metric."""
-    return {
-        metric: choose([value for runs in found if (value := _mean(runs, metric)) is not None], default=0.0)
-        for metric, choose in (("psnr", max), ("ssim", max), ("flip", min))
-    }
-
-
-def _cell(runs: list[dict[str, Any]], best: dict[str, float]) -> str:
+def _cell(runs: list[dict[str, Any]], best: dict[str, float], version: set[str]) -> str:
     if not runs:
         return "-"
-    flip, seeds = _mean(runs, "flip"), f" ({len(runs)})" if len(runs) > 1 else ""
-    values = [
-        bold(f"{_mean(runs, 'psnr'):.2f}", _mean(runs, "psnr") == best["psnr"]),
-        bold(f"{_mean(runs, 'ssim'):.3f}", _mean(runs, "ssim") == best["ssim"]),
-        "-" if flip is None else bold(f"{flip:.3f}", flip == best["flip"]),
-    ]
+    values = []
+    for metric, form in (("psnr", ".2f"), ("ssim", ".3f"), ("flip", ".3f")):
+        value = _mean(runs, metric)
+        values.append("-" if value is None else bold(format(value, form), value == best[metric]))
     splats = _mean(runs, "splats")
-    mark = EXPOSURE_LEARNT if any(one.get("photographs") == "on" for one in runs) else ""
-    return " / ".join(values) + ("" if splats is None else f", {splats / 1000:.0f}k") + seeds + mark
+    text = " / ".join(values) + ("" if splats is None else f", {splats / 1000:.0f}k")
+    text += f" ({len(runs)})" if len(runs) > 1 else ""
+    return text + (OLDER if any(one.get("machine", {}).get("source") not in version for one in runs) else "")
 
 
 def test_views() -> str:
     """PSNR / SSIM / FLIP and splats on test views."""
+    names = FIELD, SHRUNK, HARMONICS, LONG, HOST
+    version = {one["machine"]["source"] for scene in TRAINING_VIEWS for one in runs_of(scene, FIELD)}
     body = []
     for scene, views in TRAINING_VIEWS.items():
-        found = [runs_of(scene, name) for name in (FIELD, HARMONICS, SHRUNK, LONG)]
-        body.append([scene, str(views), *(_cell(runs, _best(found)) for runs in found)])
-    return grid(["", "views", "`nrfgs`", "harmonics, the same steps", "and shrinkage", "`nrfgs-sh`"], body)
+        found = [runs_of(scene, name) for name in names]
+        best = {
+            metric: choose((value for runs in found if (value := _mean(runs, metric)) is not None), default=0.0)
+            for metric, choose in (("psnr", max), ("ssim", max), ("flip", min))
+        }
+        body.append([scene, str(views), *(_cell(runs, best, version) for runs in found)])
+    head = "`nrfgs`", "harmonics, same steps and shrinkage", "without shrinkage", "`nrfgs-sh`", "splatfacto"
+    return grid(["", "views", *head], body)
 
 
 def gaps() -> str:
     """Gains in the median view, and how far training views are above test views."""
     body = []
     for scene, views in TRAINING_VIEWS.items():
-        field, harmonics, shrunk, long = (runs_of(scene, name) for name in (FIELD, HARMONICS, SHRUNK, LONG))
-        if not field:
-            continue
+        field, *others = (runs_of(scene, name) for name in (FIELD, SHRUNK, LONG, HOST))
         cells = []
-        for other in (harmonics, shrunk, long):
-            gains = view_gains(field, [one for one in other if "per_image" in one])
+        for other in others:
+            gains = view_gains(field, other)
             cells.append(f"{median(gains):+.2f}, {sum(one > 0 for one in gains)} of {len(gains)}" if gains else "-")
-        for runs in (field, harmonics):
+        ssim = _mean(field, "ssim"), _mean(others[0], "ssim")
+        cells.insert(1, "-" if None in ssim else f"{1000 * (ssim[0] - ssim[1]):+.0f}")
+        for runs in (field, others[0]):
             learnt = _mean(runs, "train_psnr")
             cells.append("-" if learnt is None else f"{learnt - _mean(runs, 'psnr'):.1f}")
         body.append([scene, str(views), *cells])
-    names = "over harmonics, the same steps", "with shrinkage", "over `nrfgs-sh`", "gap, `nrfgs`", "gap, harmonics"
-    return grid(["", "views", *names], body)
+    names = "over harmonics with shrinkage, dB", "SSIM x 1000", "over `nrfgs-sh`", "over splatfacto"
+    return grid(["", "views", *names, "gap, `nrfgs`", "gap, harmonics"], body)
 
 
-def before() -> str:
-    """What the default was before, and a late start on bonsai, on test views."""
-    names = {"nrfgs without noise": "no noise", "nrfgs, noise alone": "noise alone", FIELD: "`nrfgs`"}
-    late = "nrfgs, late start and shrinkage"
-    scenes = "bonsai", "kitchen", "fern"
-    rows = {label: [runs_of(scene, name) for scene in scenes] for name, label in names.items()}
-    rows |= {"noise, late start, shrinkage": [runs_of(scene, late) for scene in scenes]}
-    cells = [
-        [label, *(f"{_mean(runs, 'psnr'):.2f} / {_mean(runs, 'ssim'):.3f}" if runs else "" for runs in row)]
-        for label, row in rows.items()
-    ]
-    return grid(["PSNR / SSIM", *scenes], cells)
+def many() -> str:
+    """What trust and shrinkage cost a capture of many views."""
+    found = [runs_of("bonsai", name)[0] for name in (FIELD, "nrfgs, noise alone")]
+    with_them, without = (f"{one['psnr']:.2f} dB with {one['splats'] / 1000:.0f}k splats" for one in found)
+    return f"{with_them}; an earlier version with noise alone {without}"

@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table and the figure of docs/compact-format.md.
+"""The table and the figure of docs/compact-format.md, from the records of `nrfgs_lab.compact` in results/compact.json.
 
-    python -m nrfgs_lab.pages.tables.compact_format        # writes docs/images/compact-trade.png
-
-results/compact.json has the reports of `nrfgs export compact`: SCENE-version-1 of a writer of that format,
-SCENE-version-2 without a fine-tune, and SCENE-rate-RATE with one; SCENE-rate-RATE-STEPS with more steps than the
-others. Those of the captures, and SCENE-first-rate-RATE, are of the fine-tune's first settings.
+python -m nrfgs_lab.pages.tables.compact_format        # writes docs/images/compact-trade.png
 """
 
 from typing import Any
@@ -14,50 +10,70 @@ from nrfgs_lab.pages.tables import ROOT, grid, records, signed
 from nrfgs_ns.files import whole
 
 CAPTURES = "bonsai", "goldcape", "fox"
+LABELS = {
+    "ply": "3DGS's PLY",
+    "sog": "the PLY as SOG",
+    "spz": "the PLY as SPZ",
+    "version-1": "version 1",
+    "version-2": "not trained for the file",
+}
 
 
-def reports(scene: str) -> list[tuple[str, dict[str, Any]]]:
-    """What a table names them, and the reports of a scene, the largest file first."""
+def reports(scene: str) -> dict[str, dict[str, Any]]:
+    """The records of a scene's files, the largest file first."""
     found = {name.removeprefix(f"{scene}-"): one for name, one in records("compact").items() if name.startswith(scene)}
-    labelled = [(name.replace("version-", "version ").replace("rate-", "rate "), one) for name, one in found.items()]
-    return sorted(labelled, key=lambda pair: -pair[1]["bytes"])
+    return dict(sorted(((n, one) for n, one in found.items() if "bytes" in one), key=lambda pair: -pair[1]["bytes"]))
 
 
 def captures() -> str:
     """A row for each file of the captures."""
     rows = []
     for scene in CAPTURES:
-        for number, (label, one) in enumerate(reports(scene)):
-            if number == 0:
-                ply = f"{248 * one['splats'] / 1e6:.1f}"
-                rows.append([scene, "3DGS's PLY", f"{one['splats']:,}", ply, "", "", "", ""])
-            seconds, small = one["seconds"], one["bytes"] < 1e6
-            measured = one["psnr_file"] is not None
+        for number, (name, one) in enumerate(reports(scene).items()):
+            seconds = one.get("seconds", {})
             rows.append(
                 [
-                    "",
-                    label.replace("-4000", ", 4,000 steps"),
-                    f"{one['written']:,}",
-                    f"{one['bytes'] / 1e6:.3f}" if small else f"{one['bytes'] / 1e6:.2f}",
-                    f"{one['psnr_file']:.2f}" if measured else "",
-                    signed(-one["loss_db"], 2) if measured else "",
-                    f"{seconds['finetune']:.0f}" if one["finetune"] else "",
-                    ", ".join(f"{seconds[name]:.1f}" for name in ("encode", "decode") if seconds[name] is not None),
+                    scene if number == 0 else "",
+                    LABELS.get(name, name.replace("-", " ")),
+                    f"{one['written']:,}" if "written" in one else "",
+                    f"{one['bytes'] / 1e6:.{1 if one['bytes'] > 1e7 else 2}f}",
+                    f"{one['psnr_file']:.2f}",
+                    signed(-one["loss_db"], 2),
+                    f"{seconds['finetune']:.0f}" if one.get("finetune") else "",
                 ]
             )
-    head = ["", "", "splats", "MB", "PSNR", "against the model", "seconds of training", "of encoding, decoding"]
-    return grid(head, rows)
+    return grid(["", "", "splats", "MB", "PSNR", "against the model", "seconds of fine-tune"], rows)
+
+
+def at(scene: str, what: str, value: str) -> str:
+    """Decibels that so many MB lose, or MB of a file that loses so many dB: on straight lines between fine-tunes."""
+    import numpy as np
+
+    tuned = [one for name, one in reports(scene).items() if name.startswith("rate")]
+    size, loss = [one["bytes"] / 1e6 for one in tuned], [one["loss_db"] for one in tuned]
+    if what == "loss":
+        return f"{np.interp(-float(value), [-x for x in size], loss):.2f}"
+    return f"{np.interp(float(value), loss, size):.1f}"
+
+
+def steps() -> str:
+    """Of the captures' fine-tunes."""
+    (found,) = {one["finetune"] for scene in CAPTURES for one in reports(scene).values() if one.get("finetune")}
+    return f"{found:,}"
+
+
+def added(scene: str) -> str:
+    """Per cent of a training's seconds that the longest of its fine-tunes takes."""
+    longest = max(one["seconds"]["finetune"] for one in reports(scene).values() if one.get("finetune"))
+    return f"{100 * longest / records('compact')[f'{scene}-model']['train']['seconds']:.0f} %"
 
 
 def file(name: str, what: str) -> str:
-    """A number of a file: MB, KB, PSNR, or dB that it loses."""
+    """A number of a file: its MB, decibels that it loses, seconds to write it or to read it in Python or Chromium."""
     one = records("compact")[name]
-    return {
-        "MB": f"{one['bytes'] / 1e6:.2f}",
-        "KB": f"{one['bytes'] / 1e3:.0f}",
-        "PSNR": f"{one['psnr_file']:.2f}",
-        "loss": f"{one['loss_db']:.2f}",
-    }[what]
+    if what in ("MB", "loss"):
+        return f"{one['bytes'] / 1e6 if what == 'MB' else one['loss_db']:.2f}"
+    return f"{one['seconds'][what]:.1f}"
 
 
 def draw() -> None:
@@ -71,18 +87,15 @@ def draw() -> None:
     with pyplot.rc_context({"font.size": 8}):
         figure, panel = pyplot.subplots(figsize=(5.6, 3.4), dpi=110)
         for number, scene in enumerate(CAPTURES):
-            every = reports(scene)
-            every = [(label, one) for label, one in every if one["loss_db"] is not None and one["rate"] != 0.01]
-            tuned = [one for label, one in every if label.startswith("rate") and "-" not in label]
-            color = f"C{number}"
-            for ones, style in ((tuned, "o-"), ([one for label, one in every if label == "version 2"], "s")):
-                x, y = [one["bytes"] / 1e6 for one in ones], [-one["loss_db"] for one in ones]
-                panel.plot(x, y, style, color=color, markersize=4, label=scene if style == "o-" else None)
-            for label, one in every:
-                if label.startswith("rate") and "-" not in label:
-                    place = one["bytes"] / 1e6, -one["loss_db"]
-                    text = label.removeprefix("rate ")
-                    panel.annotate(text, place, (4, -8), textcoords="offset points", fontsize=6, color=color)
+            every, color = reports(scene), f"C{number}"
+            tuned = {name: one for name, one in every.items() if name.startswith("rate")}
+            x, y = [one["bytes"] / 1e6 for one in tuned.values()], [-one["loss_db"] for one in tuned.values()]
+            panel.plot(x, y, "o-", color=color, markersize=4, label=scene)
+            for name, place in zip(tuned, zip(x, y, strict=True), strict=True):
+                text = name.removeprefix("rate-")
+                panel.annotate(text, place, (4, -8), textcoords="offset points", fontsize=6, color=color)
+            plain = every["version-2"]
+            panel.plot(plain["bytes"] / 1e6, -plain["loss_db"], "s", color=color, markersize=4)
         panel.axhline(0.0, color="grey", linewidth=0.6)
         panel.set(xlabel="MB (squares: not trained for the file)", ylabel="dB against the model", xscale="log")
         panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

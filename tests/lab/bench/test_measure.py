@@ -11,9 +11,10 @@ from nerfstudio.cameras.cameras import Cameras
 from nrfgs_lab.bench import run as bench_run
 from nrfgs_lab.bench.choice import named_run, united, with_records
 from nrfgs_lab.bench.command import Bench
-from nrfgs_lab.bench.measure import at_size
+from nrfgs_lab.bench.measure import at_size, over_views
 from nrfgs_lab.bench.spec import Job, cells_of, command, identity, make_spec
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.metrics import ImageMetrics
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -78,6 +79,42 @@ def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monke
     assert measured["diffuse"] == 0
     assert measured["fps"] > 0 and measured["checkpoint_bytes"] > measured["parameter_bytes"]
     assert len(list((tmp_path / "work" / "pictures").glob("eval_img_*.png"))) == 2
+
+
+class Grey:
+    """A model that renders grey."""
+
+    device = torch.device("cpu")
+
+    def get_outputs_for_camera(self, camera):
+        return {"rgb": torch.full((16, 16, 3), 0.5), "background": torch.zeros(3)}
+
+    def get_gt_img(self, image):
+        return image
+
+    def composite_with_background(self, image, background):
+        return image
+
+
+def test_flip_is_asked_for_inside_the_mask_and_left_out_of_the_mean_where_it_is_none():
+    asked = []
+
+    def flip(pred, truth, mask):
+        asked.append((pred.shape, float(truth.mean()), mask if mask is None else int(mask.sum())))
+        return None if mask is not None and not mask.any() else 0.25 * len(asked)
+
+    def view(name, value, mask=None):
+        batch = {"image": torch.full((16, 16, 3), value)} | ({} if mask is None else {"mask": mask})
+        return name, (None, batch)
+
+    part = torch.zeros(16, 16, 1)
+    part[:4] = 1.0
+    views = [view("a", 0.5), view("b", 0.0, part), view("c", 1.0, torch.zeros(16, 16, 1))]
+    measured = over_views(Grey(), ImageMetrics(), views, flip)
+    assert asked == [((16, 16, 3), 0.5, None), ((16, 16, 3), 0.0, 64), ((16, 16, 3), 1.0, 0)]
+    assert [one["flip"] for one in measured["per_image"]] == [0.25, 0.5, None] and measured["flip"] == 0.375
+    without = over_views(Grey(), ImageMetrics(), views)
+    assert without["flip"] is None and "flip" not in without["per_image"][0]
 
 
 def test_at_size_keeps_the_pose_and_the_vertical_angle():

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a scene costs in a file, and what the file loses: results/compact.json.
+
+    python -m nrfgs_lab.compact trade SCENES/bonsai OUT         # the same for goldcape and fox; a GPU
+    python -m nrfgs_lab.compact trade HELD_OUT/bonsai/dev0.json OUT --no-others --settings WORTH=0.3      # a setting
+    python -m nrfgs_lab.compact speed FILE.nrf OUT/speed.json   # encoding, and decoding in Python and in Chromium
+    python -m nrfgs_lab.results pack OUT results/compact.json
+    python -m nrfgs_lab.pages.tables.compact_format             # the figure
+
+`trade` trains the capture, and writes it as compact files trained at each of --rates, as those of
+versions 1 and 2 without a fine-tune, as a PLY file, and as what splat-transform makes of that, where it is installed:
+its SOG and its SPZ. Records of OUT that are there already are not made again. All PSNR is that of the test views, of
+files that are read back. They are left in --work. Settings are chosen on training views that are held out
+(`nrfgs_lab.held_out make`).
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import torch
+import tyro
+
+from nrfgs_lab.compact_1 import encode_1
+from nrfgs_lab.pages.browser import chromium
+from nrfgs_ns.compact import finetune
+from nrfgs_ns.compact.decode import decode
+from nrfgs_ns.compact.encode import encode
+from nrfgs_ns.compact.format import write_container
+from nrfgs_ns.compact.options import CompactOptions
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import write_whole
+from nrfgs_ns.training.run import machine, train
+
+RATES = (1e-4, 3e-4, 5e-4, 1e-3, 2e-3)
+TOOL = "splat-transform"
+
+
+@dataclass
+class Trade:
+    """Bytes against dB of one capture."""
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """the capture"""
+    out: Annotated[Path, tyro.conf.Positional]
+    """folder for the records"""
+    work: Path = Path("outputs/compact")
+    """folder for the training and the files"""
+    rates: tuple[float, ...] = RATES
+    """of the fine-tunes"""
+    steps: int = 4000
+    """of each fine-tune"""
+    others: bool = True
+    """also write what is not trained for the file"""
+    method: str = "nrfgs"
+    """that trains"""
+    sog_iterations: int = 10
+    """of splat-transform, to find SOG's palette"""
+    settings: tuple[str, ...] = ()
+    """NAME=VALUE, in JSON: other values of constants in nrfgs_ns/compact/finetune.py"""
+
+    def main(self) -> None:
+        from nrfgs_ns.export.command import PlyOptions
+        from nrfgs_ns.export.compact import export_compact
+        from nrfgs_ns.export.ply import export_ply
+
+        files = self.work / "files"
+        files.mkdir(parents=True, exist_ok=True)
+        name = (f"{self.data.name}" if self.data.is_dir() else f"held-out-{self.data.parent.name}") + "-{}"
+        name = name.format
+        for setting in self.settings:
+            key, value = setting.split("=")
+            if not hasattr(finetune, key):
+                raise InputError(f"--settings {setting}: nrfgs_ns/compact/finetune.py has no {key}.")
+            setattr(finetune, key, json.loads(value))
+        config = Path(self.record(name("model"), self.trained)["train"]["config_path"])
+
+        def tuned(rate: float) -> Any:
+            options = CompactOptions(finetune=self.steps, rate=rate)
+            return lambda report: export_compact(config, files / f"{report.stem}.nrf", options, True, report)
+
+        for rate in self.rates:
+            self.record(name("-".join([f"rate-{rate:g}", *self.settings])), tuned(rate))
+        if not self.others:
+            return
+        ply = files / f"{name('ply')}.ply"
+        self.record(name("ply"), lambda report: export_ply(config, ply, PlyOptions(), True, report))
+        suffixes = [suffix for suffix in ("spz", "sog") if shutil.which(TOOL)]
+        with ThreadPoolExecutor() as pool:  # minutes on a CPU
+            there = [(self.out / f"{name(suffix)}.json").exists() for suffix in suffixes]
+            todo = [suffix for suffix, done in zip(suffixes, there, strict=True) if not done]
+            running = {suffix: pool.submit(converted, ply, suffix, self.sog_iterations) for suffix in todo}
+            plain = files / f"{name('version-2')}.nrf"
+            self.record(name("version-2"), lambda report: export_compact(config, plain, CompactOptions(), True, report))
+            self.record(name("version-1"), lambda report: version_1(config, files / f"{report.stem}.nrf"))
+            for suffix, made in running.items():
+                self.record(
+                    name(suffix), lambda _, made=made: {**made.result(), **measured(config, ply, made.result())}
+                )
+
+    def record(self, name: str, make: Callable[[Path], dict[str, Any] | None]) -> dict[str, Any]:
+        """The record of a name: what `make` returns, or writes to the path that it is given."""
+        path = self.out / f"{name}.json"
+        if not path.exists() and (made := make(path)) is not None:
+            write_whole(path, json.dumps(made, indent=1) + "\n")
+        return json.loads(path.read_text(encoding="utf-8"))
+
+    def trained(self, _: Path) -> dict[str, Any]:
+        args = [self.method, "--data", str(self.data), "--output-dir", str(self.work), "--machine.seed", "42"]
+        args += ["--vis", "tensorboard", "--steps-per-eval-all-images", "1000000"]
+        return {"machine": machine(), "train": asdict(train([*args, "nrfgs-data"]))}
+
+
+def version_1(config: Path, path: Path) -> dict[str, Any]:
+    """The record of a file of version 1 with what one of version 2 has without a fine-tune."""
+    from nrfgs_ns.compact.precision import Precision
+    from nrfgs_ns.export.compact import choose, measure_file, rendered, write_config
+    from nrfgs_ns.export.loading import load_model
+
+    pipeline = load_model(config, "test")
+    field = choose(pipeline, config, CompactOptions()).field
+    begin = perf_counter()
+    size = write_container(path, *encode_1(field, Precision(), rendered(pipeline.model)))
+    written = perf_counter()
+    decode(path)
+    seconds = {"encode": written - begin, "decode": perf_counter() - written}
+    return {"bytes": size, "seconds": seconds, **measure_file(pipeline, write_config(config, path))}
+
+
+def converted(ply: Path, suffix: str, sog_iterations: int) -> dict[str, Any]:
+    """What splat-transform makes of a PLY file, and back."""
+    small = ply.with_suffix(f".{suffix}")
+    begin = perf_counter()
+    options = ["-w", "-g", "cpu", "-i", str(sog_iterations)]
+    subprocess.run([TOOL, *options, ply, small], check=True, stdout=sys.stderr)
+    seconds = {"encode": perf_counter() - begin}
+    subprocess.run([TOOL, "-w", small, ply.with_suffix(f".{suffix}.ply")], check=True, stdout=sys.stderr)
+    said = subprocess.run([TOOL, "--version"], check=True, capture_output=True, text=True)
+    version = (said.stdout + said.stderr).strip()
+    return {
+        "file": small.name,
+        "version": version,
+        "options": options,
+        "bytes": small.stat().st_size,
+        "seconds": seconds,
+    }
+
+
+def measured(config: Path, ply: Path, made: dict[str, Any]) -> dict[str, Any]:
+    """The record of what splat-transform made of a PLY file; its pictures are those of the PLY that it made back."""
+    from nrfgs_ns.export.frames import Y_DOWN
+    from nrfgs_ns.export.loading import load_model, measure_loss
+    from nrfgs_ns.export.ply import read_splats, render_splats
+
+    pipeline = load_model(config, "test")
+    model, splats = pipeline.model, Y_DOWN.inverse.moved(read_splats(ply.with_name(made["file"] + ".ply")))
+    splats = type(splats)(*(value.to(model.device) for value in splats))
+    how = model.background_color, model.config.rasterize_mode, model.scene_unit
+    loss = measure_loss(pipeline, lambda camera: {"file": render_splats(splats, camera, *how)})
+    return {**made, "written": len(splats.means), **loss}
+
+
+@dataclass
+class Speed:
+    """Seconds to write and to read a compact file on this machine, the least of some times."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """a compact file of version 2"""
+    record: Annotated[Path, tyro.conf.Positional]
+    """JSON to write"""
+    repeats: int = 5
+    """how many times"""
+
+    def main(self) -> None:
+        from nrfgs_ns.appearance.field import Field
+        from nrfgs_ns.appearance.reduce import build
+        from nrfgs_ns.compact.precision import Precision
+
+        found, again = decode(self.file), self.file.with_suffix(".again")
+        field = Field(build(found.config, found.weights, found.header["head"]["scene_unit"]), found.splats)
+        import numpy as np
+
+        steps = {name: np.array(grid["step"]) for name, grid in found.header["grids"].items()}
+
+        def written() -> None:
+            write_container(again, *encode(field, Precision(), found.header["render"], steps))
+
+        def least(what: Callable[[], Any]) -> float:
+            seconds = []
+            for _ in range(self.repeats):
+                begin = perf_counter()
+                what()
+                seconds.append(perf_counter() - begin)
+            return min(seconds)
+
+        content = {
+            "machine": machine(),
+            "threads": torch.get_num_threads(),
+            "splats": len(found.splats["means"]),
+            "bytes": self.file.stat().st_size,
+            "seconds": {
+                "encode": least(written),
+                "decode": least(lambda: decode(self.file)),
+                "chromium": in_chromium(self.file, self.repeats),
+            },
+        }
+        again.unlink()
+        write_whole(self.record, json.dumps(content, indent=1) + "\n")
+        print(json.dumps(content, indent=1))
+
+
+def in_chromium(file: Path, repeats: int) -> float:
+    """Seconds in which a page's reader unpacks a file, the least of some times."""
+    from base64 import b64encode
+    from importlib.resources import files
+
+    code = (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8")
+    with chromium() as browser:
+        page = browser.new_page()
+        page.add_script_tag(content=code)
+        page.evaluate(
+            "text => { window.bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)); }",
+            b64encode(file.read_bytes()).decode(),
+        )
+        once = "() => { const t = performance.now(); readScene(bytes, () => {}); return performance.now() - t; }"
+        return min(page.evaluate(once) for _ in range(repeats)) / 1000
+
+
+if __name__ == "__main__":
+    try:
+        tyro.extras.subcommand_cli_from_dict({"trade": Trade, "speed": Speed}).main()
+    except InputError as error:
+        sys.exit(str(error))

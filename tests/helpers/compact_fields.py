@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small field, and a way through a compact file."""
+
+from pathlib import Path
+
+import torch
+
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.reduce import with_diffuse
+from nrfgs_ns.compact.decode import Decoded, decode
+from nrfgs_ns.compact.encode import encode
+from nrfgs_ns.compact.format import write_container
+from nrfgs_ns.compact.precision import Precision
+
+
+def field(count: int = 60) -> Field:
+    torch.manual_seed(3)
+    config = NrfConfig(latent_dim=8, hidden_width=16, output_init="default")
+    head = config.setup().requires_grad_(False)
+    splats = {
+        "means": torch.randn(count, 3) * torch.tensor([1.0, 5.0, 0.2]),
+        "quats": torch.randn(count, 4) * 3,
+        "scales": torch.randn(count, 3) - 4,
+        "opacities": torch.randn(count, 1) * 4,
+        "features_dc": torch.randn(count, 3),
+        "latents": torch.randn(count, 8) * torch.linspace(2.0, 0.1, 8),
+    }
+    diffuse = torch.rand(count) < 0.4
+    return with_diffuse(Field(head, splats), diffuse, splats["features_dc"], splats["opacities"])
+
+
+def through_a_file(one: Field, tmp_path: Path, precision: Precision | None = None, encode=encode) -> Decoded:
+    header, streams = encode(one, precision or Precision(), {"rasterize_mode": "classic"})
+    write_container(tmp_path / "f.nrf", header, streams)
+    return decode(tmp_path / "f.nrf")
+
+
+def matched(one: Field, found: dict) -> torch.Tensor:
+    """The row of the field that each row of the file came from: the nearest mean."""
+    rows = torch.cdist(found["means"].double(), one.splats["means"].double()).argmin(dim=1)
+    assert len(rows.unique()) == len(rows)
+    return rows
