@@ -23,6 +23,7 @@ import shutil
 import tempfile
 import time
 from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -180,8 +181,10 @@ def train_and_measure(trial: Trial, scenes: Path, folder: Path, end: float) -> d
     from nerfstudio.scripts.train import _set_random_seed
 
     from nrfgs_lab.bench.measure import over_views
+    from nrfgs_lab.flip import flip
     from nrfgs_lab.run import host_without_downloads
     from nrfgs_ns.data.views import evenly_spaced
+    from nrfgs_ns.image.metrics import ImageMetrics
     from nrfgs_ns.training.run import machine, parse
 
     data = ["nrfgs-data"] if trial.method.startswith("nrfgs") else []
@@ -211,42 +214,22 @@ def train_and_measure(trial: Trial, scenes: Path, folder: Path, end: float) -> d
         model, loader = trainer.pipeline.model.eval(), trainer.pipeline.datamanager
         names = [Path(name).name for name in loader.eval_dataset.image_filenames]
         with torch.no_grad():
-            metrics = Metrics()
-            test = over_views(model, metrics, zip(names, loader.fixed_indices_eval_dataloader, strict=True))
+            metrics, views = ImageMetrics(), zip(names, loader.fixed_indices_eval_dataloader, strict=True)
+            test = over_views(model, metrics, views, flip if find_spec("flip_evaluator") else None)
             images, cameras = loader.cached_train, loader.train_dataset.cameras
             chosen = evenly_spaced(len(images), TRAIN_VIEWS)
             learnt = ((str(i), (cameras[i : i + 1].to(model.device), images[i])) for i in chosen)
-            train = over_views(model, metrics.without_flip, learnt)
+            train = over_views(model, metrics, learnt)
     shown = ("psnr", "ssim", "ms_ssim")
     return {
         **{metric: test[metric] for metric in shown},
         **{f"train_{metric}": train[metric] for metric in shown[:2]},
-        "flip": [view["flip"] for view in test["per_image"]],
+        "flip": [view.get("flip") for view in test["per_image"]],
         "per_image": [[view["image"], *(view[metric] for metric in shown)] for view in test["per_image"]],
         "splats": int(model.num_points),
         "made_steps": trainer.step + 1,
         "machine": machine(),
     }
-
-
-class Metrics:
-    """A view's metrics, FLIP among them; None where `flip-evaluator` is not installed."""
-
-    def __init__(self):
-        from nrfgs_ns.image.metrics import ImageMetrics
-
-        self.without_flip = ImageMetrics()
-
-    def __call__(self, pred, truth, mask=None) -> dict[str, float | None]:
-        from nrfgs_lab.flip import flip
-
-        images = (image.clamp(0.0, 1.0).numpy(force=True) for image in (pred, truth))
-        inside = None if mask is None else mask[..., 0].numpy(force=True)
-        try:
-            found = flip(*images, inside)
-        except InputError:
-            found = None
-        return {**self.without_flip(pred, truth, mask), "flip": found}
 
 
 if __name__ == "__main__":
