@@ -22,7 +22,8 @@ eighth view is held out, the others are fitted with each of `STRENGTHS`, and the
 colours, weighted as above, with the least squared error. All views are then fitted with it. For a head that is
 harmonics already the smallest strength wins and the fit is exact to 1e-8 of the coefficients.
 
-Opacity is the mean of the head's, with the weights w_v.
+Opacity is the mean of the head's over the views whose picture the splat is in, each counted once. With the weights w_v,
+views in which the splat is all but transparent would not count, and a file would show it there.
 """
 
 import math
@@ -89,7 +90,7 @@ class Fit(NamedTuple):
     views: int
     """training views that were looked through"""
     unseen: int
-    """splats that no training view sees: they have their base colour and opacity"""
+    """splats that no training view sees: they have their base colour"""
 
 
 class Observations(NamedTuple):
@@ -98,7 +99,7 @@ class Observations(NamedTuple):
     rows: Tensor
     """of the table, ascending. [M]"""
     weights: Tensor
-    """w of the module's docstring, pixels, > 0. [M]"""
+    """w of the module's docstring, pixels; 0 of what is hidden or transparent. [M]"""
     bases: Tensor
     """harmonics of the direction from camera to splat. [M, 16]"""
     residuals: Tensor
@@ -128,20 +129,23 @@ class Moments:
         self.power = zeros()  # sum w |residual|^2
         self.weight = zeros()
         self.weight_squared = zeros()
-        self.opacity = zeros()  # sum w opacity
+        self.opacity = zeros()
+        self.views = zeros()
 
     def add(self, seen: Observations) -> None:
         """Add a view. No row may occur twice in it."""
+        self.opacity.index_add_(0, seen.rows, seen.opacities.double())
+        self.views.index_add_(0, seen.rows, torch.ones_like(seen.opacities, dtype=torch.float64))
+        seen = seen.where(seen.weights > 0, seen.rows)
         for first in range(0, len(seen.rows), ROWS_AT_ONCE):
             part = Observations(*(value[first : first + ROWS_AT_ONCE] for value in seen))
-            weights, bases, residuals, opacities = (value.double() for value in part[1:])
+            weights, bases, residuals = (value.double() for value in part[1:4])
             weighted = weights[:, None] * bases
             self.gram.index_add_(0, part.rows, weighted[:, self.upper[0]] * bases[:, self.upper[1]])
             self.target.index_add_(0, part.rows, weighted[:, :, None] * residuals[:, None, :])
             self.power.index_add_(0, part.rows, weights * residuals.square().sum(dim=-1))
             self.weight.index_add_(0, part.rows, weights)
             self.weight_squared.index_add_(0, part.rows, weights.square())
-            self.opacity.index_add_(0, part.rows, weights * opacities)
 
     def full_gram(self, rows: slice) -> Tensor:
         """Both triangles of some splats' gram matrices, [count, 16, 16]."""
@@ -220,11 +224,11 @@ def fit_harmonics(model, cameras: Cameras) -> Fit:
             delta = moments.solve(strength).to(plain.means.dtype)
             plain.features_dc[first:last] += delta[:, 0]
             plain.features_rest[first:last] = delta[:, 1:]
-            seen_once = moments.weight > 0
-            unseen += int((~seen_once).sum())
-            mean = moments.opacity / moments.weight.clamp_min(torch.finfo(torch.float64).tiny)
+            unseen += int((moments.weight == 0).sum())
+            mean = moments.opacity / moments.views.clamp_min(1.0)
             logits = torch.logit(mean.clamp(1.0 - OPAQUE, OPAQUE)).to(plain.means.dtype)[:, None]
-            plain.opacities[first:last] = torch.where(seen_once[:, None], logits, plain.opacities[first:last])
+            in_a_picture = moments.views[:, None] > 0
+            plain.opacities[first:last] = torch.where(in_a_picture, logits, plain.opacities[first:last])
     return Fit(plain, exact=False, strength=strength, views=len(cameras), unseen=unseen)
 
 
@@ -250,7 +254,7 @@ def observe(model, camera: Cameras) -> Observations:
         bases=sh_bases(DEGREE, torch.nn.functional.normalize(towards, dim=-1)),
         residuals=appearance.colors - base_colors(field.splats["features_dc"].index_select(0, view.visible)),
         opacities=appearance.opacities,
-    ).where(weights > 0, view.visible)
+    )
 
 
 def look_through(model, field: Field, camera: Cameras) -> tuple[View, SplatAppearance, Tensor]:
