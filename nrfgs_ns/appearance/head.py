@@ -117,7 +117,7 @@ class AppearanceHead(nn.Module, ABC):
 
         Args:
             splats: the whole table: "means" [N, 3], "opacities" (logits) [N, 1], and this head's `splat_params`.
-            visible: rows of the table, int64 [M]; a row occurs once for each camera that sees the splat.
+            visible: rows of the table, int64 [M], camera by camera, each camera's ascending.
             camera_centers: where each visible splat is seen from, in world coordinates: [3] or [M, 3].
         """
 
@@ -160,6 +160,16 @@ class AppearanceHead(nn.Module, ABC):
         None if the head has no shared weights that could be taught.
         """
         return None
+
+
+def picked(table: Tensor, visible: Tensor, camera_centers: Tensor) -> Tensor:
+    """The visible rows of a table [N, ...]. One camera's ascend, so that N of them are the table, which is not copied.
+
+    Args:
+        visible, camera_centers: as for `AppearanceHead.forward`.
+    """
+    everything = camera_centers.dim() == 1 and len(visible) == len(table)
+    return table if everything else table.index_select(0, visible)
 
 
 def base_opacities(logits: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_opacities
+from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_opacities, picked
 from nrfgs_ns.appearance.spherical_harmonics import eval_sh, kernels_run_on, num_bases
 
 
@@ -61,10 +61,14 @@ class SphericalHarmonics(AppearanceHead):
         return self.active_degree
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        directions = splats["means"].index_select(0, visible) - camera_centers
+        means, constant, rest, logits = (
+            picked(splats[name], visible, camera_centers)
+            for name in ("means", "features_dc", "features_rest", "opacities")
+        )
+        coefficients = torch.cat([constant[:, None], rest], dim=1)
         return SplatAppearance(
-            colors=(eval_sh(self.active_degree, directions, self.coefficients(splats, visible)) + 0.5).clamp_min(0.0),
-            opacities=base_opacities(splats["opacities"].index_select(0, visible)),
+            colors=(eval_sh(self.active_degree, means - camera_centers, coefficients) + 0.5).clamp_min(0.0),
+            opacities=base_opacities(logits),
         )
 
     def coefficients(self, splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:

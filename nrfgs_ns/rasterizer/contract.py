@@ -21,7 +21,8 @@ class Projection:
     gaussian_ids: Tensor
     """Splat of each row. [M], int64"""
     radii: Tensor
-    """Half the side, in pixels, of the square of three standard deviations around the splat. [M], int32, >= 1"""
+    """Half the side, in pixels, of the square of three standard deviations around the splat. [M], int32; 0 where
+    a row was asked for that is not visible, else at least 1"""
     means2d: Tensor
     """Projected centre in pixels; the centre of the top left pixel is (0.5, 0.5). [M, 2]"""
     depths: Tensor

@@ -19,6 +19,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
+from torch.amp import GradScaler
 from torch.func import functional_call
 
 from nrfgs_ns.data.checks import warn
@@ -49,6 +50,8 @@ class StepGraphs:
         self._how: dict[str, Any] = {}
         self._pairs_for_each = 0.0
         """the most pairs of a view, for each splat, at this resolution"""
+        self.at_hand = False
+        """whether the gradients of the step have been computed with its losses"""
         self._given_up = False
         self._has_said_why = False
 
@@ -84,12 +87,13 @@ class StepGraphs:
     def losses(
         self, camera: Cameras, batch: Mapping[str, Any], step: int
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]] | None:
-        """Outputs and losses as of the model, and the gradients of the losses' sum to all parameters, when that is
-        differentiated. None: the step is the first of its kind, or cannot be recorded.
+        """Outputs and losses as of the model, and the gradients of the losses' sum to all parameters. None: the step is
+        the first of its kind, or cannot be recorded.
 
         Raises:
             TrainingStopped: the step before was condemned.
         """
+        self.at_hand = False
         if not self._takes(step, batch) or self._is_new():
             self.guard.settle()
             return None
@@ -103,15 +107,12 @@ class StepGraphs:
             graph = self._record(kind, *now)
         if graph is None:
             return None
-        losses = graph.run()
+        losses, self.at_hand = graph.run(), True
         model.info = {**graph.info, "pairs": graph.last_pairs}
-        watched = {
-            "the rendered image": graph.outputs["rgb"],
-            **{f"loss {name}": loss for name, loss in losses.items()},
-        }
-        model.watched = {name: value.detach() for name, value in watched.items()}
+        model.watched = {"the rendered image": graph.outputs["rgb"]}
+        model.watched |= {f"loss {name}": loss for name, loss in losses.items()}
         model.watched_image = batch.get("image_idx")
-        return dict(graph.outputs), losses
+        return dict(graph.outputs), dict(losses)
 
     def _is_new(self) -> bool:
         """Whether a step is another than the one before, and none that has been recorded: splats have come or gone,
@@ -319,8 +320,7 @@ class _StepGraph:
             self.shot.copy_(self.model.photograph.shots.detach()[index : index + 1])
 
     def run(self) -> dict[str, Tensor]:
-        """The losses; the gradients of their sum are handed out when that is differentiated. `outputs` and `info` are
-        this step's."""
+        """The losses; the parameters have the gradients of their sum. `outputs` and `info` are this step's."""
         self.graph.replay()
         if self.shot is not None:
             shots = self.parameters["photograph.shots"] = self.model.photograph.shots
@@ -328,22 +328,28 @@ class _StepGraph:
             self.gradients["photograph.shots"][self.index] = self.shot_gradient[0]
         self._counted.copy_(self.room.counted, non_blocking=True)
         self._arrived.record()
-        ready = _Ready.apply(self.losses["main_loss"], self, self.parameters["splats.means"])
-        return {**self.losses, "main_loss": ready}
-
-
-class _Ready(torch.autograd.Function):
-    """A loss whose gradients, and those of what is added to it, have been computed with it."""
-
-    @staticmethod
-    def forward(ctx, loss: Tensor, graph: _StepGraph, _: Tensor) -> Tensor:
-        ctx.graph = graph
-        return loss.clone()
-
-    @staticmethod
-    def backward(ctx, d_loss: Tensor) -> tuple[None, None, None]:
-        for name, parameter in ctx.graph.parameters.items():
-            gradient = ctx.graph.gradients[name]
+        for name, parameter in self.parameters.items():
+            gradient = self.gradients[name]
             if gradient is not None:
                 parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-        return None, None, None
+        return self.losses
+
+
+class Unscaled(GradScaler):
+    """Scales nothing, and where a graph has left the gradients, does not let autograd look for them: it would find
+    nothing to do, after a turn through a thread of its own that takes longer than many a kernel."""
+
+    def __init__(self):
+        super().__init__("cuda", enabled=False)
+        self.graphs: StepGraphs | None = None
+
+    def scale(self, loss: Tensor) -> Tensor | AtHand:
+        at_hand = self.graphs is not None and self.graphs.at_hand
+        return AtHand() if at_hand and not loss.requires_grad else loss
+
+
+class AtHand:
+    """A loss whose gradients are there."""
+
+    def backward(self) -> None:
+        """Nothing."""

@@ -39,7 +39,7 @@ from nrfgs_ns.training.pace import (
     steps_for,
 )
 from nrfgs_ns.training.progress import ProgressLine
-from nrfgs_ns.training.step_graph import StepGraphs
+from nrfgs_ns.training.step_graph import StepGraphs, Unscaled
 from nrfgs_ns.training.stopping import (
     StopRequest,
     command_to_go_on,
@@ -83,6 +83,8 @@ class NrfgsTrainer(Trainer):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's GradScaler
             super().__init__(config, local_rank, world_size)
+        if not self.use_grad_scaler:
+            self.grad_scaler = Unscaled()
         self.total_steps = config.max_num_iterations
         self.steps_are_chosen = False
         self.pace: Pace | None = None
@@ -120,8 +122,9 @@ class NrfgsTrainer(Trainer):
             self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last step that was made"""
-        if self.world_size == 1 and not self.grad_scaler.is_enabled():
-            self.pipeline.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
+        if self.world_size == 1 and isinstance(self.grad_scaler, Unscaled):
+            graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
+            self.pipeline.graphs = self.grad_scaler.graphs = graphs
         if comms.is_main_process():
             self._tell_what_was_chosen()
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step

@@ -61,9 +61,9 @@ def recorded(pipeline, graphs, step: int, view: int, **more: torch.Tensor) -> tu
     done = graphs.losses(camera, batch | more, step)
     if done is None:
         return None
+    assert graphs.at_hand
     loss = sum(done[1].values())
-    loss.backward()
-    return loss.detach(), done[0]["rgb"].clone(), gradients(pipeline)
+    return loss.clone(), done[0]["rgb"].clone(), gradients(pipeline)
 
 
 def gradients(pipeline) -> dict[str, torch.Tensor]:

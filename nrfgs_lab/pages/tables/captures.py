@@ -20,9 +20,6 @@ TRIED = {
     "field: whole": "u = 1",
     f"field: trust{STORED}": "shrinkage of stored opacity",
     f"field: whole{STORED}": "u = 1, shrinkage of stored opacity",
-    f"field: whole, late start{STORED}": "the same, asked from 0.3 on",
-    f"field: whole, noise by each splat's angle between views{STORED}": "u = 1, stored, noise by each splat's angles",
-    f"field: whole, a tenth of the noise from anywhere{STORED}": "u = 1, stored, a tenth of the noise far",
     "field: rules at 30 and 100 views": "below 30 views one band, fixed opacity, asked from 0.3 on",
 }
 """Rows of the table of held-out views, by the names of their trials."""

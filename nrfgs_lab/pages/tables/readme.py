@@ -73,13 +73,6 @@ def gain(scene: str) -> str:
     return f"{signed(median(gains))} dB in the median view, better in {sum(one > 0 for one in gains)} of {len(gains)}"
 
 
-def preset(run: str, column: str) -> str:
-    """A number of a training of bonsai."""
-    row = next(row for (scene, _, name), row in bench_rows("presets").items() if (scene, name) == ("bonsai", run))
-    form = {"PSNR": ".2f", "time s": ".0f", "splats": ",.0f"}[column]
-    return format(mean_of(row, column), form)
-
-
 def demo(what: str) -> str:
     """Decibels by which the field is ahead in the demo, of each seed: over whole pictures, or where it shines."""
     part = {"whole": "eval", "shine": "shine"}[what]

@@ -3,13 +3,18 @@
 
 from statistics import median
 
-from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, mean_of, records
+from nrfgs_lab.bench.table import Row
+from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, records
 
 TRAININGS = {
-    "nerfstudio_splatfacto": "splatfacto (nerfstudio's own)",
-    "harmonics_nrfgs-sh": "`nrfgs-sh`",
-    "default": "`nrfgs`",
-    "preset_nrfgs-fast": "`nrfgs-fast`, another day",
+    "splatfacto": "splatfacto (nerfstudio's own)",
+    "splatfacto-10k": "splatfacto in 10,000 steps",
+    "splatfacto-big": "splatfacto-big (nerfstudio's own)",
+    "splatfacto-big-10k": "splatfacto-big in 10,000 steps",
+    "nrfgs-sh": "`nrfgs-sh`",
+    "nrfgs": "`nrfgs`",
+    "nrfgs-fast": "`nrfgs-fast`",
+    "nrfgs-best": "`nrfgs-best`",
 }
 VARIANTS = {
     "fused bf16": "the field (bf16, the default)",
@@ -22,24 +27,34 @@ VARIANTS = {
 }
 
 
+def _trainings() -> dict[str, Row]:
+    """Whole trainings of bonsai, by their names in docs/bench/speed.yaml."""
+    return {run: row for (_, _, run), row in bench_rows("speed").items()}
+
+
 def trainings() -> str:
-    """What whole trainings of bonsai cost."""
-    rows = {run: row for (scene, _, run), row in bench_rows("presets").items() if scene == "bonsai"}
-    base = mean_of(rows["nerfstudio_splatfacto"], "time s")
+    """What whole trainings of bonsai cost: medians and ranges of seconds, means of the rest."""
+    rows = _trainings()
+    base = median(rows["splatfacto"].values["time s"].values())
     body = []
     for run, label in TRAININGS.items():
-        row = rows[run]
-        seconds = mean_of(row, "time s")
-        cells = [row.text(BY_NAME[name]) for name in ("PSNR", "splats", "FPS", "FPS 1080p", "MB", "peak MB")]
-        body.append([label, f"{seconds:.0f}", f"{seconds / base:.2f}", *cells])
-    head = ["bonsai", "train s", "of splatfacto's", "PSNR", "splats", "FPS, 799 x 532", "FPS, 1080p", "MB", "peak MB"]
+        if run in rows:
+            row, seconds = rows[run], list(rows[run].values["time s"].values())
+            cells = [row.text(BY_NAME[name]) for name in ("PSNR", "splats", "FPS", "FPS 1080p", "peak MB")]
+            body.append([label, str(len(seconds)), spread(seconds, 0), f"{median(seconds) / base:.2f}", *cells])
+    head = ["bonsai", "runs", "train s", "of splatfacto's", "PSNR", "splats", "FPS, 799 x 532", "FPS, 1080p", "peak MB"]
     return grid(head, body)
 
 
 def ratio(what: str, run: str, base: str) -> str:
-    """A quantity of one training of bonsai over another's."""
-    rows = {run: row for (scene, _, run), row in bench_rows("presets").items() if scene == "bonsai"}
-    return f"{mean_of(rows[run], what) / mean_of(rows[base], what):.2f}"
+    """A quantity of trainings of bonsai over others', medians."""
+    first, second = (median(_trainings()[one].values[what].values()) for one in (run, base))
+    return f"{first / second:.2f}"
+
+
+def of_training(what: str, run: str) -> str:
+    """A quantity of trainings of bonsai, the median."""
+    return BY_NAME[what].form.format(median(_trainings()[run].values[what].values()))
 
 
 def heads() -> str:
@@ -127,6 +142,31 @@ def imports(which: str = "seconds") -> str:
     return f"{records('start_up')[which]:.1f}"
 
 
+STEPS = {
+    "whole": "while splats come and go",
+    "at rest: whole": "later",
+    "without graph": "without the graph, while splats come and go",
+    "at rest: without graph": "without the graph, later",
+}
+
+
+def steps() -> str:
+    """A step of each method, with its CUDA graph and without."""
+    rows = {(row["method"], row["variant"]): row for row in records("step_parts")["graph"]["steps"]}
+    body = []
+    for variant, label in STEPS.items():
+        mine = [rows[method, variant] for method in ("nrfgs", "nrfgs-sh")]
+        body.append([label, *(f"{row[key]:.2f}" for row in mine for key in ("step_ms", "gpu_ms"))])
+    counts = [f"{rows[method, 'whole']['splats']:,}" for method in ("nrfgs", "nrfgs-sh")]
+    return grid(["", f"`nrfgs`, {counts[0]} splats", "GPU", f"`nrfgs-sh`, {counts[1]} splats", "GPU"], body)
+
+
+def step_share(method: str, variant: str, base_method: str, base_variant: str) -> str:
+    """A step's time over another's."""
+    rows = {(row["method"], row["variant"]): row for row in records("step_parts")["graph"]["steps"]}
+    return f"{rows[method, variant]['step_ms'] / rows[base_method, base_variant]['step_ms']:.2f}"
+
+
 PARTS = {
     "whole": "as it is",
     "without lists": "gsplat's lists of what tiles draw",
@@ -156,7 +196,7 @@ def gpu_share(method: str, variant: str, base_method: str, base_variant: str) ->
 
 def frames() -> str:
     """Frames per second of models with about as many splats, in turns: each round."""
-    rows = records("step_parts")["bonsai_250k"]["frames"]
+    rows = records("step_parts")["graph"]["frames"]
     body = []
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row["fps"] for row in rows if row["method"] == method]
@@ -166,7 +206,9 @@ def frames() -> str:
 
 
 def spread(numbers: list[float], digits: int) -> str:
-    """Median, least and largest."""
+    """Median, least and largest; of one number, itself."""
+    if len(numbers) == 1:
+        return f"{numbers[0]:.{digits}f}"
     return f"{median(numbers):.{digits}f} ({min(numbers):.{digits}f} to {max(numbers):.{digits}f})"
 
 
