@@ -44,10 +44,3 @@ def diffuse() -> str:
         masked = (found[visible, share, "mask"] for share in shares)
         body.append([f"{visible:,}", f"{whole:.2f}", *(f"{100 * (ms / whole - 1):+.0f} %" for ms in masked)])
     return grid(["visible", "no mask (ms)", *(f"{100 * share:.0f} % diffuse" for share in shares)], body)
-
-
-def few_views(run: str) -> str:
-    """PSNR on fern without a part from the start."""
-    runs = records("few-views")
-    found = [runs[f"runs/{run}-own-fern-{seed}"]["measured"]["test"]["psnr"] for seed in (42, 43)]
-    return " and ".join(f"{psnr:.1f}" for psnr in found)
