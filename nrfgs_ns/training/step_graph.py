@@ -56,7 +56,7 @@ class StepGraphs:
         self._has_said_why = False
 
     def _takes(self, step: int, batch: Mapping[str, Any]) -> bool:
-        """Whether this step can be a graph's. What keeps all of a training's from it is said once."""
+        """Whether this step can be a graph's. What keeps steps from it is said once."""
         model = self.model
         if self._given_up or model.device.type != "cuda" or model.num_points == 0:
             return False
@@ -66,10 +66,10 @@ class StepGraphs:
                 self._has_said_why = True
             return False
         regularised = model.config.use_scale_regularization and step % 10 == 0
-        return not regularised and (_kind(batch) in self._graphs or len(self._graphs) < MOST_SIZES)
+        return not regularised
 
     def _obstacle(self, batch: Mapping[str, Any]) -> str | None:
-        """What of the training's options a graph does not know."""
+        """What of the training's options a graph does not know, or of this photograph."""
         model = self.model
         exposed = model.photograph is not None
         obstacles = (
@@ -81,6 +81,10 @@ class StepGraphs:
             ("bilateral grids are learnt", model.config.use_bilateral_grid),
             ("depth is rendered", model.config.output_depth_during_training),
             ("some splats are diffuse", model.densification.diffuse is not None),
+            (
+                f"photographs have more than {MOST_SIZES} sizes, and only those of {MOST_SIZES} have a graph",
+                len(self._graphs) >= MOST_SIZES and _kind(batch) not in self._graphs,
+            ),
         )
         return next((what for what, there in obstacles if there), None)
 

@@ -8,7 +8,7 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 
 from nrfgs_ns.training.run import evaluate, parse, train
-from nrfgs_ns.training.step_graph import StepGraphs
+from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs
 
 gpu = [
     pytest.mark.gpu,
@@ -33,6 +33,14 @@ def build(tiny_scene, tmp_path):
         return built, StepGraphs(built.model, built.datamanager, SimpleNamespace(settle=lambda: None))
 
     return pipeline
+
+
+def test_a_photograph_of_one_size_too_many_has_no_graph_and_it_is_said(build):
+    pipeline, graphs = build("cpu")
+    assert graphs._obstacle({"image": torch.zeros(5, 4, 3)}) is None
+    graphs._graphs = {((height, 4, 3), False): None for height in range(5, 5 + MOST_SIZES)}
+    assert graphs._obstacle({"image": torch.zeros(5, 4, 3)}) is None
+    assert "more than 4 sizes" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
 
 
 def begin(pipeline, step: int) -> None:
