@@ -25,6 +25,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 import tyro
 
@@ -185,8 +186,6 @@ class Speed:
 
         found, again = decode(self.file), self.file.with_suffix(".again")
         field = Field(build(found.config, found.weights, found.header["head"]["scene_unit"]), found.splats)
-        import numpy as np
-
         steps = {name: np.array(grid["step"]) for name, grid in found.header["grids"].items()}
 
         def written() -> None:

@@ -10,6 +10,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.checkpoint import differences, reduced_config
+from nrfgs_ns.model.model import NrfgsModelConfig
 from nrfgs_ns.training.run import parse
 
 QUICK = {"--pipeline.model.num-downscales": 0, "--pipeline.model.warmup-length": 2, "--pipeline.model.refine-every": 4}
@@ -122,3 +123,13 @@ def test_shrinkage_falls_with_the_square_of_the_number_of_views(tiny_scene, tmp_
     assert by_logit[1] > 0.0 and by_logit[rows].abs().max() < 1e-9, "a head that adds opacity is paid for it"
     model.config.densification = "mcmc"  # which has terms of its own
     assert model.shrinking() == {}
+
+
+@pytest.mark.parametrize("written, read", [("on", "auto"), ("auto", "auto"), ("off", "off")])
+def test_options_of_an_older_config_are_todays(written, read):
+    old = vars(NrfgsModelConfig()) | {"head_from": None, "few_views": written, "densification": "consistent"}
+    del old["keep"], old["shrinkage"]
+    config = NrfgsModelConfig.__new__(NrfgsModelConfig)
+    config.__setstate__(old)
+    assert (config.head_from, config.few_views, config.densification) == (0.0, read, "splatfacto")
+    assert (config.keep, config.shrinkage) == (1.0, 0.0)

@@ -205,6 +205,13 @@ def frames() -> str:
     return grid(["", "799 x 532", "1080p", "799 x 532, gsplat's lists", "1080p, gsplat's lists"], body)
 
 
+def frame_share(size: str) -> str:
+    """The field's frames per second over the harmonics', at about as many splats."""
+    rows = records("step_parts")["graph"]["frames"]
+    fps = {row["method"]: row["fps"][size] for row in rows}
+    return f"{fps['nrfgs'] / fps['nrfgs-sh']:.2f}"
+
+
 def spread(numbers: list[float], digits: int) -> str:
     """Median, least and largest; of one number, itself."""
     if len(numbers) == 1:
