@@ -27,12 +27,12 @@ TRIED = {
 
 def trials() -> str:
     """How many trainings on held-out views there were."""
-    return str(sum(len(records(study)) for study in ("held-out", "held-out-trials")))
+    return str(len(records("held-out")))
 
 
 def tried() -> str:
     """What settings gain over harmonics with shrinkage on held-out views: median dB / mean SSIM x 1000."""
-    runs = list(records("held-out-trials").values())
+    runs = list(records("held-out").values())
     base = {(one["scene"], view[0]): view for one in runs if one["name"] == BASE for view in one["per_image"]}
     gains: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for one in runs:
