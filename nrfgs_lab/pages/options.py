@@ -32,7 +32,7 @@ INTRODUCTION = """# Options
 
 What this package adds to nerfstudio's options, or presets in its own way; all are in `ns-train nrfgs --help`.
 Written by `python -m nrfgs_lab.pages.options` from the configurations. Cameras lie within [-1, 1] scene units. Defaults
-are `nrfgs`'s; of the other heads' methods `view-noise`, `head-from` and `shrinkage` are 0, `few-views` is off,
+are `nrfgs`'s; of the other heads' methods `view-noise` and `shrinkage` are 0, `few-views` is off,
 `max-num-iterations` 30,000 and `average-steps` 0.
 """
 RULES = "original", "mcmc"
