@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import BaseField, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import (
@@ -73,8 +73,6 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     view_noise: float = 0.0
     """noise on the camera centre from which the head sees each splat in training, in distances between neighbouring
     training cameras (docs/captures.md)"""
-    head_from: float = 0.0
-    """share of the training during which splats have their base colours and opacities alone"""
     few_views: Literal["auto", "off"] = "off"
     """auto: V training views trust the head with u = V / (V + 20): noise is longer by 1 / u, its opacity residual is u
     times as large (docs/captures.md)"""
@@ -114,9 +112,9 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Be what a config.yml says; that of an older version has fewer options, or values that are no more."""
+        """Be what a config.yml says; that of an older version has other options, or values that are no more."""
         state = {**vars(type(self)()), **state}
-        state["head_from"] = state["head_from"] or 0.0  # None: by the number of views
+        state.pop("head_from", None)
         state["few_views"] = "auto" if state["few_views"] == "on" else state["few_views"]
         self.__dict__.update(state)
         self.densification = RETIRED.get(self.densification, self.densification)
@@ -140,10 +138,6 @@ class NrfgsModel(SplatfactoModel):
     camera_spacing: float = 0.0
     """world units between neighbouring training cameras; 0 until a training begins"""
     _scheduled: int | None = None
-    head_has_begun: bool = False
-    """whether the head has learnt in a step of this training, or of the one that it goes on from"""
-    head_rests: bool = False
-    """whether the head is left out of the present step"""
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
@@ -182,8 +176,6 @@ class NrfgsModel(SplatfactoModel):
         for name in ("view_noise", "shrinkage"):
             if not getattr(self.config, name) >= 0:
                 raise InputError(f"pipeline.model.{name} is {getattr(self.config, name)}; it must be zero or positive.")
-        if not 0 <= self.config.head_from < 1:
-            raise InputError(f"pipeline.model.head_from is {self.config.head_from}; it must be at least 0 and below 1.")
         self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
 
     def _strategy(self) -> Densification:
@@ -390,12 +382,9 @@ class NrfgsModel(SplatfactoModel):
         return self.photograph.names.index(name) if name else None
 
     def _as_learnt(self, field: Field) -> Field:
-        """The field as its head is asked about it in this step; outside of training, the field. Before `head_from` the
-        head is not asked; then it is under noise (`view_noise.py`)."""
+        """The field as its head is asked about it in this step: under noise (`view_noise.py`) in training."""
         if not self.training:
             return field
-        if self.head_rests:
-            return BaseField(*field)
         return field._replace(splats=self.view_noise.moved(field.splats, self.step))
 
     def _finish_for_training(self, outputs: dict[str, Tensor], camera: Cameras, background: Tensor) -> None:
@@ -547,11 +536,6 @@ class NrfgsModel(SplatfactoModel):
         """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
         self._scheduled = step
 
-    def begin_step(self, share: float) -> None:
-        """A training step begins, when this share of the training, in [0, 1], is over."""
-        self.head_has_begun = self.head_has_begun or share >= self.config.head_from  # and goes on in a longer training
-        self.head_rests = not self.head_has_begun
-
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
         self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
@@ -683,7 +667,6 @@ class NrfgsModel(SplatfactoModel):
             "head": self.head.name,
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
-            "head_has_begun": self.head_has_begun,
         }
         if self.reduced_head is not None:
             state["capacity"] = {"head": self.reduced_head}
@@ -698,7 +681,6 @@ class NrfgsModel(SplatfactoModel):
                 f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
-        self.head_has_begun = state.get("head_has_begun", True)  # older checkpoints do not say: it did at once
         if "pace" in state:  # of version 0.1.0
             state = {**state, "schedule_step": int(state["pace"]["position"])}
         if "schedule_step" in state:

@@ -15,12 +15,10 @@ OLDER = " *"
 """Mark of what an earlier version trained."""
 TRIED = {
     "field: trust": "**`nrfgs`**",
-    "field: trust, late start": "asked from 0.3 of the training on",
     "field: trust, one band": "one band",
     "field: whole": "u = 1",
     f"field: trust{STORED}": "shrinkage of stored opacity",
     f"field: whole{STORED}": "u = 1, shrinkage of stored opacity",
-    "field: rules at 30 and 100 views": "below 30 views one band, fixed opacity, asked from 0.3 on",
 }
 """Rows of the table of held-out views, by the names of their trials."""
 
