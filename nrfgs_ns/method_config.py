@@ -113,7 +113,7 @@ nrfgs = preset(
 nrfgs_fast = preset(
     "nrfgs-fast",
     nrfgs,
-    "nrfgs in 10,000 steps, however many views there are, for a first result (docs/trade-off.md).",
+    "nrfgs in 10,000 steps, for a first result (docs/trade-off.md).",
     model={},
     max_num_iterations=FEWEST_STEPS,
     schedule_steps=STEPS,
@@ -123,7 +123,7 @@ nrfgs_fast = preset(
 nrfgs_best = preset(
     "nrfgs-best",
     nrfgs,
-    "nrfgs in 30,000 steps with the densification of 3DGS: more splats, more time, more detail (docs/trade-off.md).",
+    "nrfgs in 30,000 steps with 3DGS's densification: more splats, time and detail (docs/trade-off.md).",
     model={"densification": "original", "shrinkage": 0.0},
     max_num_iterations=STEPS,
     average_steps=AVERAGED,
@@ -132,14 +132,14 @@ nrfgs_best = preset(
 nrfgs_sh = method(
     "nrfgs-sh",
     ShConfig(),
-    "The same model with spherical harmonics: 3DGS as in splatfacto, for comparison.",
+    "For comparison: spherical harmonics, 3DGS as in splatfacto.",
     features_rest=adam(0.0025 / 20),
 )
 
 nrfgs_vdgs = method(
     "nrfgs-vdgs",
     VdgsConfig(),
-    "The same model with VDGS's head: spherical harmonics, and opacity that depends on the view; for comparison.",
+    "For comparison: VDGS, spherical harmonics and opacity that depends on the view.",
     features_rest=adam(0.0025 / 20),
     field=adam(1e-3),
 )
@@ -147,7 +147,7 @@ nrfgs_vdgs = method(
 nrfgs_gsnb = method(
     "nrfgs-gsnb",
     GsnbConfig(),
-    "The same model with GSNB's head: spherical harmonics, and a learnt basis beside them; for comparison.",
+    "For comparison: GSNB, spherical harmonics and a learnt basis.",
     features_rest=adam(0.0025 / 20),
     # AdamW as its reference has it, with torch's own eps and decay.
     field={"optimizer": AdamOptimizerConfig(_target=torch.optim.AdamW, lr=1e-3, weight_decay=0.01), "scheduler": None},
@@ -156,7 +156,7 @@ nrfgs_gsnb = method(
 nrfgs_sg = method(
     "nrfgs-sg",
     SgConfig(),
-    "The same model with three spherical Gaussians on each splat's base colour, for comparison.",
+    "For comparison: SG, three spherical Gaussians on a base colour.",
     sg_axes=adam(0.0025),
     sg_sharpness=adam(0.0025),
     sg_colors=adam(0.0025),

@@ -51,7 +51,7 @@ class Running:
 
 @dataclass
 class Bench:
-    """Compare methods: train each under each strategy on each scene with each seed, and report. See docs/bench.md."""
+    """Compare methods over strategies, scenes and seeds: train all, and report. See docs/bench.md."""
 
     spec: Annotated[Path | None, tyro.conf.Positional] = None
     """YAML file with runs, strategies, scenes, seeds, ...; what is given as an option here has precedence"""
@@ -70,7 +70,7 @@ class Bench:
     seeds: tuple[int, ...] = ()
     """--machine.seed of each repetition"""
     steps: int | None = None
-    """training steps, but for runs and presets that have their own"""
+    """training steps, except of runs and presets that have their own"""
     options: str | None = None
     """options of ns-train for every run"""
     train_views: int | None = None

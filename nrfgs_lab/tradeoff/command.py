@@ -12,7 +12,7 @@ from nrfgs_lab.bench.command import Bench
 
 @dataclass
 class Tradeoff:
-    """Find out what each knob buys and what it costs: turn one at a time, and report. See docs/trade-off.md."""
+    """Find out what each option buys and what it costs, one at a time. See docs/trade-off.md."""
 
     spec: Annotated[Path, tyro.conf.Positional]
     """YAML file with the default, knobs, scenes, seeds, ...; what is given as an option here has precedence"""
@@ -29,7 +29,7 @@ class Tradeoff:
     seeds: tuple[int, ...] = ()
     """--machine.seed of each repetition"""
     steps: int | None = None
-    """training steps, but for runs and presets that have their own"""
+    """training steps, except of runs and presets that have their own"""
     jobs: int | None = None
     """runs at once on each GPU, or on the CPU; times are reported only with 1"""
     gpus: int | None = None

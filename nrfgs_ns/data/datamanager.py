@@ -101,8 +101,8 @@ class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """The image type returned from manager, caching images in uint8 saves memory"""
     image_memory: float | None = None
-    """gigabytes of host memory that the decoded images may take; of more, files are made and read whenever an image is
-    needed (docs/own-data.md). None: half of what is free"""
+    """gigabytes of host memory for decoded images; more images are kept in files (docs/own-data.md). None: half of what
+    is free"""
 
 
 class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):

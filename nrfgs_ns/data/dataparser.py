@@ -71,11 +71,11 @@ class NrfgsDataParserConfig(NerfstudioDataParserConfig):
     _target: type = field(default_factory=lambda: NrfgsDataParser)
     """target class to instantiate"""
     eval_mode: Literal["interior", "interval", "fraction", "filename", "all"] = "interior"
-    """How to split where the data set names no split. interior: every eval_interval-th image by name is for testing,
-    from the middle of the first eval_interval on. interval: from the first image on. fraction: train_split_fraction
-    train. filename: by train or eval in the name. all: every image is both."""
+    """test images where the data set names none. interior: every eval_interval-th by name, from the middle of the first
+    interval on. interval: from the first on. fraction: all but train_split_fraction. filename: by train or eval in the
+    name. all: every image is both"""
     load_3D_points: bool = True
-    """Whether to start from the points of the data set (ply_file_path, or else colmap/sparse/0)."""
+    """start from the points of the data set (ply_file_path, otherwise colmap/sparse/0)"""
 
 
 class Scene(NamedTuple):

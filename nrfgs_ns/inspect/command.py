@@ -10,7 +10,7 @@ from nrfgs_ns.errors import InputError
 
 @dataclass
 class Inspect:
-    """Find out what each part of a trained field is worth on test views, and what it costs."""
+    """Find out what each part of a trained field is worth, and what it costs."""
 
     load_config: Path
     """config.yml of the training"""

@@ -34,7 +34,7 @@ def differences(config: AppearanceHeadConfig, other: AppearanceHeadConfig) -> di
 def upgraded(state: Mapping[str, Any]) -> dict[str, Any]:
     """A model's extra state as this version writes it, from one that any version wrote."""
     strategy = state.get("densification", "splatfacto")
-    now = {"head_has_begun": True, **state, "densification": RETIRED.get(strategy, strategy)}
+    now = {**state, "densification": RETIRED.get(strategy, strategy)}
     if "pace" in state:  # of version 0.1.0
         now["schedule_step"] = int(state["pace"]["position"])
     return now

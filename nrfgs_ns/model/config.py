@@ -33,20 +33,16 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
     view_noise: float = 0.0
-    """in training the head sees each splat from a camera centre moved by noise this many times as long as neighbouring
-    training cameras are apart (docs/captures.md)"""
-    head_from: float = 0.0
-    """share of the training after which the head is asked and learns. Until then splats have their base colours and
-    opacities"""
+    """noise on the camera centre from which the head sees each splat in training, in distances between neighbouring
+    training cameras (docs/captures.md)"""
     few_views: Literal["auto", "off"] = "off"
-    """auto: V training views trust the head with V / (V + 20), by which view_noise is longer and its opacity residual
-    smaller (docs/captures.md)"""
+    """auto: V training views trust the head with u = V / (V + 20): noise is longer by 1 / u, its opacity residual is u
+    times as large (docs/captures.md)"""
     shrinkage: float = 0.0
-    """weight, in the loss, of the mean opacity and of the mean standard deviation in scene units, divided by the square
-    of the number of training views: what few views need becomes faint and small. mcmc has its own instead
-    (docs/captures.md)"""
+    """weight in the loss of the splats' mean opacity and mean size, divided by the square of the number of training
+    views (docs/captures.md). mcmc has its own instead"""
     warmup_steps: int | None = None
-    """steps before training in which a head that adds something at its start learns to add nothing. None: one for each
+    """steps before training in which a head with a residual at its start learns to have none. None: one for each
     training view"""
     warmup_lr: float = 1e-3
     """learning rate of the warm-up's Adam"""
@@ -56,31 +52,31 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     splat_budget: int = 1_000_000
     """mcmc: the number of splats that it grows to and keeps"""
     opacity_seen_by_densification: OpacitySeen | None = None
-    """which opacity makes a splat die. base: the stored one. peak: the largest that a view since the last refinement
-    would show. None: peak for mcmc, base for the others"""
+    """opacity by which splats are pruned or moved (docs/opacity.md). base: stored. peak: largest shown since the last
+    refinement. None: peak for mcmc, otherwise base"""
     keep: float = 1.0
-    """share of the splats that is left once growth has ended, at stop_split_at: those go, in six rounds, that the
-    training views would miss least (docs/fewer-splats.md). 1: all"""
+    """share of the splats that is kept after growth; those that the training views would miss least are removed
+    (docs/fewer-splats.md)"""
     original: OriginalDensification = field(default_factory=OriginalDensification)
     """thresholds of the densification 'original'"""
     mcmc: McmcDensification = field(default_factory=McmcDensification)
     """constants of the densification 'mcmc'"""
     photographs: Literal["auto", "on", "off"] = "auto"
-    """whether each photograph's exposure and white balance are learnt. auto: where EXIF or the photographs themselves
-    say that they vary; a line in the log says why"""
+    """learn each photograph's exposure and white balance. auto: if photographs or EXIF show that they vary
+    (docs/exposure.md)"""
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
-    """what is learnt: exposure and white-balance of each photograph, vignetting and response of each camera"""
+    """what is learnt, of each photograph (exposure, white-balance) or camera (vignetting, response)"""
     robust_loss: float = 0.0
-    """share of the pixels that the loss leaves out at most, those with the largest residuals: passers-by, moving
-    shadows. 0: none; 0.1 is a start"""
+    """largest share of the pixels that the loss ignores, those with the largest residuals: people passing by
+    (docs/exposure.md)"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Be what a config.yml says; that of an older version has fewer options, or values that are no more."""
+        """Be what a config.yml says; that of an older version has other options, or values that are no more."""
         state = {**vars(type(self)()), **state}
-        state["head_from"] = state["head_from"] or 0.0  # None: by the number of views
+        state.pop("head_from", None)
         state["few_views"] = "auto" if state["few_views"] == "on" else state["few_views"]
         self.__dict__.update(state)
         self.densification = RETIRED.get(self.densification, self.densification)
@@ -99,9 +95,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
         for name in ("view_noise", "shrinkage"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"pipeline.model.{name} is {getattr(self, name)}; it must be zero or positive.")
-        for name in ("head_from", "robust_loss"):
-            if not 0 <= getattr(self, name) < 1:
-                raise InputError(f"pipeline.model.{name} is {getattr(self, name)}; it must be at least 0 and below 1.")
+        if not 0 <= self.robust_loss < 1:
+            raise InputError(f"pipeline.model.robust_loss is {self.robust_loss}; it must be at least 0 and below 1.")
 
     def trust(self, views: int) -> float:
         """How far so many training views trust the head, in (0, 1]."""

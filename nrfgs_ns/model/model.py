@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import BaseField, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.densification import Densification, build_densification
 from nrfgs_ns.errors import InputError
@@ -59,10 +59,6 @@ class NrfgsModel(SplatfactoModel):
     """options of the head that are not the configuration's: those that a checkpoint or the number of views decides"""
     camera_spacing: float = 0.0
     """world units between neighbouring training cameras; 0 until a training begins"""
-    head_has_begun: bool = False
-    """whether the head has learnt in a step of this training, or of the one that it goes on from"""
-    head_rests: bool = False
-    """whether the head is left out of the present step"""
     viewer_panel: Any = None
     """who says what a browser sees (`show_by`); None: there is no viewer"""
     _scheduled: int | None = None
@@ -265,12 +261,9 @@ class NrfgsModel(SplatfactoModel):
         return (camera.metadata or {}).get("cam_idx") if self.training else look_asked_for(self.photograph)
 
     def _as_learnt(self, field: Field) -> Field:
-        """The field as its head is asked about it in this step; outside of training, the field. Before `head_from` the
-        head is not asked; then it is under noise (`view_noise.py`)."""
+        """The field as its head is asked about it in this step: under noise (`view_noise.py`) in training."""
         if not self.training:
             return field
-        if self.head_rests:
-            return BaseField(*field)
         return field._replace(splats=self.view_noise.moved(field.splats, self.step))
 
     @torch.no_grad()
@@ -351,11 +344,6 @@ class NrfgsModel(SplatfactoModel):
     def schedule_at(self, step: int) -> None:
         """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
         self._scheduled = step
-
-    def begin_step(self, share: float) -> None:
-        """A training step begins, when this share of the training, in [0, 1], is over."""
-        self.head_has_begun = self.head_has_begun or share >= self.config.head_from  # and goes on in a longer training
-        self.head_rests = not self.head_has_begun
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
         """Splatfacto's losses, and in training what the densification strategy adds to them.
@@ -531,7 +519,6 @@ class NrfgsModel(SplatfactoModel):
             "head": self.head.name,
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
-            "head_has_begun": self.head_has_begun,
         }
         if self.reduced_head is not None:
             state["capacity"] = {"head": self.reduced_head}
@@ -545,7 +532,6 @@ class NrfgsModel(SplatfactoModel):
                 f"with {self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
-        self.head_has_begun = state["head_has_begun"]
         if "schedule_step" in state:
             self.schedule_at(state["schedule_step"])
             self.head.set_step(self.schedule_step)

@@ -40,10 +40,10 @@ class ShardingConfig:
     """How the splats are spread over the devices, and what a step counts. Nothing of it is read with one device."""
 
     rebalance_at: float = 1.1
-    """splats move between devices once one has more than this many times the mean; looked at after each refinement"""
+    """splats move between devices when one has more than this many times the mean"""
     schedules: Literal["steps", "images"] = "steps"
-    """what step numbers and learning rates are of. steps: of steps, each of which sees one image for each device.
-    images: of one device's training; as many images are seen as there, in fewer steps (docs/many-gpus.md)"""
+    """what schedules count (docs/many-gpus.md). steps: steps, of one image on each device. images: images, so that
+    there are fewer steps"""
 
 
 @dataclass
@@ -59,7 +59,7 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
     sharding: ShardingConfig = field(default_factory=ShardingConfig)
     """with several devices: how the splats are spread over them, and what a step counts"""
     compact: Path | None = None
-    """a file of `nrfgs export compact` that the model is read from instead of the checkpoint; not for a training"""
+    """read the model from a file of `nrfgs export compact` instead of the checkpoint; not for training"""
 
 
 class NrfgsPipeline(VanillaPipeline):
