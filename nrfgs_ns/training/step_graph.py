@@ -126,7 +126,7 @@ class StepGraphs:
         now = [*splats, model.head]  # whose weights live as long as it does
         how = {
             "places": [value.data_ptr() for value in splats],
-            "head": (model.head.phase, model.head_rests),
+            "head": model.head.phase,
             "densification": model.densification.rests_at(model.step),
             "downscale": model._get_downscale_factor(),
         }
@@ -271,11 +271,8 @@ class _StepGraph:
             look = lambda rgb: functional_call(model.photograph, {"shots": shot}, (rgb, 0))  # noqa: E731
         with torch.enable_grad(), self.room.in_use():
             view = project_view(splats, self.seen_from, model.projecting._replace(every_row=True))
-            if model.head_rests:
-                appearance = model.head.base_appearance(splats, view.visible)
-            else:
-                asked = model.view_noise.moved_by(splats, self.noise)
-                appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
+            asked = model.view_noise.moved_by(splats, self.noise)
+            appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
             background = model._get_background_color()
             outputs, info = composite_view(
                 view,

@@ -331,7 +331,6 @@ class NrfgsTrainer(Trainer):
         if pace is not None:
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
-        model.begin_step(step / self.total_steps if pace is None else pace.position / pace.length)
         with self._last_good_state_on_disk():
             self.guard.begin(step, self.optimizers)
             loss, losses, metrics = super().train_iteration(step)

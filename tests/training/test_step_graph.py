@@ -45,9 +45,8 @@ def test_a_photograph_of_one_size_too_many_has_no_graph_and_it_is_said(build):
 
 
 def begin(pipeline, step: int) -> None:
-    """What the trainer does before a step, with the same random numbers each time. The head begins at step 50."""
+    """What the trainer does before a step, with the same random numbers each time."""
     pipeline.model.step_cb(Optimizers({}, {}), step)
-    pipeline.model.head_rests = step < 50
     torch.manual_seed(step)
     for parameter in pipeline.model.parameters():
         parameter.grad = None
