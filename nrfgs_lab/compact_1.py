@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A writer of compact files of version 1, which are still read: a field's header and streams.
 
-As in version 2 (`nrfgs_ns/compact/encode.py`), except that every stream is xz, of uint8 to uint64; tables are
-[columns, n], those of view-dependent and diffuse splats apart (view.*, diffuse.*); rotations are the three smaller
-numbers of a quaternion in header["quats_bits"] bits each.
+docs/compact-format.md describes them.
 """
 
 from typing import Any

@@ -68,7 +68,7 @@ def steps() -> str:
 def added(scene: str) -> str:
     """Per cent of a training's seconds that the longest of its fine-tunes takes."""
     longest = max(one["seconds"]["finetune"] for one in reports(scene).values() if one.get("finetune"))
-    return f"{100 * longest / records('compact')[f'{scene}-model']['train']['seconds']:.0f}%"
+    return f"{100 * longest / records('compact')[f'{scene}-model']['train']['seconds']:.0f} %"
 
 
 def file(name: str, what: str) -> str:
