@@ -1,34 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A field as the header and the streams of a compact file, version 2.
+"""A field as the header and the streams of a compact file of version 2; the container is `format.py`'s.
 
-All splats lie in Morton order of their rounded means, so that a number's neighbours in its table are neighbours in
-space, and the means are the differences between successive Morton numbers. Every table lies on a grid whose step is a
-choice of precision, not of bits: outliers then cost a few long codes, and not everyone's precision.
-
-Keys of the header:
+Keys of the header, beside "streams":
 
     format   "nrfgs-compact"
     splats   {"view": V, "diffuse": W}: how many of each kind; N = V + W
-    head     name ("nrf"), config (the field's options, latent_dim the rank R), scene_unit
-    render   rasterize_mode, background (RGB)
-    grids    of means, turns, scales, opacities, colors, latents: low and step of each column; k stands for low + step k
+    head     "name" ("nrf"), "config" (the field's options, "latent_dim" the rank R), "scene_unit"
+    render   "rasterize_mode", "background" (RGB)
+    grids    for "means", "turns", "scales", "opacities", "colors", "latents": "low" and "step", [columns]
 
-Streams, with their coding (`format.py`) and shape:
+A whole number k in a column of a table stands for low + step k, low being 0 except in means. The streams:
 
-    means        rans, unsigned  [2, N]   upper and lower 32 bits of the differences of successive Morton numbers, from
-                                          0; bit 3 k + a of a Morton number is bit k of axis a, 21 bits each
-    splats       rans            [11, N]  1 column: 0 view-dependent, otherwise diffuse; 1 opacities: logits within
-                                          +-10; 3 scales: logarithms of standard deviations; 3 colors: base colours, 1
-                                          is white, diffuse ones at least 0; 3 turns
-    latents      rans            [R, V]   of the view-dependent splats, in order
-    head.<name>  xz              as in the network: float16, or float32 where too large for it
+    means        rans   [2, N]    upper and lower 32 bits of the differences of successive Morton numbers, the first
+                                  counted from 0; not signed. Bit 3 k + a of a Morton number is bit k of the code of
+                                  axis a, 21 bits each
+    splats       rans   [11, N]   1 column: 0 if the splat is view-dependent, else it is diffuse; then opacities (1),
+                                  scales (3), colors (3), turns (3), as in `tables.py`
+    latents      rans   [R, V]    of the view-dependent splats, in the order of the others
+    head.<name>  xz               the network's weights, float16; float32 where they are too large for it
 
-turns are x, y, z of a rotation (w, x, y, z) with w = sqrt(max(1 - x^2 - y^2 - z^2, 1e-6)), then normalised; of the 24
-ways to name an ellipsoid's axes the writer takes the one that turns least. head.low.0.weight [H, I], head.low.0.bias,
-head.low.2.weight, head.low.2.bias and the same of high are the layers of `appearance/nrf.py`. A diffuse splat has its
-base colour and opacity from everywhere.
+head.low.0.weight [H, I], head.low.0.bias, head.low.2.weight, head.low.2.bias and the same of high are the layers of
+`appearance/nrf.py`. A diffuse splat has its base colour, cut off at 0, and its base opacity from everywhere.
 
-No number is off by more than half a step (`precision.py`).
+All splats lie in Morton order of their rounded means, so that a number's neighbours in its table are neighbours in
+space. Every table lies on a grid whose step is a choice of precision, not of bits: outliers then cost a few long codes,
+and not everyone's precision.
 """
 
 from collections.abc import Mapping
