@@ -145,3 +145,10 @@ def trial_gains(head: str, trial: str) -> dict[str, float]:
         if all(pair):
             found[scene] = median(_view_gains(*pair))
     return found
+
+
+def best_trial(head: str) -> str:
+    """The trial that gains most in the mean over captures; empty: the head's own setting."""
+    gains = {trial: list(trial_gains(head, trial).values()) for trial in TRIALS}
+    best = max(TRIALS, key=lambda trial: fmean(gains[trial]) if gains[trial] else 0.0)
+    return best if gains[best] and fmean(gains[best]) > 0 else ""
