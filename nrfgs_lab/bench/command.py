@@ -65,7 +65,7 @@ class Bench:
     """data sets: folders below --scenes, read as the file says if it has them"""
     runs: tuple[str, ...] = ()
     """runs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
-    strategies: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--protocols"])] = ()
+    strategies: tuple[str, ...] = ()
     """densification: splatfacto, original, mcmc, mcmc@BUDGET, own"""
     seeds: tuple[int, ...] = ()
     """--machine.seed of each repetition"""
