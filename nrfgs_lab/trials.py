@@ -8,9 +8,10 @@ A plan is a list, what is worth most first; each entry is trained on each of its
     - {name: nrfgs, method: nrfgs, scenes: [fern, fox], seeds: [42, 43]}
     - {name: harmonics, method: nrfgs-sh, options: --schedule-steps 30000, steps: 10000, scenes: [fern]}
 
-A scene is a folder below SCENES, or one of its files (fern/dev0.json). OUT.jsonl gets a line for each training: its
-entry, PSNR, SSIM, MS-SSIM and FLIP (where `flip-evaluator` is installed) of each test view, and what eight training
-views have. What OUT.jsonl has is not repeated; what does not fit into the seconds is left for another call.
+A scene is a folder below SCENES, or one of its files (fern/dev0.json), which every method reads alike (nrfgs-data).
+OUT.jsonl gets a line for each training: its entry, PSNR, SSIM, MS-SSIM and FLIP (where `flip-evaluator` is installed)
+of each test view, and what eight training views have. What OUT.jsonl has is not repeated; what does not fit into the
+seconds is left for another call.
 `nrfgs bench` takes times, goes on where it was stopped, and makes tables; it starts Python for each training.
 """
 
@@ -187,12 +188,11 @@ def train_and_measure(trial: Trial, scenes: Path, folder: Path, end: float) -> d
     from nrfgs_ns.image.metrics import ImageMetrics
     from nrfgs_ns.training.run import machine, parse
 
-    data = ["nrfgs-data"] if trial.method.startswith("nrfgs") else []
     steps = [] if trial.steps is None else ["--max-num-iterations", str(trial.steps)]
     paths = ["--data", str(scenes / trial.scene), "--output-dir", str(folder)]
     seed = ["--machine.seed", str(trial.seed)]
     with host_without_downloads(trial.method):
-        config = parse([trial.method, *paths, *QUIET, *seed, *steps, *trial.options.split(), *data])
+        config = parse([trial.method, *paths, *QUIET, *seed, *steps, *trial.options.split(), "nrfgs-data"])
         _set_random_seed(config.machine.seed)
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()

@@ -31,7 +31,7 @@ SHINES = 0.1
 
 @dataclass
 class Demo:
-    """Make a scene with known reflectance, train NRF and SH on it for the same number of steps, and compare them."""
+    """Make a glossy scene, train NRF and SH on it for the same number of steps, and compare them."""
 
     out: Path = Path("demo")
     """folder for the data set, the trainings, results.json and contact_sheet.png"""

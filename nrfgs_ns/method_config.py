@@ -22,7 +22,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.start import with_methods
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS
 from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
@@ -63,8 +63,9 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
             steps_per_save=2000,
             steps_per_eval_all_images=1000,
             mixed_precision=False,
-            # The profiler's table of durations would end every command.
-            logging=LoggingConfig(profiler="none", local_writer=ProgressLineConfig()),
+            # The profiler's table of durations would end every command. For what is logged the host waits until the GPU
+            # has nothing left to do.
+            logging=LoggingConfig(profiler="none", local_writer=ProgressLineConfig(), steps_per_log=100),
             machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
             pipeline=NrfgsPipelineConfig(model=NrfgsModelConfig(appearance=appearance)),
             optimizers={
@@ -113,7 +114,7 @@ nrfgs = preset(
 nrfgs_fast = preset(
     "nrfgs-fast",
     nrfgs,
-    "nrfgs in 10,000 steps, however many views there are, for a first result (docs/trade-off.md).",
+    "nrfgs in 10,000 steps, for a first result (docs/trade-off.md).",
     model={},
     max_num_iterations=FEWEST_STEPS,
     schedule_steps=STEPS,
@@ -123,7 +124,7 @@ nrfgs_fast = preset(
 nrfgs_best = preset(
     "nrfgs-best",
     nrfgs,
-    "nrfgs in 30,000 steps with the densification of 3DGS: more splats, more time, more detail (docs/trade-off.md).",
+    "nrfgs in 30,000 steps with 3DGS's densification: more splats, time and detail (docs/trade-off.md).",
     model={"densification": "original", "shrinkage": 0.0},
     max_num_iterations=STEPS,
     average_steps=AVERAGED,
@@ -132,14 +133,14 @@ nrfgs_best = preset(
 nrfgs_sh = method(
     "nrfgs-sh",
     ShConfig(),
-    "The same model with spherical harmonics: 3DGS as in splatfacto, for comparison.",
+    "For comparison: spherical harmonics, 3DGS as in splatfacto.",
     features_rest=adam(0.0025 / 20),
 )
 
 nrfgs_vdgs = method(
     "nrfgs-vdgs",
     VdgsConfig(),
-    "The same model with VDGS's head: spherical harmonics, and opacity that depends on the view; for comparison.",
+    "For comparison: VDGS, spherical harmonics and opacity that depends on the view.",
     features_rest=adam(0.0025 / 20),
     field=adam(1e-3),
 )
@@ -147,7 +148,7 @@ nrfgs_vdgs = method(
 nrfgs_gsnb = method(
     "nrfgs-gsnb",
     GsnbConfig(),
-    "The same model with GSNB's head: spherical harmonics, and a learnt basis beside them; for comparison.",
+    "For comparison: GSNB, spherical harmonics and a learnt basis.",
     features_rest=adam(0.0025 / 20),
     # AdamW as its reference has it, with torch's own eps and decay.
     field={"optimizer": AdamOptimizerConfig(_target=torch.optim.AdamW, lr=1e-3, weight_decay=0.01), "scheduler": None},
@@ -156,7 +157,7 @@ nrfgs_gsnb = method(
 nrfgs_sg = method(
     "nrfgs-sg",
     SgConfig(),
-    "The same model with three spherical Gaussians on each splat's base colour, for comparison.",
+    "For comparison: SG, three spherical Gaussians on a base colour.",
     sg_axes=adam(0.0025),
     sg_sharpness=adam(0.0025),
     sg_colors=adam(0.0025),

@@ -88,7 +88,7 @@ class Spec:
     seeds: list[int] = field(default_factory=lambda: [42])
     """--machine.seed of each repetition"""
     steps: int = 30_000
-    """training steps, but for runs and presets that have their own"""
+    """training steps, except of runs and presets that have their own"""
     options: tuple[str, ...] = ()
     """options of ns-train for every run"""
     train_views: int = 16

@@ -23,7 +23,7 @@ MIN_SAMPLES = 120
 
 @dataclass
 class Express:
-    """Fit colours over directions with harmonics, the neural field and others, at one budget, and compare them.
+    """Fit colours over directions with harmonics, the field and others, at one budget, and compare them.
 
     Interrupted runs go on where they stopped: each finished fit is a record in OUT/runs, and is not repeated.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way from photographs to a splat file, walked with the commands that docs/first-scene.md shows.
+"""The way from photographs to a splat file, walked with the commands that docs/own-data.md shows.
 
     python -m nrfgs_lab.pages.newcomer PHOTOS --work outputs/newcomer
 
@@ -114,7 +114,7 @@ def wait(condition, served: Served, patience: float = 6 * PATIENCE) -> None:
 
 
 def look(diary: Diary, browser, config: Path, work: Path) -> None:
-    """`ns-viewer`: the picture, and what the field adds to it."""
+    """`ns-viewer`: the picture."""
     if diary.has("look"):
         return
     words = ["--load-config", config]
@@ -123,11 +123,8 @@ def look(diary: Diary, browser, config: Path, work: Path) -> None:
         page = Page(browser, viewer.port, *WINDOW)
         page.hide_cameras()
         page.set_resolution(800)
-        full = page.sharp()
+        page.sharp()
         page.save(IMAGES / "first-scene-viewer.jpg")
-        page.show("residual")
-        page.sharp(unlike=full)
-        page.save(IMAGES / "first-scene-residual.jpg")
         page.page.close()
     diary.write("look", ["ns-viewer", *words], time.time() - start)
 

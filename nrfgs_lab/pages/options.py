@@ -30,16 +30,19 @@ APPEARANCE = "pipeline.model.appearance."
 
 INTRODUCTION = """# Options
 
-What this package adds to nerfstudio's options, or presets in its own way; all are in `ns-train nrfgs --help`.
-Written by `python -m nrfgs_lab.pages.options` from the configurations. Cameras lie within [-1, 1] scene units. Defaults
-are `nrfgs`'s; of the other heads' methods `view-noise`, `head-from` and `shrinkage` are 0, `few-views` is off,
-`max-num-iterations` 30,000 and `average-steps` 0.
+What this package adds to nerfstudio's options, or sets in its own way; `ns-train nrfgs --help` lists all. Written by
+`python -m nrfgs_lab.pages.options`. Defaults are `nrfgs`'s. The other heads have no `view-noise`, `few-views` and
+`shrinkage`; they train for 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
 """
 RULES = "original", "mcmc"
 """Densification strategies with options of their own."""
-UNSAID = "none", "required", "False"
-"""Defaults that a list of options does not tell."""
-HOST = "`--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
+LEFT_OUT = (
+    *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
+    *("pipeline.model.warmup-lr", "pipeline.model.appearance.distance-eps", "load-3D-points"),
+    *("viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact", "pipeline.sharding.schedules"),
+)
+"""Options that hardly anybody needs, or that a page of their own explains: `--help` has them."""
+HOST = "`--data`, `--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
 
 
 class Option(NamedTuple):
@@ -121,41 +124,35 @@ def methods() -> list[MethodSpecification]:
 def page() -> str:
     """The whole page."""
     first, *others = methods()
-    options = list(own_options(first.config))
+    options = [one for one in own_options(first.config) if one.flag not in LEFT_OUT]
     heads = [option for option in options if option.flag.startswith(APPEARANCE)]
     model = [option for option in options if option.flag.startswith(MODEL) and option not in heads]
     rules = {name: [one for one in model if one.flag.startswith(f"{MODEL}{name}.")] for name in RULES}
     model = [option for option in model if option not in sum(rules.values(), [])]
     rest = [option._replace(flag=f"--{option.flag}") for option in options if not option.flag.startswith(MODEL)]
-    data = [option._replace(flag=f"--{option.flag}") for option in own_options(NrfgsDataParserConfig())]
+    data = [one for one in own_options(NrfgsDataParserConfig()) if one.flag not in LEFT_OUT]
+    data = [option._replace(flag=f"nrfgs-data --{option.flag}") for option in data]
     parts = [
         INTRODUCTION,
-        "## `ns-train nrfgs`: the field\n",
+        "## The field\n",
         table(heads, APPEARANCE),
-        "## All methods: the model\n",
+        "## The model, with every head\n",
         table(model, MODEL),
         _of_rules(rules),
-        "## All methods: training\n",
-        table([option for option in rest if ".dataparser." not in option.flag]),
+        "## Training and data\n\n`nrfgs-data` and what follows it come last in a command.\n",
+        table([option for option in rest if ".dataparser." not in option.flag] + data),
         HOST,
-        "## All methods: the data set\n\nAfter the word `nrfgs-data`, at the end of the command.\n",
-        table(data),
+        rates(first),
+        "## Methods\n",
+        "| `ns-train` | |\n|---|---|",
+        *(f"| `{one.config.method_name}` | {linked(one.description)} |" for one in others),
+        "\n`ns-train METHOD --help` explains the options of its head.\n",
+        "## Commands\n\n| | |\n|---|---|",
     ]
-    presets = [method for method in others if is_preset(method, first)]
-    parts += ["## Presets\n", *(f"`ns-train {one.config.method_name}`: {linked(one.description)}\n" for one in presets)]
-    parts += ["## The other heads\n\nTheir `--pipeline.model.appearance.` options; `--help` explains each.\n"]
-    rows = [
-        (one.config.method_name, own_options(one.config.pipeline.model.appearance), one.description)
-        for one in others
-        if one not in presets
-    ]
-    parts += [_listed(rows), "## Learning rates\n", rates(first)]
-    parts += ["## Commands\n\n`nrfgs COMMAND --help` lists and explains their options.\n"]
-    lines = ["| command | |", "|---|---|"]
     for name, entry_point in commands().items():
         summary, *_ = inspect.getdoc(entry_point.load()).splitlines()
-        lines.append(f"| `nrfgs {name}` | {linked(summary)} |")
-    return "\n".join([*parts, *lines]) + "\n"
+        parts.append(f"| `nrfgs {name}` | {summary.split('. ')[0].removesuffix('.')} |")
+    return "\n".join(parts) + "\n"
 
 
 def _of_rules(rules: dict[str, list[Option]]) -> str:
@@ -164,22 +161,7 @@ def _of_rules(rules: dict[str, list[Option]]) -> str:
     for name, options in rules.items():
         shown = (f"`{one.flag.removeprefix(f'{MODEL}{name}.')}` {_shown(one.default)}" for one in options)
         parts.append(f"`--{MODEL}{name}.`: {', '.join(shown)}")
-    return f"Thresholds of the strategies ([bench.md](bench.md#densification-strategies)): {'. '.join(parts)}.\n"
-
-
-def _listed(rows: list[tuple[str, Iterator[Option], str]]) -> str:
-    """A table of methods by name, with their options and defaults in one cell."""
-    lines = ["| method | | options |", "|---|---|---|"]
-    for name, options, text in rows:
-        shown = [(option.flag, _shown(option.default)) for option in options]
-        cell = ", ".join(f"`{flag}`" + ("" if value in UNSAID else f" {value}") for flag, value in shown)
-        lines.append(f"| `{name}` | {linked(text)} | {cell} |")
-    return "\n".join(lines) + "\n"
-
-
-def is_preset(method: MethodSpecification, of: MethodSpecification) -> bool:
-    """Whether a method has the same head as another one."""
-    return type(method.config.pipeline.model.appearance) is type(of.config.pipeline.model.appearance)
+    return f"[Strategies](bench.md#densification-strategies) have thresholds of their own. {'. '.join(parts)}.\n"
 
 
 def rates(method: MethodSpecification) -> str:
@@ -189,7 +171,7 @@ def rates(method: MethodSpecification) -> str:
         scheduler = group["scheduler"]
         final = "" if scheduler is None else f" to {scheduler.lr_final:g}"
         parts.append(f"`{name}` {group['optimizer'].lr:g}{final}")
-    return f"`--optimizers.NAME.optimizer.lr` to `.scheduler.lr-final`: {', '.join(parts)}.\n"
+    return f"Learning rates, `--optimizers.NAME.optimizer.lr` to `.scheduler.lr-final`: {', '.join(parts)}.\n"
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from nrfgs_lab.bench.command import Bench
 
 @dataclass
 class Tradeoff:
-    """Find out what each knob buys and what it costs: turn one at a time, and report. See docs/trade-off.md."""
+    """Find out what each option buys and what it costs, one at a time. See docs/trade-off.md."""
 
     spec: Annotated[Path, tyro.conf.Positional]
     """YAML file with the default, knobs, scenes, seeds, ...; what is given as an option here has precedence"""
@@ -23,13 +23,13 @@ class Tradeoff:
     work: Path = Path("outputs/tradeoff")
     """folder for checkpoints, pictures and logs"""
     data: tuple[str, ...] = ()
-    """data sets: folders below --scenes, read as the file says if it has them"""
+    """data sets: folders in --scenes; the file may say how to read them"""
     knobs: tuple[str, ...] = ()
     """knobs to turn, or single settings such as "steps 7000"; none for all of the file"""
     seeds: tuple[int, ...] = ()
-    """--machine.seed of each repetition"""
+    """seeds (--machine.seed), one training for each"""
     steps: int | None = None
-    """training steps, but for runs and presets that have their own"""
+    """training steps, except of runs and presets that have their own"""
     jobs: int | None = None
     """runs at once on each GPU, or on the CPU; times are reported only with 1"""
     gpus: int | None = None

@@ -60,10 +60,3 @@ class Field(NamedTuple):
                 rows = int((~diffuse).sum()) if left_out else len(value)
                 size += rows * value[:1].numel() * value.element_size()
         return size
-
-
-class BaseField(Field):
-    """A field without what its head adds."""
-
-    def seen_from(self, view: Sight) -> SplatAppearance:
-        return self.base_of(view)

@@ -39,40 +39,36 @@ class NrfConfig(AppearanceHeadConfig):
     _target: type = field(default_factory=lambda: NeuralResidualField)
     """the head class that this configuration builds"""
     latent_dim: int = 32
-    """D: numbers in a splat's latent."""
+    """D: numbers in a splat's latent"""
     num_bands: int = 3
-    """K: Fourier bands of the view direction. Band 0 is low, the others are high; with 1 there is no high branch."""
+    """K: Fourier bands of the view direction; band 0 is low, the others are high"""
     hidden_width: int = 64
-    """hidden units of each branch; the single branch has twice as many."""
+    """hidden units of each branch; a single branch has twice as many"""
     split_bands: bool = True
-    """low and high bands in a branch each, joined by a gate. Off: one branch of twice the width, no gate."""
+    """one branch for low and one for high bands, joined by a gate. Off: a single branch"""
     opacity_residual: bool = True
-    """let the field change opacity with the view."""
+    """the field changes opacity with the view"""
     use_distance: bool = True
-    """let the field see the log distance to the camera."""
+    """the field sees the log distance to the camera"""
     color_scale: float = 0.2
-    """s_c: largest change of a colour channel, in units of white."""
+    """s_c: largest change of a colour channel, in units of white"""
     opacity_scale: float = 0.2
-    """s_alpha: largest change of opacity."""
+    """s_alpha: largest change of opacity"""
     distance_eps: float = 0.01
-    """smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
+    """smallest camera distance told apart, in scene units: the near plane"""
     latent_std: float = 0.1
-    """standard deviation of the initial latents."""
+    """standard deviation of the initial latents"""
     output_init: Literal["zero", "default"] = "zero"
-    """start of the output layers. zero: the residual is exactly nothing. default: torch's uniform, as in the paper, to
-    be quieted by the warm-up."""
+    """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound = "straight-through"
-    """how base + residual is brought back into [0, 1] (docs/opacity.md). clamp: no gradient beyond the ends.
-    straight-through: the gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with
-    round corners."""
+    """how base + residual stays in [0, 1] (docs/opacity.md). clamp: no gradient beyond the ends. straight-through: the
+    gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with round corners"""
     geometry_gradient: bool = True
-    """let direction and distance send gradients to the means and the camera."""
+    """direction and distance send gradients to means and cameras"""
     implementation: Literal["auto", "torch", "fused"] = "auto"
-    """auto: the fused Triton kernels on CUDA, where they can run, and PyTorch elsewhere. fused: an error instead of
-    PyTorch."""
+    """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere. fused: an error instead of PyTorch"""
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"
-    """what the fused kernels round the factors of matrix products to; sums are always float32. PyTorch's path ignores
-    it."""
+    """rounding in matrix products of the fused kernels; sums are float32"""
 
     def trusted(self, share: float) -> "NrfConfig":
         """Opacity that changes less with the view: an opacity for each view is a geometry for each."""

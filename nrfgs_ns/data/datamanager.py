@@ -22,7 +22,8 @@ from PIL import Image
 from torch import Tensor
 
 from nrfgs_ns.data.checks import some, warn
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, checked
+from nrfgs_ns.data.colmap_parser import checked
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.pictures import read_picture
 from nrfgs_ns.data.pixels import (
     free_memory,
@@ -100,8 +101,8 @@ class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """The image type returned from manager, caching images in uint8 saves memory"""
     image_memory: float | None = None
-    """gigabytes of host memory that the decoded images may take; of more, files are made and read whenever an image is
-    needed (docs/own-data.md). None: half of what is free"""
+    """gigabytes of host memory for decoded images; more images are kept in files (docs/own-data.md). None: half of what
+    is free"""
 
 
 class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):

@@ -10,7 +10,7 @@ from nrfgs_ns.errors import InputError
 
 @dataclass
 class Inspect:
-    """Find out what each part of a trained field is worth on test views, and what it costs."""
+    """Find out what each part of a trained field is worth, and what it costs."""
 
     load_config: Path
     """config.yml of the training"""
@@ -19,7 +19,7 @@ class Inspect:
     views: int = 12
     """test views to measure on, evenly spaced"""
     budget: float = 0.05
-    """dB that all that is left out together may cost"""
+    """dB that the parts may cost together that are left out at once"""
 
     def main(self) -> None:
         # Heavy imports only when there is work to do: `nrfgs --help` answers at once.

@@ -19,10 +19,10 @@ class View:
     model: tyro.conf.Positional[Path]
     """config.yml of the training, or a file of `nrfgs export compact`, which needs nothing else"""
     host: str = "127.0.0.1"
-    """the address to listen on. 127.0.0.1: this machine alone; to look from another one, forward the port (ssh -L
-    7007:localhost:7007 HOST). 0.0.0.0: whoever reaches this machine can look"""
+    """address to listen on. 127.0.0.1: this machine only; from another use ssh -L 7007:localhost:7007 HOST. 0.0.0.0:
+    everybody who reaches this machine can look"""
     port: int | None = None
-    """where it listens; None: 7007, or the next that is free"""
+    """port to listen on. None: 7007, or the next that is free"""
 
     def main(self) -> None:
         if not self.model.is_file():

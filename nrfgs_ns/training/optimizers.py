@@ -7,7 +7,6 @@ one kernel does all groups (`adam_triton.py`). State is torch's own, so densific
 expect.
 """
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -35,8 +34,6 @@ class LeanOptimizers(Optimizers):
 
     def __init__(self, config, param_groups, steps_per_log: int = 10, pace: Pace | None = None):
         super().__init__(config, param_groups)
-        # That is so of a head that rests at first (`head_from`).
-        warnings.filterwarnings("ignore", message=r"Detected call of `lr_scheduler\.step\(\)` before `optimizer\.step")
         self.steps_per_log = steps_per_log
         self.pace = pace
         self._warm: set[Optimizer] = set()

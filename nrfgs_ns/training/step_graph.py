@@ -62,7 +62,7 @@ class StepGraphs:
             return False
         if (obstacle := self._obstacle(batch)) is not None:
             if not self._has_said_why:
-                CONSOLE.print(f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}.")
+                tell_why_not_recorded(obstacle)
                 self._has_said_why = True
             return False
         regularised = model.config.use_scale_regularization and step % 10 == 0
@@ -122,10 +122,11 @@ class StepGraphs:
         """Whether a step is another than the one before, and none that has been recorded: splats have come or gone,
         pixels are others, or the head or the densification does something else."""
         model = self.model
-        now = [*model.gauss_params.values(), model.head, *model.head.parameters()]
+        splats = list(model.gauss_params.values())
+        now = [*splats, model.head]  # whose weights live as long as it does
         how = {
-            "places": [value.data_ptr() for value in now if isinstance(value, Tensor)],
-            "head": (model.head.phase, model.head_rests),
+            "places": [value.data_ptr() for value in splats],
+            "head": model.head.phase,
             "densification": model.densification.rests_at(model.step),
             "downscale": model._get_downscale_factor(),
         }
@@ -187,6 +188,11 @@ class StepGraphs:
         if most < 0:
             raise RuntimeError("gsplat lists what tiles draw, and the host waits for its lists")
         return most
+
+
+def tell_why_not_recorded(why: str) -> None:
+    """Say that a training goes without graphs."""
+    CONSOLE.print(f"Steps are not recorded as a CUDA graph, so they take longer: {why}.", soft_wrap=True)
 
 
 def _kind(batch: Mapping[str, Any]) -> tuple:
@@ -265,11 +271,8 @@ class _StepGraph:
             look = lambda rgb: functional_call(model.photograph, {"shots": shot}, (rgb, 0))  # noqa: E731
         with torch.enable_grad(), self.room.in_use():
             view = project_view(splats, self.seen_from, model.projecting._replace(every_row=True))
-            if model.head_rests:
-                appearance = model.head.base_appearance(splats, view.visible)
-            else:
-                asked = model.view_noise.moved_by(splats, self.noise)
-                appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
+            asked = model.view_noise.moved_by(splats, self.noise)
+            appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
             background = model._get_background_color()
             outputs, info = composite_view(
                 view,

@@ -36,16 +36,16 @@ class NrfgsTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: resolve_name(TRAINER))
     """target class to instantiate"""
     max_num_iterations: int = STEPS
-    """training steps. 0: chosen, 120 for each training view but at least 10,000 and at most 30,000, with all schedules
-    stretched to them (docs/captures.md)"""
+    """training steps. 0: 120 for each training view, from 10,000 to 30,000, with schedules stretched to them
+    (docs/captures.md)"""
     time_budget: float | None = None
-    """minutes that the steps may take together: as many are made as fit, with all schedules stretched to them"""
+    """minutes for all steps; schedules are stretched to as many as fit"""
     schedule_steps: int | None = None
-    """steps that schedules are laid out for; they are stretched to the steps that are made. None: not stretched, or
-    with a time budget laid out for max_num_iterations"""
+    """steps for which schedules are given, which are stretched to the steps that are made. None: not stretched; with a
+    time budget max_num_iterations"""
     average_steps: int | None = None
-    """the trained model is the mean of its parameters over the last so many steps. 0: the last step's numbers. None:
-    200 where the number of steps is chosen, 0 otherwise"""
+    """last steps over which the model's parameters are averaged. 0: none. None: 200 if max_num_iterations is 0,
+    otherwise 0"""
 
     def setup(self, **kwargs) -> Trainer:
         """The trainer; for several devices, the one that spreads the splats over them (`distributed`).

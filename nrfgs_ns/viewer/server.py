@@ -63,8 +63,8 @@ class LocalViewerConfig(ViewerConfig):
     """Nerfstudio's viewer, served to this machine alone."""
 
     websocket_host: str = LOCAL
-    """The address to listen on. 127.0.0.1: this machine alone; to look from another one, forward the port (ssh -L
-    7007:localhost:7007 HOST). 0.0.0.0: whoever reaches this machine can look and steer."""
+    """address to listen on. 127.0.0.1: this machine only; from another use ssh -L 7007:localhost:7007 HOST. 0.0.0.0:
+    everybody who reaches this machine can look and steer"""
 
 
 def protect() -> None:

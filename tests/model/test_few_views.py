@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What keeps a head from learning few views by heart: trust by their number, shrinkage, and a late start."""
+"""What keeps a head from learning few views by heart: trust by their number, and shrinkage."""
 
 import pytest
 import torch
@@ -8,9 +8,8 @@ from torch.testing import assert_close
 
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.checkpoint import differences, reduced_config
-from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.training.run import parse
 
 QUICK = {"--pipeline.model.num-downscales": 0, "--pipeline.model.warmup-length": 2, "--pipeline.model.refine-every": 4}
@@ -21,36 +20,6 @@ def ready(scene, out, steps, *options):
     trainer = parse(command_line("nrfgs", scene, out, steps, QUICK, *options)).setup(local_rank=0, world_size=1)
     trainer.setup()
     return trainer
-
-
-def test_the_head_rests_until_its_share_of_the_training_is_over(tiny_scene, tmp_path, no_cuda):
-    trainer = ready(tiny_scene, tmp_path, 10, {"--pipeline.model.head-from": 0.4})
-    model = trainer.pipeline.model
-    latents = model.gauss_params["latents"].detach().clone()
-    head = [weight.detach().clone() for weight in model.head.parameters()]
-    base = model.gauss_params["features_dc"].detach().clone()
-    for step in range(4):
-        trainer.train_iteration(step)
-    assert not torch.equal(model.gauss_params["features_dc"], base)
-    assert torch.equal(model.gauss_params["latents"], latents)
-    assert all(map(torch.equal, model.head.parameters(), head))
-    trainer.train_iteration(4)
-    assert not all(map(torch.equal, model.head.parameters(), head)), "it never begins"
-
-
-def test_a_head_that_learns_goes_on_in_a_longer_training(tiny_scene, tmp_path, no_cuda):
-    options = {"--pipeline.model.head-from": 0.4}
-    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "short", 5, QUICK, options))
-    assert checkpoint_of(config)["pipeline"]["_model._extra_state"]["head_has_begun"] is True
-    trainer = ready(tiny_scene, tmp_path / "long", 100, options, {"--load-dir": models_of(config)})
-    trainer.train_iteration(5)
-    assert not trainer.pipeline.model.head_rests
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.0])
-def test_a_share_out_of_range_is_refused(share, tiny_scene, tmp_path, no_cuda):
-    with pytest.raises(InputError, match=f"head_from is {share}"):
-        ready(tiny_scene, tmp_path, 1, {"--pipeline.model.head-from": share})
 
 
 def test_the_fewer_the_views_the_less_the_head_is_trusted(tiny_scene, tmp_path, no_cuda, capsys):
@@ -127,9 +96,9 @@ def test_shrinkage_falls_with_the_square_of_the_number_of_views(tiny_scene, tmp_
 
 @pytest.mark.parametrize("written, read", [("on", "auto"), ("auto", "auto"), ("off", "off")])
 def test_options_of_an_older_config_are_todays(written, read):
-    old = vars(NrfgsModelConfig()) | {"head_from": None, "few_views": written, "densification": "consistent"}
+    old = vars(NrfgsModelConfig()) | {"head_from": 0.3, "few_views": written, "densification": "consistent"}
     del old["keep"], old["shrinkage"]
     config = NrfgsModelConfig.__new__(NrfgsModelConfig)
     config.__setstate__(old)
-    assert (config.head_from, config.few_views, config.densification) == (0.0, read, "splatfacto")
+    assert (config.few_views, config.densification) == (read, "splatfacto") and not hasattr(config, "head_from")
     assert (config.keep, config.shrinkage) == (1.0, 0.0)

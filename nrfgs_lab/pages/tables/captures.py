@@ -15,24 +15,22 @@ OLDER = " *"
 """Mark of what an earlier version trained."""
 TRIED = {
     "field: trust": "**`nrfgs`**",
-    "field: trust, late start": "asked from 0.3 of the training on",
     "field: trust, one band": "one band",
     "field: whole": "u = 1",
     f"field: trust{STORED}": "shrinkage of stored opacity",
     f"field: whole{STORED}": "u = 1, shrinkage of stored opacity",
-    "field: rules at 30 and 100 views": "below 30 views one band, fixed opacity, asked from 0.3 on",
 }
 """Rows of the table of held-out views, by the names of their trials."""
 
 
 def trials() -> str:
     """How many trainings on held-out views there were."""
-    return str(sum(len(records(study)) for study in ("held-out", "held-out-trials")))
+    return str(len(records("held-out")))
 
 
 def tried() -> str:
     """What settings gain over harmonics with shrinkage on held-out views: median dB / mean SSIM x 1000."""
-    runs = list(records("held-out-trials").values())
+    runs = list(records("held-out").values())
     base = {(one["scene"], view[0]): view for one in runs if one["name"] == BASE for view in one["per_image"]}
     gains: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for one in runs:

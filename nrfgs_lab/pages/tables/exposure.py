@@ -41,8 +41,8 @@ def worth() -> str:
         if all(pair):
             seeds = len(pair[1])
             name += f", {seeds} seeds" if seeds > 1 else ""
-            body.append([name, *(mean(found, metric) for found in pair for metric in ("psnr", "cc_psnr"))])
-    return grid(["", "off: PSNR", "cc PSNR", "on: PSNR", "cc PSNR"], body)
+            body.append([name, *(f"{mean(found, 'psnr')}/{mean(found, 'cc_psnr')}" for found in pair)])
+    return grid(["PSNR/cc PSNR", "off", "on"], body)
 
 
 def gap(one: str, other: str, metric: str) -> str:

@@ -19,12 +19,16 @@ def models() -> str:
         cells = [label]
         for setup in SETUPS:
             row = found.get((setup, model))
-            cells.append(f"{number(row, 'train_psnr')} / {_short(row, 'held_out_psnr')}" if row else "-")
+            cells.append(f"{_tight(row, 'train_psnr')} / {_short(row, 'held_out_psnr')}" if row else "-")
         body.append(cells)
     for model, place in (("sh", 0), ("nrf", 1)):
-        figures = (f"{PAPER[setup][place]} / -" for setup in SETUPS)
+        figures = (str(PAPER[setup][place]) for setup in SETUPS)
         body.append([f"*the paper's {'SH' if model == 'sh' else 'NRF'}*", *figures])
-    return grid(["training / held-out directions", *SETUPS.values()], body)
+    return grid(["training/held-out directions", *SETUPS.values()], body)
+
+
+def _tight(row: dict, key: str) -> str:
+    return number(row, key).replace(" ", "")
 
 
 def _short(row: dict, key: str) -> str:

@@ -40,7 +40,7 @@ def bonsai() -> str:
         cells = []
         for method in HEADS:
             one = _trial(method, trial, "bonsai")
-            cells += [""] * 2 if one is None else [_thousands([one]), f"{one['psnr']:.2f} / {one['ssim']:.4f}"]
+            cells += [""] * 2 if one is None else [_thousands([one]), f"{one['psnr']:.2f}/{one['ssim']:.4f}"]
         body.append([label, *cells])
     return grid(["`bonsai`, held-out views", "splats", "field", "splats", "harmonics"], body)
 
@@ -87,4 +87,4 @@ def _gain(new: dict[str, Any] | None, old: dict[str, Any] | None) -> str:
     views = list(zip(sorted(new["per_image"]), sorted(old["per_image"]), strict=True))
     gain = median(one[1] - other[1] for one, other in views)
     ssim = 1000 * fmean(one[2] - other[2] for one, other in views)
-    return f"{signed(gain, 2)} / {signed(ssim, 1)} / {new['splats'] / old['splats']:.2f}"
+    return f"{signed(gain, 2)}/{signed(ssim, 1)}/{new['splats'] / old['splats']:.2f}"

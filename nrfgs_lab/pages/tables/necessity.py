@@ -25,7 +25,7 @@ def parts() -> str:
         cells = []
         for model in MODELS:
             row = found[model][part]
-            share = f" ({100 * row['diffuse']:.0f} %)" if part.startswith("residuals") else ""
+            share = f" ({100 * row['diffuse']:.0f}%)" if part.startswith("residuals") else ""
             cells.append(f"{row['loss_db']:.3f}{share}")
         body.append([part, *cells])
     return grid(["left out", *MODELS.values()], body)
@@ -42,5 +42,5 @@ def diffuse() -> str:
     for visible in sorted({visible for visible, _, _ in found}):
         whole = found[visible, 0.0, "no mask"]
         masked = (found[visible, share, "mask"] for share in shares)
-        body.append([f"{visible:,}", f"{whole:.2f}", *(f"{100 * (ms / whole - 1):+.0f} %" for ms in masked)])
-    return grid(["visible", "no mask (ms)", *(f"{100 * share:.0f} % diffuse" for share in shares)], body)
+        body.append([f"{visible:,}", f"{whole:.2f}", *(f"{100 * (ms / whole - 1):+.0f}%" for ms in masked)])
+    return grid(["visible", "no mask (ms)", *(f"{100 * share:.0f}% diffuse" for share in shares)], body)

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of docs/nerfstudio/nrfgs.md."""
 
-from nrfgs_lab.pages.tables import bench_rows, grid, mean_of
+from nrfgs_lab.pages.tables import grid
+from nrfgs_lab.pages.tables.speed import of_training
 
 METHODS = {
-    "default": ("nrfgs", "the method"),
-    "harmonics_nrfgs-sh": ("nrfgs-sh", "the same model with spherical harmonics (3DGS)"),
-    "nerfstudio_splatfacto": ("splatfacto", "nerfstudio's own, for comparison"),
+    "nrfgs": "the method",
+    "nrfgs-sh": "the same model with spherical harmonics (3DGS)",
+    "splatfacto": "nerfstudio's own, for comparison",
 }
 
 
 def methods() -> str:
     """Memory and time of the methods on bonsai."""
-    rows = {run: row for (scene, _, run), row in bench_rows("presets").items() if scene == "bonsai"}
     body = [
-        [f"`{name}`", text, f"{mean_of(rows[run], 'peak MB') / 1000:.1f} GB", f"{mean_of(rows[run], 'time s'):.0f} s"]
-        for run, (name, text) in METHODS.items()
+        [f"`{name}`", text, f"{float(of_training('peak MB', name)) / 1000:.1f} GB", f"{of_training('time s', name)} s"]
+        for name, text in METHODS.items()
     ]
     return grid(["method", "description", "memory (bonsai, 799 x 532)", "time for 30,000 steps (H200)"], body)

@@ -20,7 +20,7 @@ def pruning() -> str:
         found = {one["run"]: one for one in study[f"{part}opacity"]}
         for run, (label, seen) in SEEN.items():
             rows = [found[name] for name in (f"{run}-original-{scene}-{seed}" for seed in seeds) if name in found]
-            cells = [" / ".join(form.format(row[key]) for row in rows) for key, form in FORMS.items()]
+            cells = ["/".join(form.format(row[key]) for row in rows) for key, form in FORMS.items()]
             body.append([scene if scene == "bonsai" else "fox, small", label, seen, *cells])
     return grid(["", "", "pruned by", "splats", "PSNR", "PSNR right after a reset"], body)
 
@@ -46,9 +46,9 @@ def bounds() -> str:
             cell(bound, "psnr", "{:.2f}"),
             cell(bound, "ssim", "{:.4f}"),
             cell(bound, "splats", "{:.0f}k", 1000),
-            cell(bound, "dead_share", "{:.0f} %", 0.01),
+            cell(bound, "dead_share", "{:.0f}", 0.01),
             cell(bound, "opacity_change", "{:.1f}", 0.001),
         ]
         for bound in BOUNDS
     ]
-    return grid(["", "PSNR", "SSIM", "splats", "dead gradients", "flicker (1e-3)"], body)
+    return grid(["", "PSNR", "SSIM", "splats", "dead gradients (%)", "flicker (1e-3)"], body)

@@ -1,29 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table and the numbers of docs/own-data.md."""
+"""The numbers of docs/own-data.md."""
 
-from nrfgs_lab.pages.tables import grid, records
+from nrfgs_lab.pages.tables import records
 
-SCENES = {"castle": "castle", "caliterra": "caliterra", "lund": "lund (29 steps straight ahead)", "fox": "fox"}
+SCENES = "castle", "caliterra", "lund"
+
+
+def walk(part: str) -> str:
+    """What the steps from photographs to a file found, or the minutes that they took, start-up included."""
+    record = records("newcomer")["newcomer"]
+    if part == "minutes":
+        return f"{record['seconds'] / 60:.1f}"
+    found = record[part]
+    if part == "prepare":
+        return (
+            f"{found['registered']} of {found['photographs']} photographs placed, {found['points']:,} points, "
+            f"mean reprojection error {found['mean_reprojection_error_px']:.2f} pixels"
+        )
+    if part == "eval":
+        return f"PSNR {found['psnr']:.2f} dB, SSIM {found['ssim']:.3f}, {found['splats']:,} splats"
+    return f"{found['psnr_file']:.2f} dB, {found['loss_db']:.2f} dB less than the model"
 
 
 def prepared() -> str:
-    """What `nrfgs prepare` made of captures, and what matching every pair takes."""
+    """What `nrfgs prepare` made of captures, and the seconds of two cores' own time."""
     study = records("prepare")
-    body = []
-    for scene, label in SCENES.items():
-        for name, record in (
-            (label, study.get(scene) or study["matching"][scene]),
-            (f"{label}, every pair", study["matching"].get(f"{scene}, every pair")),
-        ):
-            if record is None:
-                continue
-            stages = record.get("seconds_and_cpu_seconds")
-            seconds = f"{sum(own for _, own in stages.values()):.0f}" if stages else "-"
-            registered = f"{record['registered']} of {record['photographs']}"
-            pairs = f"{record['pairs']:,}" if "pairs" in record else "every one"
-            error = f"{record['mean_reprojection_error_px']:.2f} px"
-            body.append([name, registered, pairs, f"{record['points']:,}", error, seconds])
-    return grid(["", "registered", "pairs", "points", "mean reprojection error", "CPU seconds"], body)
+    found = {scene: study.get(scene) or study["matching"][scene] for scene in SCENES}
+    parts = []
+    for scene, one in found.items():
+        seconds = sum(own for _, own in one["seconds_and_cpu_seconds"].values())
+        placed = f"{scene} {one['registered']} of {one['photographs']}"
+        parts.append(f"{placed}{'' if parts else ' photographs'} in {seconds:.0f} s")
+    errors = [one["mean_reprojection_error_px"] for one in found.values()]
+    return f"{', '.join(parts)}; mean reprojection errors of {min(errors):.2f} to {max(errors):.2f} pixels"
 
 
 def loading() -> str:

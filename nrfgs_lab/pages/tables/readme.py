@@ -41,19 +41,20 @@ def captures() -> str:
         psnr = [fmean(one["psnr"] for one in runs) for runs in (field, harmonics)]
         ssim = [fmean(one["ssim"] for one in runs) for runs in (field, harmonics)]
         splats = [fmean(one["splats"] for one in runs) for runs in (field, harmonics)]
+        median_gain = signed(median(gains)) if gains else signed(psnr[0] - psnr[1])
+        ahead = f"{sum(gain > 0 for gain in gains)}/{len(gains)}" if gains else "mean"
         body.append(
             [
                 f"{scene}, {views}",
-                f"{psnr[0]:.2f}, {ssim[0]:.3f}",
-                f"{psnr[1]:.2f}, {ssim[1]:.3f}",
-                f"{fmean(one['psnr'] for one in long):.2f}, {fmean(one['ssim'] for one in long):.3f}" if long else "-",
-                signed(median(gains)) if gains else f"{signed(psnr[0] - psnr[1])} (mean)",
-                f"{sum(gain > 0 for gain in gains)} of {len(gains)}" if gains else "-",
+                f"{psnr[0]:.2f}/{ssim[0]:.3f}",
+                f"{psnr[1]:.2f}/{ssim[1]:.3f}",
+                f"{fmean(one['psnr'] for one in long):.2f}/{fmean(one['ssim'] for one in long):.3f}" if long else "-",
+                f"{median_gain} ({ahead})",
                 f"{splats[0] / splats[1]:.2f}",
             ]
         )
-    head = ["capture, training views", "`nrfgs`", "harmonics, same steps and shrinkage", "harmonics, 30,000 steps"]
-    return grid([*head, "gain in the median view, dB", "better in", "splats"], body)
+    head = ["capture, training views", "`nrfgs`", "harmonics, same steps", "harmonics, 30,000 steps"]
+    return grid([*head, "median gain (views ahead)", "splats"], body)
 
 
 def view_gains(field: list[dict[str, Any]], harmonics: list[dict[str, Any]]) -> list[float]:
