@@ -10,13 +10,17 @@ from nrfgs_lab.pages.tables import grid, records
 from nrfgs_lab.pages.tables.readme import FIELD, HOST, LONG, SHRUNK, TRAINING_VIEWS, runs_of, view_gains
 
 BASE = "harmonics: shrinkage"
-STORED = ", shrinkage of what is stored"
+FIELDS = "field", "field: trust"
+"""The default, of this version and of one whose field was the same."""
 TRIED = {
-    "field: trust": "**`nrfgs`**",
-    "field: trust, one band": "one band",
-    "field: whole": "u = 1",
-    f"field: trust{STORED}": "shrinkage of stored opacity",
-    f"field: whole{STORED}": "u = 1, shrinkage of stored opacity",
+    "**`nrfgs`**": FIELDS,
+    "u = V / (V + 10)": ("field: u = V / (V + 10)",),
+    "u = 1": ("field: u = 1", "field: whole"),
+    "u for noise alone": ("field: longer noise alone",),
+    "u for opacity alone": ("field: less opacity alone",),
+    "shrinkage 135 / V^3": ("field: shrinkage 135 / V^3",),
+    "of stored opacity": ("field: trust, shrinkage of what is stored",),
+    "`peak`, twice the splats": ("field: peak",),
 }
 """Rows of the table of held-out views, by the names of their trials."""
 
@@ -27,29 +31,40 @@ def trials() -> str:
 
 
 def tried() -> str:
-    """What settings gain over harmonics with shrinkage on held-out views: median dB / mean SSIM x 1000."""
+    """What settings gain over harmonics with shrinkage on held-out views: median dB, mean SSIM x 1000."""
     runs = list(records("held-out").values())
     base = {(one["scene"], view[0]): view for one in runs if one["name"] == BASE for view in one["per_image"]}
     gains: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for one in runs:
-        for name, psnr, ssim, *_ in one["per_image"]:
-            if (truth := base.get((one["scene"], name))) is not None:
-                gains[one["name"], one["scene"].split("/", 1)[1]].append((psnr - truth[1], ssim - truth[2]))
-    scenes = [scene for scene in ("32/bonsai", "64/bonsai", *TRAINING_VIEWS) if ("field: trust", scene) in gains]
+        for view in one["per_image"]:
+            if (truth := base.get((one["scene"], view[0]))) is not None:
+                gains[one["name"], one["scene"].split("/", 1)[1]].append((view[1] - truth[1], view[2] - truth[2]))
+    scenes = ["64/bonsai", *list(TRAINING_VIEWS)[1:]]
     body = []
-    for trial, label in TRIED.items():
-        views = [gains[trial, scene] for scene in scenes]
-        if any(views):
-            body.append([label, *map(_gain, views)])
-    head = (f"bonsai, {scene.split('/')[0]} views" if "/" in scene else scene for scene in scenes)
-    return grid(["", *head], body)
+    for label, names in TRIED.items():
+        found = [[pair for name in names for pair in gains[name, scene]] for scene in scenes]
+        body.append([label, *map(_gain, found)])
+    return grid(["", *(" of ".join(scene.split("/")) for scene in scenes)], body)
 
 
 def _gain(views: list[tuple[float, float]]) -> str:
-    """Of PSNR, the median; of SSIM, the mean; and the number of views."""
-    if not views:
-        return ""
-    return f"{median(a for a, _ in views):+.2f} / {1000 * fmean(b for _, b in views):+.0f} ({len(views)})"
+    return f"{median(a for a, _ in views):+.2f}, {1000 * fmean(b for _, b in views):+.0f}" if views else ""
+
+
+def without(trial: str) -> str:
+    """What a trial has more than the default on `bonsai` with all its views but those held out, in both ways."""
+    runs = records("held-out")
+    texts, better, count, splats = [], 0, 0, []
+    for place in ("4/bonsai", "0/bonsai"):
+        base = runs[f"field/{place}-42"]
+        if (one := runs.get(f"field: {trial}/{place}-42")) is None:
+            continue
+        pairs = list(zip(one["per_image"], base["per_image"], strict=True))
+        texts.append(f"{fmean(ours[1] - theirs[1] for ours, theirs in pairs):+.2f}")
+        better += sum(ours[2] > theirs[2] for ours, theirs in pairs)
+        count += len(pairs)
+        splats.append(one["splats"] / base["splats"])
+    return f"{' and '.join(texts)} dB, SSIM better in {better} of {count} views, {100 * fmean(splats) - 100:+.0f} % splats"
 
 
 def _mean(runs: Iterable[dict[str, Any]], metric: str) -> float | None:
