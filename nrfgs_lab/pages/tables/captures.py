@@ -64,7 +64,8 @@ def without(trial: str) -> str:
         better += sum(ours[2] > theirs[2] for ours, theirs in pairs)
         count += len(pairs)
         splats.append(one["splats"] / base["splats"])
-    return f"{' and '.join(texts)} dB, SSIM better in {better} of {count} views, {100 * fmean(splats) - 100:+.0f} % splats"
+    more = f"{100 * fmean(splats) - 100:+.0f} % splats"
+    return f"{' and '.join(texts)} dB, SSIM better in {better} of {count} views, {more}"
 
 
 def _mean(runs: Iterable[dict[str, Any]], metric: str) -> float | None:
