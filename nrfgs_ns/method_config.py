@@ -63,8 +63,9 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
             steps_per_save=2000,
             steps_per_eval_all_images=1000,
             mixed_precision=False,
-            # The profiler's table of durations would end every command.
-            logging=LoggingConfig(profiler="none", local_writer=ProgressLineConfig()),
+            # The profiler's table of durations would end every command. For what is logged the host waits until the GPU
+            # has nothing left to do.
+            logging=LoggingConfig(profiler="none", local_writer=ProgressLineConfig(), steps_per_log=100),
             machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
             pipeline=NrfgsPipelineConfig(model=NrfgsModelConfig(appearance=appearance)),
             optimizers={

@@ -47,7 +47,7 @@ class ProgressLineConfig(LocalWriterConfig):
 class ProgressLine(LocalWriter):
     """A line that is kept up to date on a terminal, and written now and then into anything else.
 
-    Nerfstudio's loop calls `write_stats_log` every `logging.steps_per_log` steps.
+    The trainer calls `write_stats_log` after each step, nerfstudio's loop in those that are logged.
 
     Args:
         config: its options.

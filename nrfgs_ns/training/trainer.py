@@ -39,7 +39,7 @@ from nrfgs_ns.training.pace import (
     steps_for,
 )
 from nrfgs_ns.training.progress import ProgressLine
-from nrfgs_ns.training.step_graph import StepGraphs, Unscaled
+from nrfgs_ns.training.step_graph import StepGraphs, Unscaled, tell_why_not_recorded
 from nrfgs_ns.training.stopping import (
     StopRequest,
     command_to_go_on,
@@ -122,13 +122,20 @@ class NrfgsTrainer(Trainer):
             self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last step that was made"""
-        if self.world_size == 1 and isinstance(self.grad_scaler, Unscaled):
-            graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
-            self.pipeline.graphs = self.grad_scaler.graphs = graphs
+        self._record_steps()
         if comms.is_main_process():
             self._tell_what_was_chosen()
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
+
+    def _record_steps(self) -> None:
+        """Let steps be CUDA graphs, where they can; where no step of this training can, say so."""
+        if self.world_size > 1 or not isinstance(self.grad_scaler, Unscaled):
+            if self.pipeline.model.device.type == "cuda" and comms.is_main_process():
+                tell_why_not_recorded("several devices share it" if self.world_size > 1 else "it is of mixed precision")
+            return
+        graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
+        self.pipeline.graphs = self.grad_scaler.graphs = graphs
 
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
@@ -293,10 +300,13 @@ class NrfgsTrainer(Trainer):
 
     def _update_viewer_state(self, step: int) -> None:
         """Nerfstudio's, and fewer events: it would send each step's duration to the log, which takes the host longer
-        than some kernels. Averages go on; they are sent with the rest, every `logging.steps_per_log` steps."""
+        than some kernels. Averages go on; they are sent with the rest, every `logging.steps_per_log` steps, for which
+        the line on the terminal does not wait."""
         super()._update_viewer_state(step)
         if step % self.config.logging.steps_per_log != 0:
             writer.EVENT_STORAGE.clear()
+            if self.line is not None:
+                self.line.write_stats_log(step)
 
     @check_eval_enabled
     def eval_iteration(self, step: int) -> None:
