@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The expressiveness study: counts, models against the heads, fits with known answers, and the verb."""
+"""The expressiveness study: counts, models against the heads, fits with known answers, and the command."""
 
 import json
 import math
@@ -348,7 +348,7 @@ def test_deviation_over_seeds_is_the_samples(tmp_path):
     assert "| synthetic | SH degree 3, Adam | 15,744 | 3 | 22.00 ± 2.00 | - | 21.1 |" in report.markdown(summary)
 
 
-def test_the_verb_measures_once_and_resumes(tmp_path):
+def test_the_command_measures_once_and_resumes(tmp_path):
     out = tmp_path / "out"
     command = [sys.executable, "-m", "nrfgs_ns.cli", "express", "--out", str(out), "--quick", "--passes", "1"]
     run = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
@@ -373,14 +373,14 @@ def test_the_verb_measures_once_and_resumes(tmp_path):
     assert json.loads(runs[2].read_text())["seconds"] == 12345.0
 
 
-def test_the_verb_runs_on_measured_reflectance(tmp_path, networks_folder):
+def test_the_command_runs_on_measured_reflectance(tmp_path, networks_folder):
     Express(out=tmp_path / "out", quick=True, passes=1, setups=("image",), reflectance=networks_folder).main()
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert {row["setup"] for row in summary["table"]} == {"image"}
     assert (tmp_path / "out" / "express-image.jpg").exists()
 
 
-def test_the_verb_runs_on_photographs(tmp_path):
+def test_the_command_runs_on_photographs(tmp_path):
     folder = tmp_path / "wool"
     folder.mkdir()
     generator = np.random.default_rng(0)

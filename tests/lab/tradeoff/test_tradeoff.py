@@ -352,25 +352,25 @@ def fake_runs(monkeypatch):
     return ran
 
 
-def test_the_verb_runs_a_benchmark(tmp_path, fake_runs):
+def test_the_command_runs_a_benchmark(tmp_path, fake_runs):
     """It leaves the benchmark's file, hands it to `nrfgs bench` with its options, and reports what that has left."""
     ran = fake_runs
     (tmp_path / "knobs.yaml").write_text(yaml.safe_dump({**KNOBS, "knobs": {"D": KNOBS["knobs"]["D"]}}))
-    verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", seeds=(7,), cuda=False)
-    verb.main()
+    command = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", seeds=(7,), cuda=False)
+    command.main()
     assert ran == ["default-own-s-7", "D_4-own-s-7", "D_8-own-s-7"]
     assert yaml.safe_load((tmp_path / "out" / "bench.yaml").read_text())["seeds"] == [7]
     assert (tmp_path / "out" / "tradeoff.md").exists() and (tmp_path / "out" / "table.md").exists()
     ran.clear()
-    verb.main()
+    command.main()
     assert ran == []
 
 
 def test_rows_with_steps_of_their_own_are_named(tmp_path, fake_runs, capsys):
     """A file's "a third of the steps" is no third of others."""
     (tmp_path / "knobs.yaml").write_text(yaml.safe_dump(KNOBS))
-    verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path, work=tmp_path, knobs=("steps", "D"), steps=40, cuda=False)
-    verb.main()
+    command = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path, work=tmp_path, knobs=("steps", "D"), steps=40, cuda=False)
+    command.main()
     assert "--steps does not change runs that have their own: steps 50 (50)." in capsys.readouterr().out
     with pytest.raises(InputError, match="steps is 0"):
         Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "none", steps=0).main()
@@ -384,8 +384,8 @@ def test_parts_of_a_sweep_report_all_that_is_there(tmp_path, fake_runs):
 
     def sweep(**chosen) -> tuple[list[str], list]:
         """The rows of the report on the first scene, and its seeds."""
-        verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", data=("s",), **chosen)
-        verb.main()
+        command = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", data=("s",), **chosen)
+        command.main()
         first = json.loads((tmp_path / "out" / "tradeoff.json").read_text())[0]
         content = yaml.safe_load((tmp_path / "out" / "bench.yaml").read_text())
         assert list(content["runs"]) == [one["run"] for one in first["settings"]]
