@@ -3,9 +3,6 @@
 
 import json
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,6 +33,7 @@ from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.spherical_harmonics import sh_bases
+from nrfgs_ns.cli import chosen
 from nrfgs_ns.errors import InputError
 
 
@@ -348,12 +346,10 @@ def test_deviation_over_seeds_is_the_samples(tmp_path):
     assert "| synthetic | SH degree 3, Adam | 15,744 | 3 | 22.00 ± 2.00 | - | 21.1 |" in report.markdown(summary)
 
 
-def test_the_command_measures_once_and_resumes(tmp_path):
+def test_the_command_measures_once_and_resumes(tmp_path, capsys):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "nrfgs_ns.cli", "express", "--out", str(out), "--quick", "--passes", "1"]
-    run = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    assert run.returncode == 0, run.stderr
-    assert "only the synthetic set-up is run" in " ".join(run.stdout.split())
+    chosen(["express", "--out", str(out), "--quick", "--passes", "1"]).main()
+    assert "only the synthetic set-up is run" in " ".join(capsys.readouterr().out.split())
     runs = sorted((out / "runs").glob("*.json"))
     rows = {row["model"]: row for row in json.loads((out / "summary.json").read_text())["table"]}
     assert set(rows) == set(report.ROWS)

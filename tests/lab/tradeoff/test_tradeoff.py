@@ -230,6 +230,13 @@ def test_report_from_records(tmp_path, capsys):
     assert "D 8" in capsys.readouterr().out
 
 
+@pytest.fixture
+def no_figure(monkeypatch):
+    """Reports without the figure, which takes a second; other tests draw it."""
+    monkeypatch.setattr("nrfgs_lab.tradeoff.report.draw", lambda rows, settings, path: None)
+
+
+@pytest.mark.usefixtures("no_figure")
 def test_costs_are_absolute_where_the_default_has_none(tmp_path, capsys):
     """The default shared its GPU on scene t, whose other times are known all the same. On s there are factors, and a
     footnote only where a reader meets such a number."""
@@ -376,6 +383,7 @@ def test_rows_with_steps_of_their_own_are_named(tmp_path, fake_runs, capsys):
         Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "none", steps=0).main()
 
 
+@pytest.mark.usefixtures("no_figure")
 def test_parts_of_a_sweep_report_all_that_is_there(tmp_path, fake_runs):
     """Knobs one after the other, a report without a GPU of what was made with one."""
     (tmp_path / "knobs.yaml").write_text(
