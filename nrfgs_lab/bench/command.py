@@ -65,7 +65,7 @@ class Bench:
     """data sets: folders in --scenes; the file may say how to read them"""
     runs: tuple[str, ...] = ()
     """runs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
-    strategies: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--protocols"])] = ()
+    strategies: tuple[str, ...] = ()
     """densification: splatfacto, original, mcmc, mcmc@BUDGET, own"""
     seeds: tuple[int, ...] = ()
     """seeds (--machine.seed), one training for each"""
