@@ -265,7 +265,7 @@ def look_through(model, field: Field, camera: Cameras) -> tuple[View, SplatAppea
     """
     view = model.project(no_larger(camera.to(model.device)), field.splats)
     appearance = field.seen_from(view)
-    return view, appearance, contributions(view.projection, appearance.opacities)[:, 0]
+    return view, appearance, contributions(view.projection, appearance.opacities)
 
 
 def no_larger(camera: Cameras) -> Cameras:
