@@ -36,7 +36,7 @@ HALF_A_SPACING = 0.5
 """Noise on where the field is asked from, in distances between neighbouring training cameras (docs/captures.md)."""
 
 SHRINKAGE = 3.0
-"""Weight of mean opacity and mean size in the loss, divided by the square of the number of training views."""
+"""Weight of mean opacity and mean size in the loss, in percent, halved with every 12 training views."""
 
 
 def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str, Any]:

@@ -16,6 +16,10 @@ from nrfgs_ns.model.retired import RETIRED
 
 PRIOR_VIEWS = 20
 """So many training views are half of what a head needs: `few_views` trusts it by that."""
+HALVING_VIEWS = 12
+"""So many more training views halve `shrinkage`."""
+NEGLIGIBLE = 1e-6
+"""A weight of shrinkage below it is none: Adam would still make whole steps of it for splats that no view sees."""
 
 
 def _model() -> type:
@@ -39,8 +43,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """auto: V training views trust the head with u = V / (V + 20): noise is longer by 1 / u, its opacity residual is u
     times as large (docs/captures.md)"""
     shrinkage: float = 0.0
-    """weight in the loss of the splats' mean opacity and mean size, divided by the square of the number of training
-    views (docs/captures.md). mcmc has its own instead"""
+    """weight in the loss of the splats' mean opacity and mean size, in percent, halved with every 12 training views
+    (docs/captures.md). mcmc has its own instead"""
     warmup_steps: int | None = None
     """steps before training in which a head with a residual at its start learns to have none. None: one for each
     training view"""
@@ -101,3 +105,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     def trust(self, views: int) -> float:
         """How far so many training views trust the head, in (0, 1]."""
         return views / (views + PRIOR_VIEWS) if self.few_views == "auto" and views > 0 else 1.0
+
+    def shrinkage_weight(self, views: int) -> float:
+        """What `shrinkage` is with so many training views."""
+        weight = self.shrinkage / 100 * 0.5 ** (views / HALVING_VIEWS)
+        return weight if weight >= NEGLIGIBLE and self.densification != "mcmc" else 0.0

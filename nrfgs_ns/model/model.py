@@ -382,8 +382,8 @@ class NrfgsModel(SplatfactoModel):
     def shrinking(self, splats: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
         """What `shrinkage` adds to the loss. `splats`: another table than the model's."""
         splats = self.gauss_params if splats is None else splats
-        weight = self.config.shrinkage / max(self.num_train_data, 1) ** 2
-        if weight == 0.0 or self.config.densification == "mcmc":
+        weight = self.config.shrinkage_weight(self.num_train_data)
+        if weight == 0.0:
             return {}
         return {
             "shrink_opacities": weight * self.densification.mean_opacity(splats["opacities"]),
