@@ -270,4 +270,4 @@ def look_through(model, field: Field, camera: Cameras) -> tuple[View, SplatAppea
         camera.rescale_output_resolution(0.5**halvings)
     view = model.project(camera, field.splats)
     appearance = field.seen_from(view)
-    return view, appearance, contributions(view.projection, appearance.opacities)[:, 0]
+    return view, appearance, contributions(view.projection, appearance.opacities)

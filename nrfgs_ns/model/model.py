@@ -26,7 +26,7 @@ from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.densification import Densification, build_densification
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
-from nrfgs_ns.image.metrics import ImageMetrics
+from nrfgs_ns.image.metrics import image_metrics
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config, upgraded
@@ -87,7 +87,6 @@ class NrfgsModel(SplatfactoModel):
 
         self.photograph: PhotographModel | None = None  # the pipeline knows the photographs
         self.trimming = robust.Trimming(config.robust_loss) if config.robust_loss > 0.0 else None
-        self.image_metrics = ImageMetrics()
         self.step = 0
         self.crop_box = None
         self.pinholes = Pinholes()
@@ -428,7 +427,7 @@ class NrfgsModel(SplatfactoModel):
         """
         truth = self.truth_of(batch, outputs["background"])
         rgb = outputs["rgb"]
-        metrics = self.image_metrics(rgb, truth, self.mask_of(batch))
+        metrics = image_metrics(rgb, truth, self.mask_of(batch))
         return (
             {name: value for name, value in metrics.items() if value is not None},
             {"img": torch.cat([truth, rgb], dim=1)},

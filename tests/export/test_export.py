@@ -259,7 +259,7 @@ def test_the_fit_follows_a_random_field_closer_than_its_base_colour(trained):
     assert 0 < distance["file"] < 0.1 * distance["base"]
 
 
-# The verbs.
+# The commands.
 
 
 @pytest.mark.parametrize("method", METHODS)
