@@ -32,6 +32,7 @@ from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config, upgraded
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
+from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.model.initial_splats import initial_splats
 from nrfgs_ns.model.look import look_asked_for
 from nrfgs_ns.model.pinhole import Pinhole, Pinholes
@@ -467,6 +468,8 @@ class NrfgsModel(SplatfactoModel):
         """The fitted harmonics, or None where `fit_on` was not called."""
         if self._fit is None and self._fit_cameras is not None:
             self._fit = fit_harmonics(self, self._fit_cameras)
+            if not self._fit.exact:
+                self._fit = self._fit._replace(splats=fine_tune(self, self._fit.splats, self._fit_cameras))
         return self._fit
 
     def _exported(self, name: str) -> Tensor:
