@@ -142,23 +142,25 @@ class NrfgsTrainer(Trainer):
         return WatchedOptimizers(self.optimizer_configs(), groups, self.guard, every, self.pace)
 
     def _tell_what_was_chosen(self) -> None:
-        """One line: how many steps, how much noise, and why."""
+        """One line: how many steps, how far the views are trusted, and what follows from that."""
         model, views = self.pipeline.model, len(self.pipeline.datamanager.train_dataset)
         chosen = []
         if self.steps_are_chosen and self.config.time_budget is None:
             chosen.append(
                 f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
             )
-        if model.view_noise.sigma > 0.0:
-            chosen.append(f"the head sees each splat from about {model.noise_factor:.2g} of that beside the camera")
         if model.trust < 1.0 and model.reduced_head:
             options = ", ".join(f"{name} {value:.2g}" for name, value in model.reduced_head.items())
-            chosen.append(f"they trust it with {model.trust:.2g}, so that it has {options}")
-        if chosen:
-            apart = model.camera_spacing / model.scene_unit
-            CONSOLE.print(
-                f"{views} training views, {apart:.2g} scene units apart: {'; '.join(chosen)}.", soft_wrap=True
+            chosen.append(f"their view dependence is trusted with {model.trust:.2g} of 1, so that it has {options}")
+        if model.view_noise.sigma > 0.0:
+            spacing = model.camera_spacing / model.scene_unit
+            chosen.append(
+                f"in training the head sees each splat from about {model.noise_factor * spacing:.2g} scene units beside the "
+                f"camera, {model.noise_factor:.2g} times the distance between neighbouring cameras"
             )
+        if chosen:
+            named = "training view" if views == 1 else "training views"
+            CONSOLE.print(f"{views} {named}: {'; '.join(chosen)} (docs/captures.md).", soft_wrap=True)
 
     def _pace(self) -> Pace | None:
         """How fast to walk through the schedules (`pace.py`), or None for a step at a time."""

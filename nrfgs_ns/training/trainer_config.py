@@ -127,7 +127,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         machine = self.machine
         if machine.num_devices * machine.num_machines > 1:
             resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
-        data = self.data or self.pipeline.datamanager.data
+        datamanager = self.pipeline.datamanager
+        data = self.data or datamanager.data or _absolute(datamanager.dataparser.data)
         lines = [f"{self.method_name} on {data}"]
         if machine.device_type == "cpu" and self.time_budget is None:
             lines.append(f"No CUDA device: the CPU trains. A result in ten minutes: {ten_minute_command(data)}")
