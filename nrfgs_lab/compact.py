@@ -7,8 +7,8 @@
     python -m nrfgs_lab.results pack OUT results/compact.json
     python -m nrfgs_lab.pages.tables.compact_format             # the figure
 
-`trade` trains the capture, and writes it as compact files trained at each of --rates, as those of
-versions 1 and 2 without a fine-tune, as a PLY file, and as what splat-transform makes of that, where it is installed:
+`trade` trains the capture, and writes it as compact files trained at each of --rates, as one without a fine-tune, as a
+PLY file, and as what splat-transform makes of that, where it is installed:
 its SOG and its SPZ. Records of OUT that are there already are not made again. All PSNR is that of the test views, of
 files that are read back. They are left in --work. Settings are chosen on training views that are held out
 (`nrfgs_lab.held_out make`).
@@ -29,7 +29,6 @@ import numpy as np
 import torch
 import tyro
 
-from nrfgs_lab.compact_1 import encode_1
 from nrfgs_lab.pages.browser import chromium
 from nrfgs_ns.compact import finetune
 from nrfgs_ns.compact.decode import decode
@@ -100,7 +99,6 @@ class Trade:
             running = {suffix: pool.submit(converted, ply, suffix, self.sog_iterations) for suffix in todo}
             plain = files / f"{name('version-2')}.nrf"
             self.record(name("version-2"), lambda report: export_compact(config, plain, CompactOptions(), True, report))
-            self.record(name("version-1"), lambda report: version_1(config, files / f"{report.stem}.nrf"))
             for suffix, made in running.items():
                 self.record(
                     name(suffix), lambda _, made=made: {**made.result(), **measured(config, ply, made.result())}
@@ -117,22 +115,6 @@ class Trade:
         args = [self.method, "--data", str(self.data), "--output-dir", str(self.work), "--machine.seed", "42"]
         args += ["--vis", "tensorboard", "--steps-per-eval-all-images", "1000000"]
         return {"machine": machine(), "train": asdict(train([*args, "nrfgs-data"]))}
-
-
-def version_1(config: Path, path: Path) -> dict[str, Any]:
-    """The record of a file of version 1 with what one of version 2 has without a fine-tune."""
-    from nrfgs_ns.compact.precision import Precision
-    from nrfgs_ns.export.compact import choose, measure_file, rendered, write_config
-    from nrfgs_ns.export.loading import load_model
-
-    pipeline = load_model(config, "test")
-    field = choose(pipeline, config, CompactOptions()).field
-    begin = perf_counter()
-    size = write_container(path, *encode_1(field, Precision(), rendered(pipeline.model)))
-    written = perf_counter()
-    decode(path)
-    seconds = {"encode": written - begin, "decode": perf_counter() - written}
-    return {"bytes": size, "seconds": seconds, **measure_file(pipeline, write_config(config, path))}
 
 
 def converted(ply: Path, suffix: str, sog_iterations: int) -> dict[str, Any]:

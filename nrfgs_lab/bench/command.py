@@ -54,7 +54,7 @@ class Bench:
     """Compare methods over strategies, scenes and seeds: train all, and report. See docs/bench.md."""
 
     spec: Annotated[Path | None, tyro.conf.Positional] = None
-    """YAML file with runs, strategies, scenes, seeds, ...; what is given as an option here has precedence"""
+    """YAML file with runs, strategies, scenes, seeds, ...; options given here override it"""
     scenes: Path = Path(".")
     """folder in which the data sets lie"""
     out: Path = Path("bench")
@@ -62,19 +62,19 @@ class Bench:
     work: Path = Path("outputs/bench")
     """folder for checkpoints, pictures and logs"""
     data: tuple[str, ...] = ()
-    """data sets: folders below --scenes, read as the file says if it has them"""
+    """data sets: folders in --scenes; the file may say how to read them"""
     runs: tuple[str, ...] = ()
     """runs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
-    strategies: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--protocols"])] = ()
+    strategies: tuple[str, ...] = ()
     """densification: splatfacto, original, mcmc, mcmc@BUDGET, own"""
     seeds: tuple[int, ...] = ()
-    """--machine.seed of each repetition"""
+    """seeds (--machine.seed), one training for each"""
     steps: int | None = None
     """training steps, except of runs and presets that have their own"""
     options: str | None = None
     """options of ns-train for every run"""
     train_views: int | None = None
-    """training images that are evaluated beside the test images"""
+    """number of training images to evaluate, too"""
     jobs: int | None = None
     """runs at once on each GPU, or on the CPU; times are reported only with 1"""
     gpus: int | None = None
@@ -84,11 +84,11 @@ class Bench:
     slurm: tuple[str, ...] = ()
     """parameters of a task, KEY=VALUE: timeout_min=600 partition=gpu gpus_per_node=1 cpus_per_task=8 ..."""
     queued: int = 64
-    """slurm: most runs in the queue at once"""
+    """slurm: largest number of runs in the queue"""
     report_only: bool = False
     """run nothing: report what is there"""
     redo_stale: bool = False
-    """rename records that were made with other arguments to NAME.stale, and make them anew"""
+    """rename records of other arguments to NAME.stale, and run them again"""
 
     def main(self) -> None:
         asked, whole = self.plans()

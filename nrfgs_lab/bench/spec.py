@@ -151,20 +151,7 @@ def load_spec(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
     if not isinstance(content, dict):
         raise InputError(f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md for an example.")
-    return _today(content)
-
-
-RENAMED = {"protocols": "strategies", "protocol": "strategy"}
-"""Keys of version 0.1.0 -> what they are called now."""
-
-
-def _today(content: Any) -> Any:
-    """The same with today's keys."""
-    if isinstance(content, list):
-        return [_today(value) for value in content]
-    if not isinstance(content, dict):
-        return content
-    return {key if RENAMED.get(key, key) in content else RENAMED.get(key, key): _today(content[key]) for key in content}
+    return content
 
 
 def make_spec(content: dict[str, Any], where: str) -> Spec:

@@ -21,7 +21,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
 
-import numpy as np
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
@@ -29,7 +28,7 @@ import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from nrfgs_ns.distributed.launch import free_port, join_group
-from nrfgs_ns.model.model import NrfgsModel
+from nrfgs_ns.model import initial_splats
 from nrfgs_ns.training.run import evaluate, machine, parse
 
 QUIET = {
@@ -139,8 +138,7 @@ def one_device(rank: int, load: Load, count: int, world: int, url: str, folder: 
     config = parse([load.method, *words, *shlex.split(load.options)])
     torch.manual_seed(config.machine.seed)
     # Splats as wide as a grid of as many is fine: to look for the neighbours of millions takes longer than to measure.
-    spacing = np.full((count, 3), load.extent / count ** (1 / 3), dtype=np.float32)
-    NrfgsModel.k_nearest_sklearn = lambda self, x, k: (spacing[: len(x), :k], None)
+    initial_splats.mean_distance = lambda means: means.new_full((len(means), 1), load.extent / count ** (1 / 3))
     trainer = config.setup(local_rank=rank, world_size=world)
     trainer.setup()
     measured: dict[str, Any] = {}

@@ -5,7 +5,8 @@
 
 Each method trains at full resolution until it has the splats, loses what are too many, and goes on without adding or
 removing any. Then stretches of steps are timed in turns: with everything, and with each part closed, which leaves its
-work to gsplat or PyTorch. A few steps of each variant are traced for the GPU's own time. At last all trained models
+work to gsplat or PyTorch. What a step takes the host is the median over a stretch of its time without what the host has
+waited for the GPU. A few steps of each variant are traced for the GPU's own time. At last all trained models
 render the test views in turns, at the photographs' size and at 1080p. Methods take turns, too, `rounds` times.
 """
 
@@ -110,7 +111,7 @@ class StepParts:
         args += ["--logging.profiler", "none", "--pipeline.model.num-downscales", "0"]
         folder = tempfile.mkdtemp()  # left behind: tensorboard's thread writes to it until the process ends
         rows: list[dict[str, Any]] = []
-        with host_without_downloads(method), contextlib.ExitStack() as closing:
+        with host_without_downloads(method), contextlib.ExitStack() as closing, waiting() as waited:
             config = parse([method, "--output-dir", folder, *args[1:], "nrfgs-data", "--data", str(self.scene)])
             config.save_config()
             _set_random_seed(config.machine.seed)
@@ -118,6 +119,7 @@ class StepParts:
             trainer.setup()
             model, graphs = trainer.pipeline.model, trainer.pipeline.graphs
             watch: list[Any] = []
+            busy: list[float] = []
 
             def after(step: int) -> None:
                 if step == self.grow:
@@ -131,6 +133,8 @@ class StepParts:
                     model.densification.strategy.refine_stop_iter = 0 if "at rest" in name else NEVER
                     trainer.pipeline.graphs = None if "graph" in closed else graphs
                     closing.enter_context(shut(closed))
+                if 5 <= at <= 5 + self.steps:
+                    busy.append(perf_counter() - waited[0])
                 if at in (5, 5 + self.steps):
                     torch.cuda.synchronize()
                     watch.append(perf_counter())
@@ -144,7 +148,10 @@ class StepParts:
                     watch.clear()
                     closing.close()
                     row = {"variant": name, "splats": model.num_points, "recorded": bool(graphs._graphs)}
-                    rows.append({**row, "step_ms": 1e3 * (end - start) / self.steps, **kernels(traced, self.traced)})
+                    row["step_ms"] = 1e3 * (end - start) / self.steps
+                    row["host_ms"] = 1e3 * statistics.median(b - a for a, b in zip(busy, busy[1:], strict=False))
+                    rows.append({**row, **kernels(traced, self.traced)})
+                    busy.clear()
 
             trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after))
             with contextlib.redirect_stdout(sys.stderr):
@@ -178,6 +185,24 @@ def shut(names: tuple[str, ...]) -> Iterator[None]:
             gate.update(known)
 
 
+@contextlib.contextmanager
+def waiting() -> Iterator[list[float]]:
+    """Seconds that the host has waited for the GPU at events, the only number of a list."""
+    waited = [0.0]
+    wait = torch.cuda.Event.synchronize
+
+    def timed(event: torch.cuda.Event) -> None:
+        start = perf_counter()
+        wait(event)
+        waited[0] += perf_counter() - start
+
+    torch.cuda.Event.synchronize = timed
+    try:
+        yield waited
+    finally:
+        torch.cuda.Event.synchronize = wait
+
+
 def kernels(watch: profile, steps: int) -> dict[str, Any]:
     """The GPU's time and launches of traced steps, each per step, and the kernels that take longest."""
     found: dict[str, list[float]] = {}
@@ -203,10 +228,10 @@ def fps(model: Any, cameras: Mapping[str, list]) -> dict[str, float]:
 
 def report(rows: list[dict[str, Any]], frames: list[dict[str, Any]]) -> None:
     """Print medians and ranges over rounds."""
-    table = Table("method", "variant", "splats", "step ms", "GPU ms", "launches")
+    table = Table("method", "variant", "splats", "step ms", "host ms", "GPU ms", "launches")
     for method, variant in dict.fromkeys((row["method"], row["variant"]) for row in rows):
         mine = [row for row in rows if (row["method"], row["variant"]) == (method, variant)]
-        cells = [spread([row[key] for row in mine], digits) for key, digits in (("step_ms", 2), ("gpu_ms", 2))]
+        cells = [spread([row[key] for row in mine], 2) for key in ("step_ms", "host_ms", "gpu_ms")]
         table.add_row(method, variant, f"{mine[0]['splats']:,}", *cells, f"{mine[0]['launches']:.0f}")
     Console(width=140).print(table)
     table = Table("method", "splats", *frames[0]["fps"])

@@ -23,11 +23,11 @@ class Tradeoff:
     work: Path = Path("outputs/tradeoff")
     """folder for checkpoints, pictures and logs"""
     data: tuple[str, ...] = ()
-    """data sets: folders below --scenes, read as the file says if it has them"""
+    """data sets: folders in --scenes; the file may say how to read them"""
     knobs: tuple[str, ...] = ()
     """knobs to turn, or single settings such as "steps 7000"; none for all of the file"""
     seeds: tuple[int, ...] = ()
-    """--machine.seed of each repetition"""
+    """seeds (--machine.seed), one training for each"""
     steps: int | None = None
     """training steps, except of runs and presets that have their own"""
     jobs: int | None = None

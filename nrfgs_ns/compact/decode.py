@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A compact file as the tables of a model."""
+"""A compact file as the tables of a model. `format.py`, `encode.py` and `entropy.py` describe the file.
+
+In version 1 every stream is xz, of uint8 to uint64. Splats that depend on the view come first, then the diffuse ones,
+as streams view.<table> and diffuse.<table>, [columns, n], each in Morton order; codes are >= 0, with low in every grid.
+means are differences of Morton numbers, [n]. Rotations: quats_largest, [n], which of (w, x, y, z) is the largest, and
+quats, [3, n], the others in quats_bits bits each, from -sqrt(1/2) to sqrt(1/2). There are no turns.
+"""
 
 import math
 from dataclasses import fields

@@ -1,9 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A field as the streams of a compact file. docs/compact-format.md describes each of them.
+"""A field as the header and the streams of a compact file of version 2; the container is `format.py`'s.
+
+Keys of the header, beside "streams":
+
+    format   "nrfgs-compact"
+    splats   {"view": V, "diffuse": W}: how many of each kind; N = V + W
+    head     "name" ("nrf"), "config" (the field's options, "latent_dim" the rank R), "scene_unit"
+    render   "rasterize_mode", "background" (RGB)
+    grids    for "means", "turns", "scales", "opacities", "colors", "latents": "low" and "step", [columns]
+
+A whole number k in a column of a table stands for low + step k, low being 0 except in means. The streams:
+
+    means        rans   [2, N]    upper and lower 32 bits of the differences of successive Morton numbers, the first
+                                  counted from 0; not signed. Bit 3 k + a of a Morton number is bit k of the code of
+                                  axis a, 21 bits each
+    splats       rans   [11, N]   1 column: 0 if the splat is view-dependent, else it is diffuse; then opacities (1),
+                                  scales (3), colors (3), turns (3), as in `tables.py`
+    latents      rans   [R, V]    of the view-dependent splats, in the order of the others
+    head.<name>  xz               the network's weights, float16; float32 where they are too large for it
+
+head.low.0.weight [H, I], head.low.0.bias, head.low.2.weight, head.low.2.bias and the same of high are the layers of
+`appearance/nrf.py`. A diffuse splat has its base colour, cut off at 0, and its base opacity from everywhere.
 
 All splats lie in Morton order of their rounded means, so that a number's neighbours in its table are neighbours in
-space, and the means are the differences between successive Morton numbers. Every table lies on a grid whose step is a
-choice of precision, not of bits: outliers then cost a few long codes, and not everyone's precision.
+space. Every table lies on a grid whose step is a choice of precision, not of bits: outliers then cost a few long codes,
+and not everyone's precision.
 """
 
 from collections.abc import Mapping

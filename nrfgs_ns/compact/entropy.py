@@ -6,9 +6,48 @@ linear prediction from its neighbours (two rows before it, and two columns to it
 depends on how large the neighbours' residuals were. Frequencies and weights are part of the stream, as whole numbers;
 nothing here or in a reader rounds, so that a reader in another language finds the same numbers to the bit.
 
-The coder is range ANS (Duda, arXiv 1311.2540) with states of 32 bits and words of 16, interleaved as by Giesen (arXiv
-1402.3392): lane l codes the rows from l S on, S of them, and all lanes take a step at once, which is what makes it
-quick in numpy. docs/compact-format.md has the stream, byte by byte.
+The coder is range ANS (Duda, arXiv 1311.2540) with states of 32 bits, words of 16 and frequencies of 14, interleaved
+as by Giesen (arXiv 1402.3392): all lanes take a step at once, which is what makes it quick in numpy. It writes
+
+    bytes
+    4 L    a state for each of the L lanes, uint32, >= 2^16
+           words, uint16, to the end of the stream
+
+L is the smallest power of two that is at least C n / 2048, but no more than 1024; S = ceil(n / L). Lane l has the rows
+from l S to l S + S - 1, as far as there are so many. Columns are coded one after the other; of a column, step
+t = 0, ..., S - 1 codes row l S + t of each lane that has one: the first ceil((n - t) / S) lanes. The model has, for
+each column in turn,
+
+    numbers
+    1       1: the column is signed and predicted; 0: it is neither
+    7       weights w0, ..., w6 of the prediction, in 1/256
+    4       shares s1, ..., s4 of the neighbours in the activity
+    1 + K   K < 16, and K thresholds, rising
+            for each of the K + 1 contexts: the first token that occurs, how many tokens follow with it, and their
+            frequencies, which sum up to 2^14. Other tokens have frequency 0
+
+x(i, c) is the number in row i and column c, and t(i, c) its token; both are 0 outside of the table, and before a lane's
+first row. The activity is s1 t(i-1, c) + s2 t(i-2, c) + s3 t(i, c-1) + s4 t(i, c-2), with rows i-1 and i-2 of the same
+lane; the context k is how many thresholds are not above it. In a step, each lane with a row, in turn, takes its token
+from its state X:
+
+    slot = X mod 2^14
+    token: the one with start <= slot < start + frequency, in context k; start is the sum of smaller tokens' frequencies
+    X = frequency (X div 2^14) + slot - start
+    if X < 2^16: X = 2^16 X + the next word
+
+Tokens below 32 are the number u itself. Token 32 + 4 e + m stands for u from (4 + m) 2^b on, 2^b of them, b = e + 3;
+which, the b low bits say. After all lanes have their token, each lane whose token is 32 or more takes the lower
+min(b, 16) of these bits, and after that, each takes the others, if there are any; r bits at once are
+
+    bits = X mod 2^r,   X = X div 2^r,   if X < 2^16: X = 2^16 X + the next word
+
+In a column that is not signed, x = u. In a signed one, x is the prediction plus 0, -1, 1, -2, 2, ... for
+u = 0, 1, 2, 3, 4, ...; the prediction is, rounded down,
+
+    (128 + w0 + w1 x(i-1, c) + w2 x(i-2, c) + w3 x(i, c-1) + w4 x(i-1, c-1) + w5 x(i, c-2) + w6 x(i-1, c-2)) div 256
+
+At the end every state is 2^16 and no word is left: a reader checks it.
 """
 
 from typing import NamedTuple

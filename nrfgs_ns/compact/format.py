@@ -10,13 +10,21 @@
     24 + L  4      CRC-32 of everything before, uint32
     28 + L         the streams, one after the other, in the order of the list
 
-All numbers are little-endian. An entry of "streams" has "name", "dtype" (of the numbers), "shape", "bytes" (in the
-file), "crc32" (of these bytes) and, from version 2 on, "coding". In version 1 every stream is "xz".
+All numbers are little-endian. An entry of "streams" has "name", "coding", "dtype" (of the numbers), "shape", "bytes"
+(in the file) and "crc32" (of these bytes). Version 1 has no "coding": there every stream is "xz".
 
 "xz": the xz format; unpacked, the numbers' bytes by significance: first every number's lowest byte, then every number's
 next, and so on; numbers (uint8, uint16, uint32, uint64, float16 or float32) in row-major order.
-"rans": a table [columns, rows] of int16, int32 or uint32, by an entropy coder (`entropy.py`): uint32 how many numbers
-its model has, uint32 how many bytes, the model (int32, packed like "xz"), and the coder's bytes.
+"rans": a table [columns, rows] of int16, int32 or uint32, by an entropy coder:
+
+    bytes
+    4      how many numbers the coder's model has, uint32
+    4      bytes of the packed model, uint32
+           the model, int32 numbers, packed as in "xz"
+           what the coder wrote (`entropy.py`)
+
+`encode.py` says which streams there are. A reader refuses a later version, another length than the file's, and a
+checksum that does not hold.
 
 Nothing in a file is ever run, and nothing is allocated before its size was checked against the lengths in the header,
 and these against the size of the file: it cannot unpack to more than 32 times that, or 16 MB.

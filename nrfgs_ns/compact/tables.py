@@ -2,9 +2,10 @@
 """The tables of a file, from version 2 on: what the numbers of a splat are before they are rounded.
 
 means      [N, 3]
-turns      [N, 3]   x, y, z of the rotation with w > 0 that turns least and draws the same ellipsoid
+turns      [N, 3]   x, y, z of the rotation with w > 0 that turns least and draws the same ellipsoid: of the 24 ways to
+                    name its axes. A reader takes w = sqrt(max(1 - x^2 - y^2 - z^2, 1e-6)), and unit length
 scales     [N, 3]   natural logarithms of the standard deviations, along the axes that the rotation names
-opacities  [N, 1]   logits
+opacities  [N, 1]   logits, cut off at +-10
 colors     [N, 3]   base colours, 1 is white
 latents    [V, R]   of the V splats that are not diffuse
 """

@@ -22,7 +22,8 @@ from PIL import Image
 from torch import Tensor
 
 from nrfgs_ns.data.checks import some, warn
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, checked
+from nrfgs_ns.data.colmap_parser import checked
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.pictures import read_picture
 from nrfgs_ns.data.pixels import (
     free_memory,

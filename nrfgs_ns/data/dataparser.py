@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs-data`: nerfstudio's own data sets, checked up front, every 8th image for testing, points read by plyfile; and
-what reads COLMAP's models in its place.
+"""`nrfgs-data`: nerfstudio's own data sets, checked up front, every 8th image for testing, points read by plyfile.
 
-Both layouts become one dictionary, that of transforms.json, so that there is one way from it to cameras, and the same
-checks on it.
+COLMAP's layout (`colmap_parser.py`) becomes the same dictionary, that of transforms.json, so that there is one way from
+it to cameras, and the same checks on it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,16 +14,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION, NerfstudioDataParserConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.data.utils.dataparsers_utils import (
-    get_train_eval_split_all,
-    get_train_eval_split_filename,
-    get_train_eval_split_fraction,
-    get_train_eval_split_interval,
-)
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from nrfgs_ns.data.checks import (
@@ -37,40 +29,39 @@ from nrfgs_ns.data.checks import (
     check_poses,
     check_unique,
     could_exist,
-    exists,
     number,
     read_transforms,
     shown,
     some,
     warn,
 )
-from nrfgs_ns.data.colmap import read_model
+from nrfgs_ns.data.layout import FOLDERS, Layout
 from nrfgs_ns.data.lenses import cameras_of, size_of
-from nrfgs_ns.data.pictures import read_header, smaller_copies, stored_exif
+from nrfgs_ns.data.pictures import smaller_copies, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
-from nrfgs_ns.data.views import interior_test_images
+from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
 from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.start import with_data_parsers
 
 with_data_parsers()
 
-SPLITS = ("train", "val", "test")
-"""nerfstudio's names of the parts of a data set."""
-STAND_INS = {"val": ("val", "test", "train"), "test": ("test", "val", "train")}
-"""Which part is evaluated: the first of these that has images."""
 MASK_MODES = ("1", "L", "I", "I;16")
 """PIL modes with one value per pixel that means something by itself (a palette index does not)."""
 MIN_POINTS = 4
 """Fewer points cannot start a training: a splat's first size is its distance to its three nearest neighbours."""
 ORIENTATIONS = ("pca", "up", "vertical", "none")
-FOLDERS = {"file_path": "images", "mask_path": "masks", "depth_file_path": "depths"}
-"""Where smaller copies of a frame's files are, followed by _ and the factor."""
 COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """The applied_transform of data sets from before nerfstudio wrote it down."""
-COLMAP_UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""nerfstudio's turn of COLMAP's world, whose y points downwards, to one whose z points upwards."""
+
+
+def __getattr__(name: str):
+    if name == "NrfgsColmapDataParser":  # where a config.yml may say that it is
+        from nrfgs_ns.data import colmap_parser
+
+        return colmap_parser.NrfgsColmapDataParser
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 @dataclass
@@ -94,7 +85,9 @@ class Scene(NamedTuple):
     """what transforms.json says, or would say"""
     source: Path
     """the file that messages name"""
-    splits: dict[str, np.ndarray]
+    layout: Layout
+    """where its files are"""
+    splits: Rows
     """rows of each split"""
     factor: int
     """by which images are smaller than the intrinsics say"""
@@ -134,11 +127,11 @@ class NrfgsDataParser(DataParser):
             warn(f"{scene.source}: no image is kept for {split}. The training images are evaluated instead.")
         rows = scene.splits[chosen]
         frames = [scene.meta["frames"][row] for row in rows]
-        files = {key: self._files(frames, key, scene.factor) for key in FOLDERS}
+        files = {key: scene.layout.files(frames, key, scene.factor) for key in FOLDERS}
         cameras = scene.cameras[torch.from_numpy(rows)]
         if self._images_needed:
             sizes = list(zip(cameras.width.flatten().tolist(), cameras.height.flatten().tolist(), strict=True))
-            files = self._checked_files(scene, frames, files, sizes)
+            files |= _checked_files(scene, frames, files, sizes)
         box = self.config.scene_scale * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         outputs = PlacedOutputs(
             image_filenames=files["file_path"],
@@ -163,13 +156,11 @@ class NrfgsDataParser(DataParser):
         """Whether nerfstudio asks for images."""
         return self.downscale_factor is None
 
-    # From files to a scene.
-
     @cached_property
     def _scene(self) -> Scene:
         """The whole data set, checked as far as can be done without opening all images."""
         check_options(self.config)
-        meta, source = self._read()
+        meta, source, layout = self._read()
         frames, config = meta["frames"], self.config
         check_intrinsics(meta, source)
         check_poses(frames, source, need_spread=config.auto_scale_poses and len(frames) > 1)
@@ -178,42 +169,26 @@ class NrfgsDataParser(DataParser):
                 f"{source}: --mask-color is set, but no frame has a mask_path. Add masks or drop the option."
             )
         if self._images_needed:
-            if config.downscale_factor is None:  # the first image in its full size decides
-                check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
-            factor = self._factor(frames)
+            factor = config.downscale_factor
+            if factor is None:  # the first image in its full size decides
+                check_exist([layout.file(frame["file_path"]) for frame in frames], source, "images")
+                factor = layout.factor_of(frames[0]["file_path"])
             for key in FOLDERS:
                 what = "images" if key == "file_path" else f"files of {key}"
-                check_exist(self._files(frames, key, factor), source, what)
+                check_exist(layout.files(frames, key, factor), source, what)
         else:
             factor = self.downscale_factor
-        frames = meta["frames"] = self._order(frames)
-        paths = [self._file(frame["file_path"]) for frame in frames]
+        frames = meta["frames"] = self._order(frames, layout)
+        paths = [layout.file(frame["file_path"]) for frame in frames]
         check_unique(paths, f"{source}: frames")
-        splits = self._splits(meta, source, paths)
+        named = self._named_splits(meta, layout)
+        splits = split_by_names(named, paths, layout.file, source) if named else split_by_rule(config, paths, source)
         if not len(splits["train"]):
             raise InputError(
                 f"{source}: no image is left for training. Correct train_filenames if it is there, else --eval-mode, "
                 "--eval-interval or --train-split-fraction."
             )
-        orientation = meta.get("orientation_override", config.orientation_method)
-        if orientation not in ORIENTATIONS:
-            raise InputError(
-                f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, "
-                "or remove it."
-            )
-        single = len(frames) == 1
-        poses, transform, scale = place(
-            np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64),
-            "up" if single and orientation == "vertical" else orientation,  # which needs two cameras
-            config.center_method,
-            config.auto_scale_poses and not single,
-            config.scale_factor,
-        )
-        if not torch.isfinite(poses).all():
-            raise InputError(
-                f"{source}: the poses cannot be oriented (their up directions cancel). "
-                "Set --orientation-method none, or recompute the poses."
-            )
+        poses, transform, scale = self._placed(meta, source)
         cameras = cameras_of(meta, poses, source)
         rounding = getattr(config, "downscale_rounding_mode", "floor")
         cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
@@ -222,160 +197,54 @@ class NrfgsDataParser(DataParser):
                 f"{source}: --downscale-factor {factor} leaves images of {cameras.width.min()} x "
                 f"{cameras.height.min()} pixels. Give a smaller one."
             )
-        return Scene(meta, source, splits, factor, cameras, transform, self._to_frames(meta), scale)
+        return Scene(meta, source, layout, splits, factor, cameras, transform, self._to_frames(meta, layout), scale)
 
-    def _read(self) -> tuple[dict[str, Any], Path]:
-        """What the data set says, and the file that it says so in."""
+    def _placed(self, meta: dict[str, Any], source: Path) -> tuple[torch.Tensor, torch.Tensor, float]:
+        """Poses in the world that is trained in, and the way there (`world.place`)."""
+        frames, config = meta["frames"], self.config
+        orientation = meta.get("orientation_override", config.orientation_method)
+        if orientation not in ORIENTATIONS:
+            raise InputError(
+                f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, "
+                "or remove it."
+            )
+        single = len(frames) == 1
+        placed = place(
+            np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64),
+            "up" if single and orientation == "vertical" else orientation,  # which needs two cameras
+            config.center_method,
+            config.auto_scale_poses and not single,
+            config.scale_factor,
+        )
+        if not torch.isfinite(placed[0]).all():
+            raise InputError(
+                f"{source}: the poses cannot be oriented (their up directions cancel). "
+                "Set --orientation-method none, or recompute the poses."
+            )
+        return placed
+
+    # What is another thing in COLMAP's layout.
+
+    def _read(self) -> tuple[dict[str, Any], Path, Layout]:
+        """What the data set says, the file that it says so in, and where its files are."""
         meta, source = read_transforms(self.config.data)
-        self._folder = source.parent
         check_frames(meta["frames"], source)
-        return meta, source
+        return meta, source, Layout(source.parent)
 
-    def _order(self, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    def _order(self, frames: list[dict[str, Any]], layout: Layout) -> list[dict[str, Any]]:
         """The frames in the order that they are split in: by name, as in nerfstudio."""
-        return sorted(frames, key=lambda frame: self._file(frame["file_path"]))
+        return sorted(frames, key=lambda frame: layout.file(frame["file_path"]))
 
-    def _to_frames(self, meta: dict[str, Any]) -> torch.Tensor | None:
+    def _to_frames(self, meta: dict[str, Any], layout: Layout) -> torch.Tensor | None:
         """The transform [3, 4] that has already been applied to the frames' poses, if one has."""
         if "applied_transform" in meta:
             return torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
-        return COLMAP_TO_FRAMES if self._colmap.exists() else None
+        return COLMAP_TO_FRAMES if layout.colmap.exists() else None
 
-    @property
-    def _colmap(self) -> Path:
-        return self._folder / "colmap" / "sparse" / "0"
-
-    def _file(self, name: str, key: str = "file_path") -> Path:
-        """A file that a frame names, in full size."""
-        return self._folder / name
-
-    def _root(self, key: str) -> Path:
-        """The folder of a frame's files of one kind, in full size."""
-        return self._folder / FOLDERS[key]
-
-    def _smaller(self, key: str, factor: int) -> Path:
-        """The folder where the data set keeps its own copies at 1 / factor of the size, if it does."""
-        root = self._root(key)
-        return root.with_name(f"{root.name}_{factor}")
-
-    def _copy(self, name: str, key: str, factor: int) -> Path:
-        return self._smaller(key, factor) / Path(name).name
-
-    def _may_halve(self, name: str, factor: int) -> bool:
-        """Whether images may be taken at 1 / factor of their size without having been asked for."""
-        return self._copy(name, "file_path", factor).exists()
-
-    def _factor(self, frames: list[dict[str, Any]]) -> int:
-        """The factor that was asked for, or the smallest power of two that makes the first image no larger than 1600
-        pixels and that `_may_halve` admits."""
-        if self.config.downscale_factor is not None:
-            return self.config.downscale_factor
-        name = frames[0]["file_path"]
-        size, factor = max(read_header(self._file(name))[0]), 1
-        while size / factor > MAX_AUTO_RESOLUTION and self._may_halve(name, 2 * factor):
-            factor *= 2
-        return factor
-
-    def _files(self, frames: list[dict[str, Any]], key: str, factor: int) -> list[Path]:
-        """The files of some frames, in full size or, where the data set has copies of the size wanted, those."""
-        names = [frame[key] for frame in frames if key in frame]
-        copies = names and self._has_copies(key, factor)
-        return [self._copy(name, key, factor) if copies else self._file(name, key) for name in names]
-
-    def _has_copies(self, key: str, factor: int) -> bool:
-        return factor > 1 and self._smaller(key, factor).is_dir()
-
-    def _checked_files(
-        self,
-        scene: Scene,
-        frames: list[dict[str, Any]],
-        files: dict[str, list[Path]],
-        sizes: Sequence[tuple[int, int]],
-    ) -> dict[str, list[Path]]:
-        """The same files, found to have the sizes that their cameras have; those that are larger, resized."""
-        scale_all = "Use the images that the poses were computed from, or scale w, h, fl_x, fl_y, cx and cy alike."
-        for key, what, fix in (
-            ("file_path", "images", scale_all),
-            ("mask_path", "masks", "Make them as large as the images."),
-        ):
-            if not files[key]:
-                continue
-            shrink = scene.factor > 1 and not self._has_copies(key, scene.factor)
-            if not shrink:
-                check_unique(files[key], f"{scene.source}: frames")
-            expected = [size_of(scene.meta, frame) for frame in frames] if shrink else sizes
-            modes = check_headers(files[key], expected, what, fix)
-            if key == "mask_path":
-                bad = [path for path, mode in zip(files[key], modes, strict=True) if mode not in MASK_MODES]
-                if bad:
-                    raise InputError(
-                        f"{some(bad)}: a mask must have one grey channel (0 outside, anything else inside), not "
-                        "colours or a palette. Save it as 8-bit grey."
-                    )
-            if shrink:
-                files = {**files, key: smaller_copies(files[key], sizes, what)}
-        return files
-
-    # Splits.
-
-    def _splits(self, meta: dict[str, Any], source: Path, images: list[Path]) -> dict[str, np.ndarray]:
-        """The rows of each split, int64."""
-        named = self._named_splits(meta, source)
-        if named is not None:
-            return self._rows_of(named, source, images)
-        if len(images) == 1:
-            return {"train": np.array([0]), "val": np.empty(0, int), "test": np.empty(0, int)}
-        config = self.config
-        if config.eval_mode == "interior":
-            if config.eval_interval < 2:
-                raise InputError(
-                    f"--eval-interval is {config.eval_interval}. Give 2 or more, or choose another --eval-mode."
-                )
-            evaluated = np.array(interior_test_images(len(images), config.eval_interval))
-            return {"train": np.setdiff1d(np.arange(len(images)), evaluated), "val": evaluated, "test": evaluated}
-        try:
-            train, evaluated = {
-                "fraction": lambda: get_train_eval_split_fraction(images, config.train_split_fraction),
-                "filename": lambda: get_train_eval_split_filename(images),
-                "interval": lambda: get_train_eval_split_interval(images, config.eval_interval),
-                "all": lambda: get_train_eval_split_all(images),
-            }[config.eval_mode]()
-        except (AssertionError, ValueError, KeyError) as error:
-            raise InputError(
-                f"{source}: --eval-mode {config.eval_mode} cannot split these images ({error}). Choose another."
-            ) from error
-        train, evaluated = (np.asarray(rows, dtype=np.int64) for rows in (train, evaluated))
-        return {"train": train, "val": evaluated, "test": evaluated}
-
-    def _named_splits(self, meta: dict[str, Any], source: Path) -> dict[str, tuple[str, Any]] | None:
-        """The splits that the data set names itself, if it does: what names it, and the names."""
-        named = {split: (f"{split}_filenames", meta.get(f"{split}_filenames")) for split in SPLITS}
-        return {k: v for k, v in named.items() if v[0] in meta} or None
-
-    def _rows_of(self, named: dict[str, tuple[str, Any]], source: Path, images: list[Path]) -> dict[str, np.ndarray]:
-        """The rows of splits that are named, which must name images that there are."""
-        members = dict.fromkeys(SPLITS, frozenset())
-        for split, (field_name, names) in named.items():
-            where = f"{source}: {field_name}"
-            if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-                raise InputError(f"{where} is not a list of file paths. Correct or remove it.")
-            paths = [self._file(name) for name in names]
-            check_unique(paths, where)
-            members[split] = frozenset(paths)
-            unknown = sorted(members[split].difference(images))
-            if unknown:
-                raise InputError(
-                    f"{where} names {some(unknown)}, of which there is no frame. Use each frame's file_path."
-                )
-        shared = sorted(members["train"] & (members["val"] | members["test"]))
-        if shared:
-            warn(f"{source}: {some(shared)} are for training and for evaluation, whose results this flatters.")
-        return {
-            split: np.array([row for row, path in enumerate(images) if path in paths], dtype=np.int64)
-            for split, paths in members.items()
-        }
-
-    # Points.
+    def _named_splits(self, meta: dict[str, Any], layout: Layout) -> Named:
+        """The splits that the data set names itself; empty if it names none."""
+        fields = {split: f"{split}_filenames" for split in SPLITS}
+        return {split: (name, meta[name]) for split, name in fields.items() if name in meta}
 
     def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor] | None:
         """Positions [N, 3] and colours [N, 3] as stored, and the transform [3, 4] from their world to the cameras'
@@ -384,9 +253,9 @@ class NrfgsDataParser(DataParser):
             name = scene.meta["ply_file_path"]
             if not (isinstance(name, str) and could_exist(name)):
                 raise InputError(f"{scene.source}: ply_file_path is {shown(repr(name))}. Name a file, or remove it.")
-            return *read_ply(self._file(name)), scene.transform
-        if self._colmap.is_dir():
-            return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
+            return *read_ply(scene.layout.file(name)), scene.transform
+        if scene.layout.colmap.is_dir():
+            return *read_colmap(scene.layout.colmap), after(scene.transform, scene.to_frames)
         return None
 
     @cached_property
@@ -414,89 +283,32 @@ class NrfgsDataParser(DataParser):
         return {"points3D_xyz": xyz, "points3D_rgb": rgb}
 
 
-class NrfgsColmapDataParser(NrfgsDataParser):
-    """nerfstudio's `colmap` parser, with the checks of `NrfgsDataParser` and without questions at the terminal.
-
-    Images that are larger than 1600 pixels are resized by a power of two, as nerfstudio proposes. Multiple cameras may
-    be of several models if all are pinholes or all are fisheyes.
-    """
-
-    config: ColmapDataParserConfig
-
-    def _read(self) -> tuple[dict[str, Any], Path]:
-        self._folder = self.config.data
-        if not exists(self._folder):
-            raise InputError(f"{shown(str(self._folder))}: no such folder. Check the path that --data names.")
-        cameras, views, source = read_model(self._colmap)
-        kinds = {cameras[view.camera]["camera_model"] for view in views}
-        if len(kinds) > 1:
-            raise InputError(f"{source}: some cameras are fisheyes and some are not. Undistort the photographs.")
-        upright = COLMAP_UPRIGHT if self.config.assume_colmap_world_coordinate_convention else np.eye(4)
-        frames = []
-        for view in views:
-            frame = {"file_path": view.name, **cameras[view.camera]}
-            pose = upright @ np.linalg.inv(view.world_to_camera)
-            frame["transform_matrix"] = pose * np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backwards
-            if self.config.masks_path is not None:
-                frame["mask_path"] = view.name
-            if self.config.depths_path is not None:
-                frame["depth_file_path"] = view.name
-            frames.append(frame)
-        meta = {"frames": frames, "camera_model": kinds.pop()}
-        if self.config.assume_colmap_world_coordinate_convention:
-            meta["applied_transform"] = COLMAP_UPRIGHT[:3].tolist()
-        check_frames(frames, source)
-        return meta, source
-
-    def _order(self, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        return frames  # by COLMAP's numbers
-
-    def _to_frames(self, meta: dict[str, Any]) -> torch.Tensor | None:
-        return torch.tensor(meta["applied_transform"]) if "applied_transform" in meta else None
-
-    @property
-    def _colmap(self) -> Path:
-        return self._folder / self.config.colmap_path
-
-    def _root(self, key: str) -> Path:
-        config = self.config
-        folders = {
-            "file_path": config.images_path,
-            "mask_path": config.masks_path,
-            "depth_file_path": config.depths_path,
-        }
-        return self._folder / folders[key]
-
-    def _file(self, name: str, key: str = "file_path") -> Path:
-        path = self._root(key) / name
-        return path if key == "file_path" else path.with_suffix(".png")
-
-    def _copy(self, name: str, key: str, factor: int) -> Path:
-        return self._smaller(key, factor) / self._file(name, key).relative_to(self._root(key))
-
-    def _may_halve(self, name: str, factor: int) -> bool:
-        return True
-
-    def _named_splits(self, meta: dict[str, Any], source: Path) -> dict[str, tuple[str, Any]] | None:
-        named = {}
-        for split, file in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
-            path = self._folder / f"{file}_list.txt"
-            if path.is_file():
-                try:
-                    lines = path.read_text(encoding="utf-8").splitlines()
-                except (OSError, ValueError) as error:
-                    raise InputError(f"{path} cannot be read ({error}). Write one image name on each line.") from error
-                named[split] = path.name, [line.strip() for line in lines if line.strip()]
-        return named or None
-
-    def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
-
-
-def checked(config: DataParserConfig) -> DataParserConfig:
-    """The configuration of a parser that checks what it reads, for nerfstudio's own two, and any other as it is."""
-    parsers = {NerfstudioDataParserConfig: NrfgsDataParser, ColmapDataParserConfig: NrfgsColmapDataParser}
-    return replace(config, _target=parsers[type(config)]) if type(config) in parsers else config
+def _checked_files(
+    scene: Scene, frames: list[dict[str, Any]], files: dict[str, list[Path]], sizes: Sequence[tuple[int, int]]
+) -> dict[str, list[Path]]:
+    """Images and masks, found to have the sizes that their cameras have; those that are larger, resized."""
+    checked = {}
+    fixes = {
+        "images": "Use the images that the poses were computed from, or scale w, h, fl_x, fl_y, cx and cy alike.",
+        "masks": "Make them as large as the images.",
+    }
+    for key, what in (("file_path", "images"), ("mask_path", "masks")):
+        paths = files[key]
+        if not paths:
+            continue
+        shrink = scene.factor > 1 and not scene.layout.has_copies(key, scene.factor)
+        if not shrink:
+            check_unique(paths, f"{scene.source}: frames")
+        expected = [size_of(scene.meta, frame) for frame in frames] if shrink else sizes
+        modes = check_headers(paths, expected, what, fixes[what])
+        bad = [path for path, mode in zip(paths, modes, strict=True) if mode not in MASK_MODES]
+        if key == "mask_path" and bad:
+            raise InputError(
+                f"{some(bad)}: a mask must have one grey channel (0 outside, anything else inside), not colours or a "
+                "palette. Save it as 8-bit grey."
+            )
+        checked[key] = smaller_copies(paths, sizes, what) if shrink else paths
+    return checked
 
 
 nrfgs_dataparser = DataParserSpecification(

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
-from torch.nn import Parameter
 
 from nrfgs_ns.densification import Densification, GradientDensification, build_densification
 from nrfgs_ns.distributed import comm
@@ -67,12 +66,12 @@ class ShardedModel(NrfgsModel):
             found.strategy.verbose = rank == 0
         return found
 
-    def _initial_splats(self) -> dict[str, Parameter]:
+    def _initial_splats(self) -> dict[str, Tensor]:
         whole = super()._initial_splats()
         total = len(whole["means"])
         self.counts = shard_counts(total, comm.world())
         rows = rows_of(comm.rank(), total, comm.world())
-        return {name: Parameter(value.detach()[rows].clone()) for name, value in whole.items()}
+        return {name: value[rows].clone() for name, value in whole.items()}
 
     def learn_photographs(self, photographs: PhotographModel | None) -> None:
         """Let each photograph's look be learnt, from where the main device starts: others may round differently."""
@@ -109,9 +108,7 @@ class ShardedModel(NrfgsModel):
 
         absgrad = self.training and self.densification.needs_absgrad(self.step)
         own, colored = send_to_cameras(projection, appearance, *self.sizes[comm.rank()], absgrad)
-        background = self._get_background_color()
-        view = View(own, pinholes[comm.rank()].center)
-        outputs, _ = self.composite(view, colored, background, self._photograph_of(cameras[comm.rank()]))
+        outputs, _ = self.picture(View(own, pinholes[comm.rank()].center), colored, cameras[comm.rank()])
         if self.training:
             if len(own.depths) == 0:  # all devices must go backward through the exchange, the one that sees nothing too
                 outputs["rgb"] = outputs["rgb"] + colored.colors.sum()
@@ -124,7 +121,6 @@ class ShardedModel(NrfgsModel):
                 "n_cameras": len(pinholes),
             }
             self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
-            self._finish_for_training(outputs, cameras[comm.rank()], background)
         return outputs
 
     def _project_everywhere(self, splats: Mapping[str, Tensor], pinholes: list[Pinhole]) -> Projection:

@@ -2,7 +2,6 @@
 """`nrfgs export compact`: choose what is left out, write the file, and a config.yml with which nerfstudio reads it."""
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -112,7 +111,7 @@ def trained_for_the_file(
         return chosen.field, None
     model = pipeline.model
     centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
-    noise = ViewNoise(model.noise_factor * camera_spacing(centers) / math.sqrt(3.0), torch.initial_seed())
+    noise = ViewNoise.as_long_as(model.noise_factor * camera_spacing(centers), torch.initial_seed())
     columns = TextColumn("Training for the file {task.description}"), BarColumn(), TimeRemainingColumn()
     with Progress(*columns, console=CONSOLE, transient=True) as progress:
         task = progress.add_task("", total=options.finetune)

@@ -100,7 +100,7 @@ def load_file(path: Path) -> "NrfgsModel":
     from nerfstudio.data.scene_box import SceneBox
 
     from nrfgs_ns.compact.decode import decode, model_state
-    from nrfgs_ns.model.model import NrfgsModelConfig
+    from nrfgs_ns.model.config import NrfgsModelConfig
 
     decoded = decode(path)
     means, render = decoded.splats["means"], decoded.header.get("render", {})

@@ -101,9 +101,10 @@ def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tenso
     height, width = image.shape[:2]
     window = max(round(max(height, width) / LONGEST_SIDE), 1)
     points, viewmat, K = (value.to(image.device, torch.float32) for value in (points, viewmat, K))
-    seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    # Not as matrix products: cuBLAS would keep 32 MiB of a GPU for each thread that asks for one.
+    seen = (points[:, None] * viewmat[:3, :3]).sum(dim=-1) + viewmat[:3, 3]
     depth = seen[:, 2]
-    pixel = seen @ K.T
+    pixel = (seen[:, None] * K).sum(dim=-1)
     x, y = pixel[:, 0] / depth, pixel[:, 1] / depth
     rows = ((depth > 0) & (x >= window) & (x < width - window) & (y >= window) & (y < height - window)).nonzero()[:, 0]
     x, y, depth = x[rows].long(), y[rows].long(), depth[rows]

@@ -19,7 +19,7 @@ class Inspect:
     views: int = 12
     """test views to measure on, evenly spaced"""
     budget: float = 0.05
-    """dB that all that is left out together may cost"""
+    """dB that the parts may cost together that are left out at once"""
 
     def main(self) -> None:
         # Heavy imports only when there is work to do: `nrfgs --help` answers at once.

@@ -1,123 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splatfacto with an appearance head: nerfstudio's hooks. `renderer.py` has how a camera is rendered.
+"""Splatfacto with an appearance head: what nerfstudio asks of a model, in the order of a training.
 
-Loss, schedules and crop are nerfstudio's, and so is densification unless another strategy is asked for
-(`densification/`). What differs: colours and opacities come from the head, for the splats that the camera sees only;
-nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the parameter objects that the optimisers
-hold, so that an interrupted training can go on.
+How a camera is rendered is in `renderer.py`, how splats come and go in `densification/`, what the splats start from in
+`initial_splats.py`. Loss, schedules and crop are nerfstudio's. What differs: colours and opacities come from the head,
+for the splats that the camera sees only; nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the
+parameter objects that the optimisers hold, so that an interrupted training can go on.
 """
 
-import math
-import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Any
 
 import torch
-import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
-from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
+from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.colors import get_color
-from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn import Parameter
+from torch.nn import Parameter, ParameterDict
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
-from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.densification import (
-    Densification,
-    McmcDensification,
-    OpacitySeen,
-    OriginalDensification,
-    Strategy,
-    build_densification,
-    statistics,
-)
+from nrfgs_ns.appearance.head import SplatAppearance, base_colors
+from nrfgs_ns.densification import Densification, build_densification
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.image import robust, ssim
+from nrfgs_ns.image import robust
 from nrfgs_ns.image.metrics import ImageMetrics
-from nrfgs_ns.image.photograph import Part, PhotographModel
+from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
-from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config
+from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config, upgraded
+from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
-from nrfgs_ns.model.pinhole import FixedPinholes, Pinhole, pinhole
+from nrfgs_ns.model.initial_splats import initial_splats
+from nrfgs_ns.model.look import look_asked_for
+from nrfgs_ns.model.pinhole import Pinhole, Pinholes
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
-from nrfgs_ns.model.retired import RETIRED
 from nrfgs_ns.model.training_views import TrainingPictures
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.rasterizer import load_kernels
 
-LOOK = "NRFGS_LOOK"
-"""Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
-PRIOR_VIEWS = 20
-"""So many training views are half of what a head needs: `few_views` trusts it by that."""
+__all__ = ["NrfgsModel", "NrfgsModelConfig"]  # a config.yml names both here
+
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
-
-
-@dataclass
-class NrfgsModelConfig(SplatfactoModelConfig):
-    """Splatfacto's options, and the appearance head's."""
-
-    _target: type = field(default_factory=lambda: NrfgsModel)
-    """target class to instantiate"""
-    appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
-    """the appearance head: what a splat's colour and opacity are, seen from a camera"""
-    view_noise: float = 0.0
-    """noise on the camera centre from which the head sees each splat in training, in distances between neighbouring
-    training cameras (docs/captures.md)"""
-    few_views: Literal["auto", "off"] = "off"
-    """auto: V training views trust the head with u = V / (V + 20): noise is longer by 1 / u, its opacity residual is u
-    times as large (docs/captures.md)"""
-    shrinkage: float = 0.0
-    """weight in the loss of the splats' mean opacity and mean size, divided by the square of the number of training
-    views (docs/captures.md). mcmc has its own instead"""
-    warmup_steps: int | None = None
-    """steps before training in which a head with a residual at its start learns to have none. None: one for each
-    training view"""
-    warmup_lr: float = 1e-3
-    """learning rate of the warm-up's Adam"""
-    densification: Strategy = "splatfacto"
-    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
-    splat_budget"""
-    splat_budget: int = 1_000_000
-    """mcmc: the number of splats that it grows to and keeps"""
-    opacity_seen_by_densification: OpacitySeen | None = None
-    """opacity by which splats are pruned or moved (docs/opacity.md). base: stored. peak: largest shown since the last
-    refinement. None: peak for mcmc, otherwise base"""
-    keep: float = 1.0
-    """share of the splats that is kept after growth; those that the training views would miss least are removed
-    (docs/fewer-splats.md)"""
-    original: OriginalDensification = field(default_factory=OriginalDensification)
-    """thresholds of the densification 'original'"""
-    mcmc: McmcDensification = field(default_factory=McmcDensification)
-    """constants of the densification 'mcmc'"""
-    photographs: Literal["auto", "on", "off"] = "auto"
-    """learn each photograph's exposure and white balance. auto: if photographs or EXIF show that they vary
-    (docs/exposure.md)"""
-    photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
-    """what is learnt, of each photograph (exposure, white-balance) or camera (vignetting, response)"""
-    robust_loss: float = 0.0
-    """largest share of the pixels that the loss ignores, those with the largest residuals: people passing by
-    (docs/exposure.md)"""
-    # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
-    sh_degree: tyro.conf.Suppress[int] = 3
-    sh_degree_interval: tyro.conf.Suppress[int] = 1000
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Be what a config.yml says; that of an older version has other options, or values that are no more."""
-        state = {**vars(type(self)()), **state}
-        state.pop("head_from", None)
-        state["few_views"] = "auto" if state["few_views"] == "on" else state["few_views"]
-        self.__dict__.update(state)
-        self.densification = RETIRED.get(self.densification, self.densification)
 
 
 class NrfgsModel(SplatfactoModel):
@@ -130,103 +56,74 @@ class NrfgsModel(SplatfactoModel):
 
     config: NrfgsModelConfig
     reduced_head: dict[str, Any] | None = None
-    """options of the head that a checkpoint was written with, where they are not the configuration's"""
-    viewer_panel: Any = None
-    """who says what a browser sees (`show_by`); None: there is no viewer"""
-    _fit_cameras: Cameras | None = None
-    _fit: Fit | None = None
+    """options of the head that are not the configuration's: those that a checkpoint or the number of views decides"""
     camera_spacing: float = 0.0
     """world units between neighbouring training cameras; 0 until a training begins"""
+    viewer_panel: Any = None
+    """who says what a browser sees (`show_by`); None: there is no viewer"""
     _scheduled: int | None = None
+    _fit_cameras: Cameras | None = None
+    _fit: Fit | None = None
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
-        if not isinstance(self.config.appearance, AppearanceHeadConfig):
-            raise InputError(
-                f"pipeline.model.appearance is {self.config.appearance!r}, which is not the configuration of an "
-                "appearance head. Use one from nrfgs_ns.appearance, such as NrfConfig or ShConfig."
-            )
+        config = self.config
+        config.check()
         self.scene_unit: float = (self.kwargs.get("metadata") or {}).get("scene_unit", 1.0)
         """World units in a scene unit; lengths in the configuration are in scene units."""
-        appearance = self.config.appearance
-        if self.trust < 1.0:
-            appearance.validate()
-            appearance = appearance.trusted(self.trust)
-            self.reduced_head = differences(self.config.appearance, appearance) or None
+        self.trust = config.trust(self.num_train_data)
+        """How far the training views trust the head, in (0, 1]."""
+        self.noise_factor = config.view_noise / self.trust
+        """Length of the noise on where the head is asked from, in spacings of the training cameras."""
+        config.appearance.validate()
+        appearance = config.appearance.trusted(self.trust)
+        self.reduced_head = differences(config.appearance, appearance) or None
         self.head = appearance.setup(self.scene_unit)
-        self.config.sh_degree = self.head.sh_degree
-        self.gauss_params = torch.nn.ParameterDict(self._initial_splats())
-        self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
-        if self.config.use_bilateral_grid:
-            self.bil_grids = BilateralGrid(self.num_train_data, *self.config.grid_shape)
+        config.sh_degree = self.head.sh_degree
+        self.gauss_params = ParameterDict({name: Parameter(value) for name, value in self._initial_splats().items()})
+        self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        if config.use_bilateral_grid:
+            self.bil_grids = BilateralGrid(self.num_train_data, *config.grid_shape)
 
         self.photograph: PhotographModel | None = None  # the pipeline knows the photographs
-        self.trimming = _trimming(self.config.robust_loss)
+        self.trimming = robust.Trimming(config.robust_loss) if config.robust_loss > 0.0 else None
         self.image_metrics = ImageMetrics()
         self.step = 0
         self.crop_box = None
-        self._pinholes: dict[tuple[int, int], Pinhole] = {}  # training cameras by index and downscale
-        self._fixed_pinholes: FixedPinholes | None = None  # all others
+        self.pinholes = Pinholes()
         self.background_color = (
             torch.tensor(VISER_BACKGROUND)
-            if self.config.background_color == "random"
-            else get_color(self.config.background_color)
+            if config.background_color == "random"
+            else get_color(config.background_color)
         )
         self.densification = self._strategy()
-        for name in ("view_noise", "shrinkage"):
-            if not getattr(self.config, name) >= 0:
-                raise InputError(f"pipeline.model.{name} is {getattr(self.config, name)}; it must be zero or positive.")
         self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
+
+    def _initial_splats(self) -> dict[str, Tensor]:
+        """The table of splats to start from."""
+        return initial_splats(self.config, self.head, self.seed_points, self.scene_unit)
 
     def _strategy(self) -> Densification:
         """What makes splats come and go."""
         return build_densification(self.config, self.num_train_data, self.scene_unit)
 
-    @property
-    def trust(self) -> float:
-        """How far the training views trust the head, in (0, 1]."""
-        if self.config.few_views not in ("auto", "off"):
-            raise InputError(f"pipeline.model.few_views is {self.config.few_views!r}; use 'auto' or 'off'.")
-        views = self.num_train_data
-        return views / (views + PRIOR_VIEWS) if self.config.few_views == "auto" and views > 0 else 1.0
+    def learn_photographs(self, photographs: PhotographModel | None) -> None:
+        """Let each photograph's look be learnt; None: all have one look."""
+        self.photograph = None if photographs is None else photographs.to(self.device)
+        if self.photograph is not None:
+            look_asked_for(self.photograph)  # a name that is none is told before the first evaluation
 
-    @property
-    def noise_factor(self) -> float:
-        """Length of the noise on where the head is asked from, in spacings of the training cameras."""
-        return self.config.view_noise / self.trust
+    def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
+        return {name: [parameter] for name, parameter in self.gauss_params.items()}
 
-    def _initial_splats(self) -> dict[str, Parameter]:
-        """Splatfacto's start: a round splat at each seed point, as wide as its neighbours are far; or random ones."""
-        if self.seed_points is not None and not self.config.random_init:
-            means, rgb = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
-        else:
-            means = (torch.rand(self.config.num_random, 3) - 0.5) * self.config.random_scale * self.scene_unit
-            rgb = torch.rand(len(means), 3)
-        neighbours = min(3, len(means) - 1)
-        if neighbours > 0:
-            # The distances of splatfacto's scikit-learn to the last bit, without a second to import it.
-            distances, _ = cKDTree(means.cpu().numpy()).query(means.cpu().numpy(), k=neighbours + 1, workers=-1)
-            width = torch.from_numpy(distances[:, 1:]).float().mean(dim=-1, keepdim=True)
-        else:
-            width = torch.full((len(means), 1), self.config.densify_size_thresh * self.scene_unit)
-        return {
-            name: Parameter(value)
-            for name, value in {
-                "means": means.clone(),
-                # Duplicate points have distance 0.
-                "scales": width.clamp_min(1e-7 * self.scene_unit).log().repeat(1, 3),
-                "quats": random_quat_tensor(len(means)),
-                "opacities": torch.logit(torch.full((len(means), 1), 0.1)),
-                **self.head.splat_params(rgb),
-            }.items()
-        }
-
-    def kernel_trials(self) -> list[Callable[[], object]]:
-        """What loads or compiles the kernels that a first step would wait for (`kernels.trial`); none on a CPU."""
-        if self.device.type != "cuda":
-            return []
-        trials = load_kernels, self.head.try_kernels, ssim.try_kernels, statistics.try_kernel
-        return [partial(trial, self.device) for trial in trials]
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """One group for each per-splat tensor, "field" for the head's shared weights if it has any, "photograph" for
+        the photographs' exposures if they are learnt."""
+        groups = super().get_param_groups()
+        others = {"field": list(self.head.parameters())}
+        if self.photograph is not None:
+            others["photograph"] = list(self.photograph.parameters())
+        return {**groups, **{name: parameters for name, parameters in others.items() if parameters}}
 
     @property
     def parameter_bytes(self) -> int:
@@ -258,10 +155,8 @@ class NrfgsModel(SplatfactoModel):
     @property
     def projecting(self) -> Projecting:
         """How this model projects its splats."""
-        mode = self.config.rasterize_mode
-        if mode not in ("antialiased", "classic"):
-            raise InputError(f"pipeline.model.rasterize_mode is {mode!r}; use 'classic' or 'antialiased'.")
-        return Projecting(mode, self.scene_unit, assume_finite=self.training)  # the trainer's guard watches
+        # In training the guard looks for what is not finite.
+        return Projecting(self.config.rasterize_mode, self.scene_unit, assume_finite=self.training)
 
     def project(self, camera: Cameras, splats: Mapping[str, Tensor] | None = None) -> View:
         """Project splats into one camera (`project_view`).
@@ -298,18 +193,10 @@ class NrfgsModel(SplatfactoModel):
 
     def pinhole(self, camera: Cameras) -> Pinhole:
         """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
-        downscale = self._get_downscale_factor()
         if not self.training:
-            if self._fixed_pinholes is None or self._fixed_pinholes.device != self.device:
-                self._fixed_pinholes = FixedPinholes(self.device)
-            return self._fixed_pinholes(camera)
-        assert camera.shape[0] == 1, "Only one camera at a time"
-        index = (camera.metadata or {}).get("cam_idx")
-        if index is None or self.camera_optimizer.config.mode != "off":
-            return pinhole(camera, self.camera_optimizer.apply_to_camera(camera), downscale)
-        if (index, downscale) not in self._pinholes:
-            self._pinholes[index, downscale] = pinhole(camera, camera.camera_to_worlds, downscale)
-        return self._pinholes[index, downscale]
+            return self.pinholes.fixed(camera, self.device)
+        learnt = self.camera_optimizer if self.camera_optimizer.config.mode != "off" else None
+        return self.pinholes.of_training(camera, self._get_downscale_factor(), learnt)
 
     def _get_downscale_factor(self) -> int:
         if not self.training:
@@ -343,43 +230,35 @@ class NrfgsModel(SplatfactoModel):
         """
         view = self.project(camera, field.splats)
         appearance = asked.seen_from(view)
-        background = self._get_background_color()
-        outputs, self.info = self.composite(view, appearance, background, self._photograph_of(camera))
-        if self.training:
-            self._finish_for_training(outputs, camera, background)
+        outputs, self.info = self.picture(view, appearance, camera)
         return outputs, appearance
 
-    def against_photograph(
-        self, camera: Cameras, batch: Mapping[str, Any], view: View, appearance: SplatAppearance
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """A training view as `get_outputs` renders it, on a background that does not change, and its photograph.
+    def picture(
+        self, view: View, appearance: SplatAppearance, camera: Cameras, background: Tensor | None = None
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Composite what a camera sees, with the look of its photograph in training.
 
         Args:
-            camera, batch: as the datamanager gives them.
-            view, appearance: what the camera sees, and as what.
+            view, appearance, background: as for `composite`.
+            camera: a batch of one camera, [1].
 
         Returns:
-            Outputs, with "rgb" [H, W, 3], and the photograph [H, W, 3] at that size.
+            what `get_outputs` does, and the rasterizer's `info`.
         """
-        background = self.background_color.to(self.device)
-        outputs, _ = self.composite(view, appearance, background, self._photograph_of(camera))
-        self._finish_for_training(outputs, camera, background)
-        return outputs, self.truth_of(batch, background)
+        background = self._get_background_color() if background is None else background
+        outputs, info = self.composite(view, appearance, background, self._photograph_of(camera))
+        if self.training:
+            outputs["background"] = background
+            if self.config.use_bilateral_grid and "cam_idx" in (camera.metadata or {}):
+                rgb, index = outputs["rgb"], camera.metadata["cam_idx"]
+                outputs["rgb"] = self._apply_bilateral_grid(rgb[None], index, *rgb.shape[:2])[0]
+        return outputs, info
 
     def _photograph_of(self, camera: Cameras) -> int | None:
         """Which photograph's look a rendering has: in training, the one that the camera took; None: the mean look."""
         if self.photograph is None:
             return None
-        return (camera.metadata or {}).get("cam_idx") if self.training else self._look_asked_for()
-
-    def _look_asked_for(self) -> int | None:
-        """The photograph that LOOK names, if it names one."""
-        name = os.environ.get(LOOK) if self.photograph is not None else None
-        if name and name not in self.photograph.names:
-            raise InputError(
-                f"{LOOK} is {name!r}, which is none of the training photographs, such as {self.photograph.names[0]!r}."
-            )
-        return self.photograph.names.index(name) if name else None
+        return (camera.metadata or {}).get("cam_idx") if self.training else look_asked_for(self.photograph)
 
     def _as_learnt(self, field: Field) -> Field:
         """The field as its head is asked about it in this step: under noise (`view_noise.py`) in training."""
@@ -387,29 +266,12 @@ class NrfgsModel(SplatfactoModel):
             return field
         return field._replace(splats=self.view_noise.moved(field.splats, self.step))
 
-    def _finish_for_training(self, outputs: dict[str, Tensor], camera: Cameras, background: Tensor) -> None:
-        """Leave the background a colour [3], and apply the camera's bilateral grid, if there are grids."""
-        outputs["background"] = background
-        if self.config.use_bilateral_grid and "cam_idx" in (camera.metadata or {}):
-            height, width = outputs["rgb"].shape[:2]
-            index = camera.metadata["cam_idx"]
-            outputs["rgb"] = self._apply_bilateral_grid(outputs["rgb"][None], index, height, width)[0]
-
     @torch.no_grad()
     def get_base_color(self, camera: Cameras) -> Tensor:
         """The image [H, W, 3] of the base colours and opacities alone, without what depends on the view."""
         field = self.field
         view = self.project(camera, field.splats)
         return self.composite(view, field.base_of(view))[0]["rgb"]
-
-    def learn_photographs(self, photographs: PhotographModel | None) -> None:
-        """Let each photograph's look be learnt; None: all have one look."""
-        self.photograph = None if photographs is None else photographs.to(self.device)
-        self._look_asked_for()  # a name that is none is told before the first evaluation
-
-    def show_by(self, panel: Any) -> None:
-        """Let a viewer's panel (`viewer/panel.py`) say what its browsers see."""
-        self.viewer_panel = panel
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
@@ -426,14 +288,172 @@ class NrfgsModel(SplatfactoModel):
         self.set_crop(obb_box)
         return self.get_outputs(camera.to(self.device) if self.training else camera)
 
+    # Training.
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        cameras = attributes.pipeline.datamanager.train_dataset.cameras
+        centers = cameras.camera_to_worlds[:, :3, 3]
+        self.densification.see_cameras(centers)
+        self.densification.see_training_views(TrainingPictures(self, attributes.pipeline.datamanager))
+        self.camera_spacing = camera_spacing(centers)
+        self.view_noise = ViewNoise.as_long_as(self.noise_factor * self.camera_spacing, self.view_noise.seed)
+
+        def before_first_step(step: int) -> None:
+            steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
+            warm_up(self, cameras, steps, self.config.warmup_lr)
+
+        callbacks = [
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before_first_step, iters=(0,)),
+            *super().get_training_callbacks(attributes),
+        ]
+        if self.photograph is not None:
+            after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+            callbacks.append(TrainingCallback(after, lambda step: self.photograph.center_()))
+        return callbacks
+
+    def far_from_neutral(
+        self, camera: Cameras, weights: list[Parameter]
+    ) -> tuple[int, Tensor, tuple[Tensor, ...]] | None:
+        """How far the head is from adding nothing to what a camera sees, for the warm-up.
+
+        Args:
+            camera: a batch of one camera, [1].
+            weights: the head's shared weights.
+
+        Returns:
+            The number of visible splats; the head's neutral loss, NaN if that is 0; its gradients by the weights. None
+            if there is nothing that could be taught.
+        """
+        with torch.no_grad():
+            view = self.project(camera)
+        loss = self.head.neutral_loss(self.field.splats, view.visible, view.center)
+        if loss is None:
+            return None
+        # Only the shared weights learn: the splats' parameters keep no gradient from here.
+        return len(view.visible), loss.detach(), torch.autograd.grad(loss, weights)
+
+    def step_cb(self, optimizers, step: int) -> None:
+        super().step_cb(optimizers, step)
+        self.head.set_step(self.schedule_step)
+
+    @property
+    def schedule_step(self) -> int:
+        """The step that the head and the resolution are scheduled by."""
+        return self.step if self._scheduled is None else self._scheduled
+
+    def schedule_at(self, step: int) -> None:
+        """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
+        self._scheduled = step
+
+    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
+        """Splatfacto's losses, and in training what the densification strategy adds to them.
+
+        Terms that are zero in this step are left out. Nothing waits for the GPU.
+        """
+        losses = {"main_loss": self.photometric_loss(outputs, batch)}
+        if self.config.use_scale_regularization and self.step % 10 == 0:
+            scales = self.scales.exp()
+            ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
+            losses["scale_reg"] = 0.1 * (ratios - self.config.max_gauss_ratio).clamp_min(0.0).mean()
+        if self.training:
+            self.camera_optimizer.get_loss_dict(losses)
+            if self.config.use_bilateral_grid:
+                losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
+            losses |= self.densification.regularisation(self.gauss_params) | self.shrinking()
+            if self.photograph is not None and self.photograph.has_penalty and self.step % 10 == 0:
+                losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
+            watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
+            self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
+            self.watched_image = batch.get("image_idx")
+        return losses
+
+    def photometric_loss(self, outputs, batch) -> Tensor:
+        """Splatfacto's loss of an image against its photograph, a scalar."""
+        truth = self.truth_of(batch, outputs["background"])
+        rgb = outputs["rgb"]
+        if "mask" in batch:  # what is outside is black in both
+            mask = self._downscale_if_required(batch["mask"]).to(self.device)
+            truth, rgb = truth * mask, rgb * mask
+        if self.trimming is not None and self.training and self.schedule_step >= robust.FIRST_STEP:
+            kept = self.trimming(rgb, truth, self.schedule_step, mask if "mask" in batch else None)
+            truth, rgb = truth * kept, rgb * kept
+        return photometric_loss(rgb, truth, self.config.ssim_lambda)
+
+    def shrinking(self, splats: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+        """What `shrinkage` adds to the loss. `splats`: another table than the model's."""
+        splats = self.gauss_params if splats is None else splats
+        weight = self.config.shrinkage_weight(self.num_train_data)
+        if weight == 0.0:
+            return {}
+        return {
+            "shrink_opacities": weight * self.densification.mean_opacity(splats["opacities"]),
+            "shrink_scales": weight / self.scene_unit * splats["scales"].exp().mean(),
+        }
+
+    def truth_of(self, batch: Mapping[str, Any], background: Tensor) -> Tensor:
+        """The photograph at the rendered size, [H, W, 3]; where it is transparent, with what is behind the splats."""
+        image = self.get_gt_img(batch["image"])
+        if image.shape[-1] == 4 and self.training and self.photograph is not None:
+            with torch.no_grad():
+                background = self.photograph(background.expand(*image.shape[:2], 3), batch["image_idx"])
+        return self.composite_with_background(image, background)
+
+    def mask_of(self, batch: Mapping[str, Any]) -> Tensor | None:
+        """The image's mask at the rendered size, bool [H, W, 1], or None. A pixel half covered counts as inside."""
+        if "mask" not in batch:
+            return None
+        return self._downscale_if_required(batch["mask"]).to(self.device) >= 0.5
+
+    def step_post_backward(self, step: int) -> None:
+        assert step == self.step
+        self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
+
+    # Metrics.
+
+    @torch.no_grad()
+    def get_metrics_dict(self, outputs, batch) -> dict[str, Any]:
+        """What is logged while training: PSNR (inside the mask) and the number of splats. Nothing waits for the GPU."""
+        truth = self.truth_of(batch, outputs["background"])
+        error = (outputs["rgb"] - truth).square().mean(dim=-1, keepdim=True)
+        mask = self.mask_of(batch)
+        mse = error.mean() if mask is None else (error * mask).sum() / mask.sum()
+        metrics = {"psnr": -10.0 * torch.log10(mse), "gaussian_count": self.num_points}
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics of one image, inside the mask if there is one, and truth and rendering side by side.
+
+        A metric that cannot be had (LPIPS without its weights, MS-SSIM of a small image) is left out.
+        """
+        truth = self.truth_of(batch, outputs["background"])
+        rgb = outputs["rgb"]
+        metrics = self.image_metrics(rgb, truth, self.mask_of(batch))
+        return (
+            {name: value for name, value in metrics.items() if value is not None},
+            {"img": torch.cat([truth, rgb], dim=1)},
+        )
+
+    def as_photographed(self, outputs: dict[str, Tensor], camera: Cameras) -> dict[str, Tensor]:
+        """What the mean look becomes in the camera that took a test photograph: its vignetting and response, if learnt.
+        Exposure and white balance of that photograph stay unknown."""
+        if self.photograph is None:
+            return outputs
+        sizes = (float(value.flatten()[0]) for value in (camera.width, camera.height, camera.fx, camera.fy))
+        rgb = self.photograph.by_camera(outputs["rgb"], self.photograph.camera_like(*sizes))
+        return {**outputs, "rgb": rgb.clamp(0.0, 1.0)}
+
+    # Viewer and exporter. The exporter reads splats with spherical harmonics, whatever the head is. Where `fit_on` was
+    # called, as neither a training nor a viewer does, they are harmonics fitted to the head (`harmonics_fit.py`).
+
+    def show_by(self, panel: Any) -> None:
+        """Let a viewer's panel (`viewer/panel.py`) say what its browsers see."""
+        self.viewer_panel = panel
+
     def set_background(self, background_color: Tensor) -> None:
         """Take the viewer's background [3], for the viewer's pictures alone: what evaluation uses must not change."""
         if self.viewer_panel is not None:
             self.viewer_panel.set_background(background_color)
-
-    # What nerfstudio's exporter and viewer read: splats with spherical harmonics, whatever the head is. The viewer
-    # reads all of it, often. Only where `fit_on` was called, as neither a training nor a viewer does, are colours and
-    # opacities those of harmonics fitted to the head (`harmonics_fit.py`).
 
     def fit_on(self, cameras: Cameras) -> None:
         """Let the properties below be fitted harmonics from now on, as seen from these cameras [V].
@@ -487,174 +507,6 @@ class NrfgsModel(SplatfactoModel):
             return self.gauss_params["features_rest"]
         return self.features_dc.new_zeros(self.num_points, 0, 3)
 
-    # Training.
-
-    def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
-        return {name: [parameter] for name, parameter in self.gauss_params.items()}
-
-    def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """One group for each per-splat tensor, "field" for the head's shared weights if it has any, "photograph" for
-        the photographs' exposures if they are learnt."""
-        groups = super().get_param_groups()
-        others = {"field": list(self.head.parameters())}
-        if self.photograph is not None:
-            others["photograph"] = list(self.photograph.parameters())
-        return {**groups, **{name: parameters for name, parameters in others.items() if parameters}}
-
-    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
-        cameras = attributes.pipeline.datamanager.train_dataset.cameras
-        centers = cameras.camera_to_worlds[:, :3, 3]
-        self.densification.see_cameras(centers)
-        self.densification.see_training_views(TrainingPictures(self, attributes.pipeline.datamanager))
-        self.camera_spacing = camera_spacing(centers)
-        sigma = self.noise_factor * self.camera_spacing / math.sqrt(3.0)
-        self.view_noise = ViewNoise(sigma, self.view_noise.seed)
-
-        def before_first_step(step: int) -> None:
-            steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
-            warm_up(self, cameras, steps, self.config.warmup_lr)
-
-        callbacks = [
-            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before_first_step, iters=(0,)),
-            *super().get_training_callbacks(attributes),
-        ]
-        if self.photograph is not None:
-            after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
-            callbacks.append(TrainingCallback(after, lambda step: self.photograph.center_()))
-        return callbacks
-
-    def step_cb(self, optimizers, step: int) -> None:
-        super().step_cb(optimizers, step)
-        self.head.set_step(self.schedule_step)
-
-    @property
-    def schedule_step(self) -> int:
-        """The step that the head and the resolution are scheduled by."""
-        return self.step if self._scheduled is None else self._scheduled
-
-    def schedule_at(self, step: int) -> None:
-        """Look schedules up at another step than the training's, from now on: it walks through them at a pace."""
-        self._scheduled = step
-
-    def step_post_backward(self, step: int) -> None:
-        assert step == self.step
-        self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
-
-    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """Splatfacto's losses, and in training what the densification strategy adds to them.
-
-        Terms that are zero in this step are left out. Nothing waits for the GPU.
-        """
-        losses = {"main_loss": self.photometric_loss(outputs, batch)}
-        if self.config.use_scale_regularization and self.step % 10 == 0:
-            scales = self.scales.exp()
-            ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
-            losses["scale_reg"] = 0.1 * (ratios - self.config.max_gauss_ratio).clamp_min(0.0).mean()
-        if self.training:
-            self.camera_optimizer.get_loss_dict(losses)
-            if self.config.use_bilateral_grid:
-                losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
-            losses |= self.densification.regularisation(self.gauss_params) | self.shrinking()
-            if self.photograph is not None and self.photograph.has_penalty and self.step % 10 == 0:
-                losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
-            watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
-            self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
-            self.watched_image = batch.get("image_idx")
-        return losses
-
-    def shrinking(self, splats: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
-        """What `shrinkage` adds to the loss. `splats`: another table than the model's."""
-        splats = self.gauss_params if splats is None else splats
-        weight = self.config.shrinkage / max(self.num_train_data, 1) ** 2
-        if weight == 0.0 or self.config.densification == "mcmc":
-            return {}
-        return {
-            "shrink_opacities": weight * self.densification.mean_opacity(splats["opacities"]),
-            "shrink_scales": weight / self.scene_unit * splats["scales"].exp().mean(),
-        }
-
-    def photometric_loss(self, outputs, batch) -> Tensor:
-        """Splatfacto's loss of an image against its photograph, a scalar."""
-        truth = self.truth_of(batch, outputs["background"])
-        rgb = outputs["rgb"]
-        if "mask" in batch:  # what is outside is black in both
-            mask = self._downscale_if_required(batch["mask"]).to(self.device)
-            truth, rgb = truth * mask, rgb * mask
-        if self.trimming is not None and self.training and self.schedule_step >= robust.FIRST_STEP:
-            kept = self.trimming(rgb, truth, self.schedule_step, mask if "mask" in batch else None)
-            truth, rgb = truth * kept, rgb * kept
-        return photometric_loss(rgb, truth, self.config.ssim_lambda)
-
-    def truth_of(self, batch: Mapping[str, Any], background: Tensor) -> Tensor:
-        """The photograph at the rendered size, [H, W, 3]; where it is transparent, with what is behind the splats."""
-        image = self.get_gt_img(batch["image"])
-        if image.shape[-1] == 4 and self.training and self.photograph is not None:
-            with torch.no_grad():
-                background = self.photograph(background.expand(*image.shape[:2], 3), batch["image_idx"])
-        return self.composite_with_background(image, background)
-
-    def far_from_neutral(
-        self, camera: Cameras, weights: list[Parameter]
-    ) -> tuple[int, Tensor, tuple[Tensor, ...]] | None:
-        """How far the head is from adding nothing to what a camera sees, for the warm-up.
-
-        Args:
-            camera: a batch of one camera, [1].
-            weights: the head's shared weights.
-
-        Returns:
-            The number of visible splats; the head's neutral loss, NaN if that is 0; its gradients by the weights. None
-            if there is nothing that could be taught.
-        """
-        with torch.no_grad():
-            view = self.project(camera)
-        loss = self.head.neutral_loss(self.field.splats, view.visible, view.center)
-        if loss is None:
-            return None
-        # Only the shared weights learn: the splats' parameters keep no gradient from here.
-        return len(view.visible), loss.detach(), torch.autograd.grad(loss, weights)
-
-    # Metrics.
-
-    @torch.no_grad()
-    def get_metrics_dict(self, outputs, batch) -> dict[str, Any]:
-        """What is logged while training: PSNR (inside the mask) and the number of splats. Nothing waits for the GPU."""
-        truth = self.truth_of(batch, outputs["background"])
-        error = (outputs["rgb"] - truth).square().mean(dim=-1, keepdim=True)
-        mask = self.mask_of(batch)
-        mse = error.mean() if mask is None else (error * mask).sum() / mask.sum()
-        metrics = {"psnr": -10.0 * torch.log10(mse), "gaussian_count": self.num_points}
-        self.camera_optimizer.get_metrics_dict(metrics)
-        return metrics
-
-    def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Metrics of one image, inside the mask if there is one, and truth and rendering side by side.
-
-        A metric that cannot be had (LPIPS without its weights, MS-SSIM of a small image) is left out.
-        """
-        truth = self.truth_of(batch, outputs["background"])
-        rgb = outputs["rgb"]
-        metrics = self.image_metrics(rgb, truth, self.mask_of(batch))
-        return (
-            {name: value for name, value in metrics.items() if value is not None},
-            {"img": torch.cat([truth, rgb], dim=1)},
-        )
-
-    def as_photographed(self, outputs: dict[str, Tensor], camera: Cameras) -> dict[str, Tensor]:
-        """What the mean look becomes in the camera that took a test photograph: its vignetting and response, if learnt.
-        Exposure and white balance of that photograph stay unknown."""
-        if self.photograph is None:
-            return outputs
-        sizes = (float(value.flatten()[0]) for value in (camera.width, camera.height, camera.fx, camera.fy))
-        rgb = self.photograph.by_camera(outputs["rgb"], self.photograph.camera_like(*sizes))
-        return {**outputs, "rgb": rgb.clamp(0.0, 1.0)}
-
-    def mask_of(self, batch: Mapping[str, Any]) -> Tensor | None:
-        """The image's mask at the rendered size, bool [H, W, 1], or None. A pixel half covered counts as inside."""
-        if "mask" not in batch:
-            return None
-        return self._downscale_if_required(batch["mask"]).to(self.device) >= 0.5
-
     # Checkpoints.
 
     def update_to_step(self, step: int) -> None:
@@ -662,7 +514,7 @@ class NrfgsModel(SplatfactoModel):
         self.head.set_step(step)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What a checkpoint holds beside tensors: the head's name, and densification's running statistics."""
+        """What a checkpoint holds beside tensors."""
         state = {
             "head": self.head.name,
             "densification": self.densification.name,
@@ -673,16 +525,13 @@ class NrfgsModel(SplatfactoModel):
         return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        written_by = state.get("densification", "splatfacto")  # older checkpoints do not say
-        written_by = RETIRED.get(written_by, written_by)
-        if written_by != self.densification.name:
+        state = upgraded(state)
+        if state["densification"] != self.densification.name:
             raise InputError(
-                f"The checkpoint was trained with --pipeline.model.densification {written_by}, this model with "
-                f"{self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
+                f"The checkpoint was trained with --pipeline.model.densification {state['densification']}, this model "
+                f"with {self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
-        if "pace" in state:  # of version 0.1.0
-            state = {**state, "schedule_step": int(state["pace"]["position"])}
         if "schedule_step" in state:
             self.schedule_at(state["schedule_step"])
             self.head.set_step(self.schedule_step)
@@ -724,12 +573,3 @@ class NrfgsModel(SplatfactoModel):
         for name, value in head.splat_params(self.gauss_params["means"]).items():
             # In place: the optimiser was built on this very parameter.
             self.gauss_params[name].data = value.to(self.device)
-
-
-def _trimming(share: float) -> robust.Trimming | None:
-    """What the robust loss remembers, if it is asked for."""
-    if share == 0.0:
-        return None
-    if not 0.0 < share < 1.0:
-        raise InputError(f"pipeline.model.robust_loss is {share}; it must be 0, or above 0 and below 1.")
-    return robust.Trimming(share)

@@ -6,6 +6,7 @@ from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
@@ -37,6 +38,37 @@ def pinhole(camera: Cameras, camera_to_world: Tensor, downscale: int) -> Pinhole
     width, height = int(camera.width.item()) // downscale, int(camera.height.item()) // downscale
     center = camera_to_world[0, :3, 3].contiguous()  # so that no kernel has to copy it
     return Pinhole(world_to_camera(camera_to_world), K, width, height, center)
+
+
+class Pinholes:
+    """The cameras of one model."""
+
+    def __init__(self):
+        self._of_training: dict[tuple[int, int], Pinhole] = {}  # by index and downscale
+        self._fixed: FixedPinholes | None = None  # all others
+
+    def of_training(self, camera: Cameras, downscale: int, optimizer: CameraOptimizer | None) -> Pinhole:
+        """A training camera at 1 / downscale of its size.
+
+        Args:
+            camera: a batch of one, [1]; "cam_idx" in its metadata says which it is.
+            optimizer: has its learnt pose; None: the pose is fixed, and the camera is converted once.
+        """
+        assert camera.shape[0] == 1, "Only one camera at a time"
+        index = (camera.metadata or {}).get("cam_idx")
+        if optimizer is not None:
+            return pinhole(camera, optimizer.apply_to_camera(camera), downscale)
+        if index is None:
+            return pinhole(camera, camera.camera_to_worlds, downscale)
+        if (index, downscale) not in self._of_training:
+            self._of_training[index, downscale] = pinhole(camera, camera.camera_to_worlds, downscale)
+        return self._of_training[index, downscale]
+
+    def fixed(self, camera: Cameras, device: torch.device) -> Pinhole:
+        """A camera of full size that is not trained with, on a device."""
+        if self._fixed is None or self._fixed.device != device:
+            self._fixed = FixedPinholes(device)
+        return self._fixed(camera)
 
 
 class FixedPinholes:

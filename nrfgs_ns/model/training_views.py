@@ -55,6 +55,7 @@ class TrainingPictures:
         size = (view.projection.height, view.projection.width, 1)
         counted = torch.ones(size, dtype=torch.bool, device=model.device) if mask is None else mask
         if model.trimming is not None and model.schedule_step >= robust.FIRST_STEP:
-            outputs, truth = model.against_photograph(camera, batch, view, appearance)
-            counted = counted & (model.trimming.kept(outputs["rgb"], truth) > 0.5)
+            background = model.background_color.to(model.device)
+            outputs, _ = model.picture(view, appearance, camera, background)
+            counted = counted & (model.trimming.kept(outputs["rgb"], model.truth_of(batch, background)) > 0.5)
         return counted

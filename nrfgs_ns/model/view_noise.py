@@ -79,6 +79,11 @@ class ViewNoise:
         self.sigma, self.seed = sigma, seed
         self._generators: dict[torch.device, torch.Generator] = {}
 
+    @classmethod
+    def as_long_as(cls, length: float, seed: int) -> "ViewNoise":
+        """Noise of this length in the root mean square, in world units."""
+        return cls(length / math.sqrt(3.0), seed)
+
     def moved(self, splats: Mapping[str, Tensor], step: int) -> Mapping[str, Tensor]:
         """The table as the head is to see it in a step: its "means" [N, 3] moved, all else the same tensors.
 

@@ -47,20 +47,20 @@ class Prepare:
     photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")]
     """folder of photographs, or a video"""
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """folder for the scene; interrupted work in it is taken up"""
+    """folder for the scene; interrupted work in it continues"""
     matching: Literal["auto", "exhaustive"] = "auto"
-    """which pairs are matched. auto: those that are likely to show the same thing, by their largest features, EXIF
-    positions and order. exhaustive: every pair"""
+    """pairs to match. auto: those likely to show the same thing, by largest features, EXIF positions and order.
+    exhaustive: all"""
     camera_model: CameraModel = "SIMPLE_RADIAL"
-    """lens that is fitted, and undistorted to a pinhole. OPENCV for strong distortion and many photographs"""
+    """lens to fit; images are undistorted to a pinhole. OPENCV: for strong distortion and many photographs"""
     camera: Literal["auto", "single", "per-image"] = "auto"
-    """single: all photographs share one set of intrinsics. auto: they do if sizes, models and focal lengths agree"""
+    """single: one set of intrinsics for all photographs. auto: single if sizes, models and focal lengths agree"""
     feature_size: int = 1600
-    """features are found at this length of the longest side, pixels"""
+    """longest side of the images in which features are found, pixels"""
     features: int = 4096
-    """most features in a photograph; more find more points, and take longer to match"""
+    """largest number of features in a photograph; more give more points and take longer"""
     frames: int = 150
-    """a video: number of frames taken from it"""
+    """frames to take from a video"""
 
     def main(self) -> None:
         try:

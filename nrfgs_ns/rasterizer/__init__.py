@@ -108,14 +108,8 @@ def project(
         _check_shape(name, tensor, *shape)
     if rasterize_mode not in _RASTERIZE_MODES:
         raise ValueError(f"rasterize_mode must be one of {_RASTERIZE_MODES}, got {rasterize_mode!r}")
-    backend = _backend(means.device)
-    if every_row:
-        return backend.project_every_row(
-            means, quats, scales, viewmats, Ks, width, height,
-            near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
-            rasterize_mode=rasterize_mode,
-        )  # fmt: skip
-    return backend.project(
+    how = {"every_row": True} if every_row else {"packed": packed, "assume_finite": assume_finite}
+    return _backend(means.device).project(
         means,
         quats,
         scales,
@@ -128,8 +122,7 @@ def project(
         radius_clip=radius_clip,
         eps2d=eps2d,
         rasterize_mode=rasterize_mode,
-        packed=packed,
-        assume_finite=assume_finite,
+        **how,
     )
 
 

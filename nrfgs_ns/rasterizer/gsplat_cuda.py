@@ -51,8 +51,9 @@ def project(
     radius_clip: float,
     eps2d: float,
     rasterize_mode: str,
-    packed: bool,
-    assume_finite: bool,
+    packed: bool = True,
+    assume_finite: bool = False,
+    every_row: bool = False,
 ) -> Projection:
     """See `nrfgs_ns.rasterizer.project`.
 
@@ -62,13 +63,15 @@ def project(
     """
     settings = dict(
         eps2d=eps2d,
-        packed=packed,
         near_plane=near_plane,
         far_plane=far_plane,
         radius_clip=radius_clip,
         calc_compensations=rasterize_mode == "antialiased",
     )
     geometry = (means, quats, scales)
+    if every_row:
+        return _every_row(geometry, viewmats, Ks, width, height, **settings)
+    settings["packed"] = packed
     rows = _visible_rows(*geometry, viewmats, Ks, width, height, **settings)
     if not (assume_finite or _finite(rows)):
         camera_ids, gaussian_ids, _, means2d, depths, conics, _, _ = rows
@@ -83,38 +86,10 @@ def project(
     return Projection(*columns, width=width, height=height, n_cameras=viewmats.shape[0], extents=extents)
 
 
-def project_every_row(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
-    rasterize_mode: str,
-) -> Projection:
+def _every_row(geometry: tuple[Tensor, ...], viewmats, Ks, width, height, **settings) -> Projection:
     """One camera's rows of all splats; those that it does not see have radius 0, and numbers that mean nothing."""
-    rows = fully_fused_projection(
-        means,
-        None,
-        quats,
-        scales,
-        viewmats,
-        Ks,
-        width,
-        height,
-        packed=False,
-        eps2d=eps2d,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        calc_compensations=rasterize_mode == "antialiased",
-    )
+    means, quats, scales = geometry
+    rows = fully_fused_projection(means, None, quats, scales, viewmats, Ks, width, height, packed=False, **settings)
     radii, means2d, depths, conics, compensations = (None if part is None else part.squeeze(0) for part in rows)
     row = torch.arange(len(means), device=means.device)
     extents = radii if HAS_BATCHES else None

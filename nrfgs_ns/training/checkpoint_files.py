@@ -242,3 +242,15 @@ def _to_disk(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def training_in(content: dict[str, Any]) -> dict[str, Any]:
+    """What a checkpoint says to the trainer. Version 0.1.0 kept that among the pipeline's and the model's state."""
+    if "training" in content:
+        return content["training"]
+    pipeline = content["pipeline"]
+    older = {
+        "parameter_mean": pipeline.get("_extra_state", {}).get("parameter_mean"),
+        "pace": pipeline.get("_model._extra_state", {}).get("pace"),
+    }
+    return {name: value for name, value in older.items() if value is not None}

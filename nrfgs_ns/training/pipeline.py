@@ -3,6 +3,7 @@
 
 import json
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,13 +19,17 @@ from torchvision.utils import save_image
 
 from nrfgs_ns.compact.decode import model_state
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+from nrfgs_ns.densification import statistics
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.image import ssim
 from nrfgs_ns.image.metrics import METRIC_NAMES
 from nrfgs_ns.kernels.trial import tried_meanwhile
-from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.model.config import NrfgsModelConfig
+from nrfgs_ns.model.model import NrfgsModel
+from nrfgs_ns.rasterizer import load_kernels
+from nrfgs_ns.training import optimizers
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.evaluation_table import print_evaluation
-from nrfgs_ns.training.optimizers import try_kernel
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.panel import ViewerPanel
@@ -85,8 +90,7 @@ class NrfgsPipeline(VanillaPipeline):
             super().__init__(config, device, test_mode, **kwargs)
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
-            trials = self.model.kernel_trials()
-            with tried_meanwhile(trials and [*trials, partial(try_kernel, self.model.device)], self.model.device):
+            with tried_meanwhile(_kernel_trials(self.model), self.model.device):
                 self.datamanager.load_all_images()
                 photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
@@ -212,6 +216,14 @@ class NrfgsPipeline(VanillaPipeline):
         version, numbers, gauss_next = json.loads(state["python_rng"])
         random.setstate((version, tuple(numbers), gauss_next))
         self.datamanager.load_sampling_state(state["sampling"])
+
+
+def _kernel_trials(model: NrfgsModel) -> list[Callable[[], object]]:
+    """What loads or compiles the kernels that a first step would wait for; none on a CPU."""
+    if model.device.type != "cuda":
+        return []
+    trials = load_kernels, model.head.try_kernels, ssim.try_kernels, statistics.try_kernel, optimizers.try_kernel
+    return [partial(trial, model.device) for trial in trials]
 
 
 def _mean(values: list[float]) -> float | None:

@@ -44,10 +44,22 @@ class ProgressLineConfig(LocalWriterConfig):
     """of nerfstudio's table; unused"""
 
 
+def end_earlier_logs() -> None:
+    """Forget the logs of trainings that this process has set up before, and what one that was cut off left to write.
+
+    Nerfstudio would go on with both.
+    """
+    writer.EVENT_STORAGE.clear()
+    while writer.EVENT_WRITERS:
+        log = writer.EVENT_WRITERS.pop()
+        if isinstance(log, writer.TensorboardWriter):
+            log.tb_writer.close()
+
+
 class ProgressLine(LocalWriter):
     """A line that is kept up to date on a terminal, and written now and then into anything else.
 
-    Nerfstudio's loop calls `write_stats_log` every `logging.steps_per_log` steps.
+    The trainer calls `write_stats_log` after each step, nerfstudio's loop in those that are logged.
 
     Args:
         config: its options.

@@ -62,7 +62,7 @@ class StepGraphs:
             return False
         if (obstacle := self._obstacle(batch)) is not None:
             if not self._has_said_why:
-                CONSOLE.print(f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}.")
+                tell_why_not_recorded(obstacle)
                 self._has_said_why = True
             return False
         regularised = model.config.use_scale_regularization and step % 10 == 0
@@ -122,9 +122,10 @@ class StepGraphs:
         """Whether a step is another than the one before, and none that has been recorded: splats have come or gone,
         pixels are others, or the head or the densification does something else."""
         model = self.model
-        now = [*model.gauss_params.values(), model.head, *model.head.parameters()]
+        splats = list(model.gauss_params.values())
+        now = [*splats, model.head]  # whose weights live as long as it does
         how = {
-            "places": [value.data_ptr() for value in now if isinstance(value, Tensor)],
+            "places": [value.data_ptr() for value in splats],
             "head": model.head.phase,
             "densification": model.densification.rests_at(model.step),
             "downscale": model._get_downscale_factor(),
@@ -187,6 +188,11 @@ class StepGraphs:
         if most < 0:
             raise RuntimeError("gsplat lists what tiles draw, and the host waits for its lists")
         return most
+
+
+def tell_why_not_recorded(why: str) -> None:
+    """Say that a training goes without graphs."""
+    CONSOLE.print(f"Steps are not recorded as a CUDA graph, so they take longer: {why}.", soft_wrap=True)
 
 
 def _kind(batch: Mapping[str, Any]) -> tuple:

@@ -29,17 +29,9 @@ from nrfgs_ns.training.checkpoint_files import DiskFull
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 from nrfgs_ns.training.optimizers import in_world_units
-from nrfgs_ns.training.pace import (
-    FEWEST_STEPS,
-    STEPS,
-    STEPS_PER_VIEW,
-    Pace,
-    TimedPace,
-    resolution_phases,
-    steps_for,
-)
-from nrfgs_ns.training.progress import ProgressLine
-from nrfgs_ns.training.step_graph import StepGraphs, Unscaled
+from nrfgs_ns.training.pace import Pace, TimedPace
+from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
+from nrfgs_ns.training.step_graph import StepGraphs, Unscaled, tell_why_not_recorded
 from nrfgs_ns.training.stopping import (
     StopRequest,
     command_to_go_on,
@@ -48,21 +40,13 @@ from nrfgs_ns.training.stopping import (
     rows_agree,
 )
 from nrfgs_ns.training.tracking import track
-from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, nothing_left_where_refused
+from nrfgs_ns.training.trainer_config import (
+    NrfgsTrainerConfig,
+    nothing_left_where_refused,
+    tell_what_was_chosen,
+)
 
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
-
-
-def end_earlier_logs() -> None:
-    """Forget the logs of trainings that this process has set up before, and what one that was cut off left to write.
-
-    Nerfstudio would go on with both.
-    """
-    writer.EVENT_STORAGE.clear()
-    while writer.EVENT_WRITERS:
-        log = writer.EVENT_WRITERS.pop()
-        if isinstance(log, writer.TensorboardWriter):
-            log.tb_writer.close()
 
 
 class NrfgsTrainer(Trainer):
@@ -122,54 +106,32 @@ class NrfgsTrainer(Trainer):
             self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last step that was made"""
-        if self.world_size == 1 and isinstance(self.grad_scaler, Unscaled):
-            graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
-            self.pipeline.graphs = self.grad_scaler.graphs = graphs
+        self._record_steps()
         if comms.is_main_process():
-            self._tell_what_was_chosen()
+            views = len(self.pipeline.datamanager.train_dataset)
+            tell_what_was_chosen(self.pipeline.model, views, self.steps_are_chosen)
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
+    def _record_steps(self) -> None:
+        """Let steps be CUDA graphs, where they can; where no step of this training can, say so."""
+        if self.world_size > 1 or not isinstance(self.grad_scaler, Unscaled):
+            if self.pipeline.model.device.type == "cuda" and comms.is_main_process():
+                tell_why_not_recorded("several devices share it" if self.world_size > 1 else "it is of mixed precision")
+            return
+        graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
+        self.pipeline.graphs = self.grad_scaler.graphs = graphs
+
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
-        self.steps_are_chosen = self.config.max_num_iterations == 0
+        self.steps_are_chosen = self.config.max_num_iterations == 0 and self.config.time_budget is None
         self.config = self.config.for_views(len(self.pipeline.datamanager.train_dataset))
         self.total_steps = self.config.max_num_iterations
         self.guard = Guard(self.pipeline)
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
-        self.pace = self._pace()
+        self.pace = self.config.pace()
         groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
         return WatchedOptimizers(self.optimizer_configs(), groups, self.guard, every, self.pace)
-
-    def _tell_what_was_chosen(self) -> None:
-        """One line: how many steps, how far the views are trusted, and what follows from that."""
-        model, views = self.pipeline.model, len(self.pipeline.datamanager.train_dataset)
-        chosen = []
-        if self.steps_are_chosen and self.config.time_budget is None:
-            chosen.append(
-                f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
-            )
-        if model.trust < 1.0 and model.reduced_head:
-            options = ", ".join(f"{name} {value:.2g}" for name, value in model.reduced_head.items())
-            chosen.append(f"their view dependence is trusted with {model.trust:.2g} of 1, so that it has {options}")
-        if model.view_noise.sigma > 0.0:
-            spacing = model.camera_spacing / model.scene_unit
-            chosen.append(
-                f"in training the head sees each splat from about {model.noise_factor * spacing:.2g} scene units beside the "
-                f"camera, {model.noise_factor:.2g} times the distance between neighbouring cameras"
-            )
-        if chosen:
-            named = "training view" if views == 1 else "training views"
-            CONSOLE.print(f"{views} {named}: {'; '.join(chosen)} (docs/captures.md).", soft_wrap=True)
-
-    def _pace(self) -> Pace | None:
-        """How fast to walk through the schedules (`pace.py`), or None for a step at a time."""
-        length = self.config.schedule_steps or self.total_steps
-        if self.config.time_budget is not None:
-            model = self.config.pipeline.model
-            phases = resolution_phases(model.num_downscales, model.resolution_schedule)
-            return TimedPace(length, 60.0 * self.config.time_budget, phases)
-        return None if self.config.schedule_steps is None else Pace(length, length / self.total_steps)
 
     # Going on from a checkpoint.
 
@@ -191,7 +153,7 @@ class NrfgsTrainer(Trainer):
         if "optimizers" not in content:
             raise InputError(f"{path} is of a compact file, which no training goes on from. Use its training's own.")
         self._start_step = content["step"] + 1
-        training = _training_in(content)
+        training = checkpoint_files.training_in(content)
         if "scene" in training:  # older checkpoints do not say
             check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
         self.pipeline.load_pipeline(content["pipeline"], content["step"])
@@ -295,10 +257,13 @@ class NrfgsTrainer(Trainer):
 
     def _update_viewer_state(self, step: int) -> None:
         """Nerfstudio's, and fewer events: it would send each step's duration to the log, which takes the host longer
-        than some kernels. Averages go on; they are sent with the rest, every `logging.steps_per_log` steps."""
+        than some kernels. Averages go on; they are sent with the rest, every `logging.steps_per_log` steps, for which
+        the line on the terminal does not wait."""
         super()._update_viewer_state(step)
         if step % self.config.logging.steps_per_log != 0:
             writer.EVENT_STORAGE.clear()
+            if self.line is not None:
+                self.line.write_stats_log(step)
 
     @check_eval_enabled
     def eval_iteration(self, step: int) -> None:
@@ -518,15 +483,3 @@ class NrfgsTrainer(Trainer):
             "scalers": self.grad_scaler.state_dict(),
             "training": training,
         }
-
-
-def _training_in(content: dict[str, Any]) -> dict[str, Any]:
-    """What a checkpoint says to the trainer. Version 0.1.0 kept that among the pipeline's and the model's state."""
-    if "training" in content:
-        return content["training"]
-    pipeline = content["pipeline"]
-    older = {
-        "parameter_mean": pipeline.get("_extra_state", {}).get("parameter_mean"),
-        "pace": pipeline.get("_model._extra_state", {}).get("pace"),
-    }
-    return {name: value for name, value in older.items() if value is not None}

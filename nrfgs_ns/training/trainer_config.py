@@ -17,7 +17,15 @@ from nrfgs_ns.densification.thinning import ROUNDS
 from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.cpu_command import ten_minute_command
-from nrfgs_ns.training.pace import STEPS, steps_for
+from nrfgs_ns.training.pace import (
+    FEWEST_STEPS,
+    STEPS,
+    STEPS_PER_VIEW,
+    Pace,
+    TimedPace,
+    resolution_phases,
+    steps_for,
+)
 
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
 """What these are the options of. It reads them, and is looked up by name when it is set up."""
@@ -115,6 +123,15 @@ class NrfgsTrainerConfig(TrainerConfig):
             average_steps=AVERAGED if self.average_steps is None else self.average_steps,
         )
 
+    def pace(self) -> Pace | None:
+        """How fast to walk through the schedules (`pace.py`), or None for a step at a time."""
+        length = self.schedule_steps or self.max_num_iterations
+        if self.time_budget is not None:
+            model = self.pipeline.model
+            phases = resolution_phases(model.num_downscales, model.resolution_schedule)
+            return TimedPace(length, 60.0 * self.time_budget, phases)
+        return None if self.schedule_steps is None else Pace(length, length / self.max_num_iterations)
+
     def print_to_terminal(self) -> None:
         """What ns-train says before it begins: one line, and on several devices whether they are there. The whole
         configuration is in config.yml, and shown with NRFGS_DEBUG=1.
@@ -176,3 +193,30 @@ def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
                     if empty == config.output_dir:
                         break
         raise
+
+
+def tell_what_was_chosen(model, views: int, steps_are_chosen: bool) -> None:
+    """One line: how many steps, how far the views are trusted, how much noise, and why.
+
+    Args:
+        model: an NrfgsModel before its first step.
+        views: training views.
+        steps_are_chosen: whether their number says how many steps are made.
+    """
+    chosen = []
+    if steps_are_chosen:
+        chosen.append(
+            f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
+        )
+    if model.trust < 1.0 and model.reduced_head:
+        options = ", ".join(f"{name} {value:.2g}" for name, value in model.reduced_head.items())
+        chosen.append(f"their view dependence is trusted with {model.trust:.2g} of 1, so that it has {options}")
+    if model.view_noise.sigma > 0.0:
+        beside = model.noise_factor * model.camera_spacing / model.scene_unit
+        chosen.append(
+            f"in training the head sees each splat from about {beside:.2g} scene units beside the camera, "
+            f"{model.noise_factor:.2g} times the distance between neighbouring cameras"
+        )
+    if chosen:
+        noun = "training view" if views == 1 else "training views"
+        CONSOLE.print(f"{views} {noun}: {'; '.join(chosen)} (docs/captures.md).", soft_wrap=True)

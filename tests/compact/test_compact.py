@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 import torch
 import tyro
-from compact_fields import field, matched, through_a_file
+from compact_fields import VERSION_1, field, matched, through_a_file
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
 from torch.testing import assert_close
 
-from nrfgs_lab.compact_1 import encode_1
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
@@ -47,7 +46,7 @@ def test_every_number_comes_back_within_half_a_step(version, finer, tmp_path):
         **{name: getattr(precision, name) * finer for name in ("means", "scales", "opacities", "colors", "latents")},
     )
     one = field()
-    decoded = through_a_file(one, tmp_path, precision, encode_1 if version == 1 else encode)
+    decoded = decode(VERSION_1) if version == 1 else through_a_file(one, tmp_path, precision)
     found, truth = decoded.splats, {name: value[matched(one, decoded.splats)] for name, value in one.splats.items()}
     if version > 1:  # the rotations that turn least
         quats, scales = nearest_turn(truth["quats"].double().numpy(), truth["scales"].double().numpy())
@@ -208,11 +207,11 @@ def test_impossible_precision_is_refused(precision):
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node: the page's reader is tried by pytest -m browser")
 @pytest.mark.parametrize("version", [1, 2])
 def test_the_page_reads_the_same_splats(version, tmp_path):
-    header, streams = (encode_1 if version == 1 else encode)(field(), Precision(), {})
-    write_container(tmp_path / "f.nrf", header, streams)
-    decoded = decode(tmp_path / "f.nrf")
+    write_container(tmp_path / "f.nrf", *encode(field(), Precision(), {}))
+    file = VERSION_1 if version == 1 else tmp_path / "f.nrf"
+    decoded = decode(file)
     (tmp_path / "read.js").write_text((files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + READ)
-    said = subprocess.run(["node", "read.js", "f.nrf"], cwd=tmp_path, capture_output=True, check=True, timeout=60)
+    said = subprocess.run(["node", "read.js", file], cwd=tmp_path, capture_output=True, check=True, timeout=60)
     table, latents = (torch.tensor(rows) for rows in json.loads(said.stdout))
     order = decoded.splats[DIFFUSE].to(torch.uint8).argsort(stable=True)  # the page has view-dependent splats first
     splats = {name: value[order] for name, value in decoded.splats.items()}

@@ -9,7 +9,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from torch.nn import Parameter
 
 from nrfgs_ns.densification import build_densification
-from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.training.run import parse
 
 STRATEGIES = ("splatfacto", "original", "mcmc")

@@ -15,7 +15,7 @@ from nrfgs_ns.densification import (
 )
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.host import gsplat_version
-from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.model.config import NrfgsModelConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -10,7 +10,7 @@ from nrfgs_ns.densification import build_densification
 from nrfgs_ns.densification.thinning import ROUNDS, least_missed, missed
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.robust import Trimming
-from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.training_views import TrainingPictures
 from nrfgs_ns.training.run import parse
 
@@ -108,13 +108,15 @@ def test_a_view_misses_what_its_picture_shows(training, monkeypatch):
     assert torch.equal(rows, view.visible) and not changes.requires_grad
     with torch.no_grad():
         appearance = model.field.seen_from(view)
-        whole = model.against_photograph(camera, batch, view, appearance)[0]["rgb"]
+        whole = model.picture(view, appearance, camera, model.background_color)[0]["rgb"]
         most = changes.topk(10).indices
         expected = []
         for row in most:
             opacities = appearance.opacities.clone()
             opacities[row] = 0.0
-            fewer = model.against_photograph(camera, batch, view, appearance._replace(opacities=opacities))[0]["rgb"]
+            fewer = model.picture(view, appearance._replace(opacities=opacities), camera, model.background_color)[0][
+                "rgb"
+            ]
             expected.append(((fewer - whole)[:, 24:]).square().sum())
     # 50 drawings: a standard deviation is at most sqrt(2 / 50) = 0.2 of one splat's sum, and 0.06 of ten splats'.
     assert_close(changes[most], torch.stack(expected), rtol=0.5, atol=0)
@@ -138,7 +140,9 @@ def test_pictures_change_less_without_the_least_missed_than_without_others(train
             with torch.no_grad():
                 appearance = model.field.seen_from(view)
                 fewer = appearance._replace(opacities=appearance.opacities * ~gone[view.visible])
-                one, other = (model.against_photograph(camera, batch, view, a)[0]["rgb"] for a in (appearance, fewer))
+                one, other = (
+                    model.picture(view, a, camera, model.background_color)[0]["rgb"] for a in (appearance, fewer)
+                )
             total += (one - other).square().sum().item()
         return total
 

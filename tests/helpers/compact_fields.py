@@ -13,6 +13,9 @@ from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.compact.precision import Precision
 
+VERSION_1 = Path(__file__).parents[1] / "fixtures" / "version-1.nrf"
+"""A file of the first version of the format, which nothing writes any more: `field()` at the steps of `Precision()`."""
+
 
 def field(count: int = 60) -> Field:
     torch.manual_seed(3)
@@ -30,7 +33,7 @@ def field(count: int = 60) -> Field:
     return with_diffuse(Field(head, splats), diffuse, splats["features_dc"], splats["opacities"])
 
 
-def through_a_file(one: Field, tmp_path: Path, precision: Precision | None = None, encode=encode) -> Decoded:
+def through_a_file(one: Field, tmp_path: Path, precision: Precision | None = None) -> Decoded:
     header, streams = encode(one, precision or Precision(), {"rasterize_mode": "classic"})
     write_container(tmp_path / "f.nrf", header, streams)
     return decode(tmp_path / "f.nrf")

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.model.checkpoint import differences, reduced_config
-from nrfgs_ns.model.model import NrfgsModelConfig
+from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.training.run import parse
 
 QUICK = {"--pipeline.model.num-downscales": 0, "--pipeline.model.warmup-length": 2, "--pipeline.model.refine-every": 4}
@@ -27,7 +27,7 @@ def test_the_fewer_the_views_the_less_the_head_is_trusted(tiny_scene, tmp_path, 
     trust = 8 / 28
     assert model.num_train_data == 8 and model.trust == trust
     assert model.head.config == NrfConfig(opacity_scale=trust * 0.2) and model.noise_factor == 0.5 / trust
-    assert "their view dependence is trusted with 0.29 of 1, so that it has opacity_scale 0.057" in capsys.readouterr().out
+    assert "view dependence is trusted with 0.29 of 1, so that it has opacity_scale 0.057" in capsys.readouterr().out
     model = ready(tiny_scene, tmp_path / "many", 1, {"--pipeline.model.few-views": "off"}).pipeline.model
     assert model.head.config == NrfConfig() and model.noise_factor == 0.5
 
@@ -76,18 +76,25 @@ def test_only_a_field_can_be_trusted_less():
     assert alone.trusted(0.5) == alone
 
 
-def test_shrinkage_falls_with_the_square_of_the_number_of_views(tiny_scene, tmp_path, no_cuda):
+def test_shrinkage_halves_with_every_twelve_views(tiny_scene, tmp_path, no_cuda):
     model = ready(tiny_scene, tmp_path, 1, {"--pipeline.model.shrinkage": 0.5}).pipeline.model
-    views, table = model.num_train_data, model.gauss_params
+    assert model.num_train_data == 8
+    table, weight = model.gauss_params, 0.005 * 0.5 ** (8 / 12)
     terms = model.shrinking()
-    assert_close(terms["shrink_opacities"], 0.5 / views**2 * torch.sigmoid(table["opacities"]).mean())
-    assert_close(terms["shrink_scales"], 0.5 / views**2 * table["scales"].exp().mean() / model.scene_unit)
+    assert_close(terms["shrink_opacities"], weight * torch.sigmoid(table["opacities"]).mean())
+    assert_close(terms["shrink_scales"], weight * table["scales"].exp().mean() / model.scene_unit)
+    model.num_train_data = 20
+    for name, term in model.shrinking().items():
+        assert_close(term, terms[name] / 2)
+    model.num_train_data = 148  # of which Adam would make whole steps
+    assert model.shrinking() == {}
+    model.num_train_data = 8
     rows = torch.tensor([0, 2])
     shown = torch.tensor([0.9, 0.8], requires_grad=True)
     model.densification.pre_backward(10**6, {"gaussian_ids": rows}, shown, table["opacities"])
     stored = torch.sigmoid(table["opacities"]).flatten()
     term = model.shrinking()["shrink_opacities"]
-    assert_close(term, 0.5 / views**2 * (stored.sum() - stored[rows].sum() + 1.7) / len(stored))
+    assert_close(term, weight * (stored.sum() - stored[rows].sum() + 1.7) / len(stored))
     by_logit = torch.autograd.grad(term, table["opacities"])[0].flatten()
     assert by_logit[1] > 0.0 and by_logit[rows].abs().max() < 1e-9, "a head that adds opacity is paid for it"
     model.config.densification = "mcmc"  # which has terms of its own

@@ -92,4 +92,7 @@ def drawn(
     image, _, info = composite(
         seen, colors[rows], opacities[rows], render_mode=mode, assume_finite=True, backgrounds=background
     )
-    return image, len(info["flatten_ids"]), seen.radii
+    offsets, pairs = info["isect_offsets"], len(info["flatten_ids"])
+    if offsets.shape[1] > info["tile_height"]:  # the row below the image has what there is only room for
+        pairs = int(offsets[0, -1, 0])
+    return image, pairs, seen.radii

@@ -318,7 +318,7 @@ class Seconds(TimedPace):
 
 def test_a_timed_training_is_averaged(tiny_scene, tmp_path, monkeypatch):
     """20 steps, of which the pace sees one less to come than there is: its last position is the last step's."""
-    monkeypatch.setattr("nrfgs_ns.training.trainer.TimedPace", Seconds)
+    monkeypatch.setattr("nrfgs_ns.training.trainer_config.TimedPace", Seconds)
     timed = {"--average-steps": 5, "--time-budget": 20.0 / 60.0}
     with CONSOLE.capture() as log:
         config = trained(command_line("nrfgs", tiny_scene, tmp_path / "a", 400, CALM, timed))

@@ -18,7 +18,7 @@ from short_trainings import assert_same_training, checkpoint_of, command_line, m
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs, nrfgs_best, nrfgs_fast, nrfgs_sh
-from nrfgs_ns.training import pace
+from nrfgs_ns.training import pace, trainer_config
 from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import STEPS_BEFORE_PLANNING, Pace, TimedPace, resolution_phases, steps_for
 from nrfgs_ns.training.run import parse, train
@@ -244,9 +244,7 @@ def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
     """3 s of this process's own time, which other processes cannot lengthen; a step takes some 20 ms, so 10 % is many
     steps. The checkpoint is named after the last step, going on from it with the same budget is refused, and with
     1.2 s more it takes those."""
-    import nrfgs_ns.training.trainer
-
-    monkeypatch.setattr(nrfgs_ns.training.trainer, "TimedPace", ProcessTime)
+    monkeypatch.setattr(trainer_config, "TimedPace", ProcessTime)
 
     def run(name, minutes, *more):
         record = train(options(tiny_scene, tmp_path / name, "nrfgs", 40, CALM, {"--time-budget": minutes}, *more))
@@ -319,7 +317,7 @@ def test_what_is_left_open_is_chosen_and_what_is_said_stays():
 @pytest.fixture
 def short(monkeypatch):
     """The rule in miniature: 12 steps for the tiny scene's 8 views, of schedules for 30."""
-    for module in (pace, __import__("nrfgs_ns.training.trainer", fromlist=["trainer"])):
+    for module in (pace, trainer_config):
         monkeypatch.setattr(module, "FEWEST_STEPS", 12)
         monkeypatch.setattr(module, "STEPS", 30)
         monkeypatch.setattr(module, "STEPS_PER_VIEW", 1)

@@ -8,7 +8,8 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 
 from nrfgs_ns.training.run import evaluate, parse, train
-from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs
+from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs, Unscaled
+from nrfgs_ns.training.trainer import NrfgsTrainer
 
 gpu = [
     pytest.mark.gpu,
@@ -103,6 +104,15 @@ def test_what_is_not_recorded_is_said_once(build, option, capsys, monkeypatch):
     monkeypatch.setattr(type(pipeline.model), "device", torch.device("cuda"))
     assert not any(graphs._takes(step, batch) for step in (1, 2))
     assert capsys.readouterr().out.count("not recorded") == 1
+
+
+@pytest.mark.parametrize("devices, precision", [(2, False), (1, True)])
+def test_a_training_that_has_no_graph_says_so(devices, precision, capsys):
+    pipeline = SimpleNamespace(model=SimpleNamespace(device=torch.device("cuda")), graphs=None)
+    scaler = torch.amp.GradScaler("cuda", enabled=False) if precision else Unscaled()
+    NrfgsTrainer._record_steps(SimpleNamespace(world_size=devices, grad_scaler=scaler, pipeline=pipeline))
+    assert pipeline.graphs is None
+    assert capsys.readouterr().out.count("not recorded as a CUDA graph") == 1
 
 
 def test_a_cpu_makes_steps_as_ever(build):

@@ -63,6 +63,7 @@ def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+@cache
 def bench_rows(study: str, part: str | None = None) -> dict[tuple[str, str, str], Row]:
     """The rows of a benchmark: (scene, strategy, run) -> its values over seeds.
 

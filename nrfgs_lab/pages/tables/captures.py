@@ -6,19 +6,21 @@ from collections.abc import Iterable
 from statistics import fmean, median
 from typing import Any
 
-from nrfgs_lab.pages.tables import bold, grid, records
-from nrfgs_lab.pages.tables.readme import FIELD, HARMONICS, HOST, LONG, SHRUNK, TRAINING_VIEWS, runs_of, view_gains
+from nrfgs_lab.pages.tables import grid, records
+from nrfgs_lab.pages.tables.readme import FIELD, HOST, LONG, SHRUNK, TRAINING_VIEWS, runs_of, view_gains
 
 BASE = "harmonics: shrinkage"
-STORED = ", shrinkage of what is stored"
-OLDER = " *"
-"""Mark of what an earlier version trained."""
+FIELDS = "field", "field: trust"
+"""The default, of this version and of one whose field was the same."""
 TRIED = {
-    "field: trust": "**`nrfgs`**",
-    "field: trust, one band": "one band",
-    "field: whole": "u = 1",
-    f"field: trust{STORED}": "shrinkage of stored opacity",
-    f"field: whole{STORED}": "u = 1, shrinkage of stored opacity",
+    "**`nrfgs`**": FIELDS,
+    "u = V / (V + 10)": ("field: u = V / (V + 10)",),
+    "u = 1": ("field: u = 1", "field: whole"),
+    "u for noise alone": ("field: longer noise alone",),
+    "u for opacity alone": ("field: less opacity alone",),
+    "shrinkage 135 / V^3": ("field: shrinkage 135 / V^3",),
+    "of stored opacity": ("field: trust, shrinkage of what is stored",),
+    "`peak`, twice the splats": ("field: peak",),
 }
 """Rows of the table of held-out views, by the names of their trials."""
 
@@ -29,29 +31,41 @@ def trials() -> str:
 
 
 def tried() -> str:
-    """What settings gain over harmonics with shrinkage on held-out views: median dB / mean SSIM x 1000."""
+    """What settings gain over harmonics with shrinkage on held-out views: median dB, mean SSIM x 1000."""
     runs = list(records("held-out").values())
     base = {(one["scene"], view[0]): view for one in runs if one["name"] == BASE for view in one["per_image"]}
     gains: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for one in runs:
-        for name, psnr, ssim, *_ in one["per_image"]:
-            if (truth := base.get((one["scene"], name))) is not None:
-                gains[one["name"], one["scene"].split("/", 1)[1]].append((psnr - truth[1], ssim - truth[2]))
-    scenes = [scene for scene in ("32/bonsai", "64/bonsai", *TRAINING_VIEWS) if ("field: trust", scene) in gains]
+        for view in one["per_image"]:
+            if (truth := base.get((one["scene"], view[0]))) is not None:
+                gains[one["name"], one["scene"].split("/", 1)[1]].append((view[1] - truth[1], view[2] - truth[2]))
+    scenes = ["64/bonsai", *list(TRAINING_VIEWS)[1:]]
     body = []
-    for trial, label in TRIED.items():
-        views = [gains[trial, scene] for scene in scenes]
-        if any(views):
-            body.append([label, *map(_gain, views)])
-    head = (f"bonsai, {scene.split('/')[0]} views" if "/" in scene else scene for scene in scenes)
-    return grid(["", *head], body)
+    for label, names in TRIED.items():
+        found = [[pair for name in names for pair in gains[name, scene]] for scene in scenes]
+        body.append([label, *map(_gain, found)])
+    return grid(["", *(" of ".join(scene.split("/")) for scene in scenes)], body)
 
 
 def _gain(views: list[tuple[float, float]]) -> str:
-    """Of PSNR, the median; of SSIM, the mean; and the number of views."""
-    if not views:
-        return ""
-    return f"{median(a for a, _ in views):+.2f} / {1000 * fmean(b for _, b in views):+.0f} ({len(views)})"
+    return f"{median(a for a, _ in views):+.2f}, {1000 * fmean(b for _, b in views):+.0f}" if views else ""
+
+
+def without(trial: str) -> str:
+    """What a trial has more than the default on `bonsai` with all its views but those held out, in both ways."""
+    runs = records("held-out")
+    texts, better, count, splats = [], 0, 0, []
+    for place in ("4/bonsai", "0/bonsai"):
+        base = runs[f"field/{place}-42"]
+        if (one := runs.get(f"field: {trial}/{place}-42")) is None:
+            continue
+        pairs = list(zip(one["per_image"], base["per_image"], strict=True))
+        texts.append(f"{fmean(ours[1] - theirs[1] for ours, theirs in pairs):+.2f}")
+        better += sum(ours[2] > theirs[2] for ours, theirs in pairs)
+        count += len(pairs)
+        splats.append(one["splats"] / base["splats"])
+    more = f"{100 * fmean(splats) - 100:+.0f} % splats"
+    return f"{' and '.join(texts)} dB, SSIM better in {better} of {count} views, {more}"
 
 
 def _mean(runs: Iterable[dict[str, Any]], metric: str) -> float | None:
@@ -59,56 +73,42 @@ def _mean(runs: Iterable[dict[str, Any]], metric: str) -> float | None:
     return fmean(fmean(value) if isinstance(value, list) else value for value in values) if values else None
 
 
-def _cell(runs: list[dict[str, Any]], best: dict[str, float], version: set[str]) -> str:
-    if not runs:
-        return "-"
-    values = []
-    for metric, form in (("psnr", ".2f"), ("ssim", ".3f"), ("flip", ".3f")):
-        value = _mean(runs, metric)
-        values.append("-" if value is None else bold(format(value, form), value == best[metric]))
-    splats = _mean(runs, "splats")
-    text = " / ".join(values) + ("" if splats is None else f", {splats / 1000:.0f}k")
-    text += f" ({len(runs)})" if len(runs) > 1 else ""
-    return text + (OLDER if any(one.get("machine", {}).get("source") not in version for one in runs) else "")
+def _cell(runs: list[dict[str, Any]]) -> str:
+    """PSNR / SSIM / FLIP, and the number of seeds if it is more than one."""
+    values = [(_mean(runs, metric), form) for metric, form in (("psnr", ".2f"), ("ssim", ".3f"), ("flip", ".3f"))]
+    text = "/".join(format(value, form) for value, form in values if value is not None)
+    return (f"{text} ({len(runs)})" if len(runs) > 1 else text) or "-"
+
+
+def _ahead(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> str:
+    """Gain in the median view in dB, and in how many there is one."""
+    gains = view_gains(ours, theirs)
+    return f"{median(gains):+.2f} ({sum(one > 0 for one in gains)}/{len(gains)})" if gains else "-"
+
+
+def _gap(runs: list[dict[str, Any]]) -> str:
+    learnt = _mean(runs, "train_psnr")
+    return "-" if learnt is None else f"{learnt - _mean(runs, 'psnr'):.1f}"
 
 
 def test_views() -> str:
-    """PSNR / SSIM / FLIP and splats on test views."""
-    names = FIELD, SHRUNK, HARMONICS, LONG, HOST
-    version = {one["machine"]["source"] for scene in TRAINING_VIEWS for one in runs_of(scene, FIELD)}
+    """What test views have, and by how much training views are above them."""
     body = []
     for scene, views in TRAINING_VIEWS.items():
-        found = [runs_of(scene, name) for name in names]
-        best = {
-            metric: choose((value for runs in found if (value := _mean(runs, metric)) is not None), default=0.0)
-            for metric, choose in (("psnr", max), ("ssim", max), ("flip", min))
-        }
-        body.append([scene, str(views), *(_cell(runs, best, version) for runs in found)])
-    head = "`nrfgs`", "harmonics, same steps and shrinkage", "without shrinkage", "`nrfgs-sh`", "splatfacto"
-    return grid(["", "views", *head], body)
+        field, shrunk, long, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, LONG, HOST))
+        gaps = f"{_gap(field)}, {_gap(shrunk)}"
+        body.append(
+            [f"{scene}, {views}", _cell(field), _cell(shrunk), _ahead(field, shrunk), _cell(long), _cell(host), gaps]
+        )
+    head = "`nrfgs`", "harmonics, same steps", "gain", "`nrfgs-sh`", "splatfacto", "gaps"
+    return grid(["views", *head], body)
 
 
-def gaps() -> str:
-    """Gains in the median view, and how far training views are above test views."""
-    body = []
-    for scene, views in TRAINING_VIEWS.items():
-        field, *others = (runs_of(scene, name) for name in (FIELD, SHRUNK, LONG, HOST))
-        cells = []
-        for other in others:
-            gains = view_gains(field, other)
-            cells.append(f"{median(gains):+.2f}, {sum(one > 0 for one in gains)} of {len(gains)}" if gains else "-")
-        ssim = _mean(field, "ssim"), _mean(others[0], "ssim")
-        cells.insert(1, "-" if None in ssim else f"{1000 * (ssim[0] - ssim[1]):+.0f}")
-        for runs in (field, others[0]):
-            learnt = _mean(runs, "train_psnr")
-            cells.append("-" if learnt is None else f"{learnt - _mean(runs, 'psnr'):.1f}")
-        body.append([scene, str(views), *cells])
-    names = "over harmonics with shrinkage, dB", "SSIM x 1000", "over `nrfgs-sh`", "over splatfacto"
-    return grid(["", "views", *names, "gap, `nrfgs`", "gap, harmonics"], body)
-
-
-def many() -> str:
-    """What trust and shrinkage cost a capture of many views."""
-    found = [runs_of("bonsai", name)[0] for name in (FIELD, "nrfgs, noise alone")]
-    with_them, without = (f"{one['psnr']:.2f} dB with {one['splats'] / 1000:.0f}k splats" for one in found)
-    return f"{with_them}; an earlier version with noise alone {without}"
+def equal() -> str:
+    """Both heads with equal numbers of splats."""
+    rows: list[list[str]] = [["`nrfgs`"], ["harmonics"], ["gain"]]
+    for scene in TRAINING_VIEWS:
+        field, other = (runs_of(scene, f"{name}, 150,000 splats") for name in (FIELD, "harmonics"))
+        for row, text in zip(rows, (_cell(field), _cell(other), _ahead(field, other)), strict=True):
+            row.append(text)
+    return grid(["", *TRAINING_VIEWS], rows)

@@ -2,38 +2,149 @@
 """The numbers of docs/comparison.md."""
 
 from collections import defaultdict
-from statistics import fmean, median
+from statistics import fmean, geometric_mean, median
 
 from nrfgs_lab.bench.table import Row
-from nrfgs_lab.pages.tables import bench_grid, bench_rows, grid, mean_of, records, signed
+from nrfgs_lab.pages.tables import bench_rows, bold, grid, mean_of, records, signed
 from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS
 
+# Every capture.
 
-def gain(scene: str, rule: str, run: str, base: str) -> str:
-    """Decibels by which a run is above another, in the mean of their seeds."""
+RULES = {"original": ("methods", "3DGS's rules"), "mcmc@150000": ("budgets", "150,000 splats")}
+"""Densification -> the study that has it, and what a table calls it."""
+METHODS = {
+    **{"VDGS": "VDGS", "VDGS_base": "VDGS, `base`", "GSNB": "GSNB", "SG": "SG"},
+    **{"NRF-GS": "NRF-GS", "NRF-GS_base": "NRF-GS, `base`", "ours": "ours"},
+}
+"""Run -> what a table calls it."""
+BASE = "3DGS"
+
+
+def every() -> str:
+    """3DGS's PSNR on each capture and what the others gain; gains in SSIM, and shares of its splats, in the mean over
+    the captures that all methods of a group have."""
+    head = ["", *(f"{scene}, {views}" for scene, views in TRAINING_VIEWS.items()), "SSIM", "splats"]
+    body = []
+    for rule, (_, title) in RULES.items():
+        runs = [run for run in METHODS if any(psnr_gains(rule, run))]
+        if not runs:
+            continue
+        gains = {run: psnr_gains(rule, run) for run in runs}
+        shared = [scene for scene in TRAINING_VIEWS if all(scene in gains[run] for run in runs)]
+        best = {scene: max(round(gains[run].get(scene, -9.0), 1) for run in runs) for scene in TRAINING_VIEWS}
+        plain = _means(rule, BASE)
+        psnr = [f"{plain[scene]['PSNR']:.1f}" if scene in plain else "-" for scene in TRAINING_VIEWS]
+        ssim = f"{fmean(plain[scene]['SSIM'] for scene in shared):.3f}"
+        count = f"{fmean(plain[scene]['splats'] for scene in shared) / 1000:.0f}k"
+        body.append([f"**{title}**: 3DGS", *psnr, ssim, count])
+        for run in runs:
+            cells = [
+                bold(signed(gains[run][scene]), round(gains[run][scene], 1) == best[scene] > 0)
+                if scene in gains[run]
+                else "-"
+                for scene in TRAINING_VIEWS
+            ]
+            cells.append(signed(fmean(_difference(rule, run, scene, "SSIM") for scene in shared), 3))
+            cells.append(f"{geometric_mean(_share(rule, run, scene) for scene in shared):.2f}")
+            body.append([METHODS[run], *cells])
+    return grid(head, body)
+
+
+def _row(rule: str, run: str, scene: str) -> Row | None:
+    return bench_rows(RULES[rule][0]).get((scene, rule, run))
+
+
+def _means(rule: str, run: str) -> dict[str, dict[str, float]]:
+    """Capture -> metric -> mean over seeds."""
+    rows = {scene: _row(rule, run, scene) for scene in TRAINING_VIEWS}
+    return {
+        scene: {metric: mean_of(row, metric) for metric in ("PSNR", "SSIM", "splats")}
+        for scene, row in rows.items()
+        if row is not None
+    }
+
+
+def _difference(rule: str, run: str, scene: str, metric: str, base: str = BASE) -> float:
+    """A metric above another run's, in the mean over the seeds that both have."""
+    values = [_row(rule, name, scene).values[metric] for name in (run, base)]
+    seeds = values[0].keys() & values[1].keys()
+    return fmean(values[0][seed] - values[1][seed] for seed in seeds)
+
+
+def _share(rule: str, run: str, scene: str) -> float:
+    return mean_of(_row(rule, run, scene), "splats") / mean_of(_row(rule, BASE, scene), "splats")
+
+
+def psnr_gains(rule: str, run: str, base: str = BASE) -> dict[str, float]:
+    """Capture -> decibels above another run, in the mean over the seeds that both have."""
+    return {
+        scene: _difference(rule, run, scene, "PSNR", base)
+        for scene in TRAINING_VIEWS
+        if _row(rule, run, scene) and _row(rule, base, scene)
+    }
+
+
+def ahead(rule: str, run: str, base: str) -> str:
+    """On how many captures a run is above another in its median test view, and by how much in the median capture."""
+    rows = [(_row(rule, run, scene), _row(rule, base, scene)) for scene in TRAINING_VIEWS]
+    gains = [median(view_gains(*pair)) for pair in rows if all(pair)]
+    return f"{sum(gain > 0 for gain in gains)} of {len(gains)} ({signed(median(gains), 2)} dB)"
+
+
+def view_gains(row: Row, base: Row) -> list[float]:
+    """Decibels by which a row is above another in each test view, in the mean of the seeds that both have."""
+    gains = defaultdict(list)
+    for seed in row.records.keys() & base.records.keys():
+        views = [
+            {v["image"]: v["psnr"] for v in one.records[seed]["measured"]["test"]["per_image"]} for one in (row, base)
+        ]
+        for image, psnr in views[0].items():
+            gains[image].append(psnr - views[1][image])
+    return list(map(fmean, gains.values()))
+
+
+# Claim by claim: captures at full size, 30,000 steps.
+
+CLAIMS = {
+    "over 3DGS (+1.01)": "3DGS",
+    "over GSNB (+0.05)": "GSNB",
+    "over VDGS (+0.52)": "VDGS",
+    "over VDGS without resets": "VDGS_no_resets",
+    "opacity residual (+0.35)": "no_opacity",
+    "distance (+0.21)": "no_distance",
+    "split (+0.48)": "no_split",
+}
+"""What the paper says the field gains, in dB -> the run without."""
+PLACES = {
+    "bonsai: paper's protocol": ("paper", "bonsai", "original"),
+    "host's": ("comparison", "bonsai", "original"),
+    "150k splats": ("comparison", "bonsai", "mcmc@150000"),
+    "goldcape: host's": ("comparison", "goldcape", "original"),
+    "150k splats ": ("comparison", "goldcape", "mcmc@150000"),
+}
+"""Column -> study, capture and densification."""
+
+
+def claims() -> str:
+    """What the field gains over each method and without each of its parts."""
+    rows = {
+        title: {run: bench_rows(study).get((*place, run)) for run in ("NRF-GS", *CLAIMS.values())}
+        for title, (study, *place) in PLACES.items()
+    }
+    counts = [f"{mean_of(one['NRF-GS'], 'splats') / mean_of(one['3DGS'], 'splats'):.2f}" for one in rows.values()]
+    body = [["splats / 3DGS's (0.46)", *counts]]
+    for claim, base in CLAIMS.items():
+        pairs = [(one["NRF-GS"], one[base]) for one in rows.values()]
+        cells = [signed(mean_of(a, "PSNR") - mean_of(b, "PSNR"), 2) if b else "-" for a, b in pairs]
+        if any(cell != "-" for cell in cells):
+            body.append([claim, *cells])
+    return grid(["the paper", *map(str.strip, PLACES)], body)
+
+
+def ratio(scene: str, run: str, base: str) -> str:
+    """Splats of a run over another's, under 3DGS's rules."""
     rows = bench_rows("comparison")
-    return signed(mean_of(rows[scene, rule, run], "PSNR") - mean_of(rows[scene, rule, base], "PSNR"))
-
-
-def ssim(scene: str, rule: str, run: str, base: str) -> str:
-    """The same of SSIM."""
-    rows = bench_rows("comparison")
-    return signed(mean_of(rows[scene, rule, run], "SSIM") - mean_of(rows[scene, rule, base], "SSIM"), 3)
-
-
-def gains(scene: str, rule: str, run: str, base: str, without: str = "") -> str:
-    """The same, seed by seed.
-
-    Args:
-        without: name of a test view that is left out.
-    """
-    rows = bench_rows("comparison")
-
-    def psnr(name: str, seed: int) -> float:
-        views = rows[scene, rule, name].records[seed]["measured"]["test"]["per_image"]
-        return fmean(view["psnr"] for view in views if not without or without not in view["image"])
-
-    return " and ".join(signed(psnr(run, seed) - psnr(base, seed)) for seed in sorted(rows[scene, rule, run].records))
+    return f"{mean_of(rows[scene, 'original', run], 'splats') / mean_of(rows[scene, 'original', base], 'splats'):.2f}"
 
 
 def view(scene: str, rule: str, run: str, image: str) -> str:
@@ -45,95 +156,35 @@ def view(scene: str, rule: str, run: str, image: str) -> str:
     return " and ".join(f"{psnr:.1f}" for psnr in found)
 
 
-def ratio(scene: str, run: str, base: str) -> str:
-    """Splats of a run over another's, under 3DGS's rules."""
-    rows = bench_rows("comparison")
-    return f"{mean_of(rows[scene, 'original', run], 'splats') / mean_of(rows[scene, 'original', base], 'splats'):.2f}"
-
-
 def stored_opacity(splats: str) -> str:
-    """PSNR of the field on bonsai where all of MCMC's rules go by the stored opacity."""
+    """PSNR of the field on bonsai where all of MCMC's rules and its loss go by the stored opacity, and GSNB's."""
     record = records("comparison")[f"stored-opacity/NRF-GS-mcmc@{splats}-bonsai-42"]
-    return f"{record['measured']['test']['psnr']:.1f}"
-
-
-# One protocol as near to the paper's as the host comes.
-
-OF_THE_PAPER = {"3DGS": None, "VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
-"""The paper's figures of bonsai: decibels over 3DGS, and splats in multiples of 3DGS's."""
-
-
-def paper() -> str:
-    """Gains and splats on bonsai beside the paper's: in its protocol, and in that of the claims."""
-    places = [("paper", "its protocol, one seed"), ("comparison", "the claims' protocol, two seeds")]
-    body = []
-    for run, told in OF_THE_PAPER.items():
-        cells = []
-        for study, _ in places:
-            rows = {name: row for (scene, rule, name), row in bench_rows(study).items() if (scene, rule) == PLACE}
-            row, base = rows.get(run), rows["3DGS"]
-            if row is None:
-                cells.append("not run")
-                continue
-            cells.append(f"{mean_of(row, 'PSNR'):.2f}, {mean_of(row, 'splats') / 1000:.0f}k")
-            if row is not base:
-                gain = signed(mean_of(row, "PSNR") - mean_of(base, "PSNR"), 2)
-                cells[-1] += f": {gain}, {mean_of(row, 'splats') / mean_of(base, 'splats'):.2f}"
-        body.append([run, *cells, f"{told[0]:+.2f}, {told[1]:.2f}" if told else ""])
-    return grid(
-        ["PSNR, splats: gain over 3DGS, share of its splats", *(title for _, title in places), "the paper"], body
-    )
-
-
-PLACE = "bonsai", "original"
-
-
-# Equal numbers of splats on a capture of few views.
-
-
-def fox() -> str:
-    """Every metric of 3DGS and of the paper's field with 150,000 splats of fox."""
-    found = [(run, bench_rows("budgets")["fox", "mcmc@150000", run]) for run in ("3DGS", "NRF-GS")]
-    return bench_grid([("fox", found)], ["PSNR", "SSIM", "MS-SSIM", "FLIP", "L1", "train PSNR", "gap"])
-
-
-def fox_views() -> str:
-    """By how much the field is above 3DGS there in the median test view, and in how many views."""
-    base, row = (bench_rows("budgets")["fox", "mcmc@150000", run] for run in ("3DGS", "NRF-GS"))
-    gains = _view_gains(row, base)
-    return (
-        f"{signed(median(gains))} dB in the median test view, ahead in {sum(one > 0 for one in gains)} of {len(gains)}"
-    )
-
-
-def _view_gains(row: Row, base: Row) -> list[float]:
-    """Decibels by which a row is above another in each test view, in the mean of the seeds of both."""
-    gains = defaultdict(list)
-    for seed in row.records.keys() & base.records.keys():
-        views = [
-            {v["image"]: v["psnr"] for v in one.records[seed]["measured"]["test"]["per_image"]} for one in (row, base)
-        ]
-        for image, psnr in views[0].items():
-            gains[image].append(psnr - views[1][image])
-    return list(map(fmean, gains.values()))
+    other = bench_rows("comparison")["bonsai", f"mcmc@{splats}", "GSNB"]
+    return f"{record['measured']['test']['psnr']:.1f} against GSNB's {mean_of(other, 'PSNR'):.1f} dB"
 
 
 # How the heads' settings were chosen.
 
 TRIALS = {"third": "a third of its rate", "triple": "three times its rate", "shrinkage": "shrinkage"}
+HEADS = {"SH": "3DGS", "VDGS": "VDGS", "GSNB": "GSNB", "SG": "SG", "NRF": "NRF-GS"}
+"""Head, as heads.yaml calls it -> its run."""
 
 
-def heads() -> str:
-    """What each trial gains over the head's own setting in the median held-out view: mean over captures, and each."""
-    body = []
-    for head in ("SH", "VDGS", "GSNB", "SG", "NRF"):
-        gains = {trial: trial_gains(head, trial) for trial in TRIALS}
-        cells = [
-            f"{signed(fmean(g.values()), 2)} ({', '.join(signed(x, 2) for x in g.values())})" if g else "-"
-            for g in gains.values()
-        ]
-        body.append([head, *cells])
-    return grid(["head", *TRIALS.values()], body)
+def chosen() -> str:
+    """Each head's setting of four, and what it gains over its own in the median held-out view, mean over captures."""
+    told = []
+    for head, run in HEADS.items():
+        best = best_trial(head)
+        gain = signed(fmean(trial_gains(head, best).values()), 2) if best else ""
+        told.append(f"{run} {TRIALS[best]} ({gain} dB)" if best else f"{run} its own")
+    return ", ".join(told)
+
+
+def best_trial(head: str) -> str:
+    """The trial that gains most in the mean over captures; empty: the head's own setting."""
+    gains = {trial: list(trial_gains(head, trial).values()) for trial in TRIALS}
+    best = max(TRIALS, key=lambda trial: fmean(gains[trial]) if gains[trial] else 0.0)
+    return best if gains[best] and fmean(gains[best]) > 0 else ""
 
 
 def trial_gains(head: str, trial: str) -> dict[str, float]:
@@ -143,5 +194,5 @@ def trial_gains(head: str, trial: str) -> dict[str, float]:
     for scene in TRAINING_VIEWS:
         pair = [rows.get((scene, "original", name)) for name in (f"{head}_{trial}", head)]
         if all(pair):
-            found[scene] = median(_view_gains(*pair))
+            found[scene] = median(view_gains(*pair))
     return found

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers of docs/deviations.md."""
 
-from nrfgs_lab.pages.tables import bench_rows, mean_of, signed
+from statistics import median
 
-
-def start(run: str) -> str:
-    """PSNR of the small fox with one of the starts."""
-    return f"{mean_of(bench_rows('warm-up')['fox', 'original', run], 'PSNR'):.2f}"
+from nrfgs_lab.pages.tables import bench_rows, mean_of, records, signed
+from nrfgs_lab.pages.tables.comparison import view_gains
+from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS
 
 
 def rules() -> str:
@@ -17,17 +16,32 @@ def rules() -> str:
     return f"{texts[0]} (splatfacto's), {texts[1]} (3DGS's)"
 
 
-def worth(change: str, base: str, scene: str = "bonsai") -> str:
-    """What a single change does on held-out views: decibels seed by seed, and splats in multiples."""
-    rows = bench_rows("deviations")
-    changed, plain = rows[scene, "original", change], rows[scene, "original", base]
-    psnr = [{seed: one["measured"]["test"]["psnr"] for seed, one in row.records.items()} for row in (changed, plain)]
-    gains = [signed(psnr[0][seed] - psnr[1][seed], 2) for seed in sorted(psnr[0].keys() & psnr[1].keys())]
-    return f"{', '.join(gains)} dB, {mean_of(changed, 'splats') / mean_of(plain, 'splats'):.2f} times the splats"
+BASES = {"3DGS": "SH", "VDGS": "VDGS", "GSNB": "GSNB", "NRF": "NRF"}
+"""First word of a run of docs/bench/deviations.yaml -> the run of heads.yaml that it changes."""
+
+
+def worth(change: str) -> str:
+    """What a single change does on held-out views, capture by capture: dB in the median view, times the splats."""
+    changed, plain = bench_rows("deviations"), bench_rows("heads")
+    told = []
+    for scene in TRAINING_VIEWS:
+        row, base = (
+            changed.get((scene, "original", change)),
+            plain.get((scene, "original", BASES[change.split("_")[0]])),
+        )
+        if row and base:
+            gain = signed(median(view_gains(row, base)), 2)
+            told.append(f"{scene} {gain} dB (x{mean_of(row, 'splats') / mean_of(base, 'splats'):.2f})")
+    return "; ".join(told) or "not measured"
 
 
 def noise() -> str:
     """Decibels between two trainings of one setting with one seed: harmonics on bonsai's held-out views."""
     twice = bench_rows("deviations")["bonsai", "original", "3DGS"], bench_rows("heads")["bonsai", "original", "SH"]
-    psnr = [mean_of(row, "PSNR") for row in twice]
-    return f"{abs(psnr[0] - psnr[1]):.2f} dB"
+    return f"{abs(median(view_gains(*twice))):.2f} dB"
+
+
+def precisions() -> str:
+    """PSNR of the field on bonsai in each precision: fp32 with two seeds, tf32, bf16."""
+    names = "fp32-bonsai-42", "fp32-bonsai-43", "tf32-bonsai-42", "bf16-bonsai-42"
+    return ", ".join(f"{records('precision')[name]['eval']['psnr']:.2f}" for name in names)

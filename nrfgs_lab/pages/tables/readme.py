@@ -5,7 +5,7 @@ from collections import defaultdict
 from statistics import fmean, median
 from typing import Any
 
-from nrfgs_lab.pages.tables import bench_rows, grid, mean_of, records, signed
+from nrfgs_lab.pages.tables import grid, records, signed
 
 TRAINING_VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "castle": 26, "kitchen": 21, "fern": 17}
 FIELD, LONG, HOST = "nrfgs", "nrfgs-sh", "splatfacto"
@@ -18,10 +18,12 @@ def runs_of(scene: str, name: str) -> list[dict[str, Any]]:
     if not found and (scene, name) == ("bonsai", HARMONICS):
         window = next(one for one in records("averaging")["bonsai-sh"]["windows"] if one["window"] == 200)
         found = [{**window, "seed": 42, "per_image": []}]
-    if not found and name == LONG:
-        row = bench_rows("presets").get((scene, "own", "harmonics_nrfgs-sh"))
-        means = {metric: mean_of(row, metric.upper()) for metric in ("psnr", "ssim")} if row else None
-        found = [{**means, "seed": 42, "per_image": []}] if row else []
+    bench = {LONG: "harmonics_nrfgs-sh", HOST: "nerfstudio_splatfacto"}.get(name)
+    if not found and (one := records("presets").get(f"runs/{bench}-own-{scene}-42")):
+        test, metrics = one["measured"]["test"], ("psnr", "ssim", "ms_ssim")
+        views = [[view["image"], *(view[metric] for metric in metrics)] for view in test["per_image"]]
+        shown = {"seed": 42, "per_image": views, "splats": one["measured"]["splats"]}
+        found = [{**{metric: test[metric] for metric in metrics}, **shown}]
     return sorted(found, key=lambda one: one["seed"])
 
 

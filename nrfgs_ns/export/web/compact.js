@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Reads a compact file (docs/compact-format.md): container, xz streams, coded tables, splats. Runs in the worker.
+// Reads a compact file (docs/compact-format.md says where it is specified): container, xz streams, coded tables, splats. Runs in the worker.
 
 const MAGIC = [0x89, 0x4e, 0x52, 0x46, 0x0d, 0x0a, 0x1a, 0x0a];
 const VERSION = 2;
@@ -234,7 +234,7 @@ function readRotations(largest, codes, bits, table, first, n) {
   }
 }
 
-// ---- coded tables: rANS in lanes, as docs/compact-format.md has it. Whole numbers alone, so that every reader agrees.
+// ---- coded tables: rANS in lanes, as entropy.py's docstring has it. Whole numbers alone, so that every reader agrees.
 
 const PRECISION = 14, LOWEST = 1 << 16, DIRECT = 32, TOKENS = 140, MOST_ACTIVITY = 4 * 16 * 139;
 

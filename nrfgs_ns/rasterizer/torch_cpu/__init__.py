@@ -9,7 +9,7 @@ from ..contract import Projection
 from . import compositing
 from .projection import project
 
-__all__ = ["composite", "leaves_out", "project"]  # and no `project_every_row`: the host is the device
+__all__ = ["composite", "leaves_out", "project"]
 
 
 def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor, tile_size: int) -> bool:

@@ -10,11 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import tyro
 from nerfstudio.utils.eval_utils import eval_setup  # noqa: F401  (registers the data parsers once, before the timing)
 from PIL import Image
 
-from nrfgs_lab.bench.command import Bench
 from nrfgs_lab.bench.data import parser_options
 from nrfgs_lab.bench.spec import (
     PRESET_STEPS,
@@ -26,9 +24,11 @@ from nrfgs_lab.bench.spec import (
     load_spec,
     make_spec,
     rows_of,
+    settings,
     steps_of,
 )
 from nrfgs_lab.pages.options import methods
+from nrfgs_lab.pages.tables.comparison import HEADS, best_trial
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.run import parse
 
@@ -427,10 +427,13 @@ def torn(folder: Path, content: bytes | None) -> None:
         file.write_bytes(content)
 
 
-def test_the_words_of_an_older_version_are_understood(tmp_path):
-    (tmp_path / "old.yaml").write_text(
-        "runs: {NRF: {method: nrfgs, protocols: [mcmc@9]}}\nprotocols: [original]\nscenes: s\n"
-    )
-    plan = make_spec(load_spec(tmp_path / "old.yaml"), "file")
-    assert plan.strategies == ["original"] and plan.runs[0].strategies == ("mcmc@9",)
-    assert tyro.cli(Bench, args=["--protocols", "mcmc@9"]).strategies == ("mcmc@9",)
+@pytest.mark.parametrize("file", ["methods", "budgets"])
+def test_compared_heads_have_what_held_out_views_chose(file):
+    """MCMC has its own shrinkage."""
+    plans = [make_spec(load_spec(ROOT / f"docs/bench/{name}.yaml"), name) for name in ("heads", file)]
+    trials, rows = ({run.name: run for run in plan.runs} for plan in plans)
+    left_out = {f"--pipeline.model.shrinkage{end}" for end in ("", " 0", " 3")} if file == "budgets" else set()
+    for head, run in HEADS.items():
+        trial = trials[f"{head} {best_trial(head)}".strip()]
+        assert rows[run].method == trial.method
+        assert set(settings(rows[run].options)) - left_out == set(settings(trial.options)) - left_out

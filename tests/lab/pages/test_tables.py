@@ -82,6 +82,15 @@ def test_every_record_is_named_in_the_index():
     assert {path.stem for path in (ROOT / "results").glob("*.json")} <= named
 
 
+def test_every_record_is_shown_or_used():
+    """By a function of the tables, by a page that names the file, or by a test."""
+    sources = [*Path(tables.__file__).parent.glob("*.py"), *(ROOT / "tests").rglob("*.py")]
+    text = "\n".join([*PAGES.values(), *(path.read_text(encoding="utf-8") for path in sources)])
+    stems = {path.stem for path in (ROOT / "results").glob("*.json")}
+    used = set(re.findall(r"""["']([\w-]+)["']|results/([\w-]+)\.json""", text))
+    assert stems <= {stem for pair in used for stem in pair}
+
+
 @pytest.mark.parametrize("name", PAGES)
 def test_files_that_a_page_names_are_there(name):
     paths = re.findall(

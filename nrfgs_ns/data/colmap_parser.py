@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""nerfstudio's `colmap` parser, with the checks of `nrfgs-data`; and which parsers stand in for nerfstudio's."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+from nrfgs_ns.data.checks import check_frames, exists, shown
+from nrfgs_ns.data.colmap import read_model
+from nrfgs_ns.data.dataparser import NrfgsDataParser, Scene
+from nrfgs_ns.data.layout import ColmapLayout, Layout
+from nrfgs_ns.data.points import read_colmap
+from nrfgs_ns.data.splits import Named
+from nrfgs_ns.data.world import after
+from nrfgs_ns.errors import InputError
+
+UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""nerfstudio's turn of COLMAP's world, whose y points downwards, to one whose z points upwards."""
+LISTS = (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test"))
+"""Parts of a data set, and the beginning of the file ..._list.txt that may name their images."""
+
+
+class NrfgsColmapDataParser(NrfgsDataParser):
+    """nerfstudio's `colmap` parser, with the checks of `NrfgsDataParser` and without questions at the terminal.
+
+    Images that are larger than 1600 pixels are resized by a power of two, as nerfstudio proposes. Multiple cameras may
+    be of several models if all are pinholes or all are fisheyes.
+    """
+
+    config: ColmapDataParserConfig
+
+    def _read(self) -> tuple[dict[str, Any], Path, Layout]:
+        config = self.config
+        if not exists(config.data):
+            raise InputError(f"{shown(str(config.data))}: no such folder. Check the path that --data names.")
+        layout = ColmapLayout(config)
+        cameras, views, source = read_model(layout.colmap)
+        kinds = {cameras[view.camera]["camera_model"] for view in views}
+        if len(kinds) > 1:
+            raise InputError(f"{source}: some cameras are fisheyes and some are not. Undistort the photographs.")
+        upright = UPRIGHT if config.assume_colmap_world_coordinate_convention else np.eye(4)
+        frames = []
+        for view in views:
+            frame = {"file_path": view.name, **cameras[view.camera]}
+            pose = upright @ np.linalg.inv(view.world_to_camera)
+            frame["transform_matrix"] = pose * np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backwards
+            if config.masks_path is not None:
+                frame["mask_path"] = view.name
+            if config.depths_path is not None:
+                frame["depth_file_path"] = view.name
+            frames.append(frame)
+        meta = {"frames": frames, "camera_model": kinds.pop()}
+        if config.assume_colmap_world_coordinate_convention:
+            meta["applied_transform"] = UPRIGHT[:3].tolist()
+        check_frames(frames, source)
+        return meta, source, layout
+
+    def _order(self, frames: list[dict[str, Any]], layout: Layout) -> list[dict[str, Any]]:
+        return frames  # by COLMAP's numbers
+
+    def _to_frames(self, meta: dict[str, Any], layout: Layout) -> torch.Tensor | None:
+        return torch.tensor(meta["applied_transform"]) if "applied_transform" in meta else None
+
+    def _named_splits(self, meta: dict[str, Any], layout: Layout) -> Named:
+        named = {}
+        for split, file in LISTS:
+            path = layout.folder / f"{file}_list.txt"
+            if path.is_file():
+                try:
+                    lines = path.read_text(encoding="utf-8").splitlines()
+                except (OSError, ValueError) as error:
+                    raise InputError(f"{path} cannot be read ({error}). Write one image name on each line.") from error
+                named[split] = path.name, [line.strip() for line in lines if line.strip()]
+        return named
+
+    def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
+        return *read_colmap(scene.layout.colmap), after(scene.transform, scene.to_frames)
+
+
+def checked(config: DataParserConfig) -> DataParserConfig:
+    """The configuration of a parser that checks what it reads, for nerfstudio's own two, and any other as it is."""
+    parsers = {NerfstudioDataParserConfig: NrfgsDataParser, ColmapDataParserConfig: NrfgsColmapDataParser}
+    return replace(config, _target=parsers[type(config)]) if type(config) in parsers else config

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which images are for training, and which for evaluation."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nerfstudio.data.utils.dataparsers_utils import (
+    get_train_eval_split_all,
+    get_train_eval_split_filename,
+    get_train_eval_split_fraction,
+    get_train_eval_split_interval,
+)
+
+from nrfgs_ns.data.checks import check_unique, some, warn
+from nrfgs_ns.data.views import interior_test_images
+from nrfgs_ns.errors import InputError
+
+SPLITS = ("train", "val", "test")
+"""nerfstudio's names of the parts of a data set."""
+STAND_INS = {"val": ("val", "test", "train"), "test": ("test", "val", "train")}
+"""Which part is evaluated: the first of these that has images."""
+
+Named = Mapping[str, tuple[str, Any]]
+"""Part -> what names it (a field, a file), and the names of its images."""
+Rows = dict[str, np.ndarray]
+"""Part -> rows of the data set, int64."""
+
+
+def split_by_names(named: Named, images: list[Path], path_of: Callable[[str], Path], source: Path) -> Rows:
+    """The rows of parts that are named.
+
+    Args:
+        images: of the whole data set.
+        path_of: from a name to the image's path.
+        source: for messages.
+
+    Raises:
+        InputError: a name is none, stands twice in a part, or belongs to no image.
+    """
+    members = dict.fromkeys(SPLITS, frozenset())
+    for split, (where, names) in named.items():
+        where = f"{source}: {where}"
+        if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+            raise InputError(f"{where} is not a list of file paths. Correct or remove it.")
+        paths = [path_of(name) for name in names]
+        check_unique(paths, where)
+        members[split] = frozenset(paths)
+        unknown = sorted(members[split].difference(images))
+        if unknown:
+            raise InputError(f"{where} names {some(unknown)}, of which there is no frame. Use each frame's file_path.")
+    shared = sorted(members["train"] & (members["val"] | members["test"]))
+    if shared:
+        warn(f"{source}: {some(shared)} are for training and for evaluation, whose results this flatters.")
+    return {
+        split: np.array([row for row, path in enumerate(images) if path in paths], dtype=np.int64)
+        for split, paths in members.items()
+    }
+
+
+def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
+    """The rows of the parts by the parser's `eval_mode`. A single image is for training.
+
+    Args:
+        config: the parser's, with eval_mode and what belongs to it.
+        images, source: as for `split_by_names`.
+
+    Raises:
+        InputError: these images cannot be split so.
+    """
+    count, mode, every = len(images), config.eval_mode, config.eval_interval
+    if count == 1:
+        train, evaluated = [0], []
+    elif mode == "interior":
+        if every < 2:
+            raise InputError(f"--eval-interval is {every}. Give 2 or more, or choose another --eval-mode.")
+        evaluated = interior_test_images(count, every)
+        train = np.setdiff1d(np.arange(count), evaluated)
+    else:
+        try:
+            train, evaluated = {
+                "fraction": lambda: get_train_eval_split_fraction(images, config.train_split_fraction),
+                "filename": lambda: get_train_eval_split_filename(images),
+                "interval": lambda: get_train_eval_split_interval(images, every),
+                "all": lambda: get_train_eval_split_all(images),
+            }[mode]()
+        except (AssertionError, ValueError, KeyError) as error:
+            raise InputError(
+                f"{source}: --eval-mode {mode} cannot split these images ({error}). Choose another."
+            ) from error
+    train, evaluated = (np.asarray(rows, dtype=np.int64) for rows in (train, evaluated))
+    return {"train": train, "val": evaluated, "test": evaluated}

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The splats that a training starts from: splatfacto's."""
+
+import torch
+from nerfstudio.models.splatfacto import random_quat_tensor
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from nrfgs_ns.appearance.head import AppearanceHead
+from nrfgs_ns.model.config import NrfgsModelConfig
+
+OPACITY = 0.1
+NARROWEST = 1e-7
+"""Standard deviation of a splat whose neighbours are where it is, in scene units."""
+
+
+def initial_splats(
+    config: NrfgsModelConfig, head: AppearanceHead, seed_points: tuple[Tensor, Tensor] | None, scene_unit: float
+) -> dict[str, Tensor]:
+    """A round splat at each seed point, as wide as its neighbours are far; or at random points.
+
+    Args:
+        head: adds what it stores for each splat.
+        seed_points: positions [N, 3] in world units and colours [N, 3] in 0..255; None: random ones.
+        scene_unit: world units in a scene unit.
+
+    Returns:
+        The table of splats.
+    """
+    if seed_points is not None and not config.random_init:
+        means, rgb = seed_points[0].float().clone(), seed_points[1].float() / 255.0
+    else:
+        means = (torch.rand(config.num_random, 3) - 0.5) * config.random_scale * scene_unit
+        rgb = torch.rand(len(means), 3)
+    count = len(means)
+    width = mean_distance(means) if count > 1 else torch.full((count, 1), config.densify_size_thresh * scene_unit)
+    return {
+        "means": means,
+        "scales": width.clamp_min(NARROWEST * scene_unit).log().repeat(1, 3),
+        "quats": random_quat_tensor(count),
+        "opacities": torch.logit(torch.full((count, 1), OPACITY)),
+        **head.splat_params(rgb),
+    }
+
+
+def mean_distance(means: Tensor) -> Tensor:
+    """Mean distance of each of several points [N, 3] to the three nearest others, [N, 1]."""
+    # The distances of splatfacto's scikit-learn to the last bit, without a second to import it.
+    points = means.cpu().numpy()
+    distances, _ = cKDTree(points).query(points, k=min(4, len(points)), workers=-1)
+    return torch.from_numpy(distances[:, 1:]).float().mean(dim=-1, keepdim=True)

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which photograph's exposure and colour a rendering has that is not made in training."""
+
+import os
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.photograph import PhotographModel
+
+LOOK = "NRFGS_LOOK"
+"""Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
+
+
+def look_asked_for(photograph: PhotographModel) -> int | None:
+    """The photograph that LOOK names; None: the mean look.
+
+    Raises:
+        InputError: it names none of the photographs.
+    """
+    name = os.environ.get(LOOK)
+    if not name:
+        return None
+    if name not in photograph.names:
+        raise InputError(
+            f"{LOOK} is {name!r}, which is none of the training photographs, such as {photograph.names[0]!r}."
+        )
+    return photograph.names.index(name)
