@@ -185,7 +185,6 @@ def train_and_measure(trial: Trial, scenes: Path, folder: Path, end: float) -> d
     from nrfgs_lab.flip import flip
     from nrfgs_lab.run import host_without_downloads
     from nrfgs_ns.data.views import evenly_spaced
-    from nrfgs_ns.image.metrics import ImageMetrics
     from nrfgs_ns.training.run import machine, parse
 
     steps = [] if trial.steps is None else ["--max-num-iterations", str(trial.steps)]
@@ -214,12 +213,12 @@ def train_and_measure(trial: Trial, scenes: Path, folder: Path, end: float) -> d
         model, loader = trainer.pipeline.model.eval(), trainer.pipeline.datamanager
         names = [Path(name).name for name in loader.eval_dataset.image_filenames]
         with torch.no_grad():
-            metrics, views = ImageMetrics(), zip(names, loader.fixed_indices_eval_dataloader, strict=True)
-            test = over_views(model, metrics, views, flip if find_spec("flip_evaluator") else None)
+            views = zip(names, loader.fixed_indices_eval_dataloader, strict=True)
+            test = over_views(model, views, flip if find_spec("flip_evaluator") else None)
             images, cameras = loader.cached_train, loader.train_dataset.cameras
             chosen = evenly_spaced(len(images), TRAIN_VIEWS)
             learnt = ((str(i), (cameras[i : i + 1].to(model.device), images[i])) for i in chosen)
-            train = over_views(model, metrics, learnt)
+            train = over_views(model, learnt)
     shown = ("psnr", "ssim", "ms_ssim")
     return {
         **{metric: test[metric] for metric in shown},

@@ -217,23 +217,23 @@ def where_it_shines(views: list[SeenView]) -> dict[str, float | None]:
     return {"share": share, "psnr": psnr("rendered"), "psnr_base": psnr("base")}
 
 
-def brightest_window(shine: torch.Tensor, part: int = 3) -> tuple[int, int, int, int]:
-    """The window of 1 / part of a picture's sides in which gloss does most: top, left, height, width, pixels."""
-    height, width = (max(size // part, 1) for size in shine.shape)
+def brightest_window(shine: torch.Tensor) -> tuple[int, int, int, int]:
+    """The window of a third of a picture's sides in which gloss does most: top, left, height, width, pixels."""
+    height, width = (max(size // 3, 1) for size in shine.shape)
     sums = torch.nn.functional.avg_pool2d(shine[None, None], (height, width), stride=1)[0, 0]
     place = int(sums.argmax())
     return place // sums.shape[1], place % sums.shape[1], height, width
 
 
-def contact_sheet(views: dict[str, list[SeenView]], path: Path, count: int = 3) -> None:
-    """Write a picture of `count` test views, each whole and below it where it shines most: truth, NRF, SH, NRF's base
+def contact_sheet(views: dict[str, list[SeenView]], path: Path) -> None:
+    """Write a picture of three test views, each whole and below it where it shines most: truth, NRF, SH, NRF's base
     colour alone, and what NRF adds to it.
 
     Args:
         views: method -> its test views.
     """
     nrf, sh = views["nrfgs"], views["nrfgs-sh"]
-    chosen = range(0, len(nrf), max(len(nrf) // count, 1))[:count]
+    chosen = range(0, len(nrf), max(len(nrf) // 3, 1))[:3]
     columns = {
         "truth": [view.truth for view in nrf],
         METHODS["nrfgs"]: [view.rendered for view in nrf],

@@ -3,6 +3,7 @@
 
 import ast
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -48,7 +49,7 @@ def test_data_sets_of_the_hard_trainings_differ_as_they_say(tmp_path):
     plain = json.loads((scene / "transforms.json").read_text())
 
     def edited(name):
-        folder = write_scene(SCENE, tmp_path / name.replace(" ", "_"))
+        folder = shutil.copytree(scene, tmp_path / name.replace(" ", "_"))
         edits[name](folder)
         return folder, json.loads((folder / "transforms.json").read_text())
 

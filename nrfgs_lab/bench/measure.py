@@ -17,7 +17,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from nrfgs_lab.flip import flip
 from nrfgs_ns.data.views import evenly_spaced
-from nrfgs_ns.image.metrics import METRIC_NAMES, ImageMetrics
+from nrfgs_ns.image.metrics import METRIC_NAMES, image_metrics
 
 TIMED_CAMERAS = 20
 """Test cameras, evenly spaced, whose rendering is timed."""
@@ -46,19 +46,18 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
     model, data = pipeline.model, pipeline.datamanager
     model.eval()
-    metrics = ImageMetrics()
     test = data.fixed_indices_eval_dataloader
     names = [Path(name).name for name in data.eval_dataset.image_filenames]
     has_flip = find_spec("flip_evaluator") is not None
     views = zip(names, test, strict=True)
-    result: dict[str, Any] = {"test": over_views(model, metrics, views, flip if has_flip else None), "train": None}
+    result: dict[str, Any] = {"test": over_views(model, views, flip if has_flip else None), "train": None}
     if train_views > 0:
         images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
         cameras = data.train_dataset.cameras
         chosen = evenly_spaced(len(images), train_views)
         views = ((cameras[i : i + 1].to(model.device), images[i]) for i in chosen)
         names = [Path(data.train_dataset.image_filenames[i]).name for i in chosen]
-        result["train"] = over_views(model, metrics, zip(names, views, strict=True))
+        result["train"] = over_views(model, zip(names, views, strict=True))
     cameras = [camera for camera, _ in test]
     return {
         **result,
@@ -74,7 +73,7 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
     }
 
 
-def over_views(model, metrics: ImageMetrics, views: Iterable, flip: Callable | None = None) -> dict[str, Any]:
+def over_views(model, views: Iterable, flip: Callable | None = None) -> dict[str, Any]:
     """Means and each image's values over (name, (camera, batch)).
 
     Args:
@@ -87,7 +86,7 @@ def over_views(model, metrics: ImageMetrics, views: Iterable, flip: Callable | N
             outputs = model.as_photographed(outputs, camera)
         truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
         mask = batch["mask"].to(model.device).float() >= 0.5 if "mask" in batch else None
-        per_image.append({"image": name, **metrics(outputs["rgb"], truth, mask)})
+        per_image.append({"image": name, **image_metrics(outputs["rgb"], truth, mask)})
         if flip is not None:
             inside = None if mask is None else mask[..., 0].numpy(force=True)
             per_image[-1]["flip"] = flip(outputs["rgb"].numpy(force=True), truth.numpy(force=True), inside)

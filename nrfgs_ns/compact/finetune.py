@@ -37,9 +37,8 @@ STEPS_RATE, DENSITY_RATE, FIELD_RATE = 3e-2, 2e-2, 5e-4
 PRUNINGS = (0.08, 0.16, 0.24, 0.32)
 """When splats go, in shares of the steps. Each time one of so many in the file's order is asked: neighbours, which hide
 behind each other, must not go together."""
-WORTH = 0.5
-"""What a splat's bytes cost, over what the loss grows without it: below 1, because some that hide behind each other go
-together all the same."""
+WORTH = 1.0
+"""What a splat's bytes may cost, over what the loss grows without it."""
 LAST = 0.03
 """Of the learning rates, at the end; they fall by a cosine."""
 

@@ -2,12 +2,22 @@
 """Which splats a model's table has, and in which order: all that has a row for each of them follows."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from gsplat.strategy.ops import _update_param_with_optimizer
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
+
+
+def per_splat(state: Mapping[str, Any], count: int) -> dict[str, Tensor]:
+    """The entries of a state that have a row for each of `count` splats."""
+    return {
+        name: value
+        for name, value in state.items()
+        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count
+    }
 
 
 @torch.no_grad()
@@ -23,6 +33,4 @@ def take_rows(model, optimizers: Mapping[str, Optimizer], rows: Tensor) -> None:
     _update_param_with_optimizer(
         lambda _, old: Parameter(old.detach()[rows]), lambda _, old: old[rows], model.gauss_params, optimizers
     )
-    for name, value in state.items():
-        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count:
-            state[name] = value[rows]
+    state.update({name: value[rows] for name, value in per_splat(state, count).items()})

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
+from nrfgs_ns.densification.rows import per_splat
 from nrfgs_ns.distributed import comm
 
 PREFIX = "gauss_params."
@@ -41,15 +42,6 @@ def rows_of(rank: int, total: int, devices: int, written: list[int] | None = Non
     return slice(rank, total, devices)
 
 
-def per_splat(state: Mapping[str, Any], count: int) -> dict[str, Tensor]:
-    """The entries of a state that have a row for each of `count` splats."""
-    return {
-        name: value
-        for name, value in state.items()
-        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count
-    }
-
-
 def cut_model_state(state: Mapping[str, Any], rows: slice) -> dict[str, Any]:
     """A model's state with the rows of one device.
 
@@ -59,7 +51,8 @@ def cut_model_state(state: Mapping[str, Any], rows: slice) -> dict[str, Any]:
     total = len(state[f"{PREFIX}means"])
     cut = {name: value[rows] if name.startswith(PREFIX) else value for name, value in state.items()}
     extra = dict(cut["_extra_state"])
-    extra["strategy"] = {**extra["strategy"], **_cut(per_splat(extra["strategy"], total), rows)}
+    statistics = {name: value[rows] for name, value in per_splat(extra["strategy"], total).items()}
+    extra["strategy"] = {**extra["strategy"], **statistics}
     return {**cut, "_extra_state": extra}
 
 
@@ -158,10 +151,6 @@ def rebalance(
     for name in sorted(statistics):
         state[name] = moved(statistics[name])
     return shard_counts(sum(counts), len(counts))
-
-
-def _cut(tensors: Mapping[str, Tensor], rows: slice) -> dict[str, Tensor]:
-    return {name: value[rows] for name, value in tensors.items()}
 
 
 def _is_moment(value: Any) -> bool:

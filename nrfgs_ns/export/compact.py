@@ -41,30 +41,19 @@ def export_compact(
     """See `nrfgs export --help`."""
     check_options(options)
     pipeline = load_model(load_config, "test")
-    chosen = choose(pipeline, load_config, options)
-    model = pipeline.model
+    header, streams, numbers = packed(pipeline, load_config, options)
     begin = perf_counter()
-    field, steps = trained_for_the_file(pipeline, chosen, options)
-    trained = perf_counter()
-    header, streams = encode(field, options.precision, rendered(model), steps)
     size = write_container(output, header, streams)
     written = perf_counter()
     decode(output)
-    seconds = {"finetune": trained - begin, "encode": written - trained, "decode": perf_counter() - written}
-    count = sum(header["splats"].values())
-    config = write_config(load_config, output)
-    numbers = {
-        "splats": model.num_points,
-        "written": count,
-        "view_dependent": header["splats"]["view"],
-        "rank": header["head"]["config"]["latent_dim"],
-        "threshold": chosen.threshold if chosen.threshold != float("inf") else None,
+    numbers["seconds"]["encode"] += written - begin
+    numbers["seconds"]["decode"] = perf_counter() - written
+    config, count = write_config(load_config, output), numbers["written"]
+    numbers |= {
         "finetune": options.finetune,
         "rate": options.rate if options.finetune else None,
-        "seconds": seconds,
         "bytes": size,
-        "ply_bytes": PLY_BYTES * count,
-        "ply_ratio": PLY_BYTES * count / size,
+        "ply_ratio": numbers["ply_bytes"] / size,
         "stream_bytes": stream_bytes(output),
         "precision": asdict(options.precision),
     }
@@ -85,6 +74,26 @@ def export_compact(
     CONSOLE.print(f"Read it with:  ns-eval --load-config {config}", markup=False, soft_wrap=True)
     if report is not None:
         write_whole(report, json.dumps(numbers, indent=1) + "\n")
+
+
+def packed(pipeline, load_config: Path, options: CompactOptions) -> tuple[dict, dict, dict[str, Any]]:
+    """The header and streams of a model's compact file, and what a report says of them."""
+    chosen = choose(pipeline, load_config, options)
+    begin = perf_counter()
+    field, steps = trained_for_the_file(pipeline, chosen, options)
+    trained = perf_counter()
+    header, streams = encode(field, options.precision, rendered(pipeline.model), steps)
+    count = sum(header["splats"].values())
+    numbers = {
+        "splats": pipeline.model.num_points,
+        "written": count,
+        "view_dependent": header["splats"]["view"],
+        "rank": header["head"]["config"]["latent_dim"],
+        "threshold": chosen.threshold if chosen.threshold != float("inf") else None,
+        "seconds": {"finetune": trained - begin, "encode": perf_counter() - trained},
+        "ply_bytes": PLY_BYTES * count,
+    }
+    return header, streams, numbers
 
 
 class Chosen(NamedTuple):

@@ -22,6 +22,7 @@ Conventions, for every function of this module:
 
 from __future__ import annotations
 
+import functools
 import os
 import pickle
 
@@ -34,7 +35,7 @@ from nrfgs_ns.image.color_fit import fit_colors
 
 AS_THEY_ARE = ("psnr", "ssim", "ms_ssim", "l1", "lpips")
 METRIC_NAMES = (*AS_THEY_ARE, *(f"cc_{name}" for name in AS_THEY_ARE))
-"""The keys of ImageMetrics' answer, in the order of reports; cc: colour-corrected."""
+"""The keys of `image_metrics`, in the order of reports; cc: colour-corrected."""
 WINDOW_SIZE = 11
 """Side of the SSIM window, pixels (Wang et al. 2004)."""
 WINDOW_SIGMA = 1.5
@@ -131,51 +132,36 @@ def ssim_maps(pred: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
     return ssim_map, cs_map
 
 
-class ImageMetrics:
-    """All metrics of one image at once. Not an nn.Module: nothing of it may enter a model's checkpoints.
+def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[str, float | None]:
+    """All metrics of one image at once, on the device of `pred`.
 
     LPIPS (Zhang et al. 2018, AlexNet) needs backbone weights that torchvision would download. They are used if they are
-    on disk and never fetched: without them `lpips` is None, and one warning per process says how to get them. The
-    network is loaded at the first call, so that building a model costs nothing.
+    on disk and never fetched: without them `lpips` is None, and one warning per process says how to get them.
+
+    Returns:
+        psnr (dB), ssim, ms_ssim, l1 and lpips, and the same colour-corrected; None where undefined.
     """
+    gt = gt.to(pred.device)
+    mask = None if mask is None else mask.to(pred.device)
+    every = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "l1": l1, "lpips": _lpips}
+    corrected = fit_colors(pred, gt, mask)
+    return {
+        **{name: metric(pred, gt, mask) for name, metric in every.items()},
+        **{f"cc_{name}": metric(corrected, gt, mask) for name, metric in every.items()},
+    }
 
-    def __init__(self) -> None:
-        self._lpips_net: torch.nn.Module | None = None
-        self._lpips_tried = False
 
-    def __call__(self, pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[str, float | None]:
-        """Compares `pred` with `gt` (shapes, range and masks: see the module), on the device of `pred`.
-
-        Returns:
-            psnr (dB), ssim, ms_ssim, l1 and lpips, and the same colour-corrected; None where undefined.
-        """
-        gt = gt.to(pred.device)
-        mask = None if mask is None else mask.to(pred.device)
-        corrected = self._all(fit_colors(pred, gt, mask), gt, mask)
-        return {**self._all(pred, gt, mask), **{f"cc_{name}": value for name, value in corrected.items()}}
-
-    def _all(self, pred: Tensor, gt: Tensor, mask: Tensor | None) -> dict[str, float | None]:
-        return {
-            "psnr": psnr(pred, gt, mask),
-            "ssim": ssim(pred, gt, mask),
-            "ms_ssim": ms_ssim(pred, gt, mask),
-            "l1": l1(pred, gt, mask),
-            "lpips": self._lpips(pred, gt, mask),
-        }
-
-    def _lpips(self, pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
-        if not self._lpips_tried:
-            self._lpips_net = _load_lpips_net()
-            self._lpips_tried = True
-        if self._lpips_net is None:
+def _lpips(pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
+    net = _lpips_net()
+    if net is None:
+        return None
+    with torch.no_grad():
+        pred, gt, mask = _planes(pred, gt, mask)
+        if min(gt.shape[-2:]) < LPIPS_MIN_SIDE or (mask is not None and not mask.any()):
             return None
-        with torch.no_grad():
-            pred, gt, mask = _planes(pred, gt, mask)
-            if min(gt.shape[-2:]) < LPIPS_MIN_SIDE or (mask is not None and not mask.any()):
-                return None
-            # The network was trained on images in range; a rasterizer can overshoot.
-            pred, gt = (image.clamp(0.0, 1.0).float()[None] for image in (pred, gt))
-            return self._lpips_net.to(gt.device)(pred, gt, normalize=True).item()
+        # The network was trained on images in range; a rasterizer can overshoot.
+        pred, gt = (image.clamp(0.0, 1.0).float()[None] for image in (pred, gt))
+        return net.to(gt.device)(pred, gt, normalize=True).item()
 
 
 def _check(pred: Tensor, gt: Tensor, mask: Tensor | None) -> None:
@@ -231,11 +217,9 @@ def _halve(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tenso
     return pred, gt, mask
 
 
-_lpips_warned = False
-
-
-def _load_lpips_net() -> torch.nn.Module | None:
-    """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else None and (once per process) a warning."""
+@functools.cache
+def _lpips_net() -> torch.nn.Module | None:
+    """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else None and a warning."""
     # Both imports cost seconds, and only evaluation needs them.
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     from torchvision.models import AlexNet_Weights
@@ -255,11 +239,7 @@ def _load_lpips_net() -> torch.nn.Module | None:
 
 
 def _warn_lpips(finding: str, url: str) -> None:
-    """Says once per process why LPIPS is not reported, and how to change that."""
-    global _lpips_warned
-    if _lpips_warned:
-        return
-    _lpips_warned = True
+    """Says why LPIPS is not reported, and how to change that."""
     get_console().print(
         f"Warning: LPIPS is not reported: {finding}. Training and all other metrics are intact. "
         "To get it, run this on a connected machine, and copy the file here if that is another one:\n"

@@ -263,11 +263,15 @@ def look_through(model, field: Field, camera: Cameras) -> tuple[View, SplatAppea
     Args:
         camera: a batch of one, [1]; halved until it is small enough.
     """
-    camera = camera.to(model.device)
+    view = model.project(no_larger(camera.to(model.device)), field.splats)
+    appearance = field.seen_from(view)
+    return view, appearance, contributions(view.projection, appearance.opacities)
+
+
+def no_larger(camera: Cameras) -> Cameras:
+    """A camera [1] halved until no side is longer than LONGEST_SIDE pixels; it is changed itself."""
     longest = max(int(camera.width.max()), int(camera.height.max()))
     halvings = max(math.ceil(math.log2(longest / LONGEST_SIDE)), 0)
     if halvings > 0:
         camera.rescale_output_resolution(0.5**halvings)
-    view = model.project(camera, field.splats)
-    appearance = field.seen_from(view)
-    return view, appearance, contributions(view.projection, appearance.opacities)[:, 0]
+    return camera

@@ -26,12 +26,13 @@ from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.densification import Densification, build_densification
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
-from nrfgs_ns.image.metrics import ImageMetrics
+from nrfgs_ns.image.metrics import image_metrics
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config, upgraded
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
+from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.model.initial_splats import initial_splats
 from nrfgs_ns.model.look import look_asked_for
 from nrfgs_ns.model.pinhole import Pinhole, Pinholes
@@ -87,7 +88,6 @@ class NrfgsModel(SplatfactoModel):
 
         self.photograph: PhotographModel | None = None  # the pipeline knows the photographs
         self.trimming = robust.Trimming(config.robust_loss) if config.robust_loss > 0.0 else None
-        self.image_metrics = ImageMetrics()
         self.step = 0
         self.crop_box = None
         self.pinholes = Pinholes()
@@ -428,7 +428,7 @@ class NrfgsModel(SplatfactoModel):
         """
         truth = self.truth_of(batch, outputs["background"])
         rgb = outputs["rgb"]
-        metrics = self.image_metrics(rgb, truth, self.mask_of(batch))
+        metrics = image_metrics(rgb, truth, self.mask_of(batch))
         return (
             {name: value for name, value in metrics.items() if value is not None},
             {"img": torch.cat([truth, rgb], dim=1)},
@@ -468,6 +468,8 @@ class NrfgsModel(SplatfactoModel):
         """The fitted harmonics, or None where `fit_on` was not called."""
         if self._fit is None and self._fit_cameras is not None:
             self._fit = fit_harmonics(self, self._fit_cameras)
+            if not self._fit.exact:
+                self._fit = self._fit._replace(splats=fine_tune(self, self._fit.splats, self._fit_cameras))
         return self._fit
 
     def _exported(self, name: str) -> Tensor:

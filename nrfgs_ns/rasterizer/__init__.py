@@ -215,34 +215,29 @@ def composite(
     return render, alphas, info
 
 
-def contributions(projection: Projection, opacities: Tensor, maps: Tensor | None = None) -> Tensor:
-    """What each projected splat contributes to maps over the image: for map m, sum over pixels p of m(p) w_i(p).
+def contributions(projection: Projection, opacities: Tensor) -> Tensor:
+    """What each projected splat contributes to the image: the sum over its pixels p of w_i(p).
 
     w_i(p) = alpha_i(p) T_i(p) is the share of the pixel's light that comes from splat i: what `composite` multiplies
     its colour with, and so the derivative of the picture with respect to that colour. One forward and one backward pass
-    through the rasterizer, whatever the number of maps. No gradient flows through it.
+    through the rasterizer. No gradient flows through it.
 
     Args:
         projection: the result of `project`, M rows.
         opacities: per row, before antialiasing compensation, as for `composite`. [M]
-        maps: L numbers for each pixel. [C, H, W, L]. None: one map of ones, so that the sum is that of the shares.
 
     Returns:
-        [M, L], in pixels times the maps' unit.
+        [M], in pixels.
 
     Raises:
         ValueError: a tensor has the wrong shape.
     """
-    size = (projection.n_cameras, projection.height, projection.width)
-    if maps is None:
-        maps = opacities.new_ones(*size, 1)
-    _check_shape("maps", maps, *size, maps.shape[-1])
     with torch.enable_grad():
         # The picture is linear in its colours: its derivative does not ask which they are.
-        colors = projection.depths.new_zeros(len(opacities), maps.shape[-1]).requires_grad_()
+        colors = projection.depths.new_zeros(len(opacities), 1).requires_grad_()
         render, _, _ = composite(projection, colors, opacities.detach())
-        (shares,) = torch.autograd.grad(render, colors, maps.to(render.dtype))
-    return shares
+        (shares,) = torch.autograd.grad(render.sum(), colors)
+    return shares.squeeze(1)
 
 
 def changes_without(

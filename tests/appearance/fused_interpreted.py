@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fused kernels in Triton's interpreter against PyTorch's float64 field.
 
-Run by test_fused.py in a process of its own: Triton decides when it is imported whether it interprets.
+Run by kernels/test_interpreted.py.
 """
 
 from dataclasses import replace

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hash grid's kernels in Triton's interpreter against PyTorch's grid in float64.
 
-Run by test_hash_grid.py in a process of its own: Triton decides when it is imported whether it interprets.
+Run by kernels/test_interpreted.py.
 """
 
 import pytest

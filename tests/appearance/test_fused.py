@@ -1,25 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fused field: its kernels (fused_interpreted.py, in a process of its own), and when it is chosen."""
+"""When the fused field is chosen. Its kernels: fused_interpreted.py."""
 
-import importlib.util
 import logging
-from pathlib import Path
 
 import pytest
 import torch
 from fused_cases import heads, scene
-from interpreted import passes_in_the_interpreter
 
 from nrfgs_ns.appearance.fused.packing import pack
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.errors import InputError
-
-INTERPRETED = Path(__file__).with_name("fused_interpreted.py")
-
-
-@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
-def test_kernels_in_the_interpreter():
-    passes_in_the_interpreter(INTERPRETED)
 
 
 @pytest.fixture

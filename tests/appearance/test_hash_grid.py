@@ -1,25 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The hash grid's kernels (hash_grid_interpreted.py, in a process of its own), and when they are not taken. What the
-grid computes: test_vdgs.py."""
+"""When the hash grid's kernels are not taken. The kernels: hash_grid_interpreted.py. What the grid computes:
+test_vdgs.py."""
 
-import importlib.util
-from pathlib import Path
-
-import pytest
 import torch
 from hash_grid_cases import grids, positions
-from interpreted import passes_in_the_interpreter
 
 from nrfgs_ns.appearance import hash_grid
 from nrfgs_ns.kernels import trial
 from nrfgs_ns.kernels.trial import Gate
-
-INTERPRETED = Path(__file__).with_name("hash_grid_interpreted.py")
-
-
-@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
-def test_kernels_in_the_interpreter():
-    passes_in_the_interpreter(INTERPRETED)
 
 
 def test_cpu_takes_torch():

@@ -88,6 +88,7 @@ def claiming(name: str, change, version: int = 2) -> Case:
     return Case(name, build)
 
 
+@lru_cache
 def zeros(size: int) -> bytes:
     """So many, packed to next to nothing."""
     packer = lzma.LZMACompressor(format=lzma.FORMAT_XZ, check=lzma.CHECK_NONE, preset=0)

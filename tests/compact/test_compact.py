@@ -231,7 +231,7 @@ console.log(JSON.stringify([rows(scene.table, 16), rows(scene.latents, 8)]));
 """
 
 
-# The verb.
+# The command.
 
 
 @pytest.fixture(scope="module")

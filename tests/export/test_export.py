@@ -27,8 +27,9 @@ from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.ply import read_splats, render_splats, write_splats
 from nrfgs_ns.export.web.options import WebOptions
 from nrfgs_ns.image.metrics import psnr
-from nrfgs_ns.model import harmonics_fit
+from nrfgs_ns.model import harmonics_fit, harmonics_tune
 from nrfgs_ns.model.harmonics_fit import STRENGTHS, Moments, Observations, PlainSplats, fit_harmonics, observe
+from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.training.run import parse, train
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -40,6 +41,14 @@ METHODS = {
     "nrfgs": {"--pipeline.model.appearance.output-init": "default", "--pipeline.model.warmup-steps": 0},
     "nrfgs-sh": {"--pipeline.model.appearance.degree-interval": 1},
 }
+
+
+PASSES = harmonics_tune.PASSES
+
+
+@pytest.fixture(autouse=True)
+def short_fine_tune(monkeypatch):
+    monkeypatch.setattr(harmonics_tune, "PASSES", 1)
 
 
 def random_splats(count: int) -> PlainSplats:
@@ -242,7 +251,54 @@ def test_opacity_is_the_mean_over_views_also_over_those_in_which_a_splat_is_tran
     assert (found[~pictured] == model.gauss_params["opacities"].sigmoid()[~pictured, 0]).all()
 
 
-def test_the_fit_follows_a_random_field_closer_than_its_base_colour(trained):
+def squared_distance(model, splats: PlainSplats, cameras) -> float:
+    """Between pictures of splats and of the model."""
+    total = 0.0
+    for index in range(len(cameras)):
+        camera = cameras[index : index + 1]
+        wanted = model.get_outputs_for_camera(camera)["rgb"]
+        total += float((render_splats(splats, camera, model.background_color) - wanted).square().mean())
+    return total / len(cameras)
+
+
+class OpacityBySide(SphericalHarmonics):
+    """Every other splat is transparent from one side, the others from the other."""
+
+    is_harmonics = False
+
+    def forward(self, splats, visible, camera_centers):
+        appearance = super().forward(splats, visible, camera_centers)
+        shown = (visible % 2 == 0) == bool(camera_centers[0] > 0)
+        return appearance._replace(opacities=appearance.opacities * shown.float())
+
+
+def test_splats_that_not_all_views_show_are_drawn_closer_after_the_fine_tune(tiny_scene, tmp_path, monkeypatch):
+    """Also from beside the places from which it looked."""
+    monkeypatch.setattr(harmonics_tune, "PASSES", PASSES)
+    model, cameras = model_on(tiny_scene, tmp_path, "nrfgs-sh")
+    model.head = OpacityBySide(model.config.appearance)
+    fitted = fit_harmonics(model, cameras).splats
+    tuned = fine_tune(model, fitted, cameras)
+    for name in ("means", "quats", "scales"):
+        assert getattr(tuned, name) is getattr(fitted, name)
+    beside = cameras[torch.arange(len(cameras))]
+    centers = beside.camera_to_worlds[..., 3]
+    beside.camera_to_worlds = torch.cat([beside.camera_to_worlds[..., :3], 1.05 * centers[..., None]], dim=-1)
+    for places in (cameras, beside):
+        before, after = (squared_distance(model, splats, places) for splats in (fitted, tuned))
+        assert after < 0.7 * before
+
+
+def test_the_fine_tune_leaves_alone_what_is_right(tiny_scene, tmp_path):
+    model, cameras = model_on(tiny_scene, tmp_path, "nrfgs-sh")
+    model.head = HarmonicsByAnotherName(model.config.appearance)
+    fitted = fit_harmonics(model, cameras).splats
+    # Of 255 steps of a screen, a hundredth.
+    assert squared_distance(model, fine_tune(model, fitted, cameras), cameras) < (0.01 / 255) ** 2
+
+
+def test_the_fit_follows_a_random_field_closer_than_its_base_colour(trained, monkeypatch):
+    monkeypatch.setattr(harmonics_tune, "PASSES", PASSES)
     pipeline = load_model(trained("nrfgs"), "inference")
     model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
     distance = {"file": 0.0, "base": 0.0}
@@ -259,7 +315,7 @@ def test_the_fit_follows_a_random_field_closer_than_its_base_colour(trained):
     assert 0 < distance["file"] < 0.1 * distance["base"]
 
 
-# The verbs.
+# The commands.
 
 
 @pytest.mark.parametrize("method", METHODS)

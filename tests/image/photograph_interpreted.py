@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernels of a photograph's exposure in Triton's interpreter. Run by test_photograph.py in a process of its own."""
+"""The kernels of a photograph's exposure in Triton's interpreter. Run by kernels/test_interpreted.py."""
 
 import pytest
 import quick_interpreter  # noqa: F401

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loss's kernels in Triton's interpreter against pytorch_msssim in float64.
 
-Run by test_ssim.py in a process of its own: Triton decides when it is imported whether it interprets. A row of a
-program takes about a tenth of a second there, hence the small images and blocks.
+Run by kernels/test_interpreted.py. A row of a program takes about a tenth of a second there, hence the small images
+and blocks.
 """
 
 import quick_interpreter  # noqa: F401

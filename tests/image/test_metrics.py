@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The colour fit: exact where the truth is an affine map of the prediction, the best of all maps otherwise."""
 
+import functools
 import json
 import math
 
@@ -15,7 +16,7 @@ from torchmetrics.image import PeakSignalNoiseRatio
 
 from nrfgs_ns.image import metrics
 from nrfgs_ns.image.color_fit import fit_colors
-from nrfgs_ns.image.metrics import LPIPS_MIN_SIDE, METRIC_NAMES, ImageMetrics, l1, ms_ssim, psnr, ssim, ssim_maps
+from nrfgs_ns.image.metrics import LPIPS_MIN_SIDE, METRIC_NAMES, image_metrics, l1, ms_ssim, psnr, ssim, ssim_maps
 
 SCALARS = (psnr, l1, ssim, ms_ssim)
 
@@ -81,7 +82,7 @@ def test_ssim_map_against_scipy():
 
 def test_perfect_prediction():
     _, gt = pair(170, 165)
-    values = ImageMetrics()(gt, gt)
+    values = image_metrics(gt, gt)
     assert values["psnr"] == pytest.approx(100.0) and values["l1"] == 0.0  # capped: JSON has no infinity
     # In float32 cs and ssim are quotients of equal numbers, each rounded once or twice.
     assert values["ssim"] == pytest.approx(1.0, abs=1e-6) and values["ms_ssim"] == pytest.approx(1.0, abs=1e-6)
@@ -92,7 +93,7 @@ def test_perfect_prediction():
 @settings(max_examples=40)
 def test_small_images_give_a_number_or_none(height, width, masked):
     pred, gt = pair(height, width)
-    values = ImageMetrics()(pred, gt, torch.ones(height, width, 1, dtype=torch.bool) if masked else None)
+    values = image_metrics(pred, gt, torch.ones(height, width, 1, dtype=torch.bool) if masked else None)
     assert tuple(values) == METRIC_NAMES
     assert math.isfinite(values["psnr"]) and math.isfinite(values["l1"])
     assert (values["ssim"] is not None) == (min(height, width) >= 11)
@@ -122,16 +123,10 @@ def test_no_gradient_is_recorded_and_inputs_stay():
     pred.requires_grad_()
     mask = disc(165, 170, 40)
     copies = pred.detach().clone(), gt.clone(), mask.clone()
-    values = ImageMetrics()(pred, gt, mask)
+    values = image_metrics(pred, gt, mask)
     assert all(isinstance(values[name], float) for name in ("psnr", "ssim", "ms_ssim", "l1"))
     assert all(torch.equal(a, b) for a, b in zip((pred, gt, mask), copies, strict=True))
-    assert values == ImageMetrics()(pred, gt, mask)
-
-
-def test_nothing_enters_a_checkpoint():
-    module = torch.nn.Module()
-    module.metrics = ImageMetrics()
-    assert not module.state_dict() and not list(module.modules())[1:]
+    assert values == image_metrics(pred, gt, mask)
 
 
 @pytest.mark.parametrize("pred, gt, mask", [
@@ -160,7 +155,7 @@ def test_a_full_mask_changes_nothing():
 
 def test_an_empty_mask_gives_none():
     pred, gt = pair(170, 165)
-    assert set(ImageMetrics()(pred, gt, torch.zeros(170, 165, 1, dtype=torch.bool)).values()) == {None}
+    assert set(image_metrics(pred, gt, torch.zeros(170, 165, 1, dtype=torch.bool)).values()) == {None}
 
 
 def test_a_mask_at_the_border_has_pixels_but_no_window():
@@ -230,7 +225,7 @@ def test_a_thin_mask_survives_the_coarse_scales():
 def test_cuda_agrees_with_cpu(masked):
     pred, gt = pair(300, 400, noise=0.01)
     mask = disc(300, 400, 100) if masked else None
-    on_cpu, on_cuda = ImageMetrics()(pred, gt, mask), ImageMetrics()(pred.cuda(), gt, mask)
+    on_cpu, on_cuda = image_metrics(pred, gt, mask), image_metrics(pred.cuda(), gt, mask)
     for name in ("psnr", "ssim", "ms_ssim", "l1"):
         assert on_cuda[name] == pytest.approx(on_cpu[name], rel=1e-5), name  # TF32 would be off by 1e-3
 
@@ -242,7 +237,7 @@ def test_cuda_agrees_with_cpu(masked):
 def hub(tmp_path, monkeypatch):
     """An empty torch hub folder and a fresh warning."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(metrics, "_lpips_warned", False)
+    monkeypatch.setattr(metrics, "_lpips_net", functools.cache(metrics._lpips_net.__wrapped__))
     monkeypatch.setattr("torch.hub.download_url_to_file", lambda *_, **__: pytest.fail("a download was tried"))
     folder = tmp_path / "hub" / "checkpoints"
     folder.mkdir(parents=True)
@@ -262,10 +257,9 @@ def weights(hub):
 
 def test_lpips_without_weights_warns_once_and_is_none(hub, capsys):
     pred, gt = pair(40, 40)
-    for image_metrics in (ImageMetrics(), ImageMetrics()):
-        for _ in range(2):
-            values = image_metrics(pred, gt)
-            assert values["lpips"] is None and values["psnr"] is not None
+    for _ in range(2):
+        values = image_metrics(pred, gt)
+        assert values["lpips"] is None and values["psnr"] is not None
     printed = " ".join(capsys.readouterr().out.split())
     assert printed.count("LPIPS is not reported") == 1
     assert str(hub / "alexnet-owt-7be5be79.pth") in printed and "load_state_dict_from_url" in printed
@@ -273,13 +267,12 @@ def test_lpips_without_weights_warns_once_and_is_none(hub, capsys):
 
 def test_lpips_with_broken_weights_warns_and_is_none(weights, capsys):
     weights.write_bytes(weights.read_bytes()[:1000])
-    assert ImageMetrics()(*pair(40, 40))["lpips"] is None
+    assert image_metrics(*pair(40, 40))["lpips"] is None
     assert "cannot be loaded" in capsys.readouterr().out
 
 
 def test_lpips_with_weights(weights):
     """Random features do not judge images, but they tell equal from different, and inside from outside."""
-    image_metrics = ImageMetrics()
     pred, gt = pair(64, 72)
     mask = disc(64, 72, 20)
 

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The model of a photograph: known answers, gradients, gauge, identity, checkpoints."""
 
-import importlib.util
-from pathlib import Path
-
 import pytest
 import torch
-from interpreted import passes_in_the_interpreter
 
 from nrfgs_ns.image.photograph import GAMMA, PARTS, PENALTY, TOE, TOE_STEP, PhotographModel, exposed
 
@@ -189,11 +185,6 @@ def test_a_checkpoint_brings_its_own_patterns():
     few = PhotographModel([f"{i}.jpg" for i in range(5)], [0] * 5, LENSES)
     few.load_state_dict(many.state_dict())
     assert torch.equal(few.held, many.held) and few.kept.shape == (15,)
-
-
-@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
-def test_kernels_in_the_interpreter():
-    passes_in_the_interpreter(Path(__file__).with_name("photograph_interpreted.py"))
 
 
 def test_recovers_known_exposures_from_the_photographs_alone():

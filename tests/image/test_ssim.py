@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss of L1 and SSIM: PyTorch's path against pytorch_msssim, and the kernels in Triton's interpreter."""
-
-import importlib.util
-from pathlib import Path
+"""The loss of L1 and SSIM: PyTorch's path against pytorch_msssim. Its kernels: ssim_interpreted.py."""
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from interpreted import passes_in_the_interpreter
 from pytorch_msssim import SSIM
 from ssim_cases import MOMENT_ROUNDINGS, TOLERANCE, ULP, assert_near, pair, reference
 
@@ -18,14 +14,8 @@ from nrfgs_ns.image.ssim import photometric_loss, ssim
 from nrfgs_ns.kernels import trial
 from nrfgs_ns.kernels.trial import Gate
 
-INTERPRETED = Path(__file__).with_name("ssim_interpreted.py")
 DOUBLE_TOLERANCE = TOLERANCE * 2.0**-29
 """The same bound for float64's 2^-53 instead of 2^-24."""
-
-
-@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
-def test_kernels_in_the_interpreter():
-    passes_in_the_interpreter(INTERPRETED)
 
 
 @settings(max_examples=40, derandomize=True)

@@ -126,7 +126,7 @@ def test_views_score_as_the_pipeline_does(loud, field):
     assert views.psnr(field) == pytest.approx(expected, abs=1e-4)
 
 
-def test_the_verb(tiny_scene, tmp_path, capsys):
+def test_the_command(tiny_scene, tmp_path, capsys):
     options = {
         "--data": tiny_scene,
         "--output-dir": tmp_path,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Adam's kernel in Triton's interpreter against torch's Adam.
 
-Run by kernels/test_interpreted.py in a process of its own: Triton decides when it is imported whether it interprets.
+Run by kernels/test_interpreted.py.
 """
 
 from copy import deepcopy

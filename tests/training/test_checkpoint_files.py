@@ -5,6 +5,7 @@ import ctypes
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -188,35 +189,39 @@ def test_a_disk_that_is_full_indeed(tmp_path):
 
 
 KILLED = """
-import sys, torch
+import os, sys, torch
 from pathlib import Path
 from nrfgs_ns.training.checkpoint_files import write
-folder, numbers = Path(sys.argv[1]), torch.zeros(4_000_000)
-print("ready", flush=True)
-for step in range(1, 100_000):
-    numbers.fill_(step)
-    write(folder, step, {"step": step, "pipeline": {"numbers": numbers}, "optimizers": {}})
+for line in sys.stdin:  # a folder; imports take longer than all else
+    child = os.fork()
+    if child == 0:
+        numbers = torch.zeros(4_000_000)
+        for step in range(1, 100_000):
+            numbers.fill_(step)
+            write(Path(line.strip()), step, {"step": step, "pipeline": {"numbers": numbers}, "optimizers": {}})
+    print(child, flush=True)
+    print(os.waitpid(child, 0), flush=True)
 """
 
 
 @pytest.mark.parametrize("rounds", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_process_that_is_killed_while_it_writes_leaves_whole_files(rounds, tmp_path):
     draw = random.Random(0)
-    for round in range(rounds):
-        folder = tmp_path / str(round) / "models"
-        process = subprocess.Popen(
-            [sys.executable, "-c", KILLED, str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        assert process.stdout.readline() == "ready\n", process.stderr.read()
-        while not find(folder):
-            time.sleep(0.001)
-        time.sleep(draw.uniform(0.0, 0.3))
-        process.kill()
-        process.communicate()
-        for step, path in find(folder).items():
-            state = read(path)
-            assert state["step"] == step and (state["pipeline"]["numbers"] == step).all()
-        assert 1 <= len(find(folder)) <= 3, "two, and a third while the oldest is being removed"
+    command = [sys.executable, "-c", KILLED]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        for round in range(rounds):
+            folder = tmp_path / str(round) / "models"
+            print(folder, file=server.stdin, flush=True)
+            writing = int(server.stdout.readline())
+            while not find(folder):
+                time.sleep(0.001)
+            time.sleep(draw.uniform(0.0, 0.3))
+            os.kill(writing, signal.SIGKILL)
+            assert server.stdout.readline() == f"({writing}, {signal.SIGKILL:d})\n"
+            for step, path in find(folder).items():
+                state = read(path)
+                assert state["step"] == step and (state["pipeline"]["numbers"] == step).all()
+            assert 1 <= len(find(folder)) <= 3, "two, and a third while the oldest is being removed"
 
 
 def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0) -> dict:

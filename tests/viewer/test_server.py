@@ -84,7 +84,8 @@ def answer(address: str, port: int, path: str, *headers: str, host: str | None =
     with socket.create_connection((address, port), timeout=20) as connection:
         connection.sendall("\r\n".join(lines).encode())
         received = b""
-        while b"\r\n\r\n" not in received or received.startswith(b"HTTP/1.1 404"):
+        # A WebSocket stays open; all others are closed behind the body.
+        while not (received.startswith(b"HTTP/1.1 101") and b"\r\n\r\n" in received):
             part = connection.recv(1 << 16)
             received += part
             if not part:

@@ -172,12 +172,14 @@ HEADS = {"SH": "3DGS", "VDGS": "VDGS", "GSNB": "GSNB", "SG": "SG", "NRF": "NRF-G
 
 def chosen() -> str:
     """Each head's setting of four, and what it gains over its own in the median held-out view, mean over captures."""
-    told = []
-    for head, run in HEADS.items():
-        best = best_trial(head)
-        gain = signed(fmean(trial_gains(head, best).values()), 2) if best else ""
-        told.append(f"{run} {TRIALS[best]} ({gain} dB)" if best else f"{run} its own")
-    return ", ".join(told)
+    best = {head: best_trial(head) for head in HEADS}
+    told = [
+        f"{HEADS[head]} {TRIALS[trial]} ({signed(fmean(trial_gains(head, trial).values()), 2)} dB)"
+        for head, trial in best.items()
+        if trial
+    ]
+    *first, last = [HEADS[head] for head, trial in best.items() if not trial]
+    return ", ".join([*told, f"{', '.join(first)} and {last} their own"])
 
 
 def best_trial(head: str) -> str:

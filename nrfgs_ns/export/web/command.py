@@ -14,20 +14,11 @@ from PIL import Image
 
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 from nrfgs_ns.appearance.reduce import input_columns
-from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.compact import (
-    PLY_BYTES,
-    check_options,
-    choose,
-    measure_file,
-    rendered,
-    trained_for_the_file,
-    write_config,
-)
+from nrfgs_ns.export.compact import check_options, measure_file, packed, write_config
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.web.options import WebOptions
 from nrfgs_ns.export.web.page import page
@@ -77,9 +68,7 @@ def export_web(
             f"--load-config {load_config}: the field's weights fill {vectors} vectors of a shader, and some phones "
             f"have room for {MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
         )
-    chosen = choose(pipeline, load_config, options)
-    field, steps = trained_for_the_file(pipeline, chosen, options)
-    header, streams = encode(field, options.precision, rendered(model), steps)
+    header, streams, numbers = packed(pipeline, load_config, options)
     about, poster = surroundings(pipeline)
     with TemporaryDirectory() as temporary:
         file = Path(temporary) / SCENE
@@ -92,11 +81,12 @@ def export_web(
     for path, content in written.items():
         write(path, content)
 
-    count, size = sum(header["splats"].values()), sum(map(len, written.values()))
+    size = sum(map(len, written.values()))
     name = about["photographs"][about["start"]]["name"]
     CONSOLE.print(
-        f"{output}: {count:,} splats, {header['splats']['view']:,} of them view-dependent, {size / 1e6:.2f} MB; 3DGS's "
-        f"PLY of as many splats has {PLY_BYTES * count / 1e6:.2f} MB. It begins where {name} was taken.",
+        f"{output}: {numbers['written']:,} splats, {numbers['view_dependent']:,} of them view-dependent, "
+        f"{size / 1e6:.2f} MB; 3DGS's PLY of as many splats has {numbers['ply_bytes'] / 1e6:.2f} MB. It begins where "
+        f"{name} was taken.",
         markup=False,
         soft_wrap=True,
     )
@@ -108,18 +98,8 @@ def export_web(
     where = "Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md."
     CONSOLE.print(where)
     if report is not None:
-        numbers = {
-            "splats": model.num_points,
-            "written": count,
-            "view_dependent": header["splats"]["view"],
-            "rank": header["head"]["config"]["latent_dim"],
-            "threshold": chosen.threshold if chosen.threshold != float("inf") else None,
-            "bytes": size,
-            "scene_bytes": scene_bytes,
-            "ply_bytes": PLY_BYTES * count,
-            "start": name,
-        }
-        write(report, (json.dumps(numbers | losses, indent=1) + "\n").encode())
+        numbers |= {"bytes": size, "scene_bytes": scene_bytes, "start": name, **losses}
+        write(report, (json.dumps(numbers, indent=1) + "\n").encode())
 
 
 def weight_vectors(config: NrfConfig) -> int:

@@ -188,8 +188,8 @@ def test_a_report_made_while_another_command_runs(fake):
 def test_a_stopped_benchmark_says_so(fake, monkeypatch, capsys):
     """Ctrl-C: no traceback, the status of a stopped command, and no child left."""
     behave(fake, **{"SH-own-scene-1": "hangs"})
-    verb, pid = bench_in(fake, seeds=(1,)), fake / "work" / "SH-own-scene-1" / "pid"
-    monkeypatch.setattr(cli, "chosen", lambda arguments: verb)
+    command, pid = bench_in(fake, seeds=(1,)), fake / "work" / "SH-own-scene-1" / "pid"
+    monkeypatch.setattr(cli, "chosen", lambda arguments: command)
 
     def stop(_):
         if pid.exists() and pid.read_text():

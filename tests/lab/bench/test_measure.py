@@ -14,7 +14,6 @@ from nrfgs_lab.bench.command import Bench
 from nrfgs_lab.bench.measure import at_size, over_views
 from nrfgs_lab.bench.spec import Job, cells_of, command, identity, make_spec
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.image.metrics import ImageMetrics
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -110,10 +109,10 @@ def test_flip_is_asked_for_inside_the_mask_and_left_out_of_the_mean_where_it_is_
     part = torch.zeros(16, 16, 1)
     part[:4] = 1.0
     views = [view("a", 0.5), view("b", 0.0, part), view("c", 1.0, torch.zeros(16, 16, 1))]
-    measured = over_views(Grey(), ImageMetrics(), views, flip)
+    measured = over_views(Grey(), views, flip)
     assert asked == [((16, 16, 3), 0.5, None), ((16, 16, 3), 0.0, 64), ((16, 16, 3), 1.0, 0)]
     assert [one["flip"] for one in measured["per_image"]] == [0.25, 0.5, None] and measured["flip"] == 0.375
-    without = over_views(Grey(), ImageMetrics(), views)
+    without = over_views(Grey(), views)
     assert without["flip"] is None and "flip" not in without["per_image"][0]
 
 

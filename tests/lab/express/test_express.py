@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The expressiveness study: counts, models against the heads, fits with known answers, and the verb."""
+"""The expressiveness study: counts, models against the heads, fits with known answers, and the command."""
 
 import json
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,6 +33,7 @@ from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.spherical_harmonics import sh_bases
+from nrfgs_ns.cli import chosen
 from nrfgs_ns.errors import InputError
 
 
@@ -348,12 +346,10 @@ def test_deviation_over_seeds_is_the_samples(tmp_path):
     assert "| synthetic | SH degree 3, Adam | 15,744 | 3 | 22.00 ± 2.00 | - | 21.1 |" in report.markdown(summary)
 
 
-def test_the_verb_measures_once_and_resumes(tmp_path):
+def test_the_command_measures_once_and_resumes(tmp_path, capsys):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "nrfgs_ns.cli", "express", "--out", str(out), "--quick", "--passes", "1"]
-    run = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    assert run.returncode == 0, run.stderr
-    assert "only the synthetic set-up is run" in " ".join(run.stdout.split())
+    chosen(["express", "--out", str(out), "--quick", "--passes", "1"]).main()
+    assert "only the synthetic set-up is run" in " ".join(capsys.readouterr().out.split())
     runs = sorted((out / "runs").glob("*.json"))
     rows = {row["model"]: row for row in json.loads((out / "summary.json").read_text())["table"]}
     assert set(rows) == set(report.ROWS)
@@ -373,14 +369,14 @@ def test_the_verb_measures_once_and_resumes(tmp_path):
     assert json.loads(runs[2].read_text())["seconds"] == 12345.0
 
 
-def test_the_verb_runs_on_measured_reflectance(tmp_path, networks_folder):
+def test_the_command_runs_on_measured_reflectance(tmp_path, networks_folder):
     Express(out=tmp_path / "out", quick=True, passes=1, setups=("image",), reflectance=networks_folder).main()
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert {row["setup"] for row in summary["table"]} == {"image"}
     assert (tmp_path / "out" / "express-image.jpg").exists()
 
 
-def test_the_verb_runs_on_photographs(tmp_path):
+def test_the_command_runs_on_photographs(tmp_path):
     folder = tmp_path / "wool"
     folder.mkdir()
     generator = np.random.default_rng(0)

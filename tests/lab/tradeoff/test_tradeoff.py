@@ -230,6 +230,13 @@ def test_report_from_records(tmp_path, capsys):
     assert "D 8" in capsys.readouterr().out
 
 
+@pytest.fixture
+def no_figure(monkeypatch):
+    """Reports without the figure, which takes a second; other tests draw it."""
+    monkeypatch.setattr("nrfgs_lab.tradeoff.report.draw", lambda rows, settings, path: None)
+
+
+@pytest.mark.usefixtures("no_figure")
 def test_costs_are_absolute_where_the_default_has_none(tmp_path, capsys):
     """The default shared its GPU on scene t, whose other times are known all the same. On s there are factors, and a
     footnote only where a reader meets such a number."""
@@ -352,30 +359,31 @@ def fake_runs(monkeypatch):
     return ran
 
 
-def test_the_verb_runs_a_benchmark(tmp_path, fake_runs):
+def test_the_command_runs_a_benchmark(tmp_path, fake_runs):
     """It leaves the benchmark's file, hands it to `nrfgs bench` with its options, and reports what that has left."""
     ran = fake_runs
     (tmp_path / "knobs.yaml").write_text(yaml.safe_dump({**KNOBS, "knobs": {"D": KNOBS["knobs"]["D"]}}))
-    verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", seeds=(7,), cuda=False)
-    verb.main()
+    command = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", seeds=(7,), cuda=False)
+    command.main()
     assert ran == ["default-own-s-7", "D_4-own-s-7", "D_8-own-s-7"]
     assert yaml.safe_load((tmp_path / "out" / "bench.yaml").read_text())["seeds"] == [7]
     assert (tmp_path / "out" / "tradeoff.md").exists() and (tmp_path / "out" / "table.md").exists()
     ran.clear()
-    verb.main()
+    command.main()
     assert ran == []
 
 
 def test_rows_with_steps_of_their_own_are_named(tmp_path, fake_runs, capsys):
     """A file's "a third of the steps" is no third of others."""
     (tmp_path / "knobs.yaml").write_text(yaml.safe_dump(KNOBS))
-    verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path, work=tmp_path, knobs=("steps", "D"), steps=40, cuda=False)
-    verb.main()
+    command = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path, work=tmp_path, knobs=("steps", "D"), steps=40, cuda=False)
+    command.main()
     assert "--steps does not change runs that have their own: steps 50 (50)." in capsys.readouterr().out
     with pytest.raises(InputError, match="steps is 0"):
         Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "none", steps=0).main()
 
 
+@pytest.mark.usefixtures("no_figure")
 def test_parts_of_a_sweep_report_all_that_is_there(tmp_path, fake_runs):
     """Knobs one after the other, a report without a GPU of what was made with one."""
     (tmp_path / "knobs.yaml").write_text(
@@ -384,8 +392,8 @@ def test_parts_of_a_sweep_report_all_that_is_there(tmp_path, fake_runs):
 
     def sweep(**chosen) -> tuple[list[str], list]:
         """The rows of the report on the first scene, and its seeds."""
-        verb = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", data=("s",), **chosen)
-        verb.main()
+        command = Tradeoff(tmp_path / "knobs.yaml", out=tmp_path / "out", work=tmp_path / "work", data=("s",), **chosen)
+        command.main()
         first = json.loads((tmp_path / "out" / "tradeoff.json").read_text())[0]
         content = yaml.safe_load((tmp_path / "out" / "bench.yaml").read_text())
         assert list(content["runs"]) == [one["run"] for one in first["settings"]]
