@@ -151,11 +151,14 @@ class Densification(ABC):
         Args:
             logits: stored opacities [N, 1].
         """
-        stored = torch.sigmoid(logits).flatten()
         if self.shown is None:
-            return stored.mean()
+            return torch.sigmoid(logits).mean()
         rows, opacities, cameras = self.shown
-        return stored.mean() + (opacities - stored[rows]).sum() / (cameras * len(stored))
+        if cameras == 1 and len(rows) == len(logits):  # all are shown, or have a row (`takes_all_rows`)
+            return opacities.mean()
+        stored = torch.sigmoid(logits).flatten()
+        # By index_select: the gradient of an index is a sort of all rows.
+        return stored.mean() + (opacities - stored.index_select(0, rows)).sum() / (cameras * len(stored))
 
     def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Terms that the strategy adds to the loss, by name."""
