@@ -6,7 +6,7 @@ import torch
 from densification_cases import Table, arguments, strategy, trainer_of
 from torch.testing import assert_close
 
-from nrfgs_ns.densification import build_densification, thinning
+from nrfgs_ns.densification import build_densification
 from nrfgs_ns.densification.thinning import ROUNDS, least_missed, missed
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.robust import Trimming
@@ -185,7 +185,7 @@ def test_several_devices_are_refused(tiny_scene, tmp_path):
 
 def test_a_training_keeps_a_half(tiny_scene, tmp_path, monkeypatch):
     """Growth ends before it begins; the rounds are at steps 10 to 15. Which splats go, other tests look at."""
-    monkeypatch.setattr(thinning, "DRAWS", 8)
+    monkeypatch.setattr("nrfgs_ns.densification.thinning.DRAWS", 8)
     trainer = trainer_of(tiny_scene, tmp_path, "splatfacto", **{"stop-split-at": 10, "keep": 0.5})
     model = trainer.pipeline.model
     before = model.num_points
