@@ -23,7 +23,7 @@ from nrfgs_ns.model.renderer import View, composite_view
 from nrfgs_ns.model.view_noise import camera_spacing
 
 PASSES = 10
-"""How often each view is looked through."""
+"""How often each view is looked through; 0: the fit is left as it is."""
 RATES = {"opacities": 3.0, "features_dc": 0.15, "features_rest": 0.15}
 """Learning rates to begin with, where pictures are off by 1 (root of the mean square), and in proportion where they are
 off by less: Adam's steps are no shorter there. They fall to 0 by half a cosine."""
@@ -60,10 +60,10 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras) -> PlainSplats:
     with torch.no_grad():
         off = torch.stack([off_by(index, 0.0) for index in range(len(cameras))]).mean().sqrt().item()
     groups = [{"params": [tables[name]], "lr": rate * off} for name, rate in RATES.items()]
-    optimizer, steps = torch.optim.Adam(groups, eps=1e-15), PASSES * len(cameras)
+    optimizer, steps = torch.optim.Adam(groups, eps=1e-15), max(PASSES * len(cameras), 1)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.5 * (1 + math.cos(math.pi * step / steps)))
     sigma = MOVED * camera_spacing(cameras.camera_to_worlds[:, :3, 3]) / math.sqrt(3.0)
-    order = torch.cat([torch.randperm(len(cameras), generator=generator) for _ in range(PASSES)]).tolist()
+    order = [index for _ in range(PASSES) for index in torch.randperm(len(cameras), generator=generator).tolist()]
     for index in track(order, "Drawing what the model draws", console=CONSOLE, transient=True):
         with torch.enable_grad():
             loss = off_by(index, sigma)
