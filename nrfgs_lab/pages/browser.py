@@ -146,11 +146,7 @@ class Page:
 
     def step(self) -> int:
         """The training step that the page tells."""
-        return self._number("Step")
-
-    def _number(self, label: str) -> int:
-        """The first number after a label and a colon."""
-        return int(re.search(label + r":\s*(\d+)", self.page.inner_text("body")).group(1))
+        return int(re.search(r"Step:\s*(\d+)", self.page.inner_text("body")).group(1))
 
     def turn(self) -> None:
         """Drag the mouse across the scene."""
@@ -165,21 +161,28 @@ class Page:
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(np.float32)
 
     def settled(self, unlike: np.ndarray | None = None) -> np.ndarray:
-        """The picture, as soon as it is one, has not changed for two seconds, and differs from the one given.
+        """The picture at its full size, as soon as it has not changed for two seconds and differs from the one given.
 
-        The viewer first renders small, then at full size: two seconds are several times the pause between them.
+        The viewer renders small first, and on a busy machine that stays for long: the page must tell the full size
+        before and after those seconds.
         """
-        deadline, since, last = time.time() + PATIENCE, time.time(), self.shot()
+        deadline, since, last, was_full = time.time() + PATIENCE, time.time(), self.shot(), False
         while time.time() < deadline:
             time.sleep(0.3)
+            is_full = self.is_full_size()
             now = self.shot()
-            if different(now, last):
+            if different(now, last) or not (is_full and was_full):
                 since = time.time()
-            last = now
+            last, was_full = now, is_full
             there = now.std() > 1 and (unlike is None or different(now, unlike))
             if there and time.time() - since > 2:
                 return now
         raise AssertionError("the picture did not change" if unlike is not None else "no picture came to rest")
+
+    def is_full_size(self) -> bool:
+        """Whether the picture that was sent last is as large as it gets."""
+        sides = re.search(r"Resolution:\s*(\d+)x(\d+)px", self.page.inner_text("body"))
+        return sides is not None and max(map(int, sides.groups())) == int(self.control("Max res").input_value())
 
     def returns_to(self, picture: np.ndarray) -> None:
         """Wait until the scene looks like this."""
@@ -187,16 +190,6 @@ class Page:
         while different(self.shot(), picture):
             assert time.time() < deadline, "the picture did not come back"
             time.sleep(0.3)
-
-    def sharp(self, unlike: np.ndarray | None = None) -> np.ndarray:
-        """The settled picture at its full size: on a slow machine the small one stays for long."""
-        wanted = int(self.control("Max res").input_value())
-        deadline = time.time() + PATIENCE
-        while time.time() < deadline:
-            picture = self.settled(unlike)
-            if self._number("Resolution") == wanted:
-                return picture
-        raise AssertionError(f"no picture of {wanted} pixels came")
 
     def save(self, path: Path, quality: int = 85) -> None:
         """Write the whole page as a JPEG, without the logo, which comes from another site."""

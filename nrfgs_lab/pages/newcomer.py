@@ -123,7 +123,7 @@ def look(diary: Diary, browser, config: Path, work: Path) -> None:
         page = Page(browser, viewer.port, *WINDOW)
         page.hide_cameras()
         page.set_resolution(800)
-        page.sharp()
+        page.settled()
         page.save(IMAGES / "first-scene-viewer.jpg")
         page.page.close()
     diary.write("look", ["ns-viewer", *words], time.time() - start)

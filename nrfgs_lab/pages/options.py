@@ -38,7 +38,7 @@ RULES = "original", "mcmc"
 """Densification strategies with options of their own."""
 LEFT_OUT = (
     *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
-    *("pipeline.model.warmup-lr", "pipeline.model.appearance.distance-eps", "load-3D-points"),
+    *("pipeline.model.appearance.distance-eps", "load-3D-points"),
     *("viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact", "pipeline.sharding.schedules"),
 )
 """Options that hardly anybody needs, or that a page of their own explains: `--help` has them."""

@@ -55,9 +55,9 @@ def main() -> None:
             page.hide_cameras()
             page.come_closer()
             page.set_resolution(900)
-            full = page.sharp()
+            full = page.settled()
             page.show("residual")
-            page.sharp(unlike=full)
+            page.settled(unlike=full)
             page.save(IMAGES / "viewer.jpg")
 
 

@@ -42,9 +42,8 @@ class Mcmc(Densification):
             gets is computed from the stored opacities.
         scene_unit: world units in a scene unit.
 
-    The mean opacity in the loss is that of what the step's cameras are shown (`mean_opacity`). If it were that of the
-    stored ones alone, splats that every view shows would count as dead, too, and the noise, made for splats that nobody
-    sees, would shake them.
+    The mean opacity in the loss is that of what the step's cameras are shown (`mean_opacity`). With the stored ones
+    alone, splats that every view shows would count as dead, too, and the noise would shake them.
     """
 
     name = "mcmc"

@@ -18,15 +18,15 @@ OpacitySeen = Literal["base", "peak"]
 CHANGE = "opacity_change"
 """Name, in a strategy's `state`, of the largest change of each splat's opacity by a view, [N]: see `change_of`."""
 UNSEEN = -2.0
-"""Change of a splat that no view has shown since then: less than any change."""
+"""Change of a splat that no view has shown: less than any change."""
 
 
 def change_of(stored: Tensor, shown: Tensor) -> Tensor:
     """How views change stored opacities: the amount that they add, or, negative, the share that they take away.
 
-    It grows with the opacity that is shown, and is exactly 0 where that is the stored one. What is taken away counts as
-    a share because no view can take more than there is: a splat of opacity 0.6 that a view shows at 0.3 is not hidden
-    once relocation has left it 0.2.
+    It grows with the opacity that is shown, and is 0 where that is the stored one. What is taken away is a share,
+    because no view takes more than there is: a splat of 0.6 that a view shows at 0.3 is still visible once relocation
+    has left it 0.2.
 
     Args:
         stored, shown: opacities in [0, 1] of one shape.
@@ -146,17 +146,19 @@ class Densification(ABC):
     def mean_opacity(self, logits: Tensor) -> Tensor:
         """The splats' mean opacity for the loss, a scalar: as the step's cameras are shown them, stored otherwise.
 
-        If it were that of the stored ones alone, a head that adds to them would be paid for making them small, and
-        would add the more.
+        The mean of the stored ones alone would reward a head that lowers what is stored and adds the difference.
 
         Args:
             logits: stored opacities [N, 1].
         """
-        stored = torch.sigmoid(logits).flatten()
         if self.shown is None:
-            return stored.mean()
+            return torch.sigmoid(logits).mean()
         rows, opacities, cameras = self.shown
-        return stored.mean() + (opacities - stored[rows]).sum() / (cameras * len(stored))
+        if cameras == 1 and len(rows) == len(logits):  # all are shown, or have a row (`takes_all_rows`)
+            return opacities.mean()
+        stored = torch.sigmoid(logits).flatten()
+        # By index_select: the gradient of an index is a sort of all rows.
+        return stored.mean() + (opacities - stored.index_select(0, rows)).sum() / (cameras * len(stored))
 
     def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Terms that the strategy adds to the loss, by name."""

@@ -48,8 +48,6 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     warmup_steps: int | None = None
     """steps before training in which a head with a residual at its start learns to have none. None: one for each
     training view"""
-    warmup_lr: float = 1e-3
-    """learning rate of the warm-up's Adam"""
     densification: Strategy = "splatfacto"
     """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
     splat_budget"""
@@ -79,8 +77,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Be what a config.yml says; that of an older version has other options, or values that are no more."""
-        state = {**vars(type(self)()), **state}
-        state.pop("head_from", None)
+        options = vars(type(self)())
+        state = {**options, **{name: value for name, value in state.items() if name in options}}
         state["few_views"] = "auto" if state["few_views"] == "on" else state["few_views"]
         self.__dict__.update(state)
         self.densification = RETIRED.get(self.densification, self.densification)

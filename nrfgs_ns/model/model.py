@@ -300,7 +300,7 @@ class NrfgsModel(SplatfactoModel):
 
         def before_first_step(step: int) -> None:
             steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
-            warm_up(self, cameras, steps, self.config.warmup_lr)
+            warm_up(self, cameras, steps)
 
         callbacks = [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before_first_step, iters=(0,)),

@@ -41,7 +41,7 @@ def pinhole(camera: Cameras, camera_to_world: Tensor, downscale: int) -> Pinhole
 
 
 class Pinholes:
-    """The cameras of one model."""
+    """The cameras of one model, converted once where their poses are fixed."""
 
     def __init__(self):
         self._of_training: dict[tuple[int, int], Pinhole] = {}  # by index and downscale
@@ -74,8 +74,8 @@ class Pinholes:
 class FixedPinholes:
     """Cameras whose poses are not learnt, converted on the host and sent to the device in one piece.
 
-    A rendering waits for nothing that way, if its camera is in host memory. Of one on the GPU the host must ask what it
-    is, and wait for all that was asked before; so the last ones are remembered, as long as nothing writes to them.
+    A camera in host memory costs no wait. To read one on the GPU the host waits for all work there, so the last ones
+    are remembered until something writes to them.
 
     Args:
         device: where the pinholes are to be.

@@ -29,10 +29,9 @@ NEIGHBOURS = 2
 def camera_spacing(centers: Tensor) -> float:
     """The distance between neighbouring training cameras, in the units of `centers`.
 
-    Each place of the capture has two distances, to its two nearest other places; the result is their median, in which
-    a distance counts by its length. Cameras that stand at one place, or in pairs, bring only short distances, and few
-    that stand far off few long ones: neither decides. Turning, moving or scaling the capture does to the result what
-    it does to distances.
+    Of the distances from each place of the capture to its two nearest other places, the median in which a distance
+    counts by its length. So the short distances of cameras that stand at one place or in pairs do not decide, nor do
+    the long ones of a few that stand far off.
 
     Args:
         centers: of the cameras, [V, 3].

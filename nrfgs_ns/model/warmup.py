@@ -10,8 +10,11 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 
+LEARNING_RATE = 1e-3
+"""Of Adam."""
 
-def warm_up(model, cameras: Cameras, steps: int, lr: float) -> None:
+
+def warm_up(model, cameras: Cameras, steps: int) -> None:
     """Teach `model.head` to be neutral, and log what that did.
 
     Args:
@@ -22,7 +25,7 @@ def warm_up(model, cameras: Cameras, steps: int, lr: float) -> None:
     weights = list(model.head.parameters())
     if steps <= 0 or not weights:
         return
-    optimizer = torch.optim.Adam(weights, lr=lr, eps=1e-15)
+    optimizer = torch.optim.Adam(weights, lr=LEARNING_RATE, eps=1e-15)
     first = last = None
     for step in range(steps):
         index = step % len(cameras)

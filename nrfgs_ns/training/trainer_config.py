@@ -144,7 +144,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         machine = self.machine
         if machine.num_devices * machine.num_machines > 1:
             resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
-        data = self.data or self.pipeline.datamanager.data
+        datamanager = self.pipeline.datamanager
+        data = self.data or datamanager.data or _absolute(datamanager.dataparser.data)
         lines = [f"{self.method_name} on {data}"]
         if machine.device_type == "cpu" and self.time_budget is None:
             lines.append(f"No CUDA device: the CPU trains. A result in ten minutes: {ten_minute_command(data)}")
@@ -195,7 +196,7 @@ def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
 
 
 def tell_what_was_chosen(model, views: int, steps_are_chosen: bool) -> None:
-    """One line: how many steps, how much noise, and why.
+    """One line: how many steps, how far the views are trusted, how much noise, and why.
 
     Args:
         model: an NrfgsModel before its first step.
@@ -207,11 +208,15 @@ def tell_what_was_chosen(model, views: int, steps_are_chosen: bool) -> None:
         chosen.append(
             f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
         )
-    if model.view_noise.sigma > 0.0:
-        chosen.append(f"the head sees each splat from about {model.noise_factor:.2g} of that beside the camera")
     if model.trust < 1.0 and model.reduced_head:
         options = ", ".join(f"{name} {value:.2g}" for name, value in model.reduced_head.items())
-        chosen.append(f"they trust it with {model.trust:.2g}, so that it has {options}")
+        chosen.append(f"their view dependence is trusted with {model.trust:.2g} of 1, so that it has {options}")
+    if model.view_noise.sigma > 0.0:
+        beside = model.noise_factor * model.camera_spacing / model.scene_unit
+        chosen.append(
+            f"in training the head sees each splat from about {beside:.2g} scene units beside the camera, "
+            f"{model.noise_factor:.2g} times the distance between neighbouring cameras"
+        )
     if chosen:
-        apart = model.camera_spacing / model.scene_unit
-        CONSOLE.print(f"{views} training views, {apart:.2g} scene units apart: {'; '.join(chosen)}.", soft_wrap=True)
+        noun = "training view" if views == 1 else "training views"
+        CONSOLE.print(f"{views} {noun}: {'; '.join(chosen)} (docs/captures.md).", soft_wrap=True)

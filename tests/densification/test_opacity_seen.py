@@ -219,6 +219,11 @@ def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
     assert_close(by_shown, torch.full_like(shown, 0.01 / 8))
     kept = torch.tensor([1, 2, 0, 2], dtype=torch.float64)  # cameras that do not show it
     assert_close(by_logit[:, 0], 0.01 / 8 * kept * stored * (1 - stored))
+    shown = torch.tensor([0.5, 0.6, 0.7, 0.8], dtype=torch.float64, requires_grad=True)
+    rules.pre_backward(0, {"gaussian_ids": torch.arange(4)}, shown, logits)  # one camera shows all
+    term = rules.regularisation(splats)["mcmc_opacity_reg"]
+    assert_close(term.item(), 0.01 * 0.65)
+    assert_close(torch.autograd.grad(term, shown)[0], torch.full_like(shown, 0.01 / 4))
 
 
 def test_the_peak_is_forgotten_at_reset():

@@ -27,7 +27,7 @@ def test_the_fewer_the_views_the_less_the_head_is_trusted(tiny_scene, tmp_path, 
     trust = 8 / 28
     assert model.num_train_data == 8 and model.trust == trust
     assert model.head.config == NrfConfig(opacity_scale=trust * 0.2) and model.noise_factor == 0.5 / trust
-    assert "they trust it with 0.29, so that it has opacity_scale 0.057" in capsys.readouterr().out
+    assert "view dependence is trusted with 0.29 of 1, so that it has opacity_scale 0.057" in capsys.readouterr().out
     model = ready(tiny_scene, tmp_path / "many", 1, {"--pipeline.model.few-views": "off"}).pipeline.model
     assert model.head.config == NrfConfig() and model.noise_factor == 0.5
 

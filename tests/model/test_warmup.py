@@ -35,7 +35,7 @@ def test_it_quiets_a_loud_field_and_moves_nothing_else(build):
     splats = {name: value.detach().clone() for name, value in model.gauss_params.items()}
     before = residual(model, cameras)
     with CONSOLE.capture() as log:
-        warm_up(model, cameras, steps=50, lr=1e-3)
+        warm_up(model, cameras, steps=50)
     after = residual(model, cameras)
     assert before > 0.01
     assert after < before / 3
@@ -49,7 +49,7 @@ def test_zero_outputs_have_nothing_to_learn(build):
     pipeline = build()
     weights = [weight.detach().clone() for weight in pipeline.model.head.parameters()]
     with CONSOLE.capture() as log:
-        warm_up(pipeline.model, pipeline.datamanager.train_dataset.cameras, steps=50, lr=1e-3)
+        warm_up(pipeline.model, pipeline.datamanager.train_dataset.cameras, steps=50)
     assert log.get() == ""
     assert all(torch.equal(a, b) for a, b in zip(weights, pipeline.model.head.parameters(), strict=True))
 
@@ -57,7 +57,7 @@ def test_zero_outputs_have_nothing_to_learn(build):
 def test_heads_without_shared_weights_are_left_alone(build):
     pipeline = build("nrfgs-sh")
     with CONSOLE.capture() as log:
-        warm_up(pipeline.model, pipeline.datamanager.train_dataset.cameras, steps=50, lr=1e-3)
+        warm_up(pipeline.model, pipeline.datamanager.train_dataset.cameras, steps=50)
     assert log.get() == ""
 
 
@@ -66,7 +66,7 @@ def test_training_starts_with_one_step_per_view_or_as_many_as_asked(build, monke
     from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 
     asked = []
-    monkeypatch.setattr("nrfgs_ns.model.model.warm_up", lambda model, cameras, steps, lr: asked.append(steps))
+    monkeypatch.setattr("nrfgs_ns.model.model.warm_up", lambda model, cameras, steps: asked.append(steps))
     pipeline = build("nrfgs", *option)
     attributes = TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=pipeline, trainer=None)
     first = pipeline.get_training_callbacks(attributes)[0]

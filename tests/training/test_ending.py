@@ -281,11 +281,19 @@ def test_a_configuration_leads_to_its_data_from_any_folder(tiny_scene, tmp_path,
     assert config.output_dir == Path("out"), "the configuration itself stays what it is"
 
 
-def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, capsys):
-    config = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS))
+@pytest.mark.parametrize("words", [[], ["nrfgs-data"], ["colmap"]])
+def test_what_ns_train_says_before_it_begins(words, tiny_scene, tmp_path, capsys):
+    """Data may be named as nerfstudio's documentation does it: `ns-train nrfgs nrfgs-data --data FOLDER`."""
+    config = parse(["nrfgs", *words, "--data", str(tiny_scene)])
     capsys.readouterr()
     config.print_to_terminal()
     said = capsys.readouterr().out.splitlines()
     assert said[0] == f"nrfgs on {tiny_scene}" and len(said) <= 3
     if config.machine.device_type == "cpu":
         assert "No CUDA device" in " ".join(said) and f"--data {tiny_scene}" in said[-1]
+
+
+def test_without_data_the_working_folder_is_looked_at(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    parse(["nrfgs"]).print_to_terminal()
+    assert f"nrfgs on {tmp_path}" in capsys.readouterr().out

@@ -329,9 +329,8 @@ def test_the_chosen_steps_are_made_and_an_interrupted_training_goes_on_to_their_
     whole = trained(command_line("nrfgs", tiny_scene, tmp_path / "whole", 0, SMALL))
     assert checkpoint_of(whole)["step"] == 11
     said = " ".join(capsys.readouterr().out.split())
-    assert f"{VIEWS} training views, " in said
-    assert "apart: 12 steps (1 a view, at least 12 and at most 30); " in said
-    assert f"the head sees each splat from about {0.5 * (VIEWS + 20) / VIEWS:.2g} of that" in said
+    assert f"{VIEWS} training views: 12 steps (1 a view, at least 12 and at most 30); " in said
+    assert f" beside the camera, {0.5 * (VIEWS + 20) / VIEWS:.2g} times the distance between neighbouring" in said
 
     config = parse(command_line("nrfgs", tiny_scene, tmp_path / "half", 0, SMALL, {"--steps-per-save": 5}))
     config.save_config()
