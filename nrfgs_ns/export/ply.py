@@ -3,9 +3,9 @@
 
 One vertex for each splat, 62 little-endian floats: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44, opacity (a logit),
 scale_0..2 (logarithms), rot_0..3 (w x y z, of unit length). A viewer's colour is max(0, 1/2 + SH_C0 f_dc + ...), and
-f_rest is channel-major: 15 coefficients of red, then of green, then of blue. `harmonics_fit.py` says how a head's
-colours become harmonics; `ns-export gaussian-splat` gets them from the model's properties and writes the same numbers,
-in the training's world.
+f_rest is channel-major: 15 coefficients of red, then of green, then of blue. `harmonics_fit.py` and `harmonics_tune.py`
+say how a head's colours and opacities become a file's; `ns-export gaussian-splat` gets them from the model's properties
+and writes the same numbers, in the training's world.
 """
 
 import json
@@ -57,8 +57,11 @@ def export_ply(load_config: Path, output: Path, options: "PlyOptions", measure: 
 
     if options.largest is not None and not 0 < options.largest < math.inf:
         raise InputError(f"--ply.largest is {options.largest}; it must be positive.")
+    if options.steps is not None and options.steps < 0:
+        raise InputError(f"--ply.steps is {options.steps}; it must be at least 0.")
     # Set up exactly as in ns-export, so that both fit over the same cameras.
     pipeline = load_model(load_config, "inference")
+    pipeline.model.fit_on(pipeline.datamanager.train_dataset.cameras, options.steps)
     begin = perf_counter()
     fit = pipeline.model.fit
     splats, seconds = fit.splats, perf_counter() - begin
