@@ -23,7 +23,9 @@ from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from torch.testing import assert_close
+from viser.infra import _infra
 from viser.transforms import SO3
 
 import nrfgs_ns.training.trainer
@@ -511,6 +513,25 @@ def test_tensorboard_is_told_about_the_head_and_the_training_does_not_notice(tin
     histogram = events.Histograms("Appearance/gate weight")[-1].histogram_value
     assert histogram.num == visible and 0 < histogram.min < histogram.max < 1
     assert logged(quiet)[1] == {"scalars": [], "histograms": [], "images": []}
+
+
+def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):
+    """Nerfstudio interrupts one by an exception at any line, and viser keeps its lock where that is one of its own."""
+    pipeline = build()
+    viewer = open_viewer(pipeline)
+    panel, camera = pipeline.model.viewer_panel, pipeline.datamanager.eval_dataset.cameras[:1]
+    panel.count.value = "?"
+    lock = viewer.viser_server._websock_server._atomic_lock
+
+    def interrupt(frame, event, _):
+        if frame.f_code.co_filename == _infra.__file__ and lock.locked():
+            raise IOChangeException
+        return interrupt
+
+    with SetTrace(interrupt):
+        panel.render(camera)
+    assert panel.count.value == f"{pipeline.model.num_points:,}"
+    assert not lock.locked()
 
 
 def test_base_class_shows_what_forward_adds():
