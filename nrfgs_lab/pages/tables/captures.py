@@ -7,7 +7,7 @@ from statistics import fmean, median
 from typing import Any
 
 from nrfgs_lab.pages.tables import grid, records
-from nrfgs_lab.pages.tables.readme import FIELD, HOST, LONG, SHRUNK, TRAINING_VIEWS, runs_of, view_gains
+from nrfgs_lab.pages.tables.readme import FIELD, HOST, SHRUNK, TRAINING_VIEWS, runs_of, view_gains
 
 BASE = "harmonics: shrinkage"
 FIELDS = "field", "field: trust"
@@ -16,8 +16,6 @@ TRIED = {
     "**`nrfgs`**": FIELDS,
     "u = V / (V + 10)": ("field: u = V / (V + 10)",),
     "u = 1": ("field: u = 1", "field: whole"),
-    "u for noise alone": ("field: longer noise alone",),
-    "u for opacity alone": ("field: less opacity alone",),
     "stored opacity shrunk": ("field: trust, shrinkage of what is stored",),
     "`peak`": ("field: peak",),
 }
@@ -72,9 +70,9 @@ def _mean(runs: Iterable[dict[str, Any]], metric: str) -> float | None:
     return fmean(fmean(value) if isinstance(value, list) else value for value in values) if values else None
 
 
-def _cell(runs: list[dict[str, Any]]) -> str:
-    """PSNR / SSIM / FLIP, and the number of seeds if it is more than one."""
-    values = [(_mean(runs, metric), form) for metric, form in (("psnr", ".2f"), ("ssim", ".3f"), ("flip", ".3f"))]
+def _cell(runs: list[dict[str, Any]], metrics: tuple[str, ...] = ("psnr", "ssim", "flip")) -> str:
+    """Means over seeds, and how many if it is more than one."""
+    values = [(_mean(runs, metric), ".2f" if metric == "psnr" else ".3f") for metric in metrics]
     text = "/".join(format(value, form) for value, form in values if value is not None)
     return (f"{text} ({len(runs)})" if len(runs) > 1 else text) or "-"
 
@@ -94,20 +92,11 @@ def test_views() -> str:
     """What test views have, and by how much training views are above them."""
     body = []
     for scene, views in TRAINING_VIEWS.items():
-        field, shrunk, long, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, LONG, HOST))
+        field, shrunk, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, HOST))
         gaps = f"{_gap(field)}, {_gap(shrunk)}"
-        body.append(
-            [f"{scene}, {views}", _cell(field), _cell(shrunk), _ahead(field, shrunk), _cell(long), _cell(host), gaps]
-        )
-    head = "`nrfgs`", "harmonics, same steps", "gain", "`nrfgs-sh`", "splatfacto", "gaps"
+        equal = [runs_of(scene, f"{name}, 150,000 splats") for name in (FIELD, "harmonics")]
+        pair = ", ".join(_cell(runs, ("psnr", "ssim")) for runs in equal)
+        own = [_cell(field), _cell(shrunk), _ahead(field, shrunk), _cell(host), gaps]
+        body.append([f"{scene}, {views}", *own, pair, _ahead(*equal)])
+    head = "`nrfgs`", "harmonics", "gain", "splatfacto", "gaps", "150,000 splats each", "gain"
     return grid(["views", *head], body)
-
-
-def equal() -> str:
-    """Both heads with equal numbers of splats."""
-    rows: list[list[str]] = [["`nrfgs`"], ["harmonics"], ["gain"]]
-    for scene in TRAINING_VIEWS:
-        field, other = (runs_of(scene, f"{name}, 150,000 splats") for name in (FIELD, "harmonics"))
-        for row, text in zip(rows, (_cell(field), _cell(other), _ahead(field, other)), strict=True):
-            row.append(text)
-    return grid(["", *TRAINING_VIEWS], rows)
