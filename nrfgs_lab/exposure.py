@@ -32,8 +32,9 @@ import numpy as np
 import tyro
 from PIL import Image
 
+from nrfgs_lab.lock import only_one
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.files import only_one, write_whole
+from nrfgs_ns.files import write_whole
 
 Case = Literal[
     "as-is-off", "as-is-on", "as-is-auto", "varied-off", "varied-on", "varied-auto", "told-on", "told-auto",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are whole or not there, and locks between processes."""
+"""Files that are whole or not there."""
 
 import contextlib
 import os
@@ -27,21 +27,3 @@ def whole(path: Path) -> Iterator[Path]:
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def only_one(lock: Path, waiting: str) -> Iterator[None]:
-    """Hold a lock file; waits while another process holds it, and lets go however this one ends."""
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    with lock.open("w") as file:
-        try:
-            import fcntl
-        except ImportError:  # Windows: the reader must see to it
-            pass
-        else:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                print(waiting, flush=True)
-                fcntl.flock(file, fcntl.LOCK_EX)
-        yield

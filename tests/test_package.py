@@ -5,12 +5,11 @@ import os
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 import without_open3d
 
-from nrfgs_ns.files import only_one, whole, write_whole
+from nrfgs_ns.files import whole, write_whole
 
 RAISE = "from nrfgs_ns.errors import InputError\nraise InputError('x.json is missing. Make one.')"
 
@@ -62,26 +61,6 @@ def test_a_write_that_fails_leaves_the_older_file(tmp_path):
         aside.write_text("ne")
         raise OSError("disk full")
     assert file.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
-
-
-def test_a_lock_is_held_by_one(tmp_path):
-    """A lock belongs to an open file: another one waits, in this process as in any other."""
-    events = []
-
-    def first() -> None:
-        with only_one(tmp_path / "lock", "waiting"):
-            events.append("first in")
-            time.sleep(0.5)
-            events.append("first out")
-
-    thread = threading.Thread(target=first)
-    thread.start()
-    while not events:
-        time.sleep(0.01)
-    with only_one(tmp_path / "lock", "waiting"):
-        events.append("second in")
-    thread.join()
-    assert events == ["first in", "first out", "second in"]
 
 
 def test_open3d_is_hidden_here_and_in_processes_that_tests_start():

@@ -22,8 +22,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from nrfgs_lab.bench.executor import Queue, Submitted
+from nrfgs_lab.lock import only_one
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.files import only_one, write_whole
+from nrfgs_ns.files import write_whole
 
 CHILD = (sys.executable, "-m", "nrfgs_lab.bench.run")
 """The command that does a job; the file that describes the job is appended."""

@@ -17,8 +17,9 @@ from time import perf_counter
 from typing import Any
 
 from nrfgs_lab.bench.spec import Job
+from nrfgs_lab.lock import only_one
 from nrfgs_lab.run import host_without_downloads
-from nrfgs_ns.files import only_one, write_whole
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.training.run import TrainRecord, evaluate, machine, train
 
 PROGRESS_SECONDS = 1.0

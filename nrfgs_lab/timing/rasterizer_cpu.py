@@ -40,7 +40,7 @@ os.environ["CUDA_VISIBLE_DEVICES"] = ""  # before torch looks for GPUs: this is 
 import torch  # noqa: E402
 from torch import Tensor  # noqa: E402
 
-from nrfgs_ns.rasterizer import Projection, project, rasterization  # noqa: E402
+from nrfgs_ns.rasterizer import Projection, composite, project  # noqa: E402
 
 SIZES = ["20000x256x256", "50000x400x300", "200000x800x600", "200000x1600x1200"]
 LOOP_TILE = 16
@@ -49,7 +49,7 @@ TRAINED_AT, SEEN_AT = 1 / 8, 1 / 2  # size of the images of a scene that is trai
 
 @dataclass
 class Scene:
-    """Arguments of `rasterization` with leaves that require gradients."""
+    """Arguments of `ours` with leaves that require gradients."""
 
     tensors: list[Tensor]
     width: int
@@ -144,6 +144,22 @@ def load_trained(path: Path) -> Scene:
     return Scene([t.clone().requires_grad_() for t in splats] + [viewmat, K], *saved["size"])
 
 
+def ours(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    w: int,
+    h: int,
+) -> tuple[Tensor, Tensor]:
+    """What the model renders with."""
+    p = project(means, quats, scales, viewmats, Ks, w, h)
+    return composite(p, colors[p.gaussian_ids], opacities[p.gaussian_ids])[:2]
+
+
 def plain_loop(
     means: Tensor,
     quats: Tensor,
@@ -207,15 +223,15 @@ def timed(render, scene: Scene, repeats: int, warm: bool = True) -> dict[str, fl
 def agree(scene: Scene) -> float:
     """Mean absolute difference of the two images: 1e-6 or so; a few pixels may fall on the other side of a cut-off."""
     with torch.no_grad():
-        return float((rasterization(*scene.arguments)[0] - plain_loop(*scene.arguments)[0]).abs().mean())
+        return float((ours(*scene.arguments)[0] - plain_loop(*scene.arguments)[0]).abs().mean())
 
 
 def peak_memory(scene: Scene) -> float:
     """MiB by which the peak of one forward and backward exceeds what the process held before. Linux only."""
     # A first small image loads libraries and starts threads.
-    timed(rasterization, cloud(100, 32, 32), 1, warm=False)
+    timed(ours, cloud(100, 32, 32), 1, warm=False)
     before = memory_kib("VmRSS")
-    timed(rasterization, scene, 1, warm=False)
+    timed(ours, scene, 1, warm=False)
     return (memory_kib("VmHWM") - before) / 1024
 
 
@@ -273,7 +289,7 @@ def measure(name: str, scene: Scene, arguments: argparse.Namespace) -> dict:
             sys.exit(f"{name}: the two images differ by {row['mean_difference']:.1e} on average")
     while len(rounds) < arguments.rounds and (not rounds or time.perf_counter() - begin < arguments.budget):
         # In turns, so that a machine that slows down for a while slows both.
-        rounds.append({"ours": timed(rasterization, scene, arguments.repeats)})
+        rounds.append({"ours": timed(ours, scene, arguments.repeats)})
         if not arguments.no_loop:
             rounds[-1]["loop"] = timed(plain_loop, scene, 1, warm=False)
     for which in rounds[0]:

@@ -223,7 +223,7 @@ def check_intrinsics(meta: dict[str, Any], source: Path) -> None:
             f"{source}: camera_model {shown(repr(model))} is {'not drawn here' if known else 'unknown'}. Use one of "
             f"{', '.join(drawn)}{'; undistort the photographs to one of them' if known else ''}."
         )
-    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+    for key in INTRINSICS:
         for where, holder in _holders(meta, key):
             if key not in holder:
                 hint = " (from a field of view: w / (2 tan(camera_angle_x / 2)))" if key in ("fl_x", "fl_y") else ""

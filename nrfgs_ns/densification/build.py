@@ -59,57 +59,46 @@ def build_densification(config: Any, num_train_images: int, scene_unit: float = 
 
 
 def _splatfacto(config: Any, num_train_images: int, scene_unit: float) -> Densification:
-    strategy = PruneBySeenOpacity(
-        prune_opa=config.cull_alpha_thresh,
-        grow_grad2d=config.densify_grad_thresh,
-        grow_scale3d=config.densify_size_thresh,
-        grow_scale2d=config.split_screen_size,
-        prune_scale3d=config.cull_scale_thresh,
-        prune_scale2d=config.cull_screen_size,
-        refine_scale2d_stop_iter=config.stop_screen_size_at,
-        refine_start_iter=config.warmup_length,
-        refine_stop_iter=config.stop_split_at,
-        reset_every=config.reset_alpha_every * config.refine_every,
-        refine_every=config.refine_every,
-        pause_refine_after_reset=num_train_images + config.refine_every,
-        absgrad=config.use_absgrad,
-        revised_opacity=False,
-        verbose=True,
-    )
-    return GradientDensification(
-        "splatfacto",
-        strategy,
-        config.opacity_seen_by_densification or "base",
-        scene_unit,
-        reset_at_start=True,
-        keep=config.keep,
-    )
+    thresholds = {
+        "prune_opa": config.cull_alpha_thresh,
+        "grow_grad2d": config.densify_grad_thresh,
+        "grow_scale3d": config.densify_size_thresh,
+        "grow_scale2d": config.split_screen_size,
+        "prune_scale3d": config.cull_scale_thresh,
+        "prune_scale2d": config.cull_screen_size,
+        "refine_scale2d_stop_iter": config.stop_screen_size_at,
+        "pause_refine_after_reset": num_train_images + config.refine_every,
+        "absgrad": config.use_absgrad,
+    }
+    return _by_gradients(config, thresholds, scene_unit, reset_at_start=True)
 
 
 def _original(config: Any, num_train_images: int, scene_unit: float) -> Densification:
     rules: OriginalDensification = config.original
+    thresholds = {
+        "prune_opa": rules.prune_opacity,
+        "grow_grad2d": rules.grow_gradient,
+        "grow_scale3d": rules.grow_scale,
+        "prune_scale3d": rules.prune_scale,
+        "refine_scale2d_stop_iter": 0,
+        "pause_refine_after_reset": 0,
+        "absgrad": False,
+    }
+    return _by_gradients(config, thresholds, None, reset_at_start=False)
+
+
+def _by_gradients(config: Any, thresholds: dict[str, Any], scene_unit: float | None, reset_at_start: bool):
+    """Gsplat's strategy with these thresholds, on the schedule that all models have."""
     strategy = PruneBySeenOpacity(
-        prune_opa=rules.prune_opacity,
-        grow_grad2d=rules.grow_gradient,
-        grow_scale3d=rules.grow_scale,
-        prune_scale3d=rules.prune_scale,
-        refine_scale2d_stop_iter=0,
         refine_start_iter=config.warmup_length,
         refine_stop_iter=config.stop_split_at,
-        reset_every=config.reset_alpha_every * config.refine_every,
         refine_every=config.refine_every,
-        pause_refine_after_reset=0,
-        absgrad=False,
+        reset_every=config.reset_alpha_every * config.refine_every,
         verbose=True,
+        **thresholds,
     )
-    return GradientDensification(
-        "original",
-        strategy,
-        config.opacity_seen_by_densification or "base",
-        scene_unit=None,
-        reset_at_start=False,
-        keep=config.keep,
-    )
+    seen = config.opacity_seen_by_densification or "base"
+    return GradientDensification(config.densification, strategy, seen, scene_unit, reset_at_start, config.keep)
 
 
 def _mcmc(config: Any, num_train_images: int, scene_unit: float) -> Densification:

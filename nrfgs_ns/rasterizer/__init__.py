@@ -7,14 +7,11 @@ Two stages, because colours and opacities come from an appearance head that shou
     colors, opacities = head(projection.gaussian_ids, ...)                       # one row per visible splat
     render, alphas, info = composite(projection, colors, opacities)              # the image
 
-`rasterization` is both at once, with the signature of `gsplat.rasterization`. The device of the means picks the back
-end: gsplat's kernels on CUDA, `torch_cpu` (plain torch, no compiler) elsewhere on the CPU.
+The device of the means picks the back end: gsplat's kernels on CUDA, `torch_cpu` (plain torch, no compiler) on the CPU.
 """
 
 from __future__ import annotations
 
-import weakref
-from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -22,7 +19,7 @@ from torch import Tensor
 
 from .contract import Projection
 
-__all__ = ["Projection", "changes_without", "composite", "contributions", "load_kernels", "project", "rasterization"]
+__all__ = ["Projection", "changes_without", "composite", "contributions", "load_kernels", "project"]
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
@@ -281,111 +278,3 @@ def changes_without(
         (slopes,) = torch.autograd.grad(render, opacities, signs * counted.to(render.dtype), retain_graph=left > 0)
         total += (opacities.detach() * slopes).square()
     return total / passes
-
-
-def rasterization(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    packed: bool = True,
-    tile_size: int = 16,
-    backgrounds: Tensor | None = None,
-    render_mode: RenderMode = "RGB",
-    sparse_grad: bool = False,
-    absgrad: bool = False,
-    rasterize_mode: RasterizeMode = "classic",
-    channel_chunk: int = 32,
-    distributed: bool = False,
-    camera_model: str = "pinhole",
-    covars: Tensor | None = None,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """`gsplat.rasterization` on CUDA and CPU: `project`, then `composite` with the same arguments.
-
-    Args:
-        opacities: one per splat. [N]
-        colors: one per splat, or per camera and splat. [N, D] or [C, N, D]
-        packed: False gives `info` gsplat's dense layout: radii, means2d, depths, conics and opacities with leading
-            dimensions [C, N] and zeros where a splat is not visible; camera_ids and gaussian_ids are None.
-        channel_chunk: accepted for the signature's sake; any number of channels is composited at once.
-
-        The others: see `project` and `composite`.
-
-    Raises:
-        ValueError: a tensor has the wrong shape, a mode is unknown, or spherical harmonics were asked for: colours are
-            the business of an appearance head.
-        NotImplementedError: distributed, sparse_grad, covars, or a camera that is not a pinhole.
-    """
-    if sh_degree is not None:
-        raise ValueError(
-            "sh_degree must be None: evaluate colours first (see nrfgs_ns.appearance) and pass them as `colors`"
-        )
-    unsupported = {
-        "distributed": distributed,
-        "sparse_grad": sparse_grad,
-        "covars": covars is not None,
-        f"camera_model={camera_model!r}": camera_model != "pinhole",
-    }
-    if any(unsupported.values()):
-        raise NotImplementedError(f"not supported: {', '.join(name for name, asked in unsupported.items() if asked)}")
-    n, c = means.shape[0], viewmats.shape[0]
-    _check_shape("opacities", opacities, n)
-    _check_shape("colors", colors, *((n,) if colors.dim() == 2 else (c, n)), colors.shape[-1])
-
-    projection = project(
-        means,
-        quats,
-        scales,
-        viewmats,
-        Ks,
-        width,
-        height,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        eps2d=eps2d,
-        rasterize_mode=rasterize_mode,
-        packed=packed,
-    )
-    cell = (projection.camera_ids, projection.gaussian_ids)
-    if not packed:
-        dense_means2d = means.new_zeros(c, n, 2).index_put(cell, projection.means2d)
-        projection = replace(projection, means2d=dense_means2d[cell])
-    render, alphas, info = composite(
-        projection,
-        colors[cell] if colors.dim() == 3 else colors[projection.gaussian_ids],
-        opacities[projection.gaussian_ids],
-        backgrounds=backgrounds,
-        render_mode=render_mode,
-        tile_size=tile_size,
-        absgrad=absgrad,
-    )
-    if not packed:
-        for name in ("radii", "depths", "conics", "opacities"):
-            rows = info[name]
-            info[name] = rows.new_zeros(c, n, *rows.shape[1:]).index_put(cell, rows)
-        info.update(means2d=dense_means2d, camera_ids=None, gaussian_ids=None)
-        if absgrad and dense_means2d.requires_grad:
-            _densify_absgrad(dense_means2d, projection.means2d, cell)
-    return render, alphas, info
-
-
-def _densify_absgrad(dense: Tensor, packed: Tensor, cell: tuple[Tensor, Tensor]) -> None:
-    """Copy `packed.absgrad` [M, 2] to `dense.absgrad` [C, N, 2] as soon as the backward pass has produced it."""
-    target = weakref.ref(dense)  # a hook that owned its own tensor would keep it alive for ever
-
-    def copy(grad: Tensor) -> None:
-        if (tensor := target()) is not None:
-            tensor.absgrad = torch.zeros_like(grad).index_put(cell, packed.absgrad)
-
-    dense.register_hook(copy)

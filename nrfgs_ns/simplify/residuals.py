@@ -13,15 +13,8 @@ if it must have one appearance. Giving it that changes a pixel of view v by no m
 
 The first factor bounds alpha T in any one pixel, because none of the sum's terms is negative and alpha is at most the
 opacity; the second bounds the light that reaches the splat, with the contrast of the splat against what is behind it
-at its largest, 1. A splat's largest change over the views is compared with half of the step between two 8-bit values:
-what is smaller cannot, by itself, turn a pixel's byte by more than rounding does.
-
-What many splats cost together is told better by squares, as PSNR counts them. A splat that contributes w_v, and no more
-than min(a_v, w_v) in any one pixel, is spread over w_v / min(a_v, w_v) pixels or more; summed over these and the views,
-
-    power = sum_v (w_v / min(a_v, w_v)) change_v^2
-
-is what its residual changes of the pictures.
+at its largest, 1. A splat's largest change over the views is measured in steps between two 8-bit values: half a step
+cannot, by itself, turn a pixel's byte by more than rounding does.
 """
 
 from collections.abc import Iterator
@@ -35,8 +28,6 @@ from nrfgs_ns.appearance.head import SH_C0, SplatAppearance
 from nrfgs_ns.model.harmonics_fit import OPAQUE, look_through
 
 EIGHT_BIT_STEP = 1.0 / 255.0
-HALF_A_STEP = 0.5
-"""Largest change of a splat that may be diffuse, in 8-bit steps."""
 
 
 class Residuals(NamedTuple):
@@ -46,8 +37,6 @@ class Residuals(NamedTuple):
     """alpha T summed over pixels and views; 0 for a splat that no view sees. [N]"""
     largest: Tensor
     """largest change over the views, in 8-bit steps; 0 for a splat that no view sees. [N]"""
-    power: Tensor
-    """squared changes over the views' pixels; 0 for a splat that no view sees. [N]"""
     features_dc: Tensor
     """the mean colour y as the constant harmonic's coefficients; the base's for a splat that no view sees. [N, 3]"""
     opacities: Tensor
@@ -55,16 +44,9 @@ class Residuals(NamedTuple):
     mean_log_distance: float
     """mean of log r, weighted by contribution; r in scene units, as the field sees it"""
 
-    def negligible(self, threshold: float = HALF_A_STEP) -> Tensor:
+    def negligible(self, threshold: float) -> Tensor:
         """Splats whose largest change is below `threshold` 8-bit steps, bool [N]."""
         return self.largest < threshold
-
-    def least(self, share: float) -> Tensor:
-        """The given share of the splats, 0 to 1: those whose residuals change the least of the pictures, bool [N]."""
-        order = self.power.argsort(stable=True)
-        rows = torch.zeros_like(self.power, dtype=torch.bool)
-        rows[order[: round(share * len(order))]] = True
-        return rows
 
 
 class Sight(NamedTuple):
@@ -91,12 +73,13 @@ def look_over(model, cameras: Cameras) -> Residuals:
     sums = torch.zeros(count, 5, dtype=torch.float64, device=device)  # w, w y, w a
     distance = torch.zeros((), dtype=torch.float64, device=device)
     for seen in _sights(model, cameras):
-        columns = torch.cat([torch.ones_like(seen.share)[:, None], *_columns(seen.appearance)], dim=-1)
+        colors, opacities = seen.appearance
+        columns = torch.cat([torch.ones_like(opacities)[:, None], colors, opacities[:, None]], dim=-1)
         sums.index_add_(0, seen.rows, (seen.share[:, None] * columns).double())
         distance += (seen.share * seen.log_distance).double().sum()
     weight = sums[:, 0]
     mean = (sums[:, 1:] / weight.clamp_min(torch.finfo(torch.float64).tiny)[:, None]).float()
-    largest, power = torch.zeros(count, device=device), torch.zeros(count, device=device)
+    largest = torch.zeros(count, device=device)
     for seen in _sights(model, cameras):
         color, opacity = seen.appearance
         most = torch.minimum(opacity, seen.share)  # of one pixel
@@ -104,21 +87,15 @@ def look_over(model, cameras: Cameras) -> Residuals:
         lit = (seen.share / opacity.clamp_min(1e-10)).clamp_max(1.0)
         change = change + lit * (opacity - mean[seen.rows, 3]).abs()
         largest.scatter_reduce_(0, seen.rows, change / EIGHT_BIT_STEP, "amax")
-        power.index_add_(0, seen.rows, change.square() * seen.share / most.clamp_min(1e-10))
     unseen = (weight == 0)[:, None]
     logits = torch.logit(mean[:, 3:].clamp(1.0 - OPAQUE, OPAQUE))
     return Residuals(
         weight=weight.float(),
         largest=largest,
-        power=power,
         features_dc=torch.where(unseen, model.gauss_params["features_dc"], (mean[:, :3] - 0.5) / SH_C0),
         opacities=torch.where(unseen, model.gauss_params["opacities"], logits),
         mean_log_distance=float(distance / weight.sum().clamp_min(1e-30)),
     )
-
-
-def _columns(appearance: SplatAppearance) -> tuple[Tensor, Tensor]:
-    return appearance.colors, appearance.opacities[:, None]
 
 
 def _sights(model, cameras: Cameras) -> Iterator[Sight]:

@@ -117,7 +117,9 @@ class NrfgsTrainer(Trainer):
         """Let steps be CUDA graphs, where they can; where no step of this training can, say so."""
         if self.world_size > 1 or not isinstance(self.grad_scaler, Unscaled):
             if self.pipeline.model.device.type == "cuda" and comms.is_main_process():
-                tell_why_not_recorded("several devices share it" if self.world_size > 1 else "it is of mixed precision")
+                tell_why_not_recorded(
+                    "several devices share the splats" if self.world_size > 1 else "precision is mixed"
+                )
             return
         graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
         self.pipeline.graphs = self.grad_scaler.graphs = graphs

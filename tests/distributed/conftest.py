@@ -16,25 +16,15 @@ TIMEOUT = 500
 def meet(job: str, scene: Path, folder: Path, world: int = 2, device_type: str = "cpu") -> Path:
     """Run a job of `jobs.py` on `world` processes; `folder`, into which they save their results."""
     folder.mkdir(parents=True, exist_ok=True)
-    processes = []
-    for rank in range(world):
-        arguments = [job, rank, world, folder / "meeting", scene, folder, device_type]
-        log = (folder / f"log-{rank}.txt").open("w")
-        processes.append(
-            subprocess.Popen(
-                [sys.executable, str(DEVICE), *map(str, arguments)],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
-            )
-        )
-    try:
-        codes = [process.wait(timeout=TIMEOUT) for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
-    tails = [(folder / f"log-{rank}.txt").read_text()[-3000:] for rank in range(world)]
-    assert codes == [0] * world, "\n---\n".join(tails)
+    run = subprocess.run(
+        [sys.executable, str(DEVICE), job, str(world), str(scene), str(folder), device_type],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=TIMEOUT,
+    )
+    assert run.returncode == 0, run.stdout[-6000:]
     return folder
 
 

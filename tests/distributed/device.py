@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one device does in the tests: `python device.py JOB RANK WORLD MEETING_FILE SCENE FOLDER DEVICE_TYPE`.
+"""What devices do in the tests: `python device.py JOB WORLD SCENE FOLDER DEVICE_TYPE`.
 
-JOB is a function of `jobs.py`. Results are saved in FOLDER for the tests to look at.
+JOB is a function of `jobs.py`, run by a process for each of WORLD devices. Results are saved in FOLDER for the tests to
+look at.
 """
 
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
+from torch.multiprocessing import start_processes
 
 COMMON = {
     "--vis": "tensorboard",
@@ -176,24 +178,28 @@ def told(trainer) -> Path:
     return box[0]
 
 
-def main() -> None:
+def work(rank: int, job: str, world: int, scene: Path, folder: Path, device_type: str) -> None:
+    """What one process does."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
+    import device
+    import jobs
     from quick_start import keep_what_is_imported, let_go
 
     from nrfgs_ns.distributed.launch import join_group
 
-    job, rank, world, meeting, scene, folder, device_type = sys.argv[1:]
-    COMMON["--machine.device-type"] = device_type
-    join_group(int(rank), int(world), f"file://{meeting}", device_type)
-    import jobs
-
+    torch.set_num_threads(1)
+    device.COMMON["--machine.device-type"] = device_type  # what `jobs` reads; this file runs as another module
+    join_group(rank, world, f"file://{folder / 'meeting'}", device_type)
     keep_what_is_imported()
-    getattr(jobs, job)(Path(scene), Path(folder))
+    getattr(jobs, job)(scene, folder)
     let_go()
     dist.barrier()
     dist.destroy_process_group()
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
-    main()
+    job, world, scene, folder, device_type = sys.argv[1:]
+    if device_type == "cpu":
+        import jobs  # noqa: F401  (once for all processes: they are forked)
+    given = (job, int(world), Path(scene), Path(folder), device_type)
+    start_processes(work, given, nprocs=int(world), start_method="fork" if device_type == "cpu" else "spawn")

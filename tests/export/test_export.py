@@ -417,9 +417,9 @@ def test_options_of_nerfstudios_exporter_work(trained, tmp_path, export_gaussian
 def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
     """plyfile's numbers, gsplat's own harmonics, and the model's picture."""
     from gsplat.cuda._torch_impl import _spherical_harmonics
+    from gsplat_call import rasterization
 
     from nrfgs_ns.model.pinhole import pinhole
-    from nrfgs_ns.rasterizer import rasterization
 
     config = trained("nrfgs-sh")
     words = ["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--no-measure"]

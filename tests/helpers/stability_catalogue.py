@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 import tyro
+from gsplat_call import rasterization
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -21,7 +22,7 @@ from nrfgs_ns.appearance.encoding import fourier_bands, view_geometry
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 from nrfgs_ns.appearance.opacity_bound import OPACITY_BOUNDS, bounded_opacity
-from nrfgs_ns.rasterizer import Projection, project, rasterization
+from nrfgs_ns.rasterizer import Projection, project
 from nrfgs_ns.rasterizer.torch_cpu.projection import LARGEST_RADIUS, MIN_QUATERNION
 from nrfgs_ns.training.guard import MAX_GRADIENT
 

@@ -242,7 +242,7 @@ def rasterization(
     orders: list[Tensor] | None = None,
     **limits: Any,
 ) -> tuple[Tensor, Tensor, list[Screen], list[Image]]:
-    """The twin of `nrfgs_ns.rasterizer.rasterization`, camera by camera.
+    """The twin of `gsplat_call.rasterization`, camera by camera.
 
     Args:
         perturb: applied to the projected means, depths, conics and compensations, and to the transmittance that

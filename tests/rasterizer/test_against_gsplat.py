@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 from agreement import assert_agrees, judge
+from gsplat_call import rasterization
 from make_gsplat_fixtures import CASES, evaluate, load
 
 from nrfgs_ns.host import gsplat_version
-from nrfgs_ns.rasterizer import rasterization
 
 RECORDED = Path(__file__).resolve().parents[1] / "fixtures" / "gsplat.npz"
 

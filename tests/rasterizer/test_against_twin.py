@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 from agreement import FLOAT32, FLOAT64, assert_agrees, judge
+from gsplat_call import rasterization
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from make_gsplat_fixtures import CASES, Case, _camera, evaluate, upstream
 
-from nrfgs_ns.rasterizer import rasterization
 from nrfgs_ns.rasterizer.torch_cpu import batches, compositing
 
 

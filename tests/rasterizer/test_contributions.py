@@ -6,12 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 from agreement import FLOAT32, judge
+from gsplat_call import rasterization
 from hypothesis import given, settings
 from make_gsplat_fixtures import CASES, Case, upstream
 from test_against_twin import scenes
 
 from nrfgs_ns.host import gsplat_version
-from nrfgs_ns.rasterizer import Projection, contributions, project, rasterization
+from nrfgs_ns.rasterizer import Projection, contributions, project
 
 PROJECTING = ("near_plane", "far_plane", "radius_clip", "eps2d", "rasterize_mode")
 

@@ -8,10 +8,11 @@ import math
 
 import pytest
 import torch
+from gsplat_call import rasterization
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.rasterizer import composite, project, rasterization
+from nrfgs_ns.rasterizer import composite, project
 from nrfgs_ns.rasterizer.torch_cpu import compositing, tiles
 from nrfgs_ns.rasterizer.torch_cpu.projection import MIN_QUATERNION
 

@@ -5,9 +5,10 @@ else.
 
 import pytest
 import torch
+from gsplat_call import rasterization
 from make_gsplat_fixtures import CASES
 
-from nrfgs_ns.rasterizer import project, rasterization
+from nrfgs_ns.rasterizer import project
 from nrfgs_ns.rasterizer.torch_cpu import compositing
 from nrfgs_ns.rasterizer.torch_cpu.tiles import MIN_ALPHA, Block, footprints, list_tiles, split_into_blocks
 

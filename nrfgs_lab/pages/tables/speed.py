@@ -7,29 +7,25 @@ from nrfgs_lab.bench.table import Row
 from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, records
 
 TRAININGS = {
-    "splatfacto": "splatfacto (nerfstudio's own)",
-    "splatfacto-10k": "splatfacto in 10,000 steps",
-    "splatfacto-big": "splatfacto-big (nerfstudio's own)",
-    "splatfacto-big-10k": "splatfacto-big in 10,000 steps",
+    "splatfacto": "splatfacto",
     "nrfgs-sh": "`nrfgs-sh`",
     "nrfgs": "`nrfgs`",
     "nrfgs-fast": "`nrfgs-fast`",
-    "nrfgs-best": "`nrfgs-best`",
 }
 VARIANTS = {
-    "fused bf16": "the field (bf16, the default)",
-    "fused fp32": "the field (fp32)",
-    "torch": "the field in PyTorch",
-    "sh head": "spherical harmonics (gsplat's kernel)",
-    "sg head": "SG (PyTorch)",
-    "vdgs head": "VDGS (PyTorch, hash grid in Triton)",
-    "gsnb head": "GSNB (PyTorch)",
+    "fused bf16": "field",
+    "fused fp32": "field, fp32",
+    "torch": "field, PyTorch",
+    "sh head": "harmonics",
+    "sg head": "SG, PyTorch",
+    "vdgs head": "VDGS, PyTorch",
+    "gsnb head": "GSNB, PyTorch",
 }
 
 
 def _trainings() -> dict[str, Row]:
     """Whole trainings of bonsai, by their names in docs/bench/speed.yaml."""
-    return {run: row for (_, _, run), row in bench_rows("speed").items()}
+    return {run: row for (scene, _, run), row in bench_rows("speed").items() if scene == "bonsai"}
 
 
 def trainings() -> str:
@@ -40,9 +36,11 @@ def trainings() -> str:
     for run, label in TRAININGS.items():
         if run in rows:
             row, seconds = rows[run], list(rows[run].values["time s"].values())
-            cells = [row.text(BY_NAME[name]) for name in ("PSNR", "splats", "FPS", "FPS 1080p", "peak MB")]
-            body.append([label, str(len(seconds)), spread(seconds, 0), f"{median(seconds) / base:.2f}", *cells])
-    head = ["bonsai", "runs", "train s", "of splatfacto's", "PSNR", "splats", "FPS, 799 x 532", "FPS, 1080p", "peak MB"]
+            cells = [row.text(BY_NAME[name]) for name in ("PSNR", "splats")]
+            frames = "/".join(BY_NAME[name].form.format(row.mean(BY_NAME[name])) for name in ("FPS", "FPS 1080p"))
+            peak = f"{row.mean(BY_NAME['peak MB']):.0f}"
+            body.append([label, spread(seconds, 0), f"{median(seconds) / base:.2f}", *cells, frames, peak])
+    head = ["bonsai", "seconds", "of splatfacto's", "PSNR", "splats", "frames/s, own size/1080p", "peak MB"]
     return grid(head, body)
 
 
@@ -57,16 +55,43 @@ def of_training(what: str, run: str) -> str:
     return BY_NAME[what].form.format(median(_trainings()[run].values[what].values()))
 
 
+PHASES = {"to step 5,000": (0, 5_000), "to 15,000": (5_000, 15_000), "to 30,000": (15_000, 30_000)}
+"""Of a training of bonsai: what the columns are called -> first and last step."""
+
+
+def _steps(run: str, begin: int, end: int) -> float:
+    """Milliseconds of a step of whole trainings of bonsai, between two checkpoints; the median over seeds."""
+    found = []
+    for record in _trainings()[run].records.values():
+        train = record["train"]
+        seconds = {0: 0.0, **dict(train["saved"]), train["steps"]: train["seconds"]}
+        found.append(1e3 * (seconds[end] - seconds[begin]) / (end - begin))
+    return median(found)
+
+
+def steps() -> str:
+    """Milliseconds of a step of whole trainings, while splats come and go and later."""
+    body = []
+    for run in ("nrfgs", "nrfgs-sh"):
+        splats = f"{_trainings()[run].mean(BY_NAME['splats']):,.0f}"
+        body.append([f"`{run}`", *(f"{_steps(run, *phase):.2f}" for phase in PHASES.values()), splats])
+    return grid(["", *PHASES, "splats"], body)
+
+
+def step_ratio(run: str, base: str) -> str:
+    """A step of whole trainings over another's, when growth has ended."""
+    return f"{_steps(run, *PHASES['to 30,000']) / _steps(base, *PHASES['to 30,000']):.2f}"
+
+
 def heads() -> str:
     """Milliseconds of the GPU for each head, forward and backward."""
     times = records("head_gpu")["head_gpu_all"]["times"]
-    sizes = sorted({one["visible"] for one in times})
+    sizes = 100_000, 1_000_000
     found = {(one["variant"], one["visible"]): one for one in times if one["share"] == "all"}
     body = []
     for variant, label in VARIANTS.items():
-        cells = [f"{found[variant, size]['gpu_ms']:.2f}" for size in sizes]
-        body.append([label, *cells, f"{found[variant, 1_000_000]['peak_mib']:.0f}"])
-    return grid(["visible splats", *(f"{size / 1e6:g} M" for size in sizes), "peak MiB at 1 M"], body)
+        body.append([label, *(f"{found[variant, size]['gpu_ms']:.2f}" for size in sizes)])
+    return grid(["visible splats", *(f"{size / 1e6:g}M" for size in sizes)], body)
 
 
 def head_share() -> str:
@@ -82,59 +107,32 @@ def error(variant: str, what: str) -> str:
     return f"{found[what]:.0e}"
 
 
-CPU = "20000x256x256", "200000x800x600", "200000x1600x1200", "fox trained"
-"""Cases of the CPU's rasterizer that the page has."""
-
-
-def cpu_rasterizer() -> str:
-    """The CPU's rasterizer beside a loop of autograd over tiles."""
-    results = records("rasterizer_cpu")["rasterizer_cpu_two_threads"]["results"]
-    body = [
-        [
-            name,
-            f"{one['ours']['forward_ms']:.0f} + {one['ours']['backward_ms']:.0f}",
-            f"{one['times_faster']:.1f}",
-            f"{one['peak_memory_mib']:.0f}",
-        ]
-        for name, one in results.items()
-        if name in CPU
-    ]
-    return grid(["splats, image", "forward + backward (ms)", "times faster than the loop", "peak MiB"], body)
+def cpu_rasterizer(case: str, what: str) -> str:
+    """The CPU's rasterizer on a case: "ms" forward and backward, or how many "times" a loop over tiles takes."""
+    one = records("rasterizer_cpu")["rasterizer_cpu_two_threads"]["results"][case]
+    if what == "times":
+        return f"{one['times_faster']:.0f}"
+    return f"{one['ours']['forward_ms'] + one['ours']['backward_ms']:.0f}"
 
 
 def first_sight() -> str:
     """From the command to a picture that is worth looking at."""
     record = records("first_sight")["nrfgs-fast"]
     stages = {
-        "imported": "imports, the command line",
+        "imported": "imports",
         "data set checked": "data set checked",
-        "model made": "first splats",
         "images read": "images read",
         "photographs compared": "photographs compared",
         "step 0": "first step",
     }
-    body, before = [], 0.0
+    body = []
     for name, label in stages.items():
         seconds = record["stages"][name]
-        body.append([label, f"{seconds - before:.1f}", f"{seconds:.1f}"])
-        before = seconds
+        body.append([label, f"{seconds:.1f}"])
     for target, reached in record["reached"].items():
         seconds = reached["seconds"]
-        body.append([f"{target} dB, {reached['steps']:,} steps", f"{seconds - before:.1f}", f"{seconds:.1f}"])
-        before = seconds
-    return grid(["", "seconds", "since the command"], body)
-
-
-def seen(step: str) -> str:
-    """PSNR of the first look from a step on."""
-    curve = records("first_sight")["nrfgs-fast"]["curve"]
-    return next(f"{value:.1f}" for _, steps, value in curve if steps >= int(step))
-
-
-def waited_for_kernels() -> str:
-    """Seconds that a first training waits for its kernels, when it has read everything."""
-    stages = records("first_sight")["nrfgs, no compiled kernels, busy host"]["stages"]
-    return f"{stages['set up'] - stages['photographs compared']:.0f}"
+        body.append([f"{target} dB, {reached['steps']:,} steps", f"{seconds:.1f}"])
+    return grid(["", "seconds since the command"], body)
 
 
 def imports(which: str = "seconds") -> str:
@@ -142,67 +140,10 @@ def imports(which: str = "seconds") -> str:
     return f"{records('start_up')[which]:.1f}"
 
 
-STEPS = {
-    "whole": "while splats come and go",
-    "at rest: whole": "later",
-    "without graph": "without the graph, while splats come and go",
-    "at rest: without graph": "without the graph, later",
-}
-
-
-def steps() -> str:
-    """A step of each method, with its CUDA graph and without."""
-    rows = {(row["method"], row["variant"]): row for row in records("step_parts")["graph"]["steps"]}
-    body = []
-    for variant, label in STEPS.items():
-        mine = [rows[method, variant] for method in ("nrfgs", "nrfgs-sh")]
-        body.append([label, *(f"{row[key]:.2f}" for row in mine for key in ("step_ms", "gpu_ms"))])
-    counts = [f"{rows[method, 'whole']['splats']:,}" for method in ("nrfgs", "nrfgs-sh")]
-    return grid(["", f"`nrfgs`, {counts[0]} splats", "GPU", f"`nrfgs-sh`, {counts[1]} splats", "GPU"], body)
-
-
 def step_share(method: str, variant: str, base_method: str, base_variant: str) -> str:
     """A step's time over another's."""
     rows = {(row["method"], row["variant"]): row for row in records("step_parts")["graph"]["steps"]}
     return f"{rows[method, variant]['step_ms'] / rows[base_method, base_variant]['step_ms']:.2f}"
-
-
-PARTS = {
-    "whole": "as it is",
-    "without lists": "gsplat's lists of what tiles draw",
-    "without adam": "torch's fused Adam",
-    "without statistics": "growth's statistics in PyTorch",
-    "without all": "all three",
-}
-
-
-def step_parts() -> str:
-    """What each of the step's own kernels saves: medians over rounds, and the step's range."""
-    body = []
-    for variant, label in PARTS.items():
-        cells = []
-        for method in ("nrfgs", "nrfgs-sh"):
-            rows = _rows(method, variant)
-            cells += [f"{median(row['gpu_ms'] for row in rows):.2f}", spread([row["step_ms"] for row in rows], 1)]
-        body.append([label, *cells])
-    return grid(["", "`nrfgs`: GPU", "step", "`nrfgs-sh`: GPU", "step"], body)
-
-
-def gpu_share(method: str, variant: str, base_method: str, base_variant: str) -> str:
-    """The GPU's time in a step, over another's."""
-    times = [median(row["gpu_ms"] for row in _rows(*one)) for one in ((method, variant), (base_method, base_variant))]
-    return f"{times[0] / times[1]:.2f}"
-
-
-def frames() -> str:
-    """Frames per second of models with about as many splats, in turns: each round."""
-    rows = records("step_parts")["graph"]["frames"]
-    body = []
-    for method in dict.fromkeys(row["method"] for row in rows):
-        mine = [row["fps"] for row in rows if row["method"] == method]
-        cells = [", ".join(f"{fps[size]:.0f}" for fps in mine) for size in mine[0]]
-        body.append([f"`{method}`", *cells])
-    return grid(["", "799 x 532", "1080p", "799 x 532, gsplat's lists", "1080p, gsplat's lists"], body)
 
 
 def frame_share(size: str) -> str:
@@ -217,9 +158,3 @@ def spread(numbers: list[float], digits: int) -> str:
     if len(numbers) == 1:
         return f"{numbers[0]:.{digits}f}"
     return f"{median(numbers):.{digits}f} ({min(numbers):.{digits}f} to {max(numbers):.{digits}f})"
-
-
-def _rows(method: str, variant: str) -> list[dict]:
-    """The rounds of a variant of a step."""
-    rows = records("step_parts")["bonsai_250k"]["steps"]
-    return [row for row in rows if (row["method"], row["variant"]) == (method, variant)]

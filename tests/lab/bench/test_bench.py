@@ -15,9 +15,9 @@ import pytest
 
 from nrfgs_lab.bench import command as bench
 from nrfgs_lab.bench.command import Bench, gpu_names
+from nrfgs_lab.lock import only_one
 from nrfgs_ns import cli
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.files import only_one
 
 FAKE = """
 import json, os, sys, time

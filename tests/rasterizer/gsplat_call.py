@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`gsplat.rasterization` by `project` and `composite`: the call by which the two are held against gsplat."""
+
+import weakref
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nrfgs_ns.rasterizer import composite, project
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    packed: bool = True,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    tile_size: int = 16,
+    absgrad: bool = False,
+    **projecting: Any,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """`project`, then `composite` with the same arguments.
+
+    Args:
+        opacities: one per splat. [N]
+        colors: one per splat, or per camera and splat. [N, D] or [C, N, D]
+        packed: False gives `info` gsplat's dense layout: radii, means2d, depths, conics and opacities with leading
+            dimensions [C, N] and zeros where a splat is not visible; camera_ids and gaussian_ids are None.
+        projecting: more for `project`.
+    """
+    n, c = len(means), len(viewmats)
+    projection = project(means, quats, scales, viewmats, Ks, width, height, packed=packed, **projecting)
+    cell = (projection.camera_ids, projection.gaussian_ids)
+    if not packed:
+        dense_means2d = means.new_zeros(c, n, 2).index_put(cell, projection.means2d)
+        projection = replace(projection, means2d=dense_means2d[cell])
+    render, alphas, info = composite(
+        projection,
+        colors[cell] if colors.dim() == 3 else colors[projection.gaussian_ids],
+        opacities[projection.gaussian_ids],
+        backgrounds=backgrounds,
+        render_mode=render_mode,
+        tile_size=tile_size,
+        absgrad=absgrad,
+    )
+    if not packed:
+        for name in ("radii", "depths", "conics", "opacities"):
+            rows = info[name]
+            info[name] = rows.new_zeros(c, n, *rows.shape[1:]).index_put(cell, rows)
+        info.update(means2d=dense_means2d, camera_ids=None, gaussian_ids=None)
+        if absgrad and dense_means2d.requires_grad:
+            _densify_absgrad(dense_means2d, projection.means2d, cell)
+    return render, alphas, info
+
+
+def _densify_absgrad(dense: Tensor, packed: Tensor, cell: tuple[Tensor, Tensor]) -> None:
+    """Copy `packed.absgrad` [M, 2] to `dense.absgrad` [C, N, 2] as soon as the backward pass has produced it."""
+    target = weakref.ref(dense)  # a hook that owned its own tensor would keep it alive for ever
+
+    def copy(grad: Tensor) -> None:
+        if (tensor := target()) is not None:
+            tensor.absgrad = torch.zeros_like(grad).index_put(cell, packed.absgrad)
+
+    dense.register_hook(copy)
