@@ -35,7 +35,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.command import Export, PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
@@ -329,12 +329,13 @@ def test_ns_viewer_and_export_take_a_reduced_checkpoint(reduced, tmp_path, monke
     model = opened[0].pipeline.model
     assert model.head.high is None and 0 < int(model.densification.state[DIFFUSE].sum()) < model.num_points
 
-    Export("ply", reduced, tmp_path / "splats.ply", measure=False).main()
+    Export("ply", reduced, tmp_path / "splats.ply", measure=False, ply=PlyOptions(steps=4)).main()
     exported = read_splats(tmp_path / "splats.ply")
     assert 0 < len(exported.means) <= model.num_points and torch.isfinite(exported.features_dc).all()
 
 
-def test_ns_export_takes_a_reduced_checkpoint(reduced, tmp_path, export_gaussian_splat):
+def test_ns_export_takes_a_reduced_checkpoint(reduced, tmp_path, export_gaussian_splat, monkeypatch):
+    monkeypatch.setattr("nrfgs_ns.model.harmonics_tune.STEPS", 4)
     export_gaussian_splat(load_config=reduced, output_dir=tmp_path / "ply").main()
     exported = read_splats(tmp_path / "ply" / "splat.ply")
     assert len(exported.means) > 0 and torch.isfinite(exported.features_dc).all()
