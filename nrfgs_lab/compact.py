@@ -2,16 +2,16 @@
 """What a scene costs in a file, and what the file loses: results/compact.json.
 
     python -m nrfgs_lab.compact trade SCENES/bonsai OUT         # the same for goldcape and fox; a GPU
-    python -m nrfgs_lab.compact trade HELD_OUT/bonsai/dev0.json OUT --no-others --settings WORTH=0.3      # a setting
+    python -m nrfgs_lab.compact trade HELD_OUT/fox/dev0.json OUT --others --settings WORTH=0.5            # a setting
+    python -m nrfgs_lab.compact trade HELD_OUT/fox/dev0.json OUT --others ply --rates --settings MOVED=0  # and of a PLY
     python -m nrfgs_lab.compact speed FILE.nrf OUT/speed.json   # encoding, and decoding in Python and in Chromium
     python -m nrfgs_lab.results pack OUT results/compact.json
     python -m nrfgs_lab.pages.tables.compact_format             # the figure
 
-`trade` trains the capture, and writes it as compact files trained at each of --rates, as one without a fine-tune, as a
-PLY file, and as what splat-transform makes of that, where it is installed:
-its SOG and its SPZ. Records of OUT that are there already are not made again. All PSNR is that of the test views, of
-files that are read back. They are left in --work. Settings are chosen on training views that are held out
-(`nrfgs_lab.held_out make`).
+`trade` trains the capture, and writes it as compact files trained at each of --rates, and as --others: a PLY file, one
+without a fine-tune, and what splat-transform makes of the PLY, where it is installed. Records of OUT that are there
+already are not made again. All PSNR is that of the test views, of files that are read back. They are left in --work.
+Settings are chosen on training views that are held out (`nrfgs_lab.held_out make`).
 """
 
 import json
@@ -23,7 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -37,6 +37,7 @@ from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
+from nrfgs_ns.model import harmonics_tune
 from nrfgs_ns.training.run import machine, train
 
 RATES = (1e-4, 3e-4, 5e-4, 1e-3, 2e-3)
@@ -57,14 +58,15 @@ class Trade:
     """of the fine-tunes"""
     steps: int = 4000
     """of each fine-tune"""
-    others: bool = True
-    """also write what is not trained for the file"""
+    others: tuple[Literal["ply", "plain", "spz", "sog"], ...] = ("ply", "plain", "spz", "sog")
+    """also write what is not trained for the file: a PLY, a compact file, and splat-transform's"""
     method: str = "nrfgs"
     """that trains"""
     sog_iterations: int = 10
     """of splat-transform, to find SOG's palette"""
     settings: tuple[str, ...] = ()
-    """NAME=VALUE, in JSON: other values of constants in nrfgs_ns/compact/finetune.py"""
+    """NAME=VALUE, in JSON: other values of constants of the fine-tunes, nrfgs_ns/compact/finetune.py and
+    nrfgs_ns/model/harmonics_tune.py"""
 
     def main(self) -> None:
         from nrfgs_ns.export.command import PlyOptions
@@ -77,28 +79,33 @@ class Trade:
         name = name.format
         for setting in self.settings:
             key, value = setting.split("=")
-            if not hasattr(finetune, key):
-                raise InputError(f"--settings {setting}: nrfgs_ns/compact/finetune.py has no {key}.")
-            setattr(finetune, key, json.loads(value))
+            module = next((one for one in (finetune, harmonics_tune) if hasattr(one, key)), None)
+            if module is None:
+                raise InputError(f"--settings {setting}: the fine-tunes have no {key}.")
+            setattr(module, key, json.loads(value))
         config = Path(self.record(name("model"), self.trained)["train"]["config_path"])
 
         def tuned(rate: float) -> Any:
             options = CompactOptions(finetune=self.steps, rate=rate)
             return lambda report: export_compact(config, files / f"{report.stem}.nrf", options, True, report)
 
+        def named(what: str) -> str:
+            return name("-".join([what, *self.settings]))
+
         for rate in self.rates:
-            self.record(name("-".join([f"rate-{rate:g}", *self.settings])), tuned(rate))
-        if not self.others:
-            return
-        ply = files / f"{name('ply')}.ply"
-        self.record(name("ply"), lambda report: export_ply(config, ply, PlyOptions(), True, report))
-        suffixes = [suffix for suffix in ("spz", "sog") if shutil.which(TOOL)]
+            self.record(named(f"rate-{rate:g}"), tuned(rate))
+        ply = files / f"{named('ply')}.ply"
+        if "ply" in self.others:
+            self.record(named("ply"), lambda report: export_ply(config, ply, PlyOptions(), True, report))
+        suffixes = [suffix for suffix in ("spz", "sog") if suffix in self.others and shutil.which(TOOL)]
         with ThreadPoolExecutor() as pool:  # minutes on a CPU
             there = [(self.out / f"{name(suffix)}.json").exists() for suffix in suffixes]
             todo = [suffix for suffix, done in zip(suffixes, there, strict=True) if not done]
             running = {suffix: pool.submit(converted, ply, suffix, self.sog_iterations) for suffix in todo}
             plain = files / f"{name('version-2')}.nrf"
-            self.record(name("version-2"), lambda report: export_compact(config, plain, CompactOptions(), True, report))
+            if "plain" in self.others:
+                options = CompactOptions()
+                self.record(name("version-2"), lambda report: export_compact(config, plain, options, True, report))
             for suffix, made in running.items():
                 self.record(
                     name(suffix), lambda _, made=made: {**made.result(), **measured(config, ply, made.result())}

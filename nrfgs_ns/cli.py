@@ -31,7 +31,7 @@ def chosen(arguments: list[str]):
     if arguments and arguments[0] in found:
         name, *options = arguments
         return tyro.cli(found[name].load(), prog=f"nrfgs {name}", args=options)
-    # A plea for help, or a mistake: tyro says which there are.
+    # No command, or none of these: tyro lists them.
     every = {name: one.load() for name, one in found.items()}
     return tyro.extras.subcommand_cli_from_dict(every, prog="nrfgs", description=__doc__, args=arguments)
 

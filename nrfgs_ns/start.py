@@ -32,7 +32,7 @@ def with_methods() -> None:
 
 
 def _leave_modules_alone() -> None:
-    """They stay: the collector need not walk through what has been imported again and again."""
+    """Keep the garbage collector off what has been imported, which stays."""
     gc.freeze()
 
 

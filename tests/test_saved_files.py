@@ -16,7 +16,7 @@ import yaml
 import nrfgs_ns
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.densification import build_densification
-from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.command import Export, PlyOptions
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.scenes import SceneConfig, write_scene
@@ -61,7 +61,7 @@ def test_they_evaluate_as_they_did(saved, tmp_path):
 
 def test_they_export(saved, tmp_path):
     name, config = saved
-    Export("ply", config, tmp_path / "splats.ply", report=tmp_path / "ply.json").main()
+    Export("ply", config, tmp_path / "splats.ply", report=tmp_path / "ply.json", ply=PlyOptions(steps=0)).main()
     assert len(read_splats(tmp_path / "splats.ply").means) == 60
     report = yaml.safe_load((tmp_path / "ply.json").read_text())
     assert report["psnr_file"] == pytest.approx(PSNR_OF_PLY[name], abs=0.02)

@@ -144,19 +144,9 @@ def load_trained(path: Path) -> Scene:
     return Scene([t.clone().requires_grad_() for t in splats] + [viewmat, K], *saved["size"])
 
 
-def ours(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    w: int,
-    h: int,
-) -> tuple[Tensor, Tensor]:
+def ours(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, *camera) -> tuple:
     """What the model renders with."""
-    p = project(means, quats, scales, viewmats, Ks, w, h)
+    p = project(means, quats, scales, *camera)
     return composite(p, colors[p.gaussian_ids], opacities[p.gaussian_ids])[:2]
 
 

@@ -110,6 +110,8 @@ def _what_is_there(folder: Path) -> str:
     for model in ("colmap/sparse/0", "sparse/0", "sparse"):
         if any((folder / model / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
             return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
+    if (folder / "transforms_train.json").is_file():
+        return "There is a data set of Blender's: put `blender-data` at the end of the command."
     places = [folder, folder / "images"]
     if any(file.suffix.lower() in PHOTOGRAPHS for place in places if place.is_dir() for file in place.iterdir()):
         return (

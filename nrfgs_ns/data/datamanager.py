@@ -197,7 +197,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     @cached_property
     def _reader(self) -> ThreadPoolExecutor:
-        """Who looks through the next image while this one is trained on."""
+        """Reads the next image while this one is trained on."""
         return ThreadPoolExecutor(1)
 
     @cached_property

@@ -17,7 +17,7 @@ from nrfgs_ns.errors import InputError
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """nerfstudio's order of the parameters."""
 FISHEYE_AT_LEAST = 1e-12
-"""A distortion without effect: nerfstudio undistorts, and a fisheye needs it, only if some parameter is not 0."""
+"""A distortion without effect, so that nerfstudio undistorts: it does only where some parameter is not 0."""
 LEFT_OF_IMAGE = 0.25
 """Share of an image's pixels that undistortion must leave."""
 LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0

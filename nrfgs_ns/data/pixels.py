@@ -2,8 +2,8 @@
 """Photographs as training reads them, decoded and undistorted: where they are kept, and the files of those for which
 there is no memory.
 
-A file has a photograph's bytes as they are, and is mapped into memory: what is not looked at costs none, and what has
-been looked at may go again. Files are made once, and anew where the photograph, its mask or its camera has changed.
+A file holds a photograph's bytes unchanged and is mapped into memory: only what is read takes memory, and the system
+may drop it again. Files are made once, and anew where the photograph, its mask or its camera has changed.
 """
 
 import hashlib

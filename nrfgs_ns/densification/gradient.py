@@ -132,7 +132,7 @@ class GradientDensification(Densification):
         self.views = views
 
     def _thin(self, step: int, splats, optimizers) -> None:
-        """A round of thinning (`thinning.py`)."""
+        """Take out a round's share of the splats (`thinning.py`)."""
         score = thinning.missed(self.views, len(splats["means"]), splats["means"].device)
         gone = thinning.least_missed(score, self.keep)
         remove(splats, optimizers, self.state, gone)

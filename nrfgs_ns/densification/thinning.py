@@ -5,9 +5,9 @@ Growth makes many splats that other splats could stand for. How much the picture
 
     s_i = sum over training views, pixels and channels of (I(p) - I_without_i(p))^2,
 
-which is what its removal adds to the squared error, once training has brought the error's first derivative to nothing
+which is what its removal adds to the squared error, once training has brought the error's first derivative to zero
 (optimal brain damage, LeCun et al. 1989; of splats: PUP 3D-GS, Hanson et al. 2025, by the derivatives of position and
-size). An image is linear in the opacity that a view shows of a splat, so that s_i is had without removing anything
+size). An image is linear in the opacity that a view shows of a splat, so that s_i needs no removal
 (`rasterizer.changes_without`). Opacities and colours are those that the head shows to each view.
 
 The splats that stay make up for those that went in the steps between rounds and after the last one.

@@ -38,7 +38,7 @@ class ShardedModel(NrfgsModel):
     """NrfgsModel with the splats of one device.
 
     `gauss_params`, densification and `info` are about this device's shard; `counts` is about all. Every method that
-    renders, loses or refines must be called on all devices, in the same order.
+    renders, computes losses or refines must be called on all devices, in the same order.
     """
 
     counts: list[int]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fitted harmonics (`harmonics_fit.py`), trained for some passes over the training views to draw what the model draws.
+"""Fitted harmonics (`harmonics_fit.py`), trained for some steps to draw what the model draws.
 
 The fit asks each splat alone. A splat whose opacity changes with the view has one opacity in a file, which is right for
 few of them; its colour and its neighbours' can make up for much of that. So opacities and harmonics descend the squared
@@ -19,11 +19,11 @@ from torch.nn.functional import pad
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, PlainSplats, no_larger
-from nrfgs_ns.model.renderer import View, composite_view
+from nrfgs_ns.model.renderer import composite_view
 from nrfgs_ns.model.view_noise import camera_spacing
 
-PASSES = 10
-"""How often each view is looked through."""
+STEPS = 2500
+"""Of one view each."""
 RATES = {"opacities": 3.0, "features_dc": 0.15, "features_rest": 0.15}
 """Learning rates to begin with, where pictures are off by 1 (root of the mean square), and in proportion where they are
 off by less: Adam's steps are no shorter there. They fall to 0 by half a cosine."""
@@ -31,18 +31,24 @@ MOVED = 0.5
 """How far from a photograph's place a picture is taken, in distances between such places; root of the mean square."""
 
 
-def fine_tune(model, splats: PlainSplats, cameras: Cameras) -> PlainSplats:
+def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = None) -> PlainSplats:
     """Splats as a file holds them whose pictures are nearer to a model's.
 
     Args:
         model: an NrfgsModel in evaluation mode.
         splats: one for each of the model's, with its means, rotations and scales. On its device.
         cameras: the training cameras, [V].
+        steps: how many, STEPS unless said otherwise; 0 leaves the splats as they are.
     """
+    steps = STEPS if steps is None else steps
     tables = {name: getattr(splats, name).clone().requires_grad_() for name in RATES}
     field, file = model.field.detached(), Field(ShConfig(degree=DEGREE).setup(), {**splats._asdict(), **tables})
     background = model.background_color.to(model.device)
     generator = torch.Generator().manual_seed(0)
+
+    def picture(of: Field, camera: Cameras) -> torch.Tensor:
+        view = model.project(camera, of.splats)
+        return composite_view(view, of.seen_from(view), background, with_depth=False)[0]["rgb"]
 
     def off_by(index: int, sigma: float) -> torch.Tensor:
         """The mean squared difference at a training view, or beside it."""
@@ -50,23 +56,22 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras) -> PlainSplats:
         moved = sigma * torch.randn(3, 1, generator=generator)
         camera.camera_to_worlds = camera.camera_to_worlds + pad(moved, (3, 0)).to(model.device)
         with torch.no_grad():
-            view = model.project(camera, field.splats)
-            wanted = picture(field, view)
-        return (picture(file, view) - wanted).square().mean()
-
-    def picture(of: Field, view: View) -> torch.Tensor:
-        return composite_view(view, of.seen_from(view), background, with_depth=False)[0]["rgb"]
+            wanted = picture(field, camera)
+        return (picture(file, camera) - wanted).square().mean()
 
     with torch.no_grad():
         off = torch.stack([off_by(index, 0.0) for index in range(len(cameras))]).mean().sqrt().item()
     groups = [{"params": [tables[name]], "lr": rate * off} for name, rate in RATES.items()]
-    optimizer, steps = torch.optim.Adam(groups, eps=1e-15), PASSES * len(cameras)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.5 * (1 + math.cos(math.pi * step / steps)))
+    optimizer = torch.optim.Adam(groups, eps=1e-15)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda step: 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
+    )
     sigma = MOVED * camera_spacing(cameras.camera_to_worlds[:, :3, 3]) / math.sqrt(3.0)
-    order = torch.cat([torch.randperm(len(cameras), generator=generator) for _ in range(PASSES)]).tolist()
-    for index in track(order, "Drawing what the model draws", console=CONSOLE, transient=True):
+    order: list[int] = []
+    for _ in track(range(steps), "Drawing what the model draws", console=CONSOLE, transient=True):
+        order = order or torch.randperm(len(cameras), generator=generator).tolist()
         with torch.enable_grad():
-            loss = off_by(index, sigma)
+            loss = off_by(order.pop(), sigma)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()

@@ -64,6 +64,7 @@ class NrfgsModel(SplatfactoModel):
     """who says what a browser sees (`show_by`); None: there is no viewer"""
     _scheduled: int | None = None
     _fit_cameras: Cameras | None = None
+    _fit_steps: int | None = None
     _fit: Fit | None = None
 
     def populate_modules(self):
@@ -455,12 +456,13 @@ class NrfgsModel(SplatfactoModel):
         if self.viewer_panel is not None:
             self.viewer_panel.set_background(background_color)
 
-    def fit_on(self, cameras: Cameras) -> None:
+    def fit_on(self, cameras: Cameras, steps: int | None = None) -> None:
         """Let the properties below be fitted harmonics from now on, as seen from these cameras [V].
 
-        The fit is made when one of them is first read, and kept until a checkpoint is loaded.
+        The fit is made when one of them is first read, with so many steps of fine-tune (None: `harmonics_tune.STEPS`),
+        and kept until a checkpoint is loaded.
         """
-        self._fit_cameras, self._fit = cameras, None
+        self._fit_cameras, self._fit_steps, self._fit = cameras, steps, None
         self.config.sh_degree = DEGREE
 
     @property
@@ -469,7 +471,9 @@ class NrfgsModel(SplatfactoModel):
         if self._fit is None and self._fit_cameras is not None:
             self._fit = fit_harmonics(self, self._fit_cameras)
             if not self._fit.exact:
-                self._fit = self._fit._replace(splats=fine_tune(self, self._fit.splats, self._fit_cameras))
+                self._fit = self._fit._replace(
+                    splats=fine_tune(self, self._fit.splats, self._fit_cameras, self._fit_steps)
+                )
         return self._fit
 
     def _exported(self, name: str) -> Tensor:

@@ -7,8 +7,10 @@ from typing import ClassVar, NamedTuple
 
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
+
+from nrfgs_ns.data.checks import warn
 
 
 class Pinhole(NamedTuple):
@@ -88,10 +90,12 @@ class FixedPinholes:
         self.device = device
         # By what tells a tensor that is alive, and has not been written to, from all others; the tensors stay alive.
         self._known: OrderedDict[tuple, tuple[list[Tensor], Pinhole]] = OrderedDict()
+        self._has_said_so = False
 
     def __call__(self, camera: Cameras) -> Pinhole:
         """The pinhole of a camera, which is a batch of one, [1] or without batch dimension."""
-        fields = [camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
+        sizes = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+        fields = [camera.camera_to_worlds, *sizes, camera.camera_type]
         if not fields[0].is_cuda or any(field.is_inference() for field in fields):
             return self._convert(fields)
         key = tuple((id(field), field._version) for field in fields)
@@ -103,8 +107,11 @@ class FixedPinholes:
 
     def _convert(self, fields: list[Tensor]) -> Pinhole:
         # float64 holds sizes and float32 alike.
-        pose, sizes = torch.cat([field.reshape(-1).double() for field in fields]).cpu().split([12, 6])
-        fx, fy, cx, cy, width, height = sizes.tolist()
+        pose, sizes = torch.cat([field.reshape(-1).double() for field in fields]).cpu().split([12, 7])
+        fx, fy, cx, cy, width, height, kind = sizes.tolist()
+        if kind != CameraType.PERSPECTIVE.value and not self._has_said_so:
+            warn(f"Cameras of the type {CameraType(int(kind)).name.lower()} are drawn as pinholes.")
+            self._has_said_so = True
         pose = pose.float().view(1, 3, 4)
         with torch.inference_mode(False):  # what is remembered outlives a rendering that records nothing
             whole = torch.zeros(32)  # each part at a multiple of 16 bytes, as Triton's kernels like it

@@ -5,7 +5,10 @@ A model that was handed a panel (`show_by`) renders by it only where the panel s
 browser sets cannot reach a training, an evaluation or ns-render.
 """
 
+import contextlib
+import sys
 import threading
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import torch
@@ -29,6 +32,21 @@ STEP_FORWARD = 5.0
 MEAN_LOOK = "all photographs' mean"
 MARKER_COLOR = (255, 211, 105)
 """Of the frustum that stands where the view was frozen: the viewer's yellow."""
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let what a rendering sends to browsers be sent whole.
+
+    Nerfstudio interrupts a rendering that nobody waits for by an exception at any line (a trace function raises it).
+    Where that is one of viser's, viser 0.2.7 keeps its lock, and the viewer stands still.
+    """
+    trace = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(trace)
 
 
 class ViewerPanel(ViewerControl):
@@ -147,10 +165,11 @@ class ViewerPanel(ViewerControl):
         Returns:
             As `picture`.
         """
-        if self.installed and self.count.value != (count := f"{self.model.num_points:,}"):
-            self.count.value = count
         if self.installed:
-            self._welcome_waiting()
+            with uninterrupted():
+                if self.count.value != (count := f"{self.model.num_points:,}"):
+                    self.count.value = count
+                self._welcome_waiting()
         # As in nerfstudio: the viewer's background counts where the configuration leaves it open.
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)

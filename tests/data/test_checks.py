@@ -41,6 +41,9 @@ def test_data_that_is_not_there(tmp_path, capture):
     (tmp_path / "bare").mkdir()
     with pytest.raises(InputError, match=r"transforms.json is missing.*ns-process-data"):
         capture.parse(data=tmp_path / "bare")
+    (tmp_path / "bare" / "transforms_train.json").write_text("{}")
+    with pytest.raises(InputError, match=r"put `blender-data` at the end"):
+        capture.parse(data=tmp_path / "bare")
 
 
 @pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"", b"[]", b"3"])

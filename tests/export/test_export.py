@@ -43,12 +43,9 @@ METHODS = {
 }
 
 
-PASSES = harmonics_tune.PASSES
-
-
 @pytest.fixture(autouse=True)
 def short_fine_tune(monkeypatch):
-    monkeypatch.setattr(harmonics_tune, "PASSES", 1)
+    monkeypatch.setattr(harmonics_tune, "STEPS", 8)
 
 
 def random_splats(count: int) -> PlainSplats:
@@ -272,13 +269,12 @@ class OpacityBySide(SphericalHarmonics):
         return appearance._replace(opacities=appearance.opacities * shown.float())
 
 
-def test_splats_that_not_all_views_show_are_drawn_closer_after_the_fine_tune(tiny_scene, tmp_path, monkeypatch):
+def test_splats_that_not_all_views_show_are_drawn_closer_after_the_fine_tune(tiny_scene, tmp_path):
     """Also from beside the places from which it looked."""
-    monkeypatch.setattr(harmonics_tune, "PASSES", PASSES)
     model, cameras = model_on(tiny_scene, tmp_path, "nrfgs-sh")
     model.head = OpacityBySide(model.config.appearance)
     fitted = fit_harmonics(model, cameras).splats
-    tuned = fine_tune(model, fitted, cameras)
+    tuned = fine_tune(model, fitted, cameras, 80)
     for name in ("means", "quats", "scales"):
         assert getattr(tuned, name) is getattr(fitted, name)
     beside = cameras[torch.arange(len(cameras))]
@@ -294,13 +290,13 @@ def test_the_fine_tune_leaves_alone_what_is_right(tiny_scene, tmp_path):
     model.head = HarmonicsByAnotherName(model.config.appearance)
     fitted = fit_harmonics(model, cameras).splats
     # Of 255 steps of a screen, a hundredth.
-    assert squared_distance(model, fine_tune(model, fitted, cameras), cameras) < (0.01 / 255) ** 2
+    assert squared_distance(model, fine_tune(model, fitted, cameras, 20), cameras) < (0.01 / 255) ** 2
 
 
-def test_the_fit_follows_a_random_field_closer_than_its_base_colour(trained, monkeypatch):
-    monkeypatch.setattr(harmonics_tune, "PASSES", PASSES)
+def test_the_fit_follows_a_random_field_closer_than_its_base_colour(trained):
     pipeline = load_model(trained("nrfgs"), "inference")
     model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
+    model.fit_on(cameras, 60)
     distance = {"file": 0.0, "base": 0.0}
     for index in range(len(cameras)):
         camera = cameras[index : index + 1]
@@ -384,9 +380,9 @@ def test_large_splats_are_cut_down_and_spoken_of(trained, tmp_path, capsys, monk
     numbers = json.loads(report.read_text())
     assert numbers["psnr_on_screen"] != pytest.approx(numbers["psnr_file"], abs=0.01)
     assert f"show {numbers['psnr_on_screen']:.2f} dB" in " ".join(capsys.readouterr().out.split())
-    for value in ("0", "-1", "nan", "inf"):
-        with pytest.raises(InputError, match="--ply.largest"):
-            tyro.cli(Export, args=[*words, "--ply.largest", value]).main()
+    for option, value in (("largest", "0"), ("largest", "-1"), ("largest", "nan"), ("largest", "inf"), ("steps", "-1")):
+        with pytest.raises(InputError, match=f"--ply.{option}"):
+            tyro.cli(Export, args=[*words, f"--ply.{option}", value]).main()
 
 
 @pytest.mark.parametrize("method", METHODS)

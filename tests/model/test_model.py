@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.models.splatfacto import SplatfactoModel
@@ -208,6 +208,16 @@ def test_a_fixed_camera_is_what_a_camera_is(batched):
         (got.viewmat, got.K, got.center), (expected.viewmat, expected.K, expected.center), strict=True
     ):
         assert torch.equal(mine, theirs) and mine.data_ptr() % 16 == 0
+
+
+def test_another_camera_than_a_pinhole_is_drawn_as_one_and_that_is_said_once(capsys):
+    """`ns-render camera-path` and the viewer's Render tab offer fisheyes and panoramas."""
+    pinholes = FixedPinholes(torch.device("cpu"))
+    for kind, said in (("PERSPECTIVE", ""), ("EQUIRECTANGULAR", "drawn as pinholes"), ("EQUIRECTANGULAR", "")):
+        pose = torch.eye(4)[None, :3]
+        pinholes(Cameras(pose, 50.0, 50.0, 8.0, 8.0, 16, 16, camera_type=CameraType[kind])[0:1])
+        out = capsys.readouterr().out
+        assert said in out and bool(said) == ("Warning" in out)
 
 
 @pytest.mark.gpu

@@ -75,9 +75,10 @@ def test_every_mode_of_a_running_training(browser, training):
     at_pause = page.step()
     page.set_resolution(164)  # so that the full size comes soon behind the small one
 
-    # What was on the screen is some steps old: the viewer does not render each, and not the last.
+    # What is on the screen is some steps old: the viewer does not render each, and not the last.
+    old = page.settled()
     page.show(BASE)
-    stale = page.settled(unlike=page.settled())
+    stale = page.settled(unlike=old)
     page.show(FULL)
     pictures = {FULL: page.settled(unlike=stale)}
     for mode, before in zip(MODES[1:], MODES, strict=False):

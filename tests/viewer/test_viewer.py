@@ -23,7 +23,9 @@ from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from torch.testing import assert_close
+from viser.infra import _infra
 from viser.transforms import SO3
 
 import nrfgs_ns.training.trainer
@@ -35,7 +37,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.command import Export, PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
@@ -329,12 +331,13 @@ def test_ns_viewer_and_export_take_a_reduced_checkpoint(reduced, tmp_path, monke
     model = opened[0].pipeline.model
     assert model.head.high is None and 0 < int(model.densification.state[DIFFUSE].sum()) < model.num_points
 
-    Export("ply", reduced, tmp_path / "splats.ply", measure=False).main()
+    Export("ply", reduced, tmp_path / "splats.ply", measure=False, ply=PlyOptions(steps=4)).main()
     exported = read_splats(tmp_path / "splats.ply")
     assert 0 < len(exported.means) <= model.num_points and torch.isfinite(exported.features_dc).all()
 
 
-def test_ns_export_takes_a_reduced_checkpoint(reduced, tmp_path, export_gaussian_splat):
+def test_ns_export_takes_a_reduced_checkpoint(reduced, tmp_path, export_gaussian_splat, monkeypatch):
+    monkeypatch.setattr("nrfgs_ns.model.harmonics_tune.STEPS", 4)
     export_gaussian_splat(load_config=reduced, output_dir=tmp_path / "ply").main()
     exported = read_splats(tmp_path / "ply" / "splat.ply")
     assert len(exported.means) > 0 and torch.isfinite(exported.features_dc).all()
@@ -510,6 +513,25 @@ def test_tensorboard_is_told_about_the_head_and_the_training_does_not_notice(tin
     histogram = events.Histograms("Appearance/gate weight")[-1].histogram_value
     assert histogram.num == visible and 0 < histogram.min < histogram.max < 1
     assert logged(quiet)[1] == {"scalars": [], "histograms": [], "images": []}
+
+
+def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):
+    """Nerfstudio interrupts one by an exception at any line, and viser keeps its lock where that is one of its own."""
+    pipeline = build()
+    viewer = open_viewer(pipeline)
+    panel, camera = pipeline.model.viewer_panel, pipeline.datamanager.eval_dataset.cameras[:1]
+    panel.count.value = "?"
+    lock = viewer.viser_server._websock_server._atomic_lock
+
+    def interrupt(frame, event, _):
+        if frame.f_code.co_filename == _infra.__file__ and lock.locked():
+            raise IOChangeException
+        return interrupt
+
+    with SetTrace(interrupt):
+        panel.render(camera)
+    assert panel.count.value == f"{pipeline.model.num_points:,}"
+    assert not lock.locked()
 
 
 def test_base_class_shows_what_forward_adds():

@@ -14,10 +14,7 @@ FIELDS = "field", "field: trust"
 """The default, of this version and of one whose field was the same."""
 TRIED = {
     "**`nrfgs`**": FIELDS,
-    "u = V / (V + 10)": ("field: u = V / (V + 10)",),
     "u = 1": ("field: u = 1", "field: whole"),
-    "u for noise alone": ("field: longer noise alone",),
-    "u for opacity alone": ("field: less opacity alone",),
     "stored opacity shrunk": ("field: trust, shrinkage of what is stored",),
     "`peak`": ("field: peak",),
 }
@@ -73,10 +70,9 @@ def _mean(runs: Iterable[dict[str, Any]], metric: str) -> float | None:
 
 
 def _cell(runs: list[dict[str, Any]]) -> str:
-    """PSNR / SSIM / FLIP, and the number of seeds if it is more than one."""
+    """PSNR/SSIM/FLIP in the mean over seeds."""
     values = [(_mean(runs, metric), form) for metric, form in (("psnr", ".2f"), ("ssim", ".3f"), ("flip", ".3f"))]
-    text = "/".join(format(value, form) for value, form in values if value is not None)
-    return (f"{text} ({len(runs)})" if len(runs) > 1 else text) or "-"
+    return "/".join(format(value, form) for value, form in values if value is not None) or "-"
 
 
 def _ahead(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> str:
@@ -96,18 +92,7 @@ def test_views() -> str:
     for scene, views in TRAINING_VIEWS.items():
         field, shrunk, long, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, LONG, HOST))
         gaps = f"{_gap(field)}, {_gap(shrunk)}"
-        body.append(
-            [f"{scene}, {views}", _cell(field), _cell(shrunk), _ahead(field, shrunk), _cell(long), _cell(host), gaps]
-        )
-    head = "`nrfgs`", "harmonics, same steps", "gain", "`nrfgs-sh`", "splatfacto", "gaps"
+        cells = _cell(field), _cell(shrunk), _ahead(field, shrunk), _cell(long), _cell(host), gaps
+        body.append([f"{scene}, {views}", *cells])
+    head = "`nrfgs`", "harmonics", "gain", "`nrfgs-sh`", "splatfacto", "gaps"
     return grid(["views", *head], body)
-
-
-def equal() -> str:
-    """Both heads with equal numbers of splats."""
-    rows: list[list[str]] = [["`nrfgs`"], ["harmonics"], ["gain"]]
-    for scene in TRAINING_VIEWS:
-        field, other = (runs_of(scene, f"{name}, 150,000 splats") for name in (FIELD, "harmonics"))
-        for row, text in zip(rows, (_cell(field), _cell(other), _ahead(field, other)), strict=True):
-            row.append(text)
-    return grid(["", *TRAINING_VIEWS], rows)

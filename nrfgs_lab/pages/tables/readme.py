@@ -9,15 +9,12 @@ from nrfgs_lab.pages.tables import grid, records, signed
 
 TRAINING_VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "castle": 26, "kitchen": 21, "fern": 17}
 FIELD, LONG, HOST = "nrfgs", "nrfgs-sh", "splatfacto"
-HARMONICS, SHRUNK = "harmonics, same steps", "harmonics, same steps and shrinkage"
+SHRUNK = "harmonics, same steps and shrinkage"
 
 
 def runs_of(scene: str, name: str) -> list[dict[str, Any]]:
     """The trainings of a capture, as results/captures.json has them, by seed."""
     found = [one for one in records("captures").values() if (one.get("scene"), one.get("name")) == (scene, name)]
-    if not found and (scene, name) == ("bonsai", HARMONICS):
-        window = next(one for one in records("averaging")["bonsai-sh"]["windows"] if one["window"] == 200)
-        found = [{**window, "seed": 42, "per_image": []}]
     bench = {LONG: "harmonics_nrfgs-sh", HOST: "nerfstudio_splatfacto"}.get(name)
     if not found and (one := records("presets").get(f"runs/{bench}-own-{scene}-42")):
         test, metrics = one["measured"]["test"], ("psnr", "ssim", "ms_ssim")
@@ -27,31 +24,22 @@ def runs_of(scene: str, name: str) -> list[dict[str, Any]]:
     return sorted(found, key=lambda one: one["seed"])
 
 
-def opponent(scene: str) -> list[dict[str, Any]]:
-    """Harmonics with the field's steps, mean and shrinkage; without the last where that has not been run."""
-    return runs_of(scene, SHRUNK) or runs_of(scene, HARMONICS)
-
-
 def captures() -> str:
     """`nrfgs` as it comes beside harmonics with the same steps, mean and shrinkage, on test views."""
     body = []
     for scene, views in TRAINING_VIEWS.items():
-        field, harmonics, long = runs_of(scene, FIELD), opponent(scene), runs_of(scene, LONG)
-        if not field or not harmonics:
-            continue
+        field, harmonics, long = runs_of(scene, FIELD), runs_of(scene, SHRUNK), runs_of(scene, LONG)
         gains = view_gains(field, harmonics)
         psnr = [fmean(one["psnr"] for one in runs) for runs in (field, harmonics)]
         ssim = [fmean(one["ssim"] for one in runs) for runs in (field, harmonics)]
         splats = [fmean(one["splats"] for one in runs) for runs in (field, harmonics)]
-        median_gain = signed(median(gains)) if gains else signed(psnr[0] - psnr[1])
-        ahead = f"{sum(gain > 0 for gain in gains)}/{len(gains)}" if gains else "mean"
         body.append(
             [
                 f"{scene}, {views}",
                 f"{psnr[0]:.2f}/{ssim[0]:.3f}",
                 f"{psnr[1]:.2f}/{ssim[1]:.3f}",
-                f"{fmean(one['psnr'] for one in long):.2f}/{fmean(one['ssim'] for one in long):.3f}" if long else "-",
-                f"{median_gain} ({ahead})",
+                f"{fmean(one['psnr'] for one in long):.2f}/{fmean(one['ssim'] for one in long):.3f}",
+                f"{signed(median(gains))} ({sum(gain > 0 for gain in gains)}/{len(gains)})",
                 f"{splats[0] / splats[1]:.2f}",
             ]
         )
@@ -72,7 +60,7 @@ def view_gains(field: list[dict[str, Any]], harmonics: list[dict[str, Any]]) -> 
 
 def gain(scene: str) -> str:
     """What the field gains on a capture over harmonics with the same steps, and in how many test views."""
-    gains = view_gains(runs_of(scene, FIELD), opponent(scene))
+    gains = view_gains(runs_of(scene, FIELD), runs_of(scene, SHRUNK))
     return f"{signed(median(gains))} dB in the median view, better in {sum(one > 0 for one in gains)} of {len(gains)}"
 
 
