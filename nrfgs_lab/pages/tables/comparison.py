@@ -2,7 +2,7 @@
 """The numbers of docs/comparison.md."""
 
 from collections import defaultdict
-from statistics import fmean, geometric_mean, median
+from statistics import fmean, median
 
 from nrfgs_lab.bench.table import Row
 from nrfgs_lab.pages.tables import bench_rows, bold, grid, mean_of, records, signed
@@ -10,85 +10,72 @@ from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS
 
 # Every capture.
 
-RULES = {"original": ("methods", "3DGS's rules"), "mcmc@150000": ("budgets", "150,000 splats")}
-"""Densification -> the study that has it, and what a table calls it."""
-METHODS = {
-    **{"VDGS": "VDGS", "VDGS_base": "VDGS, `base`", "GSNB": "GSNB", "SG": "SG"},
-    **{"NRF-GS": "NRF-GS", "NRF-GS_base": "NRF-GS, `base`", "ours": "ours"},
+GROUPS = {
+    "3DGS's rules": {
+        "bonsai, its protocol": ("paper", "bonsai", "original"),
+        "bonsai": ("comparison", "bonsai", "original"),
+        "goldcape": ("comparison", "goldcape", "original"),
+        **{scene: ("methods", scene, "original") for scene in ("caliterra", "fox", "castle", "fern")},
+    },
+    "150,000 splats": {
+        "bonsai": ("comparison", "bonsai", "mcmc@150000"),
+        "goldcape": ("comparison", "goldcape", "mcmc@150000"),
+        "fox": ("budgets", "fox", "mcmc@150000"),
+    },
 }
-"""Run -> what a table calls it."""
+"""Group -> column -> study, capture and densification."""
+METHODS = "VDGS", "GSNB", "SG", "NRF-GS", "ours"
 BASE = "3DGS"
+OF_THE_PAPER = {"VDGS": "+0.49 (1.29)", "GSNB": "+0.96 (1.18)", "NRF-GS": "+1.01 (0.46)"}
+"""The paper's gains on bonsai, and splats in multiples of 3DGS's."""
 
 
 def every() -> str:
-    """3DGS's PSNR on each capture and what the others gain; gains in SSIM, and shares of its splats, in the mean over
-    the captures that all methods of a group have."""
-    head = ["", *(f"{scene}, {views}" for scene, views in TRAINING_VIEWS.items()), "SSIM", "splats"]
+    """3DGS's PSNR on each capture and what the others gain; gain in SSIM and share of its splats in the median of the
+    columns that all methods of a group have."""
+    columns = list(next(iter(GROUPS.values())))
     body = []
-    for rule, (_, title) in RULES.items():
-        runs = [run for run in METHODS if any(psnr_gains(rule, run))]
-        if not runs:
-            continue
-        gains = {run: psnr_gains(rule, run) for run in runs}
-        shared = [scene for scene in TRAINING_VIEWS if all(scene in gains[run] for run in runs)]
-        best = {scene: max(round(gains[run].get(scene, -9.0), 1) for run in runs) for scene in TRAINING_VIEWS}
-        plain = _means(rule, BASE)
-        psnr = [f"{plain[scene]['PSNR']:.1f}" if scene in plain else "-" for scene in TRAINING_VIEWS]
-        ssim = f"{fmean(plain[scene]['SSIM'] for scene in shared):.3f}"
-        count = f"{fmean(plain[scene]['splats'] for scene in shared) / 1000:.0f}k"
-        body.append([f"**{title}**: 3DGS", *psnr, ssim, count])
-        for run in runs:
-            cells = [
-                bold(signed(gains[run][scene]), round(gains[run][scene], 1) == best[scene] > 0)
-                if scene in gains[run]
-                else "-"
-                for scene in TRAINING_VIEWS
-            ]
-            cells.append(signed(fmean(_difference(rule, run, scene, "SSIM") for scene in shared), 3))
-            cells.append(f"{geometric_mean(_share(rule, run, scene) for scene in shared):.2f}")
-            body.append([METHODS[run], *cells])
-    return grid(head, body)
+    for group, places in GROUPS.items():
+        rows = {run: {title: _row(place, run) for title, place in places.items()} for run in (BASE, *METHODS)}
+        rows = {run: found for run, found in rows.items() if any(found.values())}
+        shared = [title for title in places if all(found[title] for found in rows.values())]
+        for run, found in rows.items():
+            cells = [_cell(run, title, rows) for title in columns]
+            ssim = median(_gain(found[title], rows[BASE][title] if run != BASE else None, "SSIM") for title in shared)
+            splats = median(mean_of(found[title], "splats") / mean_of(rows[BASE][title], "splats") for title in shared)
+            more = [f"{ssim:.3f}", ""] if run == BASE else [signed(ssim, 3), f"{splats:.2f}"]
+            told = OF_THE_PAPER.get(run, "") if places is GROUPS["3DGS's rules"] else ""
+            body.append([f"**{group}**: {BASE}" if run == BASE else run, told, *cells, *more])
+    titles = [f"{title}, {TRAINING_VIEWS[title]}" if title in TRAINING_VIEWS else title for title in columns]
+    return grid(["", "the paper, bonsai", *titles, "SSIM", "splats"], body)
 
 
-def _row(rule: str, run: str, scene: str) -> Row | None:
-    return bench_rows(RULES[rule][0]).get((scene, rule, run))
+def _row(place: tuple[str, str, str], run: str) -> Row | None:
+    return bench_rows(place[0]).get((*place[1:], run))
 
 
-def _means(rule: str, run: str) -> dict[str, dict[str, float]]:
-    """Capture -> metric -> mean over seeds."""
-    rows = {scene: _row(rule, run, scene) for scene in TRAINING_VIEWS}
-    return {
-        scene: {metric: mean_of(row, metric) for metric in ("PSNR", "SSIM", "splats")}
-        for scene, row in rows.items()
-        if row is not None
-    }
+def _cell(run: str, title: str, rows: dict[str, dict[str, Row | None]]) -> str:
+    """A number of decibels, bold if the most that is gained in its column."""
+    row, base = rows[run].get(title), rows[BASE].get(title)
+    if row is None or base is None:
+        return "-"
+    if row is base:
+        return f"{mean_of(row, 'PSNR'):.2f}"
+    gains = [_gain(found[title], base, "PSNR") for found in rows.values() if found[title] not in (None, base)]
+    gain = _gain(row, base, "PSNR")
+    return bold(signed(gain, 2), gain == max(gains) > 0)
 
 
-def _difference(rule: str, run: str, scene: str, metric: str, base: str = BASE) -> float:
-    """A metric above another run's, in the mean over the seeds that both have."""
-    values = [_row(rule, name, scene).values[metric] for name in (run, base)]
-    seeds = values[0].keys() & values[1].keys()
-    return fmean(values[0][seed] - values[1][seed] for seed in seeds)
+def _gain(row: Row, base: Row | None, metric: str) -> float:
+    """A metric above another row's, in the mean over seeds; the metric itself without another."""
+    return mean_of(row, metric) - (mean_of(base, metric) if base else 0.0)
 
 
-def _share(rule: str, run: str, scene: str) -> float:
-    return mean_of(_row(rule, run, scene), "splats") / mean_of(_row(rule, BASE, scene), "splats")
-
-
-def psnr_gains(rule: str, run: str, base: str = BASE) -> dict[str, float]:
-    """Capture -> decibels above another run, in the mean over the seeds that both have."""
-    return {
-        scene: _difference(rule, run, scene, "PSNR", base)
-        for scene in TRAINING_VIEWS
-        if _row(rule, run, scene) and _row(rule, base, scene)
-    }
-
-
-def ahead(rule: str, run: str, base: str) -> str:
-    """On how many captures a run is above another in its median test view, and by how much in the median capture."""
-    rows = [(_row(rule, run, scene), _row(rule, base, scene)) for scene in TRAINING_VIEWS]
-    gains = [median(view_gains(*pair)) for pair in rows if all(pair)]
-    return f"{sum(gain > 0 for gain in gains)} of {len(gains)} ({signed(median(gains), 2)} dB)"
+def views_ahead(group: str, title: str, run: str, base: str) -> str:
+    """By how much a run is above another in the median test view, and in how many views."""
+    place = GROUPS[group][title]
+    gains = view_gains(_row(place, run), _row(place, base))
+    return f"{signed(median(gains))} dB ({sum(gain > 0 for gain in gains)} of {len(gains)})"
 
 
 def view_gains(row: Row, base: Row) -> list[float]:
@@ -103,42 +90,26 @@ def view_gains(row: Row, base: Row) -> list[float]:
     return list(map(fmean, gains.values()))
 
 
-# Claim by claim: captures at full size, 30,000 steps.
+# What the field's parts are worth: captures at full size, 30,000 steps.
 
-CLAIMS = {
-    "over 3DGS (+1.01)": "3DGS",
-    "over GSNB (+0.05)": "GSNB",
-    "over VDGS (+0.52)": "VDGS",
-    "over VDGS without resets": "VDGS_no_resets",
+PARTS = {
     "opacity residual (+0.35)": "no_opacity",
     "distance (+0.21)": "no_distance",
     "split (+0.48)": "no_split",
 }
-"""What the paper says the field gains, in dB -> the run without."""
-PLACES = {
-    "bonsai: paper's protocol": ("paper", "bonsai", "original"),
-    "host's": ("comparison", "bonsai", "original"),
-    "150k splats": ("comparison", "bonsai", "mcmc@150000"),
-    "goldcape: host's": ("comparison", "goldcape", "original"),
-    "150k splats ": ("comparison", "goldcape", "mcmc@150000"),
-}
-"""Column -> study, capture and densification."""
+"""What the paper says a part gains, in dB -> the run without."""
 
 
-def claims() -> str:
-    """What the field gains over each method and without each of its parts."""
-    rows = {
-        title: {run: bench_rows(study).get((*place, run)) for run in ("NRF-GS", *CLAIMS.values())}
-        for title, (study, *place) in PLACES.items()
-    }
-    counts = [f"{mean_of(one['NRF-GS'], 'splats') / mean_of(one['3DGS'], 'splats'):.2f}" for one in rows.values()]
-    body = [["splats / 3DGS's (0.46)", *counts]]
-    for claim, base in CLAIMS.items():
-        pairs = [(one["NRF-GS"], one[base]) for one in rows.values()]
-        cells = [signed(mean_of(a, "PSNR") - mean_of(b, "PSNR"), 2) if b else "-" for a, b in pairs]
-        if any(cell != "-" for cell in cells):
-            body.append([claim, *cells])
-    return grid(["the paper", *map(str.strip, PLACES)], body)
+def parts() -> str:
+    """What the field gains by each of its parts."""
+    rows = bench_rows("comparison")
+    places = [(scene, rule) for scene in ("bonsai", "goldcape") for rule in ("original", "mcmc@150000")]
+    body = []
+    for part, without in PARTS.items():
+        pairs = [(rows[(*place, "NRF-GS")], rows[(*place, without)]) for place in places]
+        body.append([part, *(signed(mean_of(a, "PSNR") - mean_of(b, "PSNR"), 2) for a, b in pairs)])
+    titles = [scene if rule == "original" else "150,000 splats" for scene, rule in places]
+    return grid(["the paper", *titles], body)
 
 
 def ratio(scene: str, run: str, base: str) -> str:

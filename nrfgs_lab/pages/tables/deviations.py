@@ -8,6 +8,11 @@ from nrfgs_lab.pages.tables.comparison import view_gains
 from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS
 
 
+def start(run: str) -> str:
+    """PSNR of the small fox with one of the starts."""
+    return f"{mean_of(bench_rows('warm-up')['fox', 'original', run], 'PSNR'):.2f}"
+
+
 def rules() -> str:
     """Field and splats under splatfacto's rules and 3DGS's, on bonsai."""
     own = bench_rows("presets")["bonsai", "own", "default"]
