@@ -5,6 +5,7 @@ A model that was handed a panel (`show_by`) renders by it only where the panel s
 browser sets cannot reach a training, an evaluation or ns-render.
 """
 
+import sys
 import threading
 from typing import TYPE_CHECKING
 
@@ -147,17 +148,31 @@ class ViewerPanel(ViewerControl):
         Returns:
             As `picture`.
         """
-        if self.installed and self.count.value != (count := f"{self.model.num_points:,}"):
-            self.count.value = count
+        # Nerfstudio interrupts a picture when the camera moves, by an exception at any line of Python, which it traces.
+        interrupts = sys.gettrace()
+        sys.settrace(None)  # viser's locks would stay locked, and what tries a kernel would take it for the kernel's
         if self.installed:
+            if self.count.value != (count := f"{self.model.num_points:,}"):
+                self.count.value = count
             self._welcome_waiting()
+        shown = self.shown
         # As in nerfstudio: the viewer's background counts where the configuration leaves it open.
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)
         try:
-            return picture(self.model, camera, self.shown, background)
+            if self.takes_long:
+                sys.settrace(interrupts)
+                return picture(self.model, camera, shown, background)
+            whole = picture(self.model, camera, shown, background)
+            threading.current_thread().interrupt_render_flag = False  # it would be the next picture's
+            return whole
         finally:
             self.model.set_crop(None)
+
+    @property
+    def takes_long(self) -> bool:
+        """Whether a picture takes so long that a camera that moves should not wait for its end."""
+        return self.model.device.type == "cpu"
 
     def _change_mode(self) -> None:
         self.legend.content = self.legends[self.mode.value]

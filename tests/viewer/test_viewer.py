@@ -375,6 +375,33 @@ def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
     assert model.get_image_metrics_and_images(after, batch)[0] == before_metrics
 
 
+@pytest.mark.parametrize("on_a_gpu", [False, True])
+def test_a_moving_camera_interrupts_pictures_alone(on_a_gpu, build, open_viewer, monkeypatch):
+    """Not viser, whose locks would stay locked; nor what tries kernels, which would be given up."""
+    viewer = open_viewer(build())
+    panel, pose = viewer.pipeline.model.viewer_panel, two_cameras(viewer.pipeline)[0].camera_to_worlds[0]
+    monkeypatch.setattr(type(panel), "takes_long", property(lambda self: not on_a_gpu))
+    interruptible = set()
+
+    class Watched(Browser):
+        def check_interrupt(self, frame, event, arg):
+            interruptible.add(Path(frame.f_code.co_filename).parts[-2:])
+            return self.check_interrupt
+
+        def run(self):
+            self.interrupt_render_flag = True
+            super().run()
+
+    panel.count.value = "0"
+    thread = Watched(viewer, pose)
+    thread.start()
+    thread.join()
+    assert panel.count.value == "300" and thread.outputs["rgb"].std() > 0.01
+    assert (("viewer", "pictures.py") in interruptible) != on_a_gpu and ("viewer", "panel.py") in interruptible
+    assert not [file for file in interruptible if file[0] in ("viser", "infra")]
+    assert thread.interrupt_render_flag != on_a_gpu, "the picture is whole: what comes next must not be interrupted"
+
+
 def test_exposure_and_a_photographs_look(build, open_viewer):
     pipeline = build("nrfgs", "--pipeline.model.photographs", "on")
     model, (camera, _) = pipeline.model, two_cameras(pipeline)
