@@ -5,8 +5,10 @@ A model that was handed a panel (`show_by`) renders by it only where the panel s
 browser sets cannot reach a training, an evaluation or ns-render.
 """
 
+import contextlib
 import sys
 import threading
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import torch
@@ -30,6 +32,21 @@ STEP_FORWARD = 5.0
 MEAN_LOOK = "all photographs' mean"
 MARKER_COLOR = (255, 211, 105)
 """Of the frustum that stands where the view was frozen: the viewer's yellow."""
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let what a rendering sends to browsers be sent whole.
+
+    Nerfstudio interrupts a rendering that nobody waits for by an exception at any line (a trace function raises it).
+    Where that is one of viser's, viser 0.2.7 keeps its lock, and the viewer stands still.
+    """
+    trace = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(trace)
 
 
 class ViewerPanel(ViewerControl):
@@ -148,30 +165,24 @@ class ViewerPanel(ViewerControl):
         Returns:
             As `picture`.
         """
-        # Nerfstudio interrupts a picture when the camera moves, by an exception at any line of Python, which it traces.
-        interrupts = sys.gettrace()
-        sys.settrace(None)  # viser's locks would stay locked, and what tries a kernel would take it for the kernel's
         if self.installed:
-            if self.count.value != (count := f"{self.model.num_points:,}"):
-                self.count.value = count
-            self._welcome_waiting()
-        shown = self.shown
+            with uninterrupted():
+                if self.count.value != (count := f"{self.model.num_points:,}"):
+                    self.count.value = count
+                self._welcome_waiting()
         # As in nerfstudio: the viewer's background counts where the configuration leaves it open.
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)
         try:
-            if self.takes_long:
-                sys.settrace(interrupts)
-                return picture(self.model, camera, shown, background)
-            whole = picture(self.model, camera, shown, background)
-            threading.current_thread().interrupt_render_flag = False  # it would be the next picture's
-            return whole
+            with contextlib.nullcontext() if self.is_slow else uninterrupted():
+                return picture(self.model, camera, self.shown, background)
         finally:
             self.model.set_crop(None)
 
     @property
-    def takes_long(self) -> bool:
-        """Whether a picture takes so long that a camera that moves should not wait for its end."""
+    def is_slow(self) -> bool:
+        """Whether pictures take so long that they may be interrupted. On a GPU, where a first one tries kernels, a
+        trial that is interrupted would count as failed."""
         return self.model.device.type == "cpu"
 
     def _change_mode(self) -> None:
