@@ -174,9 +174,16 @@ class ViewerPanel(ViewerControl):
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)
         try:
-            return picture(self.model, camera, self.shown, background)
+            with contextlib.nullcontext() if self.is_slow else uninterrupted():
+                return picture(self.model, camera, self.shown, background)
         finally:
             self.model.set_crop(None)
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether pictures take so long that they may be interrupted. On a GPU, where a first one tries kernels, a
+        trial that is interrupted would count as failed."""
+        return self.model.device.type == "cpu"
 
     def _change_mode(self) -> None:
         self.legend.content = self.legends[self.mode.value]

@@ -377,6 +377,22 @@ def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
     assert model.get_image_metrics_and_images(after, batch)[0] == before_metrics
 
 
+@pytest.mark.parametrize("is_slow", [True, False])
+def test_only_slow_pictures_are_interrupted(is_slow, build, open_viewer, monkeypatch):
+    viewer = open_viewer(build())
+    panel, pose = viewer.pipeline.model.viewer_panel, two_cameras(viewer.pipeline)[0].camera_to_worlds[0]
+    monkeypatch.setattr(type(panel), "is_slow", is_slow)
+    interruptible = set()
+
+    class Watched(Browser):
+        def check_interrupt(self, frame, event, arg):
+            interruptible.add(Path(frame.f_code.co_filename).name)
+            return self.check_interrupt
+
+    assert Watched.sees(viewer, pose)["rgb"].std() > 0.01
+    assert "panel.py" in interruptible and ("pictures.py" in interruptible) == is_slow
+
+
 def test_exposure_and_a_photographs_look(build, open_viewer):
     pipeline = build("nrfgs", "--pipeline.model.photographs", "on")
     model, (camera, _) = pipeline.model, two_cameras(pipeline)
