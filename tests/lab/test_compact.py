@@ -9,7 +9,7 @@ from nrfgs_ns.errors import InputError
 
 
 def test_a_setting_that_is_none_is_refused_before_anything_is_trained(tmp_path):
-    with pytest.raises(InputError, match="has no WORHT"):
+    with pytest.raises(InputError, match="have no WORHT"):
         Trade(tmp_path, tmp_path / "out", work=tmp_path / "work", settings=("WORHT=1",)).main()
 
 
