@@ -74,8 +74,10 @@ def worth() -> str:
 
 
 def file(name: str, what: str) -> str:
-    """A number of a file: its MB, decibels that it loses, seconds to write it or to read it in Python or Chromium."""
+    """A number of a file: its splats, MB, decibels that it loses, seconds to write or to read it."""
     one = records("compact")[name]
+    if what == "splats":
+        return f"{one['splats']:,}"
     if what in ("MB", "loss"):
         return f"{one['bytes'] / 1e6 if what == 'MB' else one['loss_db']:.2f}"
     return f"{one['seconds'][what]:.1f}"
