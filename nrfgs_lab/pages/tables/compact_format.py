@@ -4,6 +4,8 @@
 python -m nrfgs_lab.pages.tables.compact_format        # writes docs/images/compact-trade.png
 """
 
+import re
+from statistics import median
 from typing import Any
 
 from nrfgs_lab.pages.tables import ROOT, grid, records, signed
@@ -58,6 +60,17 @@ def added(scene: str) -> str:
     """Per cent of a training's seconds that the longest of its fine-tunes takes."""
     longest = max(one["seconds"]["finetune"] for one in reports(scene).values() if one.get("finetune"))
     return f"{100 * longest / records('compact')[f'{scene}-model']['train']['seconds']:.0f} %"
+
+
+def worth() -> str:
+    """Files with other weights of a splat's bytes in pruning, on held-out views: MB, and dB in the median view."""
+    found: dict[str, dict[str, str]] = {}
+    for name, one in records("compact").items():
+        if match := re.fullmatch(r"held-out-(\w+)-rate-0.0003-WORTH=([\d.]+)", name):
+            lost = median(view["psnr_file"] - view["psnr_model"] for view in one["per_image"])
+            found.setdefault(match[1], {})[match[2]] = f"{one['bytes'] / 1e6:.2f}, {signed(lost, 2)}"
+    weights = sorted({weight for one in found.values() for weight in one}, key=float)
+    return grid(["", *found], [[weight, *(one.get(weight, "-") for one in found.values())] for weight in weights])
 
 
 def file(name: str, what: str) -> str:
