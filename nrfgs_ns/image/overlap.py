@@ -200,10 +200,15 @@ def _shift(first: Sighting, second: Sighting) -> tuple[Tensor, Tensor] | None:
     return shift.cpu(), 1.4826 * (regions - shift).abs().median(dim=0).values.cpu()
 
 
-def varies(known: Tensor) -> bool:
-    """Whether known exposures (stops, NaN where unknown, [V]) differ enough to be learnt: their standard deviation."""
+def spread(known: Tensor) -> float:
+    """Standard deviation of known exposures (stops, NaN where unknown, [V]); 0 where none is known."""
     there = known[torch.isfinite(known)]
-    return len(there) > 1 and float(there.std(correction=0)) >= ENOUGH_KNOWN_STOPS
+    return float(there.std(correction=0)) if len(there) else 0.0
+
+
+def varies(known: Tensor) -> bool:
+    """Whether known exposures (stops, NaN where unknown, [V]) differ enough to be learnt."""
+    return spread(known) >= ENOUGH_KNOWN_STOPS
 
 
 def slope(pairs: Pairs, known: Tensor) -> tuple[float, float | None]:

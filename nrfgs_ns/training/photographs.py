@@ -29,6 +29,7 @@ from nrfgs_ns.image.overlap import (
     estimate,
     sight,
     slope,
+    spread,
     varies,
 )
 from nrfgs_ns.image.photograph import PhotographModel
@@ -53,9 +54,14 @@ class Evidence(NamedTuple):
 
     @property
     def learnt_by_itself(self) -> bool:
-        """Whether exposure and white balance are learnt unless somebody says otherwise."""
+        """Whether exposure and white balance are learnt unless somebody says otherwise.
+
+        EXIF's exposure counts as far as the photographs' brightness follows it: one that the light or the camera's own
+        tone curve makes up for does not show.
+        """
         vary = any(size >= enough for size, enough in zip(self.seen.random, ENOUGH_STOPS, strict=True))
-        return vary or varies(self.known)
+        followed, _ = slope(self.pairs, self.known)
+        return vary or varies(self.known) and followed * spread(self.known) >= ENOUGH_STOPS[0]
 
 
 def evidence(datamanager: Any) -> Evidence:
@@ -111,14 +117,12 @@ def verdict(choice: Choice, found: Evidence) -> tuple[bool, str]:
     if not any(found.seen.random):
         words = "too few points in common to compare them"
     words += f" ({len(pairs.first)} pairs)"
-    there = known[torch.isfinite(known)]
-    spread = float(there.std(correction=0)) if len(there) else 0.0
-    if len(there) == 0:
+    if not torch.isfinite(known).any():
         told = "EXIF says nothing"
     elif not varies(known):
-        told = f"EXIF says that exposure is {'the same' if spread < 0.005 else 'almost the same'}"
+        told = f"EXIF says that exposure is {'the same' if spread(known) < 0.005 else 'almost the same'}"
     else:
-        told = f"EXIF says that exposure varies by {spread:.2f} stops"
+        told = f"EXIF says that exposure varies by {spread(known):.2f} stops"
         _, explained = slope(pairs, known)
         if explained is not None:
             told += f", which explains {explained:.0%} of their difference"

@@ -12,9 +12,12 @@ number for the size of a picture. `protect` changes that for the viewers that ar
     files     refused outside the folder of viser's page.
     messages  dropped where a browser's page would not send them; numbers are held within the bounds of their control.
 
+It also gives back a lock that viser keeps (`GuardedServer.atomic`).
+
 Read in: nerfstudio 1.1.5, viser 0.2.7 (`viser/infra/_infra.py`, `viser/_messages.py`), which nerfstudio pins.
 """
 
+import contextlib
 import functools
 import importlib.metadata
 import ipaddress
@@ -139,6 +142,19 @@ class GuardedServer(infra.WebsockServer):
         elif isinstance(message, _messages.ThemeConfigurationMessage):
             message.show_share_button = False
         super().queue_message(message)
+
+    @contextlib.contextmanager
+    def atomic(self) -> Iterator[None]:
+        """As viser's, but an exception inside gives the lock back: viser 0.2.7 keeps it, and the viewer stands still.
+
+        Nerfstudio raises one when a browser leaves while its camera moves.
+        """
+        messages = super().atomic()
+        messages.__enter__()
+        try:
+            yield
+        finally:
+            messages.__exit__(None, None, None)
 
     def _background_worker(self, ready_sem) -> None:
         _serving.server = self  # for `_serve`, which is called in this thread

@@ -44,6 +44,8 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
         ("auto", SAME, [0.3] * 11, False, "EXIF says that exposure is the same"),
         ("auto", SAME, [0.3] + [NAN] * 10, False, "EXIF says that exposure is the same"),
         ("auto", SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF says that exposure is almost the same"),
+        # The light changed, and the camera followed it.
+        ("auto", SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of their difference"),
         (
             "auto",
             DIFFERENT,

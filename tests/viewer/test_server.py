@@ -276,6 +276,13 @@ def test_messages_that_no_page_sends_do_nothing(to_all):
     assert not viewer.render_statemachines, "the client that has gone is still drawn for"
 
 
+def test_a_browser_that_leaves_while_its_camera_moves_stops_nobody(to_all):
+    """Nerfstudio then raises a KeyError inside `atomic`."""
+    with pytest.raises(KeyError), to_all.viser_server.atomic():
+        raise KeyError(0)
+    assert not to_all.viser_server._websock_server._atomic_lock.locked()
+
+
 def test_a_camera_path_is_saved_in_its_folder(to_all):
     """Its name is what the browser says, and becomes a file's."""
     (name,) = to_all.viser_server._websock_server.file_names
