@@ -21,8 +21,7 @@ class PlyOptions:
     ns-export writes it. capture: the data set's own axes and unit of length; of coordinates too large for float32 the
     file's header says what was subtracted"""
     steps: int | None = None
-    """of the fine-tune that makes the file draw what the model draws, 0 for none. None: 2,500; a GPU takes seconds,
-    a CPU minutes"""
+    """of the fine-tune that makes the file draw what the model draws, 0 for none. None: 2,500, on a CPU 400"""
     largest: float | None = None
     """cut the splats' standard deviations to this length, in the unit of the training's world, in which the cameras lie
     between -1 and 1: viewers that leave out what is centred off the screen do less harm. None: as trained"""

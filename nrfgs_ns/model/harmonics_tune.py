@@ -22,8 +22,8 @@ from nrfgs_ns.model.harmonics_fit import DEGREE, PlainSplats, no_larger
 from nrfgs_ns.model.renderer import composite_view
 from nrfgs_ns.model.view_noise import camera_spacing
 
-STEPS = 2500
-"""Of one view each."""
+STEPS, STEPS_ON_A_CPU = 2500, 400
+"""Of one view each. A GPU takes seconds; a CPU would take many minutes."""
 RATES = {"opacities": 3.0, "features_dc": 0.15, "features_rest": 0.15}
 """Learning rates to begin with, where pictures are off by 1 (root of the mean square), and in proportion where they are
 off by less: Adam's steps are no shorter there. They fall to 0 by half a cosine."""
@@ -38,9 +38,10 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
         model: an NrfgsModel in evaluation mode.
         splats: one for each of the model's, with its means, rotations and scales. On its device.
         cameras: the training cameras, [V].
-        steps: how many, STEPS unless said otherwise; 0 leaves the splats as they are.
+        steps: how many; None: STEPS, on a CPU STEPS_ON_A_CPU. 0 leaves the splats as they are.
     """
-    steps = STEPS if steps is None else steps
+    if steps is None:
+        steps = STEPS_ON_A_CPU if model.device.type == "cpu" else STEPS
     tables = {name: getattr(splats, name).clone().requires_grad_() for name in RATES}
     field, file = model.field.detached(), Field(ShConfig(degree=DEGREE).setup(), {**splats._asdict(), **tables})
     background = model.background_color.to(model.device)
