@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -9,6 +10,10 @@ from hypothesis import settings
 # A first example pays for imports and allocations; how long one takes says nothing.
 settings.register_profile("nrfgs", deadline=None)
 settings.load_profile("nrfgs")
+
+# A suite that a script starts in the background ignores Ctrl-C, and so would the processes that tests start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Modules that several test files share. tests/ itself would let its folders pass for packages of their names, and
 # nerfbaselines for installed.
