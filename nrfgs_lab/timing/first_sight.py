@@ -84,7 +84,8 @@ def child() -> None:
 
     def look(self: NrfgsTrainer, step: int) -> None:
         if clock.now() - last[0] >= every and len(reached) < len(targets):
-            measure(self, step)
+            found = measure(self, step)
+            curve.append([found["seconds"], found["steps"], round(found["psnr"], 3)])
         if len(reached) == len(targets) and not whole:
             self.stop_training = True
 
@@ -103,8 +104,7 @@ def child() -> None:
         self.pipeline.train()
         known = [value for value in values if value is not None]
         mean = sum(known) / len(known)
-        curve.append([round(start, 2), step + 1, round(mean, 3)])
-        found = {"seconds": round(start, 2), "steps": step + 1, "psnr": mean}
+        found = {"seconds": round(start, 3), "steps": step + 1, "psnr": mean}
         for target in targets:
             if mean >= target:
                 reached.setdefault(f"{target:g}", found)
