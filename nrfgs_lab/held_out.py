@@ -77,5 +77,7 @@ def _make_one(file: Path, out: Path, offset: int, views: int | None) -> None:
 
 
 if __name__ == "__main__":
+    if sys.argv[1:2] != ["make"] or len(sys.argv) < 4:
+        sys.exit(__doc__)
     first, _, kept = (sys.argv[4] if len(sys.argv) > 4 else "4").partition("/")
     make(Path(sys.argv[2]), Path(sys.argv[3]), int(first), sys.argv[5:] or None, int(kept) if kept else None)

@@ -42,6 +42,8 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
     """
     if steps is None:
         steps = STEPS_ON_A_CPU if model.device.type == "cpu" else STEPS
+    if steps == 0:
+        return splats
     tables = {name: getattr(splats, name).clone().requires_grad_() for name in RATES}
     field, file = model.field.detached(), Field(ShConfig(degree=DEGREE).setup(), {**splats._asdict(), **tables})
     background = model.background_color.to(model.device)
@@ -64,9 +66,7 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
         off = torch.stack([off_by(index, 0.0) for index in range(len(cameras))]).mean().sqrt().item()
     groups = [{"params": [tables[name]], "lr": rate * off} for name, rate in RATES.items()]
     optimizer = torch.optim.Adam(groups, eps=1e-15)
-    schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimizer, lambda step: 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
-    )
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.5 * (1 + math.cos(math.pi * step / steps)))
     sigma = MOVED * camera_spacing(cameras.camera_to_worlds[:, :3, 3]) / math.sqrt(3.0)
     order: list[int] = []
     for _ in track(range(steps), "Drawing what the model draws", console=CONSOLE, transient=True):

@@ -459,8 +459,8 @@ class NrfgsModel(SplatfactoModel):
     def fit_on(self, cameras: Cameras, steps: int | None = None) -> None:
         """Let the properties below be fitted harmonics from now on, as seen from these cameras [V].
 
-        The fit is made when one of them is first read, with so many steps of fine-tune (None: `harmonics_tune.STEPS`),
-        and kept until a checkpoint is loaded.
+        The fit is made when one of them is first read, with so many steps of fine-tune (`harmonics_tune.py`; None: as
+        many as suit the device), and kept until a checkpoint is loaded.
         """
         self._fit_cameras, self._fit_steps, self._fit = cameras, steps, None
         self.config.sh_degree = DEGREE

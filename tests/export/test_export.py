@@ -243,6 +243,7 @@ def test_opacity_is_the_mean_over_views_also_over_those_in_which_a_splat_is_tran
         total[rows] += opacity
         views[rows] += 1
     found, pictured = splats.opacities[:, 0].sigmoid(), views > 0
+    # A file's opacities keep 1e-6 away from 0 and 1, and are rounded as logits.
     assert_close(found[pictured], (total / views)[pictured], rtol=1e-5, atol=2e-6)
     assert ((found[pictured] > below + 0.05) & (found[pictured] < 0.55)).any()
     assert (found[~pictured] == model.gauss_params["opacities"].sigmoid()[~pictured, 0]).all()
