@@ -71,6 +71,10 @@ class AppearanceHeadConfig:
         """The configuration of a head that the capture trusts with a share, in (0, 1], of what it may do."""
         return self
 
+    def for_copies(self) -> "AppearanceHeadConfig":
+        """The configuration where densification replaces a splat by copies that share its opacity (3DGS-MCMC)."""
+        return self
+
     def require(self, holds: bool, name: str, needed: str) -> None:
         """Raise ValueError naming field `name`, its value and what is `needed`, unless the condition holds."""
         if not holds:

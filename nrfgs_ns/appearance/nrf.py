@@ -60,9 +60,10 @@ class NrfConfig(AppearanceHeadConfig):
     """standard deviation of the initial latents"""
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
-    opacity_bound: OpacityBound = "straight-through"
+    opacity_bound: OpacityBound | None = None
     """how base + residual stays in [0, 1] (docs/opacity.md). clamp: no gradient beyond the ends. straight-through: the
-    gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with round corners"""
+    gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with round corners. None:
+    logit for mcmc, otherwise straight-through"""
     geometry_gradient: bool = True
     """direction and distance send gradients to means and cameras"""
     implementation: Literal["auto", "torch", "fused"] = "auto"
@@ -70,9 +71,19 @@ class NrfConfig(AppearanceHeadConfig):
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"
     """rounding in matrix products of the fused kernels; sums are float32"""
 
+    @property
+    def bound(self) -> OpacityBound:
+        """The opacity bound of a head that nobody chose one for, too."""
+        return self.opacity_bound or "straight-through"
+
     def trusted(self, share: float) -> "NrfConfig":
         """Opacity that changes less with the view: an opacity for each view is a geometry for each."""
         return replace(self, opacity_scale=share * self.opacity_scale) if self.opacity_residual else self
+
+    def for_copies(self) -> "NrfConfig":
+        """Residuals on the logit, unless another bound is asked for: n copies of a splat have 1/n of its opacity each,
+        but would each add a whole residual to it."""
+        return self if self.opacity_bound or not self.opacity_residual else replace(self, opacity_bound="logit")
 
     def validate(self) -> None:
         self.require(self.latent_dim >= 1, "latent_dim", "at least 1")
@@ -84,7 +95,7 @@ class NrfConfig(AppearanceHeadConfig):
         self.require(self.latent_std >= 0, "latent_std", "zero or positive")
         self.require(self.output_init in ("zero", "default"), "output_init", "'zero' or 'default'")
         for name, choices in (
-            ("opacity_bound", OPACITY_BOUNDS),
+            ("opacity_bound", (None, *OPACITY_BOUNDS)),
             ("implementation", ("auto", "torch", "fused")),
             ("precision", ("fp32", "tf32", "bf16", "fp16")),
         ):
@@ -148,7 +159,7 @@ class NeuralResidualField(AppearanceHead):
         if d_alpha is None:
             opacity = torch.sigmoid(logit)
         else:
-            opacity = bounded_opacity(logit, d_alpha, self.config.opacity_scale, self.config.opacity_bound)
+            opacity = bounded_opacity(logit, d_alpha, self.config.opacity_scale, self.config.bound)
         return SplatAppearance(
             colors=(color + self.config.color_scale * d_color).clamp_min(0.0), opacities=opacity.squeeze(-1)
         )
@@ -173,7 +184,7 @@ class NeuralResidualField(AppearanceHead):
             shown["high branch"] = Component(whole - low, "color")
             shown["gate weight"] = Component(gate, "weight")
         if d_alpha is not None:
-            scale, bound = self.config.opacity_scale, self.config.opacity_bound
+            scale, bound = self.config.opacity_scale, self.config.bound
             change = bounded_opacity(logit, torch.tanh(d_alpha), scale, bound) - torch.sigmoid(logit)
             shown["opacity residual"] = Component(change, "opacity")
         return shown

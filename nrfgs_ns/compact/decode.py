@@ -79,8 +79,9 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     if unknown:
         raise ValueError(f"an unknown option {sorted(unknown)[0]!r} of the head")
     config = NrfConfig(**head["config"])
+    usual = NrfConfig(opacity_bound=NrfConfig().bound)
     for name in known:
-        value, default = getattr(config, name), getattr(NrfConfig(), name)
+        value, default = getattr(config, name), getattr(usual, name)
         right = isinstance(value, (int, float) if isinstance(default, float) else type(default))
         if not right or isinstance(value, bool) != isinstance(default, bool):
             raise ValueError(f"the head's {name} is {ascii(value)}")

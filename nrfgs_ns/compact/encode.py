@@ -105,7 +105,7 @@ def encode(
         half = np.abs(values).max(initial=0.0) < LARGEST_HALF
         streams[f"head.{name}"] = values.astype(np.float16 if half else np.float32)
 
-    config = asdict(field.head.config)
+    config = asdict(field.head.config) | {"opacity_bound": field.head.config.bound}
     config.pop("_target")
     header = {
         "format": FORMAT,

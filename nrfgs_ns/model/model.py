@@ -79,6 +79,8 @@ class NrfgsModel(SplatfactoModel):
         """Length of the noise on where the head is asked from, in spacings of the training cameras."""
         config.appearance.validate()
         appearance = config.appearance.trusted(self.trust)
+        if config.densification == "mcmc":
+            appearance = appearance.for_copies()
         self.reduced_head = differences(config.appearance, appearance) or None
         self.head = appearance.setup(self.scene_unit)
         config.sh_degree = self.head.sh_degree

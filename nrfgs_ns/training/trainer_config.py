@@ -209,7 +209,8 @@ def tell_what_was_chosen(model, views: int, steps_are_chosen: bool) -> None:
             f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
         )
     if model.trust < 1.0 and model.reduced_head:
-        options = ", ".join(f"{name} {value:.2g}" for name, value in model.reduced_head.items())
+        reduced = {name: value for name, value in model.reduced_head.items() if isinstance(value, float)}
+        options = ", ".join(f"{name} {value:.2g}" for name, value in reduced.items())
         chosen.append(f"their view dependence is trusted with {model.trust:.2g} of 1, so that it has {options}")
     if model.view_noise.sigma > 0.0:
         beside = model.noise_factor * model.camera_spacing / model.scene_unit

@@ -32,6 +32,18 @@ def test_the_fewer_the_views_the_less_the_head_is_trusted(tiny_scene, tmp_path, 
     assert model.head.config == NrfConfig() and model.noise_factor == 0.5
 
 
+def test_mcmc_has_residuals_on_the_logit(tiny_scene, tmp_path, no_cuda, capsys):
+    mcmc = {"--pipeline.model.densification": "mcmc", "--pipeline.model.splat-budget": 300}
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "mcmc", 3, QUICK, mcmc))
+    assert "so that it has opacity_scale 0.057;" in capsys.readouterr().out
+    again = ready(tiny_scene, tmp_path / "again", 4, mcmc, {"--load-dir": models_of(config)}).pipeline.model
+    assert again.head.config == NrfConfig(opacity_scale=8 / 28 * 0.2, opacity_bound="logit")
+    asked_for = {"--pipeline.model.appearance.opacity-bound": "clamp"}
+    assert ready(tiny_scene, tmp_path / "asked", 1, mcmc, asked_for).pipeline.model.head.config.bound == "clamp"
+    assert ready(tiny_scene, tmp_path / "other", 1).pipeline.model.head.config.bound == "straight-through"
+    assert NrfConfig(opacity_residual=False).for_copies() == NrfConfig(opacity_residual=False)
+
+
 def test_a_checkpoint_keeps_its_head_whatever_the_number_of_views(tiny_scene, tmp_path, no_cuda):
     for kept, asked in (("auto", "off"), ("off", "auto")):
         config = trained(

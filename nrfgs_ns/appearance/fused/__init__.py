@@ -140,7 +140,7 @@ class FusedField:
             opacity_scale=config.opacity_scale,
             distance_eps=config.distance_eps * scene_unit,
             log_unit=math.log(scene_unit),
-            bound=config.opacity_bound if config.opacity_residual else "none",
+            bound=config.bound if config.opacity_residual else "none",
             geometry_gradient=config.geometry_gradient,
             precision=config.precision,
         )
