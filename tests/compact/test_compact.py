@@ -328,7 +328,7 @@ def test_a_model_is_trained_for_the_file(exported, tmp_path):
     config, plain, _ = exported
     bytes_of, steps = {}, {}
     for rate in ("0", "3e-3"):
-        words = ["compact", "--load-config", str(config), "--output", str(tmp_path / f"{rate}.nrf"), "--finetune", "60"]
+        words = ["compact", "--load-config", str(config), "--output", str(tmp_path / f"{rate}.nrf"), "--finetune", "120"]
         words += ["--compact.views", "1", "--compact.rate", rate, "--report", str(tmp_path / f"{rate}.json")]
         torch.manual_seed(0)
         tyro.cli(Export, args=words).main()
@@ -338,7 +338,7 @@ def test_a_model_is_trained_for_the_file(exported, tmp_path):
         steps[rate] = np.concatenate([grids[name]["step"] for name in ("means", "scales", "colors", "turns")])
         assert found["loss_db"] < 0.1, "it has been trained on"
     assert (steps["3e-3"] > 1.1 * steps["0"]).all()
-    assert bytes_of["3e-3"] < 0.93 * bytes_of["0"]
+    assert bytes_of["3e-3"] < 0.8 * bytes_of["0"]
     with pytest.raises(InputError, match="finetune is -1"):
         tyro.cli(Export, args=[*words, "--finetune", "-1"]).main()
 
