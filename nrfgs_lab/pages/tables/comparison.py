@@ -1,115 +1,139 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers of docs/comparison.md."""
 
-from collections import defaultdict
 from statistics import fmean, median
+from typing import Any
 
-from nrfgs_lab.bench.table import Row
 from nrfgs_lab.pages.tables import bench_rows, bold, grid, mean_of, records, signed
-from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS
+from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS, runs_of, trials_of, view_gains
+
+Runs = list[dict[str, Any]]
+"""Trainings of one setting, by seed, as results/captures.json has them."""
 
 # Every capture.
 
-GROUPS = {
-    "3DGS's rules": {
-        "bonsai, its protocol": ("paper", "bonsai", "original"),
-        "bonsai": ("comparison", "bonsai", "original"),
-        "goldcape": ("comparison", "goldcape", "original"),
-        **{scene: ("methods", scene, "original") for scene in ("caliterra", "fox", "castle", "fern")},
-    },
-    "150,000 splats": {
-        "bonsai": ("comparison", "bonsai", "mcmc@150000"),
-        "goldcape": ("comparison", "goldcape", "mcmc@150000"),
-        "fox": ("budgets", "fox", "mcmc@150000"),
-    },
-}
-"""Group -> column -> study, capture and densification."""
-METHODS = "VDGS", "GSNB", "SG", "NRF-GS", "ours"
+RULES, BUDGET = "3DGS's rules", "150,000 splats"
+GROUPS = {RULES: ("VDGS", "GSNB", "SG", "NRF-GS", "ours"), BUDGET: ("ours",)}
+"""Group of rows -> what is compared with 3DGS."""
 BASE = "3DGS"
-OF_THE_PAPER = {"VDGS": "+0.49 (1.29)", "GSNB": "+0.96 (1.18)", "NRF-GS": "+1.01 (0.46)"}
-"""The paper's gains on bonsai, and splats in multiples of 3DGS's."""
+WITH_A_BUDGET = {BASE: "harmonics, 150,000 splats", "ours": "nrfgs, 150,000 splats"}
+"""Run -> its name in results/captures.json."""
+OF_THE_PAPER = {"VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
+"""The paper's gains on bonsai, in dB, and splats in multiples of 3DGS's."""
+
+
+def _runs(group: str, scene: str, run: str) -> Runs:
+    if group == BUDGET:
+        return runs_of(scene, WITH_A_BUDGET[run])
+    row = bench_rows("methods").get((scene, "original", run))
+    return trials_of(row) if row else []
+
+
+def _gain(ours: Runs, theirs: Runs, metric: str) -> float:
+    return fmean(one[metric] for one in ours) - fmean(one[metric] for one in theirs)
+
+
+def _share(ours: Runs, theirs: Runs) -> float:
+    return fmean(one["splats"] for one in ours) / fmean(one["splats"] for one in theirs)
 
 
 def every() -> str:
-    """3DGS's PSNR on each capture and what the others gain; gain in SSIM and share of its splats in the median of the
-    columns that all methods of a group have."""
-    columns = list(next(iter(GROUPS.values())))
+    """3DGS's PSNR and SSIM on each capture, and what the others gain: dB, SSIM x 1000, share of its splats."""
     body = []
-    for group, places in GROUPS.items():
-        rows = {run: {title: _row(place, run) for title, place in places.items()} for run in (BASE, *METHODS)}
-        rows = {run: found for run, found in rows.items() if any(found.values())}
-        shared = [title for title in places if all(found[title] for found in rows.values())]
-        for run, found in rows.items():
-            cells = [_cell(run, title, rows) for title in columns]
-            ssim = median(_gain(found[title], rows[BASE][title] if run != BASE else None, "SSIM") for title in shared)
-            splats = median(mean_of(found[title], "splats") / mean_of(rows[BASE][title], "splats") for title in shared)
-            more = [f"{ssim:.3f}", ""] if run == BASE else [signed(ssim, 3), f"{splats:.2f}"]
-            told = OF_THE_PAPER.get(run, "") if places is GROUPS["3DGS's rules"] else ""
-            body.append([f"**{group}**: {BASE}" if run == BASE else run, told, *cells, *more])
-    titles = [f"{title}, {TRAINING_VIEWS[title]}" if title in TRAINING_VIEWS else title for title in columns]
-    return grid(["", "the paper, bonsai", *titles, "SSIM", "splats"], body)
+    for group, methods in GROUPS.items():
+        found = {run: {scene: _runs(group, scene, run) for scene in TRAINING_VIEWS} for run in (BASE, *methods)}
+        first = [_cell(found, BASE, scene) for scene in TRAINING_VIEWS]
+        psnr = f"{mean_of(bench_rows('paper')['bonsai', 'original', BASE], 'PSNR'):.2f}"
+        body.append([f"**{group}**: {BASE}", "", psnr if group == RULES else "", *first, ""])
+        for run in methods:
+            pairs = [(found[run][scene], found[BASE][scene]) for scene in TRAINING_VIEWS]
+            shares = [_share(ours, base) for ours, base in pairs if ours and base]
+            own = [_of_the_paper(run), _protocol(run)] if group == RULES else ["", ""]
+            cells = [_cell(found, run, scene) for scene in TRAINING_VIEWS]
+            body.append([run, *own, *cells, f"{median(shares):.2f}" if shares else ""])
+    titles = [f"{scene}, {views}" for scene, views in TRAINING_VIEWS.items()]
+    return grid(["", "the paper: bonsai", "its protocol: bonsai", *titles, "splats"], body)
 
 
-def _row(place: tuple[str, str, str], run: str) -> Row | None:
-    return bench_rows(place[0]).get((*place[1:], run))
-
-
-def _cell(run: str, title: str, rows: dict[str, dict[str, Row | None]]) -> str:
-    """A number of decibels, bold if the most that is gained in its column."""
-    row, base = rows[run].get(title), rows[BASE].get(title)
-    if row is None or base is None:
+def _cell(found: dict[str, dict[str, Runs]], run: str, scene: str) -> str:
+    """Bold if the most decibels that are gained on the capture."""
+    ours, base = found[run][scene], found[BASE][scene]
+    if not ours or not base:
         return "-"
-    if row is base:
-        return f"{mean_of(row, 'PSNR'):.2f}"
-    gains = [_gain(found[title], base, "PSNR") for found in rows.values() if found[title] not in (None, base)]
-    gain = _gain(row, base, "PSNR")
-    return bold(signed(gain, 2), gain == max(gains) > 0)
+    if run == BASE:
+        return f"{fmean(one['psnr'] for one in ours):.2f}/{fmean(one['ssim'] for one in ours):.3f}"
+    gains = [_gain(runs[scene], base, "psnr") for name, runs in found.items() if name != BASE and runs[scene]]
+    gain = _gain(ours, base, "psnr")
+    return bold(f"{signed(gain, 2)}/{signed(1000 * _gain(ours, base, 'ssim'), 0)}", gain == max(gains) > 0)
 
 
-def _gain(row: Row, base: Row | None, metric: str) -> float:
-    """A metric above another row's, in the mean over seeds; the metric itself without another."""
-    return mean_of(row, metric) - (mean_of(base, metric) if base else 0.0)
+def _of_the_paper(run: str) -> str:
+    return "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
 
 
-def views_ahead(group: str, title: str, run: str, base: str) -> str:
-    """By how much a run is above another in the median test view, and in how many views."""
-    place = GROUPS[group][title]
-    gains = view_gains(_row(place, run), _row(place, base))
+def _protocol(run: str) -> str:
+    """What a method gains in the paper's protocol, and its share of 3DGS's splats."""
+    rows = bench_rows("paper")
+    ours, base = (rows.get(("bonsai", "original", name)) for name in (run, BASE))
+    if not ours:
+        return "-"
+    share = mean_of(ours, "splats") / mean_of(base, "splats")
+    return f"{signed(mean_of(ours, 'PSNR') - mean_of(base, 'PSNR'), 2)} ({share:.2f})"
+
+
+def ahead(group: str, run: str, base: str, what: str) -> str:
+    """On how many captures a run is ahead of another: in "PSNR", in "SSIM", or in the median test "view"."""
+    gains = []
+    for scene in TRAINING_VIEWS:
+        ours, theirs = _runs(group, scene, run), _runs(group, scene, base)
+        if ours and theirs:
+            gains.append(median(view_gains(ours, theirs)) if what == "view" else _gain(ours, theirs, what.lower()))
+    return f"{sum(gain > 0 for gain in gains)} of {len(gains)}"
+
+
+def views_ahead(scene: str, run: str, base: str) -> str:
+    """By how much a run is above another in the median test view under 3DGS's rules, and in how many views."""
+    return _views(_runs(RULES, scene, run), _runs(RULES, scene, base))
+
+
+def _views(ours: Runs, theirs: Runs) -> str:
+    gains = view_gains(ours, theirs)
     return f"{signed(median(gains))} dB ({sum(gain > 0 for gain in gains)} of {len(gains)})"
 
 
-def view_gains(row: Row, base: Row) -> list[float]:
-    """Decibels by which a row is above another in each test view, in the mean of the seeds that both have."""
-    gains = defaultdict(list)
-    for seed in row.records.keys() & base.records.keys():
-        views = [
-            {v["image"]: v["psnr"] for v in one.records[seed]["measured"]["test"]["per_image"]} for one in (row, base)
-        ]
-        for image, psnr in views[0].items():
-            gains[image].append(psnr - views[1][image])
-    return list(map(fmean, gains.values()))
+# Full size, 30,000 steps, two seeds.
 
 
-# What the field's parts are worth: captures at full size, 30,000 steps.
+def gains(scene: str, rule: str) -> str:
+    """What the methods gain over 3DGS on a capture."""
+    rows = bench_rows("comparison")
+    base = mean_of(rows[scene, rule, BASE], "PSNR")
+    methods = "VDGS", "GSNB", "SG", "NRF-GS"
+    return ", ".join(f"{run} {signed(mean_of(rows[scene, rule, run], 'PSNR') - base, 2)}" for run in methods)
+
+
+def short_of(scene: str) -> str:
+    """What the paper's field gains with 150,000 splats in 10,000 steps, in the median test view and in how many."""
+    rows = bench_rows("comparison", "short")
+    return _views(*(trials_of(rows[scene, "mcmc@150000", run]) for run in ("NRF-GS", BASE)))
+
 
 PARTS = {
-    "opacity residual (+0.35)": "no_opacity",
-    "distance (+0.21)": "no_distance",
-    "split (+0.48)": "no_split",
+    "the opacity residual": ("no_opacity", 0.35),
+    "distance": ("no_distance", 0.21),
+    "the split": ("no_split", 0.48),
 }
-"""What the paper says a part gains, in dB -> the run without."""
+"""Part of the field -> the run without, and what the paper says that the part gains, in dB."""
 
 
 def parts() -> str:
-    """What the field gains by each of its parts."""
-    rows = bench_rows("comparison")
-    places = [(scene, rule) for scene in ("bonsai", "goldcape") for rule in ("original", "mcmc@150000")]
-    body = []
-    for part, without in PARTS.items():
-        pairs = [(rows[(*place, "NRF-GS")], rows[(*place, without)]) for place in places]
-        body.append([part, *(signed(mean_of(a, "PSNR") - mean_of(b, "PSNR"), 2) for a, b in pairs)])
-    titles = [scene if rule == "original" else "150,000 splats" for scene, rule in places]
-    return grid(["the paper", *titles], body)
+    """What the field gains by each of its parts, on bonsai and goldcape under 3DGS's rules."""
+    rows, told = bench_rows("comparison"), []
+    for part, (without, paper) in PARTS.items():
+        pairs = [[rows[scene, "original", run] for run in ("NRF-GS", without)] for scene in ("bonsai", "goldcape")]
+        gained = " and ".join(signed(mean_of(one, "PSNR") - mean_of(other, "PSNR"), 2) for one, other in pairs)
+        told.append(f"{part} {gained} ({paper:+.2f})")
+    return ", ".join(told)
 
 
 def ratio(scene: str, run: str, base: str) -> str:
@@ -167,5 +191,5 @@ def trial_gains(head: str, trial: str) -> dict[str, float]:
     for scene in TRAINING_VIEWS:
         pair = [rows.get((scene, "original", name)) for name in (f"{head}_{trial}", head)]
         if all(pair):
-            found[scene] = median(view_gains(*pair))
+            found[scene] = median(view_gains(*map(trials_of, pair)))
     return found

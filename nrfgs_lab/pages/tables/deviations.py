@@ -4,8 +4,7 @@
 from statistics import median
 
 from nrfgs_lab.pages.tables import bench_rows, mean_of, records, signed
-from nrfgs_lab.pages.tables.comparison import view_gains
-from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS
+from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS, trials_of, view_gains
 
 
 def start(run: str) -> str:
@@ -35,7 +34,7 @@ def worth(change: str) -> str:
             plain.get((scene, "original", BASES[change.split("_")[0]])),
         )
         if row and base:
-            gain = signed(median(view_gains(row, base)), 2)
+            gain = signed(median(view_gains(trials_of(row), trials_of(base))), 2)
             told.append(f"{scene} {gain} dB (x{mean_of(row, 'splats') / mean_of(base, 'splats'):.2f})")
     return "; ".join(told) or "not measured"
 
@@ -43,7 +42,7 @@ def worth(change: str) -> str:
 def noise() -> str:
     """Decibels between two trainings of one setting with one seed: harmonics on bonsai's held-out views."""
     twice = bench_rows("deviations")["bonsai", "original", "3DGS"], bench_rows("heads")["bonsai", "original", "SH"]
-    return f"{abs(median(view_gains(*twice))):.2f} dB"
+    return f"{abs(median(view_gains(*map(trials_of, twice)))):.2f} dB"
 
 
 def precisions() -> str:

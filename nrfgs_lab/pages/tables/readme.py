@@ -5,7 +5,8 @@ from collections import defaultdict
 from statistics import fmean, median
 from typing import Any
 
-from nrfgs_lab.pages.tables import grid, records, signed
+from nrfgs_lab.bench.table import Row
+from nrfgs_lab.pages.tables import bench_rows, grid, records, signed
 
 TRAINING_VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "castle": 26, "kitchen": 21, "fern": 17}
 FIELD, LONG, HOST = "nrfgs", "nrfgs-sh", "splatfacto"
@@ -16,12 +17,20 @@ def runs_of(scene: str, name: str) -> list[dict[str, Any]]:
     """The trainings of a capture, as results/captures.json has them, by seed."""
     found = [one for one in records("captures").values() if (one.get("scene"), one.get("name")) == (scene, name)]
     bench = {LONG: "harmonics_nrfgs-sh", HOST: "nerfstudio_splatfacto"}.get(name)
-    if not found and (one := records("presets").get(f"runs/{bench}-own-{scene}-42")):
-        test, metrics = one["measured"]["test"], ("psnr", "ssim", "ms_ssim")
-        views = [[view["image"], *(view[metric] for metric in metrics)] for view in test["per_image"]]
-        shown = {"seed": 42, "per_image": views, "splats": one["measured"]["splats"]}
-        found = [{**{metric: test[metric] for metric in metrics}, **shown}]
+    if not found and (row := bench_rows("presets").get((scene, "own", bench))):
+        found = trials_of(row)
     return sorted(found, key=lambda one: one["seed"])
+
+
+def trials_of(row: Row) -> list[dict[str, Any]]:
+    """A benchmark's row as results/captures.json has trainings."""
+    found = []
+    for seed, record in row.records.items():
+        test, metrics = record["measured"]["test"], ("psnr", "ssim", "ms_ssim")
+        views = [[view["image"], *(view[metric] for metric in metrics)] for view in test["per_image"]]
+        shown = {"seed": seed, "per_image": views, "splats": record["measured"]["splats"]}
+        found.append({**{metric: test[metric] for metric in metrics}, **shown})
+    return found
 
 
 def captures() -> str:
