@@ -33,7 +33,7 @@ from nrfgs_ns.data.pixels import (
     pixels_folder,
     undistorted,
 )
-from nrfgs_ns.data.views import scene_unit
+from nrfgs_ns.data.views import different_views, scene_unit
 from nrfgs_ns.errors import InputError
 
 LARGEST_SCALE = 16.0
@@ -53,6 +53,7 @@ class NrfgsInputDataset(InputDataset):
         # A copy: the datamanager removes entries in place, and the original is shared by all datasets of the process.
         self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
         self.metadata["scene_unit"] = scene_unit(self.cameras.camera_to_worlds[:, :3, 3])
+        self.metadata["different_views"] = different_views(self.cameras.camera_to_worlds)
         # A copy too: undistortion crops the cameras while it loads the images.
         self._sizes = torch.cat([self.cameras.width, self.cameras.height], dim=-1).tolist()
 

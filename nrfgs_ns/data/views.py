@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Some views of many: evenly spaced ones, those for testing; and the length that a capture is measured in."""
+"""Some views of many: evenly spaced ones, those for testing, those that differ; and a capture's unit of length."""
 
 from __future__ import annotations
 
@@ -47,3 +47,43 @@ def scene_unit(positions: Tensor) -> float:
     positions = positions.double()
     reach = (positions - positions.mean(dim=0)).abs().max().item()
     return 2.0 ** round(math.log2(reach)) if reach > 0 else 1.0
+
+
+SAME_PLACE = 0.01
+"""Cameras nearer to each other than this share of the capture's reach stand at one place; in radians, they look one
+way."""
+
+
+def different_views(poses: Tensor) -> int:
+    """V, the number of training views that a head is trusted by and steps are chosen by: those that tell anything new.
+
+    A copy of a photograph, or a frame of a video whose camera stands still, is where an earlier view is and looks where
+    that one looks. From one place in another direction it is another view.
+
+    Args:
+        poses: camera-to-world, [V, 3 or 4, 4].
+    """
+    import torch
+
+    poses = poses.double()
+    return len(_first_of_each(torch.cat([_in_reaches(poses[:, :3, 3]), poses[:, :3, 2]], dim=1)))
+
+
+def distinct_places(centers: Tensor) -> Tensor:
+    """Cameras [V, 3] without those that stand where an earlier one does, [P, 3]."""
+    return centers[_first_of_each(_in_reaches(centers))]
+
+
+def _in_reaches(centers: Tensor) -> Tensor:
+    """Cameras [V, 3] about their mean, in distances from there to the farthest."""
+    centers = centers - centers.mean(dim=0)
+    return centers / centers.norm(dim=1).max().clamp_min(1e-300)
+
+
+def _first_of_each(rows: Tensor) -> list[int]:
+    """Which rows [V, K] are not near an earlier one of these."""
+    kept: list[int] = []
+    for i, row in enumerate(rows):
+        if not kept or (rows[kept] - row).norm(dim=1).min() > SAME_PLACE:
+            kept.append(i)
+    return kept

@@ -40,8 +40,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """noise on the camera centre from which the head sees each splat in training, in distances between neighbouring
     training cameras (docs/captures.md)"""
     few_views: Literal["auto", "off"] = "off"
-    """auto: V training views trust the head with u = V / (V + 20): noise is longer by 1 / u, its opacity residual is u
-    times as large (docs/captures.md)"""
+    """auto: V different training views trust the head with u = V / (V + 20): noise is longer by 1 / u, its opacity
+    residual is u times as large (docs/captures.md)"""
     shrinkage: float = 0.0
     """weight in the loss of the splats' mean opacity and mean size, in percent, halved with every 12 training views
     (docs/captures.md). mcmc has its own instead"""

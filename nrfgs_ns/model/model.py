@@ -71,12 +71,11 @@ class NrfgsModel(SplatfactoModel):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
         config = self.config
         config.check()
-        self.scene_unit: float = (self.kwargs.get("metadata") or {}).get("scene_unit", 1.0)
+        metadata = self.kwargs.get("metadata") or {}
+        self.scene_unit: float = metadata.get("scene_unit", 1.0)
         """World units in a scene unit; lengths in the configuration are in scene units."""
-        self.trust = config.trust(self.num_train_data)
-        """How far the training views trust the head, in (0, 1]."""
-        self.noise_factor = config.view_noise / self.trust
-        """Length of the noise on where the head is asked from, in spacings of the training cameras."""
+        self.num_views: int = metadata.get("different_views", self.num_train_data)
+        """Training views that differ (`data.views.different_views`), or as many as a checkpoint's training counted."""
         config.appearance.validate()
         appearance = config.appearance.trusted(self.trust)
         if config.densification == "mcmc":
@@ -101,6 +100,16 @@ class NrfgsModel(SplatfactoModel):
         )
         self.densification = self._strategy()
         self.view_noise = ViewNoise(0.0, torch.initial_seed())  # until the training cameras are known
+
+    @property
+    def trust(self) -> float:
+        """How far the training views trust the head, in (0, 1]."""
+        return self.config.trust(self.num_views)
+
+    @property
+    def noise_factor(self) -> float:
+        """Length of the noise on where the head is asked from, in spacings of the training cameras."""
+        return self.config.view_noise / self.trust
 
     def _initial_splats(self) -> dict[str, Tensor]:
         """The table of splats to start from."""
@@ -385,7 +394,7 @@ class NrfgsModel(SplatfactoModel):
     def shrinking(self, splats: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
         """What `shrinkage` adds to the loss. `splats`: another table than the model's."""
         splats = self.gauss_params if splats is None else splats
-        weight = self.config.shrinkage_weight(self.num_train_data)
+        weight = self.config.shrinkage_weight(self.num_views)
         if weight == 0.0:
             return {}
         return {
@@ -530,6 +539,8 @@ class NrfgsModel(SplatfactoModel):
         }
         if self.reduced_head is not None:
             state["capacity"] = {"head": self.reduced_head}
+        if self.num_views != self.num_train_data:
+            state["views"] = self.num_views
         return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -540,6 +551,7 @@ class NrfgsModel(SplatfactoModel):
                 f"with {self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
+        self.num_views = state.get("views", self.num_train_data)  # an older version counted all
         if "schedule_step" in state:
             self.schedule_at(state["schedule_step"])
             self.head.set_step(self.schedule_step)

@@ -20,8 +20,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-SAME_PLACE = 0.01
-"""Cameras nearer to each other than this share of the capture's reach stand at one place."""
+from nrfgs_ns.data.views import distinct_places
+
 NEIGHBOURS = 2
 """Nearest places that a place's spacing is measured to."""
 
@@ -47,16 +47,6 @@ def camera_spacing(centers: Tensor) -> float:
     nearest = distances.fill_diagonal_(math.inf).topk(count, largest=False).values.flatten().sort().values
     covered = nearest.cumsum(0)
     return nearest[int((covered < 0.5 * covered[-1]).sum())].item()
-
-
-def distinct_places(centers: Tensor) -> Tensor:
-    """Cameras [V, 3] without those that stand where an earlier one does, [P, 3]."""
-    reach = (centers - centers.mean(dim=0)).norm(dim=-1).max()
-    kept = centers[:1]
-    for center in centers[1:]:
-        if (kept - center).norm(dim=-1).min() > SAME_PLACE * reach:
-            kept = torch.cat([kept, center[None]])
-    return kept
 
 
 class ViewNoise:

@@ -25,6 +25,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
 
+from nrfgs_ns.data.views import different_views
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory
@@ -66,7 +67,7 @@ class Nrfgs:
         self.trainer: NrfgsTrainer | None = None
         if self.checkpoint is None:
             config = configure(self.method, config_overrides or {}, train_dataset["metadata"])
-            self.config = config.for_views(len(train_dataset["image_paths"]))
+            self.config = config.for_views(different_views(torch.from_numpy(train_dataset["cameras"].poses)))
             self.world = World.around(train_dataset["cameras"].poses, self.config.pipeline.datamanager.dataparser)
         else:
             self.config = _read_config(self.checkpoint)

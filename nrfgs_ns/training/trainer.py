@@ -108,8 +108,7 @@ class NrfgsTrainer(Trainer):
         """the last step that was made"""
         self._record_steps()
         if comms.is_main_process():
-            views = len(self.pipeline.datamanager.train_dataset)
-            tell_what_was_chosen(self.pipeline.model, views, self.steps_are_chosen)
+            tell_what_was_chosen(self.pipeline.model, self.steps_are_chosen)
         if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
@@ -127,7 +126,7 @@ class NrfgsTrainer(Trainer):
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
         self.steps_are_chosen = self.config.max_num_iterations == 0 and self.config.time_budget is None
-        self.config = self.config.for_views(len(self.pipeline.datamanager.train_dataset))
+        self.config = self.config.for_views(self.pipeline.model.num_views)
         self.total_steps = self.config.max_num_iterations
         self.guard = Guard(self.pipeline)
         self.mean = ParameterMean() if self.config.average_steps > 0 else None

@@ -195,15 +195,15 @@ def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
         raise
 
 
-def tell_what_was_chosen(model, views: int, steps_are_chosen: bool) -> None:
+def tell_what_was_chosen(model, steps_are_chosen: bool) -> None:
     """One line: how many steps, how far the views are trusted, how much noise, and why.
 
     Args:
         model: an NrfgsModel before its first step.
-        views: training views.
         steps_are_chosen: whether their number says how many steps are made.
     """
     chosen = []
+    views, given = model.num_views, model.num_train_data
     if steps_are_chosen:
         chosen.append(
             f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
@@ -219,5 +219,6 @@ def tell_what_was_chosen(model, views: int, steps_are_chosen: bool) -> None:
             f"{model.noise_factor:.2g} times the distance between neighbouring cameras"
         )
     if chosen:
-        noun = "training view" if views == 1 else "training views"
-        CONSOLE.print(f"{views} {noun}: {'; '.join(chosen)} (docs/captures.md).", soft_wrap=True)
+        noun = "training view" if given == 1 else "training views"
+        count = f"{given} {noun}" if views == given else f"{views} different training views of {given}"
+        CONSOLE.print(f"{count}: {'; '.join(chosen)} (docs/captures.md).", soft_wrap=True)

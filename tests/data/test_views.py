@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Some views of many; and a scene must train alike whatever it is measured in."""
+"""Some views of many, and how many of them differ; and a scene must train alike whatever it is measured in."""
 
+import math
 from dataclasses import dataclass, replace
 
 import pytest
@@ -10,7 +11,8 @@ from nerfstudio.scripts.train import _set_random_seed
 
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.data.views import evenly_spaced, scene_unit
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.views import different_views, evenly_spaced, scene_unit
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.optimizers import in_world_units
 from nrfgs_ns.training.run import parse
@@ -38,6 +40,53 @@ def test_scaled_cameras_are_left_alone():
     assert scene_unit(positions) == 1.0
     for nothing in (positions[:0], positions[1:2] * 100, torch.ones(3, 3) * 7):
         assert scene_unit(nothing) == 1.0
+
+
+def ring_of_poses(count, outwards=False):
+    """Cameras on a circle that look at its centre or away from it, [count, 3, 4]."""
+    angles = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+    back = torch.stack([angles.cos(), angles.sin(), 0 * angles], dim=-1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(back)
+    rotation = torch.stack([torch.linalg.cross(up, back), up, -back if outwards else back], dim=-1)
+    return torch.cat([rotation, 5 * back[..., None]], dim=-1)
+
+
+def moved(poses, sigma):
+    """The same poses with noise on their centres."""
+    noise = torch.zeros_like(poses)
+    noise[:, :, 3] = sigma * torch.randn(len(poses), 3, dtype=poses.dtype, generator=torch.Generator().manual_seed(0))
+    return poses + noise
+
+
+def test_a_view_that_another_one_is_does_not_count():
+    ring = ring_of_poses(44)
+    assert different_views(ring) == different_views(ring.float()) == 44
+    assert different_views(torch.cat([ring, ring])) == 44
+    assert different_views(torch.cat([ring, moved(ring, 1e-3)])) == 44, "posed by themselves they stand almost there"
+    assert different_views(torch.cat([ring[:1].expand(100, 3, 4), ring])) == 44, "a video that stands still for a while"
+    assert different_views(ring[:1]) == different_views(ring[:1].expand(7, 3, 4)) == 1
+    far = torch.cat([ring, ring])
+    far[:, :, 3] = 1e6 + 1e-3 * far[:, :, 3]
+    assert different_views(far) == 44
+
+
+def test_views_from_one_place_in_other_directions_count():
+    ring = ring_of_poses(44)
+    assert different_views(torch.cat([ring, ring_of_poses(44, outwards=True)])) == 88
+    tripod = torch.cat([ring[:, :, :3], ring[:1, :, 3:].expand(44, 3, 1)], dim=-1)
+    assert different_views(tripod) == different_views(torch.cat([tripod, tripod])) == 44
+    beside = ring.clone()
+    beside[:, :, 3] += 0.1 * ring[:, :, 0]  # a stereo rig, a seventh of the spacing wide
+    assert different_views(torch.cat([ring, beside])) == 88
+
+
+@pytest.mark.parametrize("capture", ["bonsai", "caliterra", "castle", "fern", "fox", "goldcape", "kitchen"])
+def test_all_views_of_ordinary_captures_differ(capture, captures):
+    if not (captures / capture).is_dir():
+        pytest.skip(f"no {capture} in {captures}")
+    parser = NrfgsDataParserConfig(data=captures / capture, load_3D_points=False).setup()
+    poses = parser.get_dataparser_outputs("train").cameras.camera_to_worlds
+    assert different_views(poses) == len(poses)
 
 
 @pytest.mark.parametrize("config", [NrfConfig(output_init="default"), VdgsConfig()], ids=["nrf", "vdgs"])

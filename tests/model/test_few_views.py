@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What keeps a head from learning few views by heart: trust by their number, and shrinkage."""
 
+import json
+import shutil
+
 import pytest
 import torch
 from short_trainings import checkpoint_of, command_line, models_of, trained
@@ -25,11 +28,55 @@ def ready(scene, out, steps, *options):
 def test_the_fewer_the_views_the_less_the_head_is_trusted(tiny_scene, tmp_path, no_cuda, capsys):
     model = ready(tiny_scene, tmp_path / "few", 1).pipeline.model
     trust = 8 / 28
-    assert model.num_train_data == 8 and model.trust == trust
+    assert model.num_views == 8 and model.trust == trust
     assert model.head.config == NrfConfig(opacity_scale=trust * 0.2) and model.noise_factor == 0.5 / trust
     assert "view dependence is trusted with 0.29 of 1, so that it has opacity_scale 0.057" in capsys.readouterr().out
     model = ready(tiny_scene, tmp_path / "many", 1, {"--pipeline.model.few-views": "off"}).pipeline.model
     assert model.head.config == NrfConfig() and model.noise_factor == 0.5
+
+
+@pytest.fixture
+def twice(tiny_scene, tmp_path):
+    """The tiny scene, which has a copy of each training photograph, too."""
+    scene = shutil.copytree(tiny_scene, tmp_path / "twice")
+    meta = json.loads((scene / "transforms.json").read_text())
+    for frame in [frame for frame in meta["frames"] if frame["file_path"] in meta["train_filenames"]]:
+        copy = frame["file_path"].replace("view", "copy")
+        shutil.copy(scene / frame["file_path"], scene / copy)
+        meta["frames"].append({**frame, "file_path": copy})
+        meta["train_filenames"].append(copy)
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    return scene
+
+
+def test_copies_of_photographs_raise_no_trust(twice, tiny_scene, tmp_path, no_cuda, capsys):
+    ours = ready(twice, tmp_path / "twice", 0)
+    assert "8 different training views of 16: 10,000 steps" in capsys.readouterr().out
+    model, single = ours.pipeline.model, ready(tiny_scene, tmp_path / "once", 0).pipeline.model
+    assert "8 training views: 10,000 steps" in capsys.readouterr().out
+    assert model.num_train_data == 16 and model.num_views == single.num_views == 8
+    assert (model.trust, model.head.config) == (single.trust, single.head.config)
+    assert model.noise_factor == single.noise_factor
+    assert_close(model.shrinking()["shrink_opacities"], single.shrinking()["shrink_opacities"])
+
+
+def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_cuda):
+    """Whatever version counted them: one of all photographs did not say."""
+    config = trained(command_line("nrfgs", twice, tmp_path / "new", 2, QUICK))
+    checkpoint = next(models_of(config).glob("*.ckpt"))
+    content = torch.load(checkpoint, weights_only=True)
+    extra = content["pipeline"]["_model._extra_state"]
+    for views in (8, 16):
+        if views == 16:
+            assert extra.pop("views") == 8
+            extra["capacity"] = {"head": {"opacity_scale": 16 / 36 * 0.2}}
+            content["pipeline"]["_extra_state"].pop("checksum")
+            torch.save(content, checkpoint)
+        again = ready(twice, tmp_path / "again", 4, QUICK, {"--load-dir": models_of(config)}).pipeline.model
+        trust = views / (views + 20)
+        assert again.num_views == views and again.trust == trust
+        assert again.head.config == NrfConfig(opacity_scale=trust * 0.2) and again.noise_factor == 0.5 / trust
+        assert again.view_noise.sigma == again.noise_factor * again.camera_spacing / 3**0.5
 
 
 def test_mcmc_has_residuals_on_the_logit(tiny_scene, tmp_path, no_cuda, capsys):
@@ -90,17 +137,17 @@ def test_only_a_field_can_be_trusted_less():
 
 def test_shrinkage_halves_with_every_twelve_views(tiny_scene, tmp_path, no_cuda):
     model = ready(tiny_scene, tmp_path, 1, {"--pipeline.model.shrinkage": 0.5}).pipeline.model
-    assert model.num_train_data == 8
+    assert model.num_views == 8
     table, weight = model.gauss_params, 0.005 * 0.5 ** (8 / 12)
     terms = model.shrinking()
     assert_close(terms["shrink_opacities"], weight * torch.sigmoid(table["opacities"]).mean())
     assert_close(terms["shrink_scales"], weight * table["scales"].exp().mean() / model.scene_unit)
-    model.num_train_data = 20
+    model.num_views = 20
     for name, term in model.shrinking().items():
         assert_close(term, terms[name] / 2)
-    model.num_train_data = 148  # of which Adam would make whole steps
+    model.num_views = 148  # of which Adam would make whole steps
     assert model.shrinking() == {}
-    model.num_train_data = 8
+    model.num_views = 8
     rows = torch.tensor([0, 2])
     shown = torch.tensor([0.9, 0.8], requires_grad=True)
     model.densification.pre_backward(10**6, {"gaussian_ids": rows}, shown, table["opacities"])

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 from torch.testing import assert_close
 
-from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing, distinct_places
+from nrfgs_ns.data.views import distinct_places
+from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 
 NRFGS = {
     "--pipeline.model.num-downscales": 0,

@@ -4,27 +4,21 @@
 from statistics import fmean, median
 from typing import Any
 
-from nrfgs_lab.pages.tables import bench_rows, bold, grid, mean_of, records, signed
-from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS, runs_of, trials_of, view_gains
+from nrfgs_lab.pages.tables import bench_rows, bold, grid, mean_of, signed
+from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS, trials_of, view_gains
 
 Runs = list[dict[str, Any]]
 """Trainings of one setting, by seed, as results/captures.json has them."""
 
-# Every capture.
+# Every capture at half its size, in 10,000 steps.
 
-RULES, BUDGET = "3DGS's rules", "150,000 splats"
-GROUPS = {RULES: ("VDGS", "GSNB", "SG", "NRF-GS", "ours"), BUDGET: ("ours",)}
-"""Group of rows -> what is compared with 3DGS."""
 BASE = "3DGS"
-WITH_A_BUDGET = {BASE: "harmonics, 150,000 splats", "ours": "nrfgs, 150,000 splats"}
-"""Run -> its name in results/captures.json."""
+METHODS = "VDGS", "GSNB", "SG", "NRF-GS", "ours"
 OF_THE_PAPER = {"VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
 """The paper's gains on bonsai, in dB, and splats in multiples of 3DGS's."""
 
 
-def _runs(group: str, scene: str, run: str) -> Runs:
-    if group == BUDGET:
-        return runs_of(scene, WITH_A_BUDGET[run])
+def _runs(scene: str, run: str) -> Runs:
     row = bench_rows("methods").get((scene, "original", run))
     return trials_of(row) if row else []
 
@@ -33,42 +27,35 @@ def _gain(ours: Runs, theirs: Runs, metric: str) -> float:
     return fmean(one[metric] for one in ours) - fmean(one[metric] for one in theirs)
 
 
-def _share(ours: Runs, theirs: Runs) -> float:
-    return fmean(one["splats"] for one in ours) / fmean(one["splats"] for one in theirs)
-
-
 def every() -> str:
-    """3DGS's PSNR and SSIM on each capture, and what the others gain: dB, SSIM x 1000, share of its splats."""
-    body = []
-    for group, methods in GROUPS.items():
-        found = {run: {scene: _runs(group, scene, run) for scene in TRAINING_VIEWS} for run in (BASE, *methods)}
-        first = [_cell(found, BASE, scene) for scene in TRAINING_VIEWS]
-        psnr = f"{mean_of(bench_rows('paper')['bonsai', 'original', BASE], 'PSNR'):.2f}"
-        body.append([f"**{group}**: {BASE}", "", psnr if group == RULES else "", *first, ""])
-        for run in methods:
-            pairs = [(found[run][scene], found[BASE][scene]) for scene in TRAINING_VIEWS]
-            shares = [_share(ours, base) for ours, base in pairs if ours and base]
-            own = [_of_the_paper(run), _protocol(run)] if group == RULES else ["", ""]
-            cells = [_cell(found, run, scene) for scene in TRAINING_VIEWS]
-            body.append([run, *own, *cells, f"{median(shares):.2f}" if shares else ""])
-    titles = [f"{scene}, {views}" for scene, views in TRAINING_VIEWS.items()]
-    return grid(["", "the paper: bonsai", "its protocol: bonsai", *titles, "splats"], body)
+    """3DGS's PSNR and SSIM, and what the others gain, dB and SSIM x 1000; the median share of its splats."""
+    psnr = f"{mean_of(bench_rows('paper')['bonsai', 'original', BASE], 'PSNR'):.2f}"
+    body = [[BASE, "", psnr, *(_level(_runs(scene, BASE)) for scene in TRAINING_VIEWS), "", ""]]
+    for run in METHODS:
+        paper = "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
+        ours, base = ([_runs(scene, one)[0]["splats"] for scene in _scenes(run)] for one in (run, BASE))
+        share = median(one / other for one, other in zip(ours, base, strict=True))
+        cells = [_cell(run, scene) for scene in TRAINING_VIEWS]
+        body.append([run, paper, _protocol(run), *cells, f"{share:.2f}", _ahead(run)])
+    return grid(["", "paper", "protocol", *TRAINING_VIEWS, "splats", "ahead"], body)
 
 
-def _cell(found: dict[str, dict[str, Runs]], run: str, scene: str) -> str:
+def _scenes(run: str) -> list[str]:
+    return [scene for scene in TRAINING_VIEWS if _runs(scene, run)]
+
+
+def _level(runs: Runs) -> str:
+    return f"{fmean(one['psnr'] for one in runs):.2f}/{fmean(one['ssim'] for one in runs):.3f}"
+
+
+def _cell(run: str, scene: str) -> str:
     """Bold if the most decibels that are gained on the capture."""
-    ours, base = found[run][scene], found[BASE][scene]
-    if not ours or not base:
+    base, found = _runs(scene, BASE), {one: _runs(scene, one) for one in METHODS}
+    if not found[run]:
         return "-"
-    if run == BASE:
-        return f"{fmean(one['psnr'] for one in ours):.2f}/{fmean(one['ssim'] for one in ours):.3f}"
-    gains = [_gain(runs[scene], base, "psnr") for name, runs in found.items() if name != BASE and runs[scene]]
-    gain = _gain(ours, base, "psnr")
-    return bold(f"{signed(gain, 2)}/{signed(1000 * _gain(ours, base, 'ssim'), 0)}", gain == max(gains) > 0)
-
-
-def _of_the_paper(run: str) -> str:
-    return "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
+    gains = {one: _gain(runs, base, "psnr") for one, runs in found.items() if runs}
+    text = f"{signed(gains[run], 2)}/{signed(1000 * _gain(found[run], base, 'ssim'), 0)}"
+    return bold(text, gains[run] == max(gains.values()) > 0)
 
 
 def _protocol(run: str) -> str:
@@ -76,24 +63,22 @@ def _protocol(run: str) -> str:
     rows = bench_rows("paper")
     ours, base = (rows.get(("bonsai", "original", name)) for name in (run, BASE))
     if not ours:
-        return "-"
+        return ""
     share = mean_of(ours, "splats") / mean_of(base, "splats")
     return f"{signed(mean_of(ours, 'PSNR') - mean_of(base, 'PSNR'), 2)} ({share:.2f})"
 
 
-def ahead(group: str, run: str, base: str, what: str) -> str:
-    """On how many captures a run is ahead of another: in "PSNR", in "SSIM", or in the median test "view"."""
-    gains = []
-    for scene in TRAINING_VIEWS:
-        ours, theirs = _runs(group, scene, run), _runs(group, scene, base)
-        if ours and theirs:
-            gains.append(median(view_gains(ours, theirs)) if what == "view" else _gain(ours, theirs, what.lower()))
-    return f"{sum(gain > 0 for gain in gains)} of {len(gains)}"
+def _ahead(run: str) -> str:
+    """On how many captures a run is above 3DGS: in PSNR, in SSIM, in PSNR in the median test view."""
+    pairs = [(_runs(scene, run), _runs(scene, BASE)) for scene in _scenes(run)]
+    measured = [(_gain(*pair, "psnr"), _gain(*pair, "ssim"), median(view_gains(*pair))) for pair in pairs]
+    counts = [sum(round(gain, 3) > 0 for gain in gains) for gains in zip(*measured, strict=True)]
+    return "/".join(map(str, counts))
 
 
 def views_ahead(scene: str, run: str, base: str) -> str:
-    """By how much a run is above another in the median test view under 3DGS's rules, and in how many views."""
-    return _views(_runs(RULES, scene, run), _runs(RULES, scene, base))
+    """By how much a run is above another in the median test view, and in how many views."""
+    return _views(_runs(scene, run), _runs(scene, base))
 
 
 def _views(ours: Runs, theirs: Runs) -> str:
@@ -104,12 +89,14 @@ def _views(ours: Runs, theirs: Runs) -> str:
 # Full size, 30,000 steps, two seeds.
 
 
-def gains(scene: str, rule: str) -> str:
-    """What the methods gain over 3DGS on a capture."""
-    rows = bench_rows("comparison")
-    base = mean_of(rows[scene, rule, BASE], "PSNR")
-    methods = "VDGS", "GSNB", "SG", "NRF-GS"
-    return ", ".join(f"{run} {signed(mean_of(rows[scene, rule, run], 'PSNR') - base, 2)}" for run in methods)
+def gains(rule: str) -> str:
+    """What the methods gain over 3DGS on each capture."""
+    rows, told = bench_rows("comparison"), []
+    for scene in "bonsai", "goldcape":
+        base = mean_of(rows[scene, rule, BASE], "PSNR")
+        found = [f"{run} {signed(mean_of(rows[scene, rule, run], 'PSNR') - base, 2)}" for run in METHODS[:-1]]
+        told.append(f"`{scene}` {', '.join(found)}")
+    return "; ".join(told)
 
 
 def short_of(scene: str) -> str:
@@ -119,9 +106,9 @@ def short_of(scene: str) -> str:
 
 
 PARTS = {
-    "the opacity residual": ("no_opacity", 0.35),
+    "opacity residual": ("no_opacity", 0.35),
     "distance": ("no_distance", 0.21),
-    "the split": ("no_split", 0.48),
+    "split": ("no_split", 0.48),
 }
 """Part of the field -> the run without, and what the paper says that the part gains, in dB."""
 
@@ -131,31 +118,9 @@ def parts() -> str:
     rows, told = bench_rows("comparison"), []
     for part, (without, paper) in PARTS.items():
         pairs = [[rows[scene, "original", run] for run in ("NRF-GS", without)] for scene in ("bonsai", "goldcape")]
-        gained = " and ".join(signed(mean_of(one, "PSNR") - mean_of(other, "PSNR"), 2) for one, other in pairs)
+        gained = ", ".join(signed(mean_of(one, "PSNR") - mean_of(other, "PSNR"), 2) for one, other in pairs)
         told.append(f"{part} {gained} ({paper:+.2f})")
-    return ", ".join(told)
-
-
-def ratio(scene: str, run: str, base: str) -> str:
-    """Splats of a run over another's, under 3DGS's rules."""
-    rows = bench_rows("comparison")
-    return f"{mean_of(rows[scene, 'original', run], 'splats') / mean_of(rows[scene, 'original', base], 'splats'):.2f}"
-
-
-def view(scene: str, rule: str, run: str, image: str) -> str:
-    """PSNR of one test view, seed by seed."""
-    found = [
-        next(one["psnr"] for one in record["measured"]["test"]["per_image"] if image in one["image"])
-        for _, record in sorted(bench_rows("comparison")[scene, rule, run].records.items())
-    ]
-    return " and ".join(f"{psnr:.1f}" for psnr in found)
-
-
-def stored_opacity(splats: str) -> str:
-    """PSNR of the field on bonsai where all of MCMC's rules and its loss go by the stored opacity, and GSNB's."""
-    record = records("comparison")[f"stored-opacity/NRF-GS-mcmc@{splats}-bonsai-42"]
-    other = bench_rows("comparison")["bonsai", f"mcmc@{splats}", "GSNB"]
-    return f"{record['measured']['test']['psnr']:.1f} against GSNB's {mean_of(other, 'PSNR'):.1f} dB"
+    return "; ".join(told)
 
 
 # How the heads' settings were chosen.
@@ -166,15 +131,14 @@ HEADS = {"SH": "3DGS", "VDGS": "VDGS", "GSNB": "GSNB", "SG": "SG", "NRF": "NRF-G
 
 
 def chosen() -> str:
-    """Each head's setting of four, and what it gains over its own in the median held-out view, mean over captures."""
+    """Which heads' settings are not their own, and the gain in the median held-out view, mean over captures."""
     best = {head: best_trial(head) for head in HEADS}
     told = [
         f"{HEADS[head]} {TRIALS[trial]} ({signed(fmean(trial_gains(head, trial).values()), 2)} dB)"
         for head, trial in best.items()
         if trial
     ]
-    *first, last = [HEADS[head] for head, trial in best.items() if not trial]
-    return ", ".join([*told, f"{', '.join(first)} and {last} their own"])
+    return ", ".join(told)
 
 
 def best_trial(head: str) -> str:

@@ -2,6 +2,7 @@
 """The tables of docs/opacity.md."""
 
 from nrfgs_lab.pages.tables import grid, records
+from nrfgs_lab.pages.tables.captures import gains_over
 
 SEEN = {
     "base": ("the field", "stored"),
@@ -10,6 +11,7 @@ SEEN = {
 }
 BOUNDS = "straight-through", "clamp", "smooth", "logit"
 SCENES = "bonsai", "goldcape", "fox"
+ADDED = "nrfgs, 150,000 splats, opacity added", "nrfgs, 150,000 splats"
 
 
 def pruning() -> str:
@@ -31,6 +33,21 @@ FORMS = {"splats": "{:,}", "psnr": "{:.2f}", "psnr_after_reset": "{:.2f}"}
 def mcmc(run: str) -> str:
     """PSNR under MCMC's rules, of 3DGS or of the field by the opacity that the rules go by."""
     return f"{records('mcmc-opacity')[f'bonsai/{run}-mcmc@150000-bonsai-42']['measured']['test']['psnr']:.2f}"
+
+
+def copies() -> str:
+    """What the field gains over harmonics under MCMC, by where its opacity residual is added."""
+    rows = {"added": "added", "on the logit": "logit", "the same, stored": "logit, base", "none": "no opacity residual"}
+    return gains_over("mcmc: harmonics", {label: [f"mcmc: {name}"] for label, name in rows.items()})
+
+
+def moved() -> str:
+    """On how many captures MCMC is better on test views with the residual on the logit, and where not."""
+    runs = records("captures").values()
+    added, logit = ({one["scene"]: one for one in runs if one["name"] == name} for name in ADDED)
+    worse = [scene for scene in added if logit[scene]["psnr"] < added[scene]["psnr"]]
+    cells = [f"`{scene}`, {added[scene]['psnr']:.2f} to {logit[scene]['psnr']:.2f} dB" for scene in worse]
+    return f"better on {len(added) - len(worse)} captures of {len(added)} (not on {', '.join(cells)})"
 
 
 def bounds() -> str:
