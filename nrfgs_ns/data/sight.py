@@ -26,6 +26,9 @@ FEWEST_SEEN = 0.01
 """Share of the points that must be in some view."""
 MOST_BLIND = 0.5
 """Share of the views that may see no point."""
+LEAST_SPREAD = 0.01
+"""Points whose distance from their middle is a smaller share of the cameras' distance from there are one spot to them;
+medians. Of real captures it is 0.1 and more."""
 ONE_WORLD = "Poses, intrinsics and points must be of one reconstruction, in one world and unit."
 
 
@@ -55,7 +58,8 @@ def in_reach(xyz: np.ndarray, cameras: Cameras, source: Path) -> np.ndarray:
 
 
 def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], source: Path) -> None:
-    """Enough points are in some training view, and most views have some; the views without any are named.
+    """Enough points are in some training view, at more than one place, and most views have some; the views without any
+    are named.
 
     Args:
         xyz: points in the world of the cameras, [N, 3].
@@ -74,6 +78,13 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
         raise InputError(
             f"{source}: of the {len(xyz)} points to start from, {100 * share:.2g} % are in any of the {len(names)} "
             f"training views. {ONE_WORLD}"
+        )
+    middle = points.median(dim=0).values
+    spread, away = ((places - middle).norm(dim=1).median() for places in (points, cameras.camera_to_worlds[:, :3, 3]))
+    if spread <= LEAST_SPREAD * away:
+        raise InputError(
+            f"{source}: the {len(xyz)} points to start from are all at one place, or half of them are. Make the points "
+            "anew, or start from random ones with --load-3D-points False."
         )
     if len(blind) > MOST_BLIND * len(names):
         raise InputError(

@@ -102,6 +102,23 @@ def test_most_views_must_see_something(tmp_path):
         capture.parse(eval_mode="all")
 
 
+@pytest.mark.parametrize("spread", [0.0, 1e-9, 0.01])
+def test_points_of_hardly_any_spread_start_nothing(tmp_path, spread):
+    capture, xyz = with_points(tmp_path / "scene")
+    capture.add_ply(np.concatenate([(5, 6, 7) + spread * (xyz[:30] - (5, 6, 7)), xyz[30:]]))
+    with pytest.raises(InputError, match=r"transforms.json: the 40 points to start from .*--load-3D-points False"):
+        capture.parse()
+    capture.add_ply((5, 6, 7) + 0.1 * (xyz - (5, 6, 7)))
+    assert len(capture.parse().metadata["points3D_xyz"]) == 40
+
+
+def test_points_outside_every_view_start_nothing(tmp_path):
+    capture, xyz = with_points(tmp_path / "scene")
+    capture.add_ply(xyz + (0, 0, 100))
+    with pytest.raises(InputError, match="of the 40 points to start from, 0 % are in any of the 9 training views"):
+        capture.parse()
+
+
 def test_some_points_far_away_are_left_out(tmp_path, printed):
     capture, xyz = with_points(tmp_path / "scene")
     xyz[:3] *= 1e8
