@@ -125,7 +125,7 @@ nrfgs_best = preset(
     "nrfgs-best",
     nrfgs,
     "nrfgs in 30,000 steps with 3DGS's densification: more splats, time and detail (docs/trade-off.md).",
-    model={"densification": "original", "shrinkage": 0.0},
+    model={"densification": "original"},
     max_num_iterations=STEPS,
     average_steps=AVERAGED,
 )

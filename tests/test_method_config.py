@@ -103,7 +103,6 @@ def test_everything_else_is_splatfactos(name):
                 "max_num_iterations": 30_000,
                 "average_steps": 200,
                 "pipeline.model.densification": "original",
-                "pipeline.model.shrinkage": 0.0,
             },
         ),
     ],

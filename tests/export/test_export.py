@@ -45,7 +45,7 @@ METHODS = {
 
 @pytest.fixture(autouse=True)
 def short_fine_tune(monkeypatch):
-    monkeypatch.setattr(harmonics_tune, "STEPS", 8)
+    monkeypatch.setattr(harmonics_tune, "STEPS_ON_A_CPU", 8)
 
 
 def random_splats(count: int) -> PlainSplats:

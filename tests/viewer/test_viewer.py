@@ -337,7 +337,7 @@ def test_ns_viewer_and_export_take_a_reduced_checkpoint(reduced, tmp_path, monke
 
 
 def test_ns_export_takes_a_reduced_checkpoint(reduced, tmp_path, export_gaussian_splat, monkeypatch):
-    monkeypatch.setattr("nrfgs_ns.model.harmonics_tune.STEPS", 4)
+    monkeypatch.setattr("nrfgs_ns.model.harmonics_tune.STEPS_ON_A_CPU", 4)
     export_gaussian_splat(load_config=reduced, output_dir=tmp_path / "ply").main()
     exported = read_splats(tmp_path / "ply" / "splat.ply")
     assert len(exported.means) > 0 and torch.isfinite(exported.features_dc).all()

@@ -6,7 +6,7 @@ from statistics import fmean, median
 from typing import Any
 
 from nrfgs_lab.bench.table import Row
-from nrfgs_lab.pages.tables import bench_rows, grid, records, signed
+from nrfgs_lab.pages.tables import bench_rows, grid, mean_of, records, signed
 
 TRAINING_VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "castle": 26, "kitchen": 21, "fern": 17}
 FIELD, HOST = "nrfgs", "splatfacto"
@@ -70,6 +70,20 @@ def gain(scene: str) -> str:
     """What the field gains on a capture over harmonics with the same steps, and in how many test views."""
     gains = view_gains(runs_of(scene, FIELD), runs_of(scene, SHRUNK))
     return f"{signed(median(gains))} dB in the median view, better in {sum(one > 0 for one in gains)} of {len(gains)}"
+
+
+def over_host(scene: str) -> str:
+    """What the field gains on a capture over splatfacto, both as they come."""
+    field, host = (fmean(one["psnr"] for one in runs_of(scene, name)) for name in (FIELD, HOST))
+    return f"{signed(field - host)} dB"
+
+
+def cost() -> str:
+    """Seconds and PSNR of whole trainings of bonsai, means."""
+    runs = {"nrfgs": "", "nrfgs-best": "`nrfgs-best` ", "nrfgs-sh": "harmonics ", "splatfacto": "splatfacto "}
+    rows = {run: bench_rows("speed")["bonsai", "own", run] for run in runs}
+    cells = [f"{runs[run]}{mean_of(row, 'time s'):.0f} s, {mean_of(row, 'PSNR'):.2f} dB" for run, row in rows.items()]
+    return "; ".join(cells)
 
 
 def demo(what: str) -> str:

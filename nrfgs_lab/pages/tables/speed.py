@@ -6,20 +6,14 @@ from statistics import median
 from nrfgs_lab.bench.table import Row
 from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, records
 
-TRAININGS = {
-    "splatfacto": "splatfacto",
-    "nrfgs-sh": "`nrfgs-sh`",
-    "nrfgs": "`nrfgs`",
-    "nrfgs-fast": "`nrfgs-fast`",
-}
+TRAININGS = "splatfacto", "splatfacto-10k", "nrfgs-sh", "nrfgs", "nrfgs-fast", "nrfgs-best"
 VARIANTS = {
     "fused bf16": "field",
-    "fused fp32": "field, fp32",
-    "torch": "field, PyTorch",
+    "torch": "in PyTorch",
     "sh head": "harmonics",
-    "sg head": "SG, PyTorch",
-    "vdgs head": "VDGS, PyTorch",
-    "gsnb head": "GSNB, PyTorch",
+    "sg head": "SG",
+    "vdgs head": "VDGS",
+    "gsnb head": "GSNB",
 }
 
 
@@ -29,25 +23,39 @@ def _trainings() -> dict[str, Row]:
 
 
 def trainings() -> str:
-    """What whole trainings of bonsai cost: medians and ranges of seconds, means of the rest."""
-    rows = _trainings()
-    base = median(rows["splatfacto"].values["time s"].values())
+    """What whole trainings of bonsai cost: each run's seconds and PSNR, means of the rest."""
     body = []
-    for run, label in TRAININGS.items():
-        if run in rows:
-            row, seconds = rows[run], list(rows[run].values["time s"].values())
-            cells = [row.text(BY_NAME[name]) for name in ("PSNR", "splats")]
-            frames = "/".join(BY_NAME[name].form.format(row.mean(BY_NAME[name])) for name in ("FPS", "FPS 1080p"))
-            peak = f"{row.mean(BY_NAME['peak MB']):.0f}"
-            body.append([label, spread(seconds, 0), f"{median(seconds) / base:.2f}", *cells, frames, peak])
-    head = ["bonsai", "seconds", "of splatfacto's", "PSNR", "splats", "frames/s, own size/1080p", "peak MB"]
+    for run in TRAININGS:
+        row = _trainings()[run]
+        shares = _ratios("time s", run, "splatfacto")
+        share = f"{shares[0]:.2f}" if shares else f"{_times_of(run)[0] / _times_of('splatfacto')[0]:.2f}*"
+        seconds = ", ".join(f"{value:.1f}" for value in _times_of(run))
+        psnr = ", ".join(f"{value:.2f}" for value in row.values["PSNR"].values())
+        means = [f"{row.mean(BY_NAME['splats']) / 1000:.0f}k", f"{row.mean(BY_NAME['peak MB']):.0f}"]
+        frames = "/".join(f"{row.mean(BY_NAME[name]):.0f}" for name in ("FPS", "FPS 1080p"))
+        body.append([f"`{run}`", seconds, share, psnr, *means, frames])
+    head = ["bonsai", "seconds", "of splatfacto's", "PSNR", "splats", "peak MB", "frames/s, own size/1080p"]
     return grid(head, body)
 
 
+def _times_of(run: str) -> list[float]:
+    return list(_trainings()[run].values["time s"].values())
+
+
+def _ratios(what: str, run: str, base: str) -> list[float]:
+    """A quantity of trainings of bonsai over another's, of those made in one call: by one version of the package."""
+    rows = _trainings()
+    return [
+        rows[run].values[what][seed] / rows[base].values[what][other]
+        for seed, one in rows[run].records.items()
+        for other, two in rows[base].records.items()
+        if one["machine"]["source"] == two["machine"]["source"]
+    ]
+
+
 def ratio(what: str, run: str, base: str) -> str:
-    """A quantity of trainings of bonsai over others', medians."""
-    first, second = (median(_trainings()[one].values[what].values()) for one in (run, base))
-    return f"{first / second:.2f}"
+    """A quantity of trainings of bonsai over others' of the same call, the median."""
+    return f"{median(_ratios(what, run, base)):.2f}"
 
 
 def of_training(what: str, run: str) -> str:
@@ -71,11 +79,8 @@ def _steps(run: str, begin: int, end: int) -> float:
 
 def steps() -> str:
     """Milliseconds of a step of whole trainings, while splats come and go and later."""
-    body = []
-    for run in ("nrfgs", "nrfgs-sh"):
-        splats = f"{_trainings()[run].mean(BY_NAME['splats']):,.0f}"
-        body.append([f"`{run}`", *(f"{_steps(run, *phase):.2f}" for phase in PHASES.values()), splats])
-    return grid(["", *PHASES, "splats"], body)
+    found = {run: [f"{_steps(run, *phase):.2f}" for phase in PHASES.values()] for run in ("nrfgs", "nrfgs-sh")}
+    return ", ".join(f"{phase} {one}/{other}" for phase, one, other in zip(PHASES, *found.values(), strict=True))
 
 
 def step_ratio(run: str, base: str) -> str:
@@ -84,55 +89,41 @@ def step_ratio(run: str, base: str) -> str:
 
 
 def heads() -> str:
-    """Milliseconds of the GPU for each head, forward and backward."""
+    """Milliseconds of the GPU for each head at a million visible splats, forward and backward."""
+    return ", ".join(f"{label} {_head(variant):.2f}" for variant, label in VARIANTS.items())
+
+
+def _head(variant: str) -> float:
     times = records("head_gpu")["head_gpu_all"]["times"]
-    sizes = 100_000, 1_000_000
-    found = {(one["variant"], one["visible"]): one for one in times if one["share"] == "all"}
-    body = []
-    for variant, label in VARIANTS.items():
-        body.append([label, *(f"{found[variant, size]['gpu_ms']:.2f}" for size in sizes)])
-    return grid(["visible splats", *(f"{size / 1e6:g}M" for size in sizes)], body)
+    found = {one["variant"]: one for one in times if one["share"] == "all" and one["visible"] == 1_000_000}
+    return found[variant]["gpu_ms"]
 
 
 def head_share() -> str:
     """The field's time at a million visible splats, of the harmonics'."""
-    times = records("head_gpu")["head_gpu_all"]["times"]
-    found = {one["variant"]: one for one in times if one["share"] == "all" and one["visible"] == 1_000_000}
-    return f"{found['fused bf16']['gpu_ms'] / found['sh head']['gpu_ms']:.2f}"
+    return f"{_head('fused bf16') / _head('sh head'):.2f}"
 
 
-def error(variant: str, what: str) -> str:
-    """Relative error of a variant of the field against float64."""
-    (found,) = (one for one in records("head_gpu")["head_gpu_all"]["errors"] if one["variant"] == variant)
-    return f"{found[what]:.0e}"
+def errors() -> str:
+    """Relative errors of the field against float64, in bf16."""
+    (found,) = (one for one in records("head_gpu")["head_gpu_all"]["errors"] if one["variant"] == "fused bf16")
+    return f"{found['colors']:.0e} in colours and {found['d weights']:.0e} in gradients of the weights"
 
 
-def cpu_rasterizer(case: str, what: str) -> str:
-    """The CPU's rasterizer on a case: "ms" forward and backward, or how many "times" a loop over tiles takes."""
+def cpu_rasterizer(case: str) -> str:
+    """The CPU's rasterizer on a case, forward and backward, and how many times a loop over tiles takes."""
     one = records("rasterizer_cpu")["rasterizer_cpu_two_threads"]["results"][case]
-    if what == "times":
-        return f"{one['times_faster']:.0f}"
-    return f"{one['ours']['forward_ms'] + one['ours']['backward_ms']:.0f}"
+    ours = one["ours"]["forward_ms"] + one["ours"]["backward_ms"]
+    return f"{ours:.0f} ms, {one['times_faster']:.0f} times faster"
 
 
 def first_sight() -> str:
-    """From the command to a picture that is worth looking at."""
+    """Seconds from the command to a picture that is worth looking at."""
     record = records("first_sight")["nrfgs-fast"]
-    stages = {
-        "imported": "imports",
-        "data set checked": "data set checked",
-        "images read": "images read",
-        "photographs compared": "photographs compared",
-        "step 0": "first step",
-    }
-    body = []
-    for name, label in stages.items():
-        seconds = record["stages"][name]
-        body.append([label, f"{seconds:.1f}"])
-    for target, reached in record["reached"].items():
-        seconds = reached["seconds"]
-        body.append([f"{target} dB, {reached['steps']:,} steps", f"{seconds:.1f}"])
-    return grid(["", "seconds since the command"], body)
+    stages = {"imported": "imports", "images read": "images read", "step 0": "first step"}
+    told = [f"{label} {record['stages'][name]:.1f}" for name, label in stages.items()]
+    told += [f"{target} dB {reached['seconds']:.1f}" for target, reached in record["reached"].items()]
+    return ", ".join(told)
 
 
 def imports(which: str = "seconds") -> str:
@@ -140,21 +131,16 @@ def imports(which: str = "seconds") -> str:
     return f"{records('start_up')[which]:.1f}"
 
 
-def step_share(method: str, variant: str, base_method: str, base_variant: str) -> str:
-    """A step's time over another's."""
-    rows = {(row["method"], row["variant"]): row for row in records("step_parts")["graph"]["steps"]}
-    return f"{rows[method, variant]['step_ms'] / rows[base_method, base_variant]['step_ms']:.2f}"
+def step_shares() -> str:
+    """A step's time over the harmonics' with as many splats, and over its own with the graph."""
+    rows = {(row["method"], row["variant"]): row["step_ms"] for row in records("step_parts")["graph"]["steps"]}
+    grown, rest = (rows["nrfgs", name] / rows["nrfgs-sh", name] for name in ("whole", "at rest: whole"))
+    slower = rows["nrfgs", "without graph"] / rows["nrfgs", "whole"]
+    return f"{grown:.2f} while splats come and go, {rest:.2f} later; without the graph {slower:.2f} times as long"
 
 
-def frame_share(size: str) -> str:
-    """The field's frames per second over the harmonics', at about as many splats."""
-    rows = records("step_parts")["graph"]["frames"]
-    fps = {row["method"]: row["fps"][size] for row in rows}
-    return f"{fps['nrfgs'] / fps['nrfgs-sh']:.2f}"
-
-
-def spread(numbers: list[float], digits: int) -> str:
-    """Median, least and largest; of one number, itself."""
-    if len(numbers) == 1:
-        return f"{numbers[0]:.{digits}f}"
-    return f"{median(numbers):.{digits}f} ({min(numbers):.{digits}f} to {max(numbers):.{digits}f})"
+def frames() -> str:
+    """The field's frames per second over the harmonics', 1080p: with about as many splats, and as they come."""
+    fps = {row["method"]: row["fps"]["1080p"] for row in records("step_parts")["graph"]["frames"]}
+    found = [fps["nrfgs"] / fps["nrfgs-sh"], *_ratios("FPS 1080p", "nrfgs", "nrfgs-sh")]
+    return f"{min(found):.2f} to {max(found):.2f}"
