@@ -18,7 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from nrfgs_lab.bench.table import COLUMNS, Row, ranks
+from nrfgs_lab.bench.table import COLUMNS, Row
 
 ROOT = Path(__file__).resolve().parents[3]
 OPENING = "<!-- table "
@@ -79,23 +79,6 @@ def bench_rows(study: str, part: str | None = None) -> dict[tuple[str, str, str]
             row = rows.setdefault((scene, strategy, run), Row(scene, run, strategy))
             row.records[int(match["seed"])] = {"jobs": 1, **record}
     return {place: row.fill() for place, row in rows.items()}
-
-
-def bench_grid(groups: Sequence[tuple[str, Sequence[tuple[str, Row]]]], columns: Sequence[str]) -> str:
-    """A table of groups of rows, the best of each group and column bold.
-
-    Args:
-        groups: what stands in the first column, and its rows by their labels.
-        columns: names of columns of `nrfgs bench`.
-    """
-    shown = [BY_NAME[name] for name in columns]
-    body = []
-    for title, labelled in groups:
-        best = {column.name: ranks([row for _, row in labelled], column) for column in shown}
-        for number, (label, row) in enumerate(labelled):
-            cells = [bold(row.text(column), best[column.name].get(number) == 1) for column in shown]
-            body.append([title if number == 0 else "", label, str(len(row.records)), *cells])
-    return grid(["scene", "", "seeds", *columns], body)
 
 
 def bold(text: str, condition: bool = True) -> str:

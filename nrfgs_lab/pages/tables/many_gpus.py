@@ -29,9 +29,3 @@ def quality() -> str:
         for run in records("many-gpus")["quality"]["runs"]
     ]
     return grid(["GPUs", "PSNR", "SSIM", "L1", "splats"], rows)
-
-
-def speedup() -> str:
-    """Images a second of two devices over one's."""
-    one, two = records("many-gpus")["load"]["runs"]
-    return f"{two['images_per_second'] / one['images_per_second']:.2f}"

@@ -43,7 +43,10 @@ def spec(**more):
 # The file.
 
 
-@pytest.mark.parametrize("name", ["tiny", "paper", "heads", "deviations", "methods", "comparison", "mcmc-opacity"])
+SHIPPED = ["tiny", "paper", "heads", "deviations", "methods", "comparison", "mcmc-opacity", "presets"]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_files_are_valid(name):
     plan = make_spec(load_spec(ROOT / "docs" / "bench" / f"{name}.yaml"), name)
     rows, cells = rows_of(plan), cells_of(plan)
