@@ -18,22 +18,24 @@ OF_THE_PAPER = {"VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0
 """The paper's gains on bonsai, in dB, and splats in multiples of 3DGS's."""
 
 
-def _runs(scene: str, run: str) -> Runs:
+def half(scene: str, run: str) -> Runs:
+    """A run of docs/bench/methods.yaml."""
     row = bench_rows("methods").get((scene, "original", run))
     return trials_of(row) if row else []
 
 
-def _gain(ours: Runs, theirs: Runs, metric: str) -> float:
+def gain(ours: Runs, theirs: Runs, metric: str) -> float:
+    """A metric above another setting's, in the mean over views and seeds."""
     return fmean(one[metric] for one in ours) - fmean(one[metric] for one in theirs)
 
 
 def every() -> str:
     """3DGS's PSNR and SSIM, and what the others gain, dB and SSIM x 1000; the median share of its splats."""
     psnr = f"{mean_of(bench_rows('paper')['bonsai', 'original', BASE], 'PSNR'):.2f}"
-    body = [[BASE, "", psnr, *(_level(_runs(scene, BASE)) for scene in TRAINING_VIEWS), "", ""]]
+    body = [[BASE, "", psnr, *(_level(half(scene, BASE)) for scene in TRAINING_VIEWS), "", ""]]
     for run in METHODS:
         paper = "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
-        ours, base = ([_runs(scene, one)[0]["splats"] for scene in _scenes(run)] for one in (run, BASE))
+        ours, base = ([half(scene, one)[0]["splats"] for scene in _scenes(run)] for one in (run, BASE))
         share = median(one / other for one, other in zip(ours, base, strict=True))
         cells = [_cell(run, scene) for scene in TRAINING_VIEWS]
         body.append([run, paper, _protocol(run), *cells, f"{share:.2f}", _ahead(run)])
@@ -41,7 +43,7 @@ def every() -> str:
 
 
 def _scenes(run: str) -> list[str]:
-    return [scene for scene in TRAINING_VIEWS if _runs(scene, run)]
+    return [scene for scene in TRAINING_VIEWS if half(scene, run)]
 
 
 def _level(runs: Runs) -> str:
@@ -50,11 +52,11 @@ def _level(runs: Runs) -> str:
 
 def _cell(run: str, scene: str) -> str:
     """Bold if the most decibels that are gained on the capture."""
-    base, found = _runs(scene, BASE), {one: _runs(scene, one) for one in METHODS}
+    base, found = half(scene, BASE), {one: half(scene, one) for one in METHODS}
     if not found[run]:
         return "-"
-    gains = {one: _gain(runs, base, "psnr") for one, runs in found.items() if runs}
-    text = f"{signed(gains[run], 2)}/{signed(1000 * _gain(found[run], base, 'ssim'), 0)}"
+    gains = {one: gain(runs, base, "psnr") for one, runs in found.items() if runs}
+    text = f"{signed(gains[run], 2)}/{signed(1000 * gain(found[run], base, 'ssim'), 0)}"
     return bold(text, gains[run] == max(gains.values()) > 0)
 
 
@@ -70,20 +72,10 @@ def _protocol(run: str) -> str:
 
 def _ahead(run: str) -> str:
     """On how many captures a run is above 3DGS: in PSNR, in SSIM, in PSNR in the median test view."""
-    pairs = [(_runs(scene, run), _runs(scene, BASE)) for scene in _scenes(run)]
-    measured = [(_gain(*pair, "psnr"), _gain(*pair, "ssim"), median(view_gains(*pair))) for pair in pairs]
+    pairs = [(half(scene, run), half(scene, BASE)) for scene in _scenes(run)]
+    measured = [(gain(*pair, "psnr"), gain(*pair, "ssim"), median(view_gains(*pair))) for pair in pairs]
     counts = [sum(round(gain, 3) > 0 for gain in gains) for gains in zip(*measured, strict=True)]
     return "/".join(map(str, counts))
-
-
-def views_ahead(scene: str, run: str, base: str) -> str:
-    """By how much a run is above another in the median test view, and in how many views."""
-    return _views(_runs(scene, run), _runs(scene, base))
-
-
-def _views(ours: Runs, theirs: Runs) -> str:
-    gains = view_gains(ours, theirs)
-    return f"{signed(median(gains))} dB ({sum(gain > 0 for gain in gains)} of {len(gains)})"
 
 
 # Full size, 30,000 steps, two seeds.
@@ -102,7 +94,8 @@ def gains(rule: str) -> str:
 def short_of(scene: str) -> str:
     """What the paper's field gains with 150,000 splats in 10,000 steps, in the median test view and in how many."""
     rows = bench_rows("comparison", "short")
-    return _views(*(trials_of(rows[scene, "mcmc@150000", run]) for run in ("NRF-GS", BASE)))
+    gains = view_gains(*(trials_of(rows[scene, "mcmc@150000", run]) for run in ("NRF-GS", BASE)))
+    return f"{signed(median(gains))} dB ({sum(gain > 0 for gain in gains)} of {len(gains)})"
 
 
 PARTS = {

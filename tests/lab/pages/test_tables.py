@@ -8,6 +8,8 @@ import pytest
 
 from nrfgs_lab.pages import tables
 from nrfgs_lab.pages.tables import BLOCK, ROOT, loose_decibels, pages, written
+from nrfgs_lab.pages.tables.comparison import gain, half
+from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS, runs_of
 
 PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
 LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -21,6 +23,21 @@ def test_numbers_are_those_of_the_records(name):
 @pytest.mark.parametrize("name", [name for name, text in PAGES.items() if BLOCK.search(text)])
 def test_decibels_in_prose_stand_in_a_block_of_the_page(name):
     assert list(loose_decibels(PAGES[name])) == []
+
+
+def test_verdicts_in_words_are_those_of_the_records():
+    """How many captures docs/comparison.md and README.md say that methods are ahead on."""
+
+    def ahead(runs, ours: str, theirs: str, metric: str = "psnr", scenes=tuple(TRAINING_VIEWS)) -> int:
+        return sum(round(gain(runs(scene, ours), runs(scene, theirs), metric), 3) > 0 for scene in scenes)
+
+    few = [scene for scene in TRAINING_VIEWS if scene != "bonsai"]
+    assert ahead(half, "NRF-GS", "3DGS", scenes=few) == ahead(half, "VDGS", "NRF-GS", scenes=few) == 5
+    assert ahead(half, "NRF-GS", "3DGS", "ssim", few) == 2
+    assert ahead(half, "ours", "VDGS", scenes=few) == 4
+    assert ahead(half, "ours", "3DGS") == ahead(half, "ours", "3DGS", "ssim") == len(TRAINING_VIEWS)
+    assert ahead(runs_of, "nrfgs", "splatfacto") == ahead(runs_of, "nrfgs", "splatfacto", "ssim") == len(TRAINING_VIEWS)
+    assert ahead(runs_of, "nrfgs, 150,000 splats", "harmonics, 150,000 splats") == 4
 
 
 def anchors(text: str) -> set[str]:
