@@ -4,7 +4,7 @@
 from statistics import fmean, median
 from typing import Any
 
-from nrfgs_lab.pages.tables import bench_rows, bold, grid, mean_of, signed
+from nrfgs_lab.pages.tables import bench_rows, bold, grid, mean_of, records, signed
 from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS, trials_of, view_gains
 
 Runs = list[dict[str, Any]]
@@ -96,6 +96,13 @@ def short_of(scene: str) -> str:
     rows = bench_rows("comparison", "short")
     gains = view_gains(*(trials_of(rows[scene, "mcmc@150000", run]) for run in ("NRF-GS", BASE)))
     return f"{signed(median(gains))} dB ({sum(gain > 0 for gain in gains)} of {len(gains)})"
+
+
+def stored_opacity() -> str:
+    """PSNR of the field and GSNB on bonsai with 150,000 splats, where MCMC goes by the stored opacity."""
+    field = records("comparison")["stored-opacity/NRF-GS-mcmc@150000-bonsai-42"]["measured"]["test"]["psnr"]
+    other = mean_of(bench_rows("comparison")["bonsai", "mcmc@150000", "GSNB"], "PSNR")
+    return f"NRF-GS {field:.1f} dB, GSNB {other:.1f}"
 
 
 PARTS = {
