@@ -29,7 +29,7 @@ MODELS = {
     9: ("RADIAL_FISHEYE", ("f", "cx", "cy", "k1", "k2")),
 }
 """Camera models that can be undistorted: COLMAP's number, name, and parameters as transforms.json names them."""
-BY_NAME = {name: parameters for name, parameters in MODELS.values()}
+BY_NAME = dict(MODELS.values())
 QUATERNION_TOLERANCE = 1e-2
 """How far a rotation's quaternion may be from unit length."""
 DAMAGED = (struct.error, OSError, ValueError, IndexError, KeyError, MemoryError, OverflowError)

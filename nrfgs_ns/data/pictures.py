@@ -109,8 +109,6 @@ def _copy_of(path: Path, size: tuple[int, int], kind: str) -> Path:
 
 
 def _resize(path: Path, size: tuple[int, int], copy: Path, kind: str) -> None:
-    from nrfgs_ns.data.pictures import exif_of_copy  # which reads with what is above
-
     picture = read_picture(path) if kind == "images" else read_mask(path)
     sampling = Image.Resampling.LANCZOS if kind == "images" else Image.Resampling.NEAREST
     lossy = kind == "images" and picture.mode == "RGB" and read_format(path) in ("JPEG", "MPO")

@@ -76,14 +76,16 @@ def distinct_places(centers: Tensor) -> Tensor:
 
 def _in_reaches(centers: Tensor) -> Tensor:
     """Cameras [V, 3] about their mean, in distances from there to the farthest."""
-    centers = centers - centers.mean(dim=0)
-    return centers / centers.norm(dim=1).max().clamp_min(1e-300)
+    away = centers.double() - centers.double().mean(dim=0)
+    return away / away.norm(dim=1).max().clamp_min(1e-300)
 
 
 def _first_of_each(rows: Tensor) -> list[int]:
     """Which rows [V, K] are not near an earlier one of these."""
-    kept: list[int] = []
-    for i, row in enumerate(rows):
-        if not kept or (rows[kept] - row).norm(dim=1).min() > SAME_PLACE:
+    kept, columns = [], rows.T.contiguous()
+    near = rows.new_zeros(len(rows)).bool()
+    for i in range(len(rows)):
+        if not near[i]:
             kept.append(i)
+            near |= (columns - columns[:, i, None]).square().sum(dim=0) <= SAME_PLACE**2
     return kept

@@ -19,6 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.optim import Optimizer
 
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.training.optimizers import parameters_of
 
 
@@ -94,10 +95,7 @@ def tell(count: int, window: int, began_anew: bool) -> None:
 
 def tell_why_not(window: int, why: str) -> None:
     """Say that a trained model is the last step's, though a mean was asked for."""
-    CONSOLE.print(
-        f"[bold yellow]average_steps is {window}, but nothing was averaged: {why}. The model is the last step's.",
-        soft_wrap=True,
-    )
+    warn(f"average_steps is {window}, but nothing was averaged: {why}. The model is the last step's.")
 
 
 def _parameters(optimizers: Mapping[str, Optimizer]) -> dict[str, Tensor]:

@@ -116,9 +116,7 @@ def read(path: Path) -> dict[str, Any]:
         if bad is not None:
             raise Damaged(f"the checksum of its record {bad} is wrong")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise
-    except Damaged:
+    except (FileNotFoundError, Damaged):
         raise
     except Exception as error:  # whatever damage makes of a zip archive and of a pickle within
         raise Damaged(str(error).splitlines()[0][:200] if str(error) else type(error).__name__) from error

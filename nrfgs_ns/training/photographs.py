@@ -32,11 +32,11 @@ from nrfgs_ns.image.overlap import (
     spread,
     varies,
 )
-from nrfgs_ns.image.photograph import PhotographModel
+from nrfgs_ns.image.photograph import COLUMNS, PhotographModel
 from nrfgs_ns.model.pinhole import world_to_camera
 
-PARTS = ["exposure", "white-balance"]
-"""What is learnt of each, as version 0.1.0 named it."""
+PARTS = [*dict.fromkeys(COLUMNS)]
+"""What is learnt of each, as version 0.1.0 wrote it."""
 Choice = Literal["auto", "on", "off"]
 Exif = dict[str, Any]
 

@@ -117,10 +117,10 @@ def command_to_go_on(folder: Path, method: str) -> str:
     kept = []
     for word in rest:
         option, has_value, _ = word.partition("=")
-        if option.replace("_", "-") in TO_LOAD:
-            None if has_value else next(rest, None)
-        else:
+        if option.replace("_", "-") not in TO_LOAD:
             kept.append(word)
+        elif not has_value:
+            next(rest, None)
     return f"{program} {shlex.join([method, *load, *kept])}"
 
 
