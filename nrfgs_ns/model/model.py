@@ -372,6 +372,8 @@ class NrfgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params) | self.shrinking()
+            if self.photograph is not None and self.photograph.has_penalty and self.step % 10 == 0:
+                losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")
@@ -443,6 +445,15 @@ class NrfgsModel(SplatfactoModel):
             {name: value for name, value in metrics.items() if value is not None},
             {"img": torch.cat([truth, rgb], dim=1)},
         )
+
+    def as_photographed(self, outputs: dict[str, Tensor], camera: Cameras) -> dict[str, Tensor]:
+        """What the mean look becomes in the camera that took a test photograph: its vignetting and response, if learnt.
+        Exposure and white balance of that photograph stay unknown."""
+        if self.photograph is None:
+            return outputs
+        sizes = (float(value.flatten()[0]) for value in (camera.width, camera.height, camera.fx, camera.fy))
+        rgb = self.photograph.by_camera(outputs["rgb"], self.photograph.camera_like(*sizes))
+        return {**outputs, "rgb": rgb.clamp(0.0, 1.0)}
 
     # Viewer and exporter. The exporter reads splats with spherical harmonics, whatever the head is. Where `fit_on` was
     # called, as neither a training nor a viewer does, they are harmonics fitted to the head (`harmonics_fit.py`).
@@ -555,29 +566,21 @@ class NrfgsModel(SplatfactoModel):
             InputError: the checkpoint belongs to another head, or to another size of this one.
         """
         self._shape_head(state)
-        state = self._take_photographs(state)
+        self._take_photographs(state)
         check_compatible(self, state)
         self._fit = None
         for name, parameter in self.gauss_params.items():
             parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)
         return super(SplatfactoModel, self).load_state_dict(state, strict=strict, **kwargs)
 
-    def _take_photographs(self, state: dict[str, Any]) -> dict[str, Any]:
-        """Know the photographs that a checkpoint knows; a training, whose optimisers hold them, knows them already.
-
-        Returns:
-            The state, with what an older version wrote of photographs as this one writes it.
-        """
+    def _take_photographs(self, state: dict[str, Any]) -> None:
+        """Know the photographs that a checkpoint knows; a training, whose optimisers hold them, knows them already."""
         prefix = "photograph."
         known = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
         if not known:
             self.photograph = None
-            return state
-        known = PhotographModel.upgraded(known)
-        if self.photograph is None:
+        elif self.photograph is None:
             self.photograph = PhotographModel.from_state(known).to(self.device)
-        others = {name: value for name, value in state.items() if not name.startswith(prefix)}
-        return {**others, **{prefix + name: value for name, value in known.items()}}
 
     def _shape_head(self, state: dict[str, Any]) -> None:
         """Take the head of a checkpoint that has a smaller one than the configuration; its weights come later."""

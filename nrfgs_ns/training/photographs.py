@@ -32,11 +32,9 @@ from nrfgs_ns.image.overlap import (
     spread,
     varies,
 )
-from nrfgs_ns.image.photograph import COLUMNS, PhotographModel
+from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.pinhole import world_to_camera
 
-PARTS = [*dict.fromkeys(COLUMNS)]
-"""What is learnt of each, as version 0.1.0 wrote it."""
 Choice = Literal["auto", "on", "off"]
 Exif = dict[str, Any]
 
@@ -47,6 +45,8 @@ class Evidence(NamedTuple):
     pairs: Pairs
     centers: Tensor
     """where they were taken, [V, 3]"""
+    exif: list[Exif]
+    """[V]"""
     known: Tensor
     """exposures from EXIF in stops, NaN where it says nothing, [V]"""
     seen: Looks
@@ -72,7 +72,7 @@ def evidence(datamanager: Any) -> Evidence:
     known = torch.tensor([exposure(of_one) for of_one in exif])
     pairs = compare_photographs(told.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
     centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
-    return Evidence(pairs, centers, known, estimate(pairs, torch.full_like(known, torch.nan), centers))
+    return Evidence(pairs, centers, exif, known, estimate(pairs, torch.full_like(known, torch.nan), centers))
 
 
 def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
@@ -88,7 +88,7 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
     Raises:
         InputError: it is asked for together with the bilateral grid.
     """
-    if config.photographs == "off":
+    if config.photographs == "off" or not config.photograph_parts:
         return None
     if config.use_bilateral_grid:
         if config.photographs == "on":
@@ -98,14 +98,15 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
         return None
     found = evidence(datamanager)
     wanted, why = verdict(config.photographs, found)
-    learnt = "learnt" if wanted else "not learnt"
-    CONSOLE.print(f"Photographs: exposure and white balance {learnt}: {why}.", soft_wrap=True, markup=False)
+    what = " and ".join(part.replace("-", " ") for part in config.photograph_parts)
+    CONSOLE.print(f"Photographs: {what} {'learnt' if wanted else 'not learnt'}: {why}.", soft_wrap=True, markup=False)
     if not wanted:
         return None
     known = found.known
     looks = estimate(found.pairs, known, found.centers) if torch.isfinite(known).any() else found.seen
     names = [path.name for path in datamanager.train_dataset.image_filenames]
-    return PhotographModel(names, channels(looks.stops), looks.held)
+    camera_of, lenses = physical_cameras(datamanager.train_dataset.cameras, found.exif)
+    return PhotographModel(names, camera_of, lenses, config.photograph_parts, channels(looks.stops), looks.held)
 
 
 def verdict(choice: Choice, found: Evidence) -> tuple[bool, str]:
@@ -132,7 +133,7 @@ def verdict(choice: Choice, found: Evidence) -> tuple[bool, str]:
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
-    """Raise InputError where a training goes on that had learnt other photographs, or something else of them.
+    """Raise InputError where a training goes on that had learnt other photographs, or other parts of them.
 
     Args:
         own: of the training that goes on.
@@ -146,10 +147,10 @@ def check_same_photographs(own: PhotographModel | None, written: Mapping[str, An
         )
     if own is None:
         return
-    if (parts := written.get("parts", PARTS)) != PARTS:
+    if list(own.parts) != written["parts"]:
         raise InputError(
-            f"The checkpoint's training learnt {' and '.join(parts)} of its photographs, this version learns "
-            f"{' and '.join(PARTS)}. Train anew; it can still be viewed and evaluated."
+            "The checkpoint's training learnt other parts of its photographs. Set "
+            f"--pipeline.model.photograph-parts {' '.join(written['parts'])}, or train anew."
         )
     if own.names != written["names"]:
         raise InputError("The checkpoint was trained on other photographs. Go on with the same ones, or train anew.")
@@ -195,3 +196,25 @@ def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequenc
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         sightings = list(pool.map(seen, viewmats, matrices, images))
     return compare(sightings, centers)
+
+
+def physical_cameras(cameras: Cameras, exif: Sequence[Exif]) -> tuple[list[int], Tensor]:
+    """Which camera took each photograph: told apart by make, model and focal length of EXIF, by size, and by the focal
+    length in pixels (to 2 %) where EXIF does not name the camera.
+
+    Returns:
+        A number for each photograph, [V]; and of each camera principal point and focal length as shares of width and
+        height, [C, 4].
+    """
+    columns = (cameras.cx, cameras.cy, cameras.fx, cameras.fy, cameras.width, cameras.height)
+    cx, cy, fx, fy, width, height = (value.flatten().double().cpu() for value in columns)
+    shares = torch.stack([cx / width, cy / height, fx / width, fy / height], dim=-1)
+    angles = (shares[:, 2].log() * 50).round().long().tolist()
+    keys = []
+    for size, angle, of_one in zip(zip(width.tolist(), height.tolist(), strict=True), angles, exif, strict=True):
+        named = of_one.get("make"), of_one.get("model"), of_one.get("focal_length")
+        keys.append((size, named if of_one.get("model") else angle))
+    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    camera_of = [numbers[key] for key in keys]
+    members = torch.tensor(camera_of)
+    return camera_of, torch.stack([shares[members == number].mean(dim=0) for number in range(len(numbers))]).float()

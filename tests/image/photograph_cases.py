@@ -5,15 +5,16 @@ import torch
 
 from nrfgs_ns.image.photograph import PhotographModel
 
+LENSES = torch.tensor([[0.5, 0.5, 1.0, 1.5]])
 TOLERANCE = 2e-6
 """Of numbers near 1 after a dozen roundings of float32."""
 
 
-def case(height: int, width: int, spread: float, seed: int = 0, device: str = "cpu"):
+def case(height: int, width: int, parts, spread: float, seed: int = 0, device: str = "cpu"):
     """A model of five photographs whose stops have this spread, a picture that is partly out of [0, 1], and the
     gradient of what becomes of it."""
     torch.manual_seed(seed)
-    model = PhotographModel([str(index) for index in range(5)], spread * torch.randn(5, 3))
+    model = PhotographModel([str(index) for index in range(5)], [0] * 5, LENSES, parts, spread * torch.randn(5, 3))
     image, d_taken = 1.6 * torch.rand(height, width, 3) - 0.3, torch.randn(height, width, 3)
     return model.to(device), image.to(device).requires_grad_(), d_taken.to(device)
 

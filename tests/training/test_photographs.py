@@ -3,7 +3,7 @@
 
 import json
 import math
-import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from short_trainings import assert_same_training, checkpoint_of, command_line, m
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
-from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, verdict
+from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, physical_cameras, verdict
 from nrfgs_ns.training.run import parse
 
 NAN = math.nan
@@ -65,7 +65,7 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 )
 def test_the_evidence_decides_and_is_told(choice, pairs, known, wanted, words):
     seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
-    found, why = verdict(choice, Evidence(pairs, CENTERS, torch.tensor(known), seen))
+    found, why = verdict(choice, Evidence(pairs, CENTERS, [{}] * 11, torch.tensor(known), seen))
     assert found == wanted
     assert words in why
 
@@ -87,6 +87,20 @@ def test_exif_comes_from_the_data_set_or_else_from_the_file(tmp_path):
     Image.new("RGB", (8, 8)).save(photo, exif=exif)
     other = tmp_path / "b.jpg"
     assert exif_of([photo, other], [{}, {"iso": 50}]) == [{"exposure_time": 0.25}, {"iso": 50}]
+
+
+def cameras_of(focals, width: int = 100):
+    column = torch.tensor(focals)[:, None]
+    ones = torch.ones_like(column)
+    return SimpleNamespace(cx=50 * ones, cy=40 * ones, fx=column, fy=column, width=width * ones, height=80 * ones)
+
+
+def test_cameras_are_told_apart_by_exif_or_by_their_angle():
+    camera_of, lenses = physical_cameras(cameras_of([100.0, 101.0, 200.0, 100.2]), [{}] * 4)
+    assert camera_of == [0, 0, 1, 0]
+    assert lenses[1].tolist() == pytest.approx([0.5, 0.5, 2.0, 2.5])
+    one, other = {"make": "A", "model": "X"}, {"make": "A", "model": "Y"}
+    assert physical_cameras(cameras_of([100.0, 130.0, 100.0]), [one, one, other])[0] == [0, 0, 1]
 
 
 # Trainings.
@@ -163,41 +177,6 @@ def test_both_corrections_at_once_are_refused(tiny_scene, tmp_path):
     both = {"--pipeline.model.photographs": "on", "--pipeline.model.use-bilateral-grid": True}
     with pytest.raises(InputError, match="bilateral"):
         trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 2, QUICK, both))
-
-
-@pytest.mark.parametrize(
-    "parts", [["exposure", "white-balance", "vignetting", "response"], ["white-balance"], ["vignetting"]]
-)
-def test_a_checkpoint_of_an_older_version_has_its_looks(parts, exposed_scene, finished, tmp_path):
-    """It may have learnt vignetting and response, or not all of a photograph."""
-    folder = shutil.copytree(finished.parent, tmp_path / "old")
-    file = next(models_of(folder / "config.yml").glob("*.ckpt"))
-    content = torch.load(file, weights_only=True)
-    state, prefix = content["pipeline"], "_model.photograph."
-    names, shots = state[f"{prefix}_extra_state"]["names"], state[f"{prefix}shots"]
-    state[f"{prefix}_extra_state"] = {"names": names, "parts": parts, "camera_of": [0] * len(names)}
-    state |= {
-        f"{prefix}lenses": torch.ones(1, 4),
-        f"{prefix}falloff": torch.ones(1, 2),
-        f"{prefix}curves": torch.ones(1, 2),
-    }
-    if len(parts) < 4:
-        for name in ("held", "kept", "shots"):
-            del state[prefix + name]
-    if parts == ["white-balance"]:
-        state[f"{prefix}shots"] = shots[:, 1:].clone()
-    state["_extra_state"].pop("checksum")
-    content["training"].pop("options")
-    torch.save(content, file)
-    wanted = shots.clone()
-    wanted[:, {4: [], 1: [0] if "white-balance" in parts else [0, 1, 2]}[len(parts)]] = 0.0
-    config = parse(command_line("nrfgs-sh", exposed_scene[0], tmp_path, 4, QUICK))
-    model = config.pipeline.setup(device="cpu", test_mode="test").model
-    model.load_state_dict({name.removeprefix("_model."): value for name, value in state.items() if "_model." in name})
-    assert torch.equal(model.photograph.shots, wanted) and model.photograph.names == names
-    more = {"--load-dir": models_of(folder / "config.yml")}
-    with pytest.raises(InputError, match=f"learnt {' and '.join(parts)} of its photographs"):
-        trained(command_line("nrfgs-sh", exposed_scene[0], tmp_path / "on", 6, QUICK, more))
 
 
 def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished, monkeypatch):
