@@ -102,6 +102,9 @@ class Bench:
         Args:
             asked: a `Spec`.
             whole: the same with everything else of its file, which is reported as far as it is there.
+
+        Returns:
+            The `Spec` of the report, and name -> difference of the records that it could not use.
         """
         from nrfgs_lab.bench.report import report  # matplotlib takes a second; `nrfgs --help` should not
         from nrfgs_lab.bench.spec import steps_of
@@ -132,6 +135,7 @@ class Bench:
             shown = self.shown(asked, whole)
             stale = self.stale(shown, parsers)
             report(shown, self.out, self.work, stale)
+        return shown, stale
 
     def shown(self, asked, whole):
         """The `Spec` of what a report shows now."""
