@@ -77,7 +77,7 @@ def distinct_places(centers: Tensor) -> Tensor:
 def _in_reaches(centers: Tensor) -> Tensor:
     """Cameras [V, 3] about their mean, in distances from there to the farthest."""
     away = centers.double() - centers.double().mean(dim=0)
-    return away / away.norm(dim=1).max().clamp_min(1e-300)
+    return away / max([1e-300, *away.norm(dim=1).tolist()])
 
 
 def _first_of_each(rows: Tensor) -> list[int]:
