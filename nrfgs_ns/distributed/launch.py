@@ -133,7 +133,9 @@ def launch(config: TrainerConfig, timeout: timedelta = TIMEOUT) -> None:
                         process.terminate()
                     is_passed_on = True
     except (mp.ProcessExitedException, mp.ProcessRaisedException) as error:
-        if was_asked_to(error):
+        # What is passed on ends a process that has just stopped by itself, and listens no longer.
+        is_ours = is_passed_on and getattr(error, "signal_name", None) == "SIGTERM"
+        if was_asked_to(error) or is_ours:
             raise SystemExit(request.exit_status or error.exit_code) from None
         raise DeviceLost(explain(error, config)) from None
     finally:
