@@ -9,6 +9,9 @@ With base opacity alpha = sigmoid(logit) and x = alpha + s t:
                                                                    first order, the same as alpha + s t
     smooth            opacity = (softplus(B x) - softplus(B (x - 1))) / B     a clamp with corners about 1 / B wide
 
+Where MCMC puts n copies in a splat's place, each of about alpha / n, s t would be added n times; on the logit it scales
+with the opacity, and the copies together show about what the one did.
+
 The last differs from alpha by at most log(2) / B where t = 0; the others do not.
 """
 

@@ -104,6 +104,11 @@ class NrfgsModelConfig(SplatfactoModelConfig):
         """How far so many training views trust the head, in (0, 1]."""
         return views / (views + PRIOR_VIEWS) if self.few_views == "auto" and views > 0 else 1.0
 
+    def suited_appearance(self, views: int) -> AppearanceHeadConfig:
+        """The head's configuration as so many training views, and the densification, want it."""
+        head = self.appearance.trusted(self.trust(views))
+        return head.for_copies() if self.densification == "mcmc" else head
+
     def shrinkage_weight(self, views: int) -> float:
         """What `shrinkage` is with so many training views."""
         weight = self.shrinkage / 100 * 0.5 ** (views / HALVING_VIEWS)

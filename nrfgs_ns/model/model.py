@@ -77,9 +77,7 @@ class NrfgsModel(SplatfactoModel):
         self.num_views: int = metadata.get("different_views", self.num_train_data)
         """Training views that differ (`data.views.different_views`), or as many as a checkpoint's training counted."""
         config.appearance.validate()
-        appearance = config.appearance.trusted(self.trust)
-        if config.densification == "mcmc":
-            appearance = appearance.for_copies()
+        appearance = config.suited_appearance(self.num_views)
         self.reduced_head = differences(config.appearance, appearance) or None
         self.head = appearance.setup(self.scene_unit)
         config.sh_degree = self.head.sh_degree

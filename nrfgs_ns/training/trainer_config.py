@@ -208,8 +208,9 @@ def tell_what_was_chosen(model, steps_are_chosen: bool) -> None:
         chosen.append(
             f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
         )
-    if model.trust < 1.0 and model.reduced_head:
-        reduced = {name: value for name, value in model.reduced_head.items() if isinstance(value, float)}
+    # The densification may have chosen one that is no number.
+    reduced = {name: value for name, value in (model.reduced_head or {}).items() if isinstance(value, float)}
+    if model.trust < 1.0 and reduced:
         options = ", ".join(f"{name} {value:.2g}" for name, value in reduced.items())
         chosen.append(f"their view dependence is trusted with {model.trust:.2g} of 1, so that it has {options}")
     if model.view_noise.sigma > 0.0:

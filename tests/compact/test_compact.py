@@ -328,16 +328,9 @@ def test_a_model_is_trained_for_the_file(exported, tmp_path):
     config, plain, _ = exported
     bytes_of, steps = {}, {}
     for rate in ("0", "3e-3"):
-        words = [
-            "compact",
-            "--load-config",
-            str(config),
-            "--output",
-            str(tmp_path / f"{rate}.nrf"),
-            "--finetune",
-            "120",
-        ]
-        words += ["--compact.views", "1", "--compact.rate", rate, "--report", str(tmp_path / f"{rate}.json")]
+        words = ["compact", "--load-config", str(config), "--output", str(tmp_path / f"{rate}.nrf")]
+        words += ["--finetune", "120", "--compact.views", "1", "--compact.rate", rate]
+        words += ["--report", str(tmp_path / f"{rate}.json")]
         torch.manual_seed(0)
         tyro.cli(Export, args=words).main()
         found = json.loads((tmp_path / f"{rate}.json").read_text())
