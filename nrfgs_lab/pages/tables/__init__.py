@@ -23,9 +23,7 @@ from nrfgs_lab.bench.table import COLUMNS, Row
 ROOT = Path(__file__).resolve().parents[3]
 OPENING = "<!-- table "
 BLOCK = re.compile(r"<!-- table (\w+)\.(\w+)(\([^\n]*?\))? -->(.*?)<!-- end -->", re.DOTALL)
-RUN = re.compile(
-    r"runs/(?P<run>.+)-(?P<strategy>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)"
-)
+RUN = re.compile(r"runs/(?P<run>.+)-(?P<strategy>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)")
 """How a benchmark names its records. An underscore stands for a space."""
 BY_NAME = {column.name: column for column in COLUMNS}
 
