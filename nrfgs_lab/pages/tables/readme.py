@@ -78,6 +78,16 @@ def over_host(scene: str) -> str:
     return f"{signed(field - host)} dB"
 
 
+def over_host_where_seen() -> str:
+    """The same on captures with 7 test views or more: least and most."""
+    gains = []
+    for scene in TRAINING_VIEWS:
+        field, host = (runs_of(scene, name) for name in (FIELD, HOST))
+        if len(field[0]["per_image"]) >= 7:
+            gains.append(fmean(one["psnr"] for one in field) - fmean(one["psnr"] for one in host))
+    return f"{min(gains):.1f} to {max(gains):.1f} dB on the {len(gains)} captures with 7 test views or more"
+
+
 def cost() -> str:
     """Seconds of whole trainings of bonsai, least and most, and their mean PSNR."""
     runs = {"nrfgs": "", "nrfgs-best": "`nrfgs-best` ", "nrfgs-sh": "harmonics ", "splatfacto": "splatfacto "}
