@@ -112,6 +112,7 @@ def load_file(path: Path) -> "NrfgsModel":
     model = config.setup(
         scene_box=SceneBox(torch.stack([means.amin(0), means.amax(0)])),
         num_train_data=1,
+        metadata={"scene_unit": decoded.header["head"]["scene_unit"]},
         seed_points=(means, torch.zeros_like(means)),
     )
     model.load_state_dict(model_state(model, path))
