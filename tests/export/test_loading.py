@@ -15,8 +15,8 @@ from torch.testing import assert_close
 
 from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.loading import load_training
 from nrfgs_ns.export.ply import on_screen, read_splats, render_splats, write_splats
 from nrfgs_ns.model.harmonics_fit import PlainSplats
