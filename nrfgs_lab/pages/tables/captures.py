@@ -41,7 +41,7 @@ def gains_over(harmonics: str, rows: Mapping[str, Iterable[str]]) -> str:
         rows: names of trials, by the row's label.
     """
     base = _views(harmonics)
-    found = {label: {view: one for name in names for view, one in _views(name).items()} for label, names in rows.items()}
+    found = {label: dict(pair for name in names for pair in _views(name).items()) for label, names in rows.items()}
     common = [view for view in base if all(view in views for views in found.values())]
     places = {scene: [view for view in common if view[0] == scene] for scene in list(TRAINING_VIEWS)[1:]}
     body = [[label, *(_gain(views, base, places[scene]) for scene in places)] for label, views in found.items()]
