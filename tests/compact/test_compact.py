@@ -21,7 +21,7 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
-from nrfgs_ns.appearance.reduce import latent_basis, with_rank
+from nrfgs_ns.appearance.reduce import build, latent_basis, with_rank
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode, wide_enough
 from nrfgs_ns.compact.entropy import encode_table
@@ -32,7 +32,7 @@ from nrfgs_ns.compact.quantise import Grid, from_morton, nearest_turn
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
-from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.export.loading import load_file, load_model
 from nrfgs_ns.training.run import evaluate, parse, train
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -164,6 +164,8 @@ def test_a_field_of_low_rank_is_written_at_its_rank(tmp_path):
         (lambda header, streams: header["grids"]["colors"].update(step=["a", 1, 1]), "grid of colors"),
         (lambda header, streams: header["grids"]["latents"].update(step=1.0), "grid of latents"),
         (lambda header, streams: header["splats"].update(view=-1), "-1"),
+        (lambda header, streams: header["head"].update(scene_unit=0), "scene_unit is 0"),
+        (lambda header, streams: header["head"].update(scene_unit="m"), "scene_unit is 'm'"),
     ],
 )
 def test_files_that_describe_no_field_are_refused(change, says, tmp_path):
@@ -172,6 +174,18 @@ def test_files_that_describe_no_field_are_refused(change, says, tmp_path):
     write_container(tmp_path / "f.nrf", header, streams)
     with pytest.raises(InputError, match=says):
         decode(tmp_path / "f.nrf")
+
+
+def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
+    one = field()
+    one.head.scene_unit = 32.0
+    header, streams = encode(one, Precision(), {"rasterize_mode": "classic", "background": [0, 0, 0]})
+    write_container(tmp_path / "f.nrf", header, streams)
+    model = load_file(tmp_path / "f.nrf")
+    rows, center = torch.arange(60), torch.tensor([40.0, 0.0, 0.0])
+    expected = build(one.head.config, model.head.state_dict(), 32.0)(model.field.splats, rows, center)
+    assert_close(model.field.head(model.field.splats, rows, center), expected)
+    assert model.projecting.scene_unit == 32.0, "the near plane is in scene units"
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

@@ -463,6 +463,11 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
         Export("ply", tmp_path / "config.yml", tmp_path / "s.ply").main()
     with pytest.raises(InputError, match="is a folder"):
         Export("ply", trained("nrfgs"), tmp_path).main()
+    (tmp_path / "file").touch()
+    for kind in ("ply", "compact", "web"):  # before anything is loaded
+        for name, report in (("file/s.html", None), ("s.html", tmp_path / "file" / "report.json")):
+            with pytest.raises(InputError, match="cannot be written"):
+                Export(kind, tmp_path / "config.yml", tmp_path / name, report=report).main()
     lost = tmp_path / "config.yml"
     text = trained("nrfgs").read_text()
     lost.write_text(text.replace("timestamp: ", "timestamp: no-"))

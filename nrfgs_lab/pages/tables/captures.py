@@ -53,6 +53,17 @@ def gains_over(harmonics: str, rows: Mapping[str, Iterable[str]]) -> str:
     return grid(["", *scenes], body)
 
 
+def over(trial: str, base: str) -> str:
+    """What a trial gains over another on held-out views, as the table has it, and the median of its share of splats."""
+    table = gains_over(base, {"": (trial,)}).splitlines()
+    scenes, cells = ([cell.strip() for cell in table[line].split("|")[2:-1]] for line in (0, 2))
+    runs = list(records("held-out").values())
+    splats = [{one["scene"]: one["splats"] for one in runs if one["name"] == name} for name in (trial, base)]
+    share = median(splats[0][scene] / splats[1][scene] for scene in splats[0].keys() & splats[1].keys())
+    told = ", ".join(f"`{scene}` {cell}" for scene, cell in zip(scenes, cells, strict=True))
+    return f"{told}, with {share:.1f} times the splats"
+
+
 def _gain(views: list[tuple[float, float]]) -> str:
     return f"{median(a for a, _ in views):+.2f}/{1000 * fmean(b for _, b in views):+.0f}" if views else ""
 

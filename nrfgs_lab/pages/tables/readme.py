@@ -79,10 +79,13 @@ def over_host(scene: str) -> str:
 
 
 def cost() -> str:
-    """Seconds and PSNR of whole trainings of bonsai, means."""
+    """Seconds of whole trainings of bonsai, least and most, and their mean PSNR."""
     runs = {"nrfgs": "", "nrfgs-best": "`nrfgs-best` ", "nrfgs-sh": "harmonics ", "splatfacto": "splatfacto "}
-    rows = {run: bench_rows("speed")["bonsai", "own", run] for run in runs}
-    cells = [f"{runs[run]}{mean_of(row, 'time s'):.0f} s, {mean_of(row, 'PSNR'):.2f} dB" for run, row in rows.items()]
+    cells = []
+    for run, label in runs.items():
+        row = bench_rows("speed")["bonsai", "own", run]
+        seconds = dict.fromkeys(f"{bound(row.values['time s'].values()):.0f}" for bound in (min, max))
+        cells.append(f"{label}{' to '.join(seconds)} s, {mean_of(row, 'PSNR'):.2f} dB")
     return "; ".join(cells)
 
 
