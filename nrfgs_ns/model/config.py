@@ -97,7 +97,8 @@ class NrfgsModelConfig(SplatfactoModelConfig):
                 raise InputError(f"pipeline.model.{name} is {getattr(self, name)!r}; use {fix}.")
         for names, low, high, needed in (
             (("view_noise", "shrinkage", "warmup_steps"), 0, math.inf, "zero or positive"),
-            (("robust_loss", "cull_alpha_thresh"), 0, 1, "at least 0 and below 1"),
+            (("robust_loss",), 0, 1, "at least 0 and below 1"),
+            (("cull_alpha_thresh",), 0, 0.5, "at least 0 and below 0.5, since a reset is to twice as much"),
             (("refine_every", "reset_alpha_every", "resolution_schedule", "num_random"), 1, math.inf, "at least 1"),
         ):
             for name in names:

@@ -95,6 +95,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"logging.steps_per_log is {self.logging.steps_per_log}; it must be at least 1.")
         self._check_learning_rates()
         self.pipeline.model.check()
+        if self.load_step is not None and self.load_dir is None:
+            raise InputError(f"load_step is {self.load_step}, but there is no --load-dir. Give the folder, too.")
         if self.load_dir is not None:
             checkpoint_files.checkpoints_in(self.load_dir)
 
