@@ -4,8 +4,28 @@
 import contextlib
 import os
 import secrets
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+from nrfgs_ns.errors import InputError
+
+
+def check_writable(path: Path, option: str) -> None:
+    """Make the folders that a file will lie in, and raise InputError where it cannot be written: a command asks before
+    its work, not after it.
+
+    Args:
+        option: that named the file, for the message.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise InputError(f"{option} {path} is a folder. Name a file in it.")
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f"{path.name}.", suffix=".writing"):
+            pass
+    except OSError as error:
+        raise InputError(f"{option} {path} cannot be written ({error}). Name a file in a folder of yours.") from error
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -9,7 +9,8 @@ import threading
 import pytest
 import without_open3d
 
-from nrfgs_ns.files import whole, write_whole
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import check_writable, whole, write_whole
 
 RAISE = "from nrfgs_ns.errors import InputError\nraise InputError('x.json is missing. Make one.')"
 
@@ -61,6 +62,18 @@ def test_a_write_that_fails_leaves_the_older_file(tmp_path):
         aside.write_text("ne")
         raise OSError("disk full")
     assert file.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_what_cannot_be_written_is_told_beforehand(tmp_path):
+    (tmp_path / "file").write_text("old")
+    check_writable(tmp_path / "file", "--output")
+    check_writable(tmp_path / "new" / "ü" / "file", "--output")
+    assert (tmp_path / "file").read_text() == "old" and not list((tmp_path / "new" / "ü").iterdir())
+    with pytest.raises(InputError, match="--report .*new is a folder"):
+        check_writable(tmp_path / "new", "--report")
+    for path in (tmp_path / "file" / "x", tmp_path / ("x" * 250)):
+        with pytest.raises(InputError, match="--output .* cannot be written .*Name a file"):
+            check_writable(path, "--output")
 
 
 def test_open3d_is_hidden_here_and_in_processes_that_tests_start():

@@ -95,6 +95,9 @@ def _config(head: dict[str, Any]) -> NrfConfig:
 
 def _check(version: int, header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor], unpacked: int) -> None:
     """Raise ValueError where the header names sizes that the file does not have, or grids that are none."""
+    unit = header["head"]["scene_unit"]
+    if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < float(unit) < math.inf:
+        raise ValueError(f"the head's scene_unit is {ascii(unit)}")
     if config.latent_dim >= weights["low.0.weight"].shape[1]:  # it sees more than the latents
         raise ValueError(
             f"head.low.0.weight of shape {list(weights['low.0.weight'].shape)} with latents of {config.latent_dim}"

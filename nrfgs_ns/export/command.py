@@ -8,8 +8,8 @@ from typing import Literal
 import tyro
 
 from nrfgs_ns.compact.options import CompactOptions
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.web.options import WebOptions
+from nrfgs_ns.files import check_writable
 
 
 @dataclass
@@ -52,13 +52,14 @@ class Export:
     """what a page says of itself"""
 
     def main(self) -> None:
+        if self.report is not None:
+            check_writable(self.report, "--report")
         if self.format == "web":
             from nrfgs_ns.export.web.command import export_web
 
             export_web(self.load_config, self.output, self.compact, self.web, self.measure, self.report)
             return
-        if self.output.is_dir():
-            raise InputError(f"--output {self.output} is a folder. Name a file in it, such as splats.ply.")
+        check_writable(self.output, "--output")
         if self.format == "compact":
             from nrfgs_ns.export.compact import export_compact
 

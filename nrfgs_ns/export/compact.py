@@ -24,7 +24,7 @@ from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.loading import load_model, measure_loss
+from nrfgs_ns.export.loading import find_data, load_model, measure_loss
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.simplify.field_views import FieldViews, slim
@@ -217,6 +217,7 @@ def write_config(load_config: Path, output: Path) -> Path:
         the config.yml.
     """
     config = read_config(load_config)
+    find_data(config, load_config)
     config.output_dir, config.experiment_name, config.timestamp = output.parent, f"{output.name}.nerfstudio", "compact"
     config.relative_model_dir = Path("nerfstudio_models")
     config.load_dir = config.load_checkpoint = config.load_step = None

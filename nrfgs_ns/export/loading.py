@@ -38,8 +38,6 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     Raises:
         InputError: there is no such training, or it is not one of this project's methods.
     """
-    import torch
-
     from nrfgs_ns.training.checkpoint_files import find, read_latest
     from nrfgs_ns.training.config_file import read_config
     from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
@@ -54,7 +52,7 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
             f"{path}: no checkpoints beside it ({places[0]}), nor where it was trained ({places[1]}). Put the "
             f"training's {config.relative_model_dir} beside it."
         )
-    _find_data(config, path)
+    find_data(config, path)
     pipeline = config.pipeline.setup(device="cuda" if torch.cuda.is_available() else "cpu", test_mode=mode)
     pipeline.eval()
     checkpoint, content = read_latest(folder)
@@ -62,7 +60,7 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     return Trained(config, pipeline, checkpoint, content["step"])
 
 
-def _find_data(config: "TrainerConfig", path: Path) -> None:
+def find_data(config: "TrainerConfig", path: Path) -> None:
     """Let a configuration name its data set where that is now: as it is stored, else in the same place as seen from
     config.yml, so that outputs and data can be moved together.
 
@@ -74,7 +72,7 @@ def _find_data(config: "TrainerConfig", path: Path) -> None:
     if stored is None or stored.exists():
         return
     begin, now = config.output_dir.absolute(), path.absolute().parents[3:4]  # outputs/EXPERIMENT/METHOD/TIME/config.yml
-    places = [(folder / os.path.relpath(stored.absolute(), begin)).resolve() for folder in now]
+    places = [(folder / os.path.relpath(stored.absolute(), begin)).resolve() for folder in now if folder != begin]
     found = next((place for place in places if place.exists()), None)
     if found is None:
         tried = "".join(f", nor at {place}" for place in places)
@@ -96,7 +94,6 @@ def load_file(path: Path) -> "NrfgsModel":
     Raises:
         InputError: as `decode`.
     """
-    import torch
     from nerfstudio.data.scene_box import SceneBox
 
     from nrfgs_ns.compact.decode import decode, model_state
@@ -112,6 +109,7 @@ def load_file(path: Path) -> "NrfgsModel":
     model = config.setup(
         scene_box=SceneBox(torch.stack([means.amin(0), means.amax(0)])),
         num_train_data=1,
+        metadata={"scene_unit": decoded.header["head"]["scene_unit"]},
         seed_points=(means, torch.zeros_like(means)),
     )
     model.load_state_dict(model_state(model, path))

@@ -31,7 +31,7 @@ class Inspect:
         from nrfgs_ns.appearance.reduce import latent_basis
         from nrfgs_ns.data.views import evenly_spaced
         from nrfgs_ns.export.loading import load_model
-        from nrfgs_ns.files import write_whole
+        from nrfgs_ns.files import check_writable, write_whole
         from nrfgs_ns.inspect.ablate import changes, row, together
         from nrfgs_ns.inspect.report import advice, draw, table
         from nrfgs_ns.simplify.field_views import FieldViews, fastest
@@ -53,6 +53,8 @@ class Inspect:
         images = [images[i] for i in evenly_spaced(len(images), self.views)]
         if not images:
             raise InputError(f"--load-config {self.load_config}: its data set has no test views to measure on.")
+        folder = self.output if self.output is not None else self.load_config.parent / "inspect"
+        check_writable(folder / "inspect.json", "--output")
         with (
             torch.no_grad(),
             CONSOLE.status(f"Looking at the splats from {len(pipeline.datamanager.train_dataset)} training views"),
@@ -94,7 +96,6 @@ class Inspect:
             markup=False,
             soft_wrap=True,
         )
-        folder = self.output if self.output is not None else self.load_config.parent / "inspect"
         for threshold_row in result["rows"]:
             if threshold_row["threshold"] == float("inf"):
                 threshold_row["threshold"] = None  # JSON has no infinity

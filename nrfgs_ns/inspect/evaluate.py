@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from nrfgs_ns.files import write_whole
+from nrfgs_ns.files import check_writable, write_whole
 
 
 @dataclass
@@ -22,6 +22,9 @@ class Eval:
     """folder for the pictures, truth and rendering side by side"""
 
     def main(self) -> None:
+        check_writable(self.output_path, "--output-path")
+        if self.render_output_path is not None:
+            check_writable(self.render_output_path / "eval.png", "--render-output-path")
         from nerfstudio.utils.rich_utils import CONSOLE
 
         from nrfgs_ns.export.loading import load_training

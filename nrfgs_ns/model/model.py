@@ -49,7 +49,7 @@ VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 
 
 class NrfgsModel(SplatfactoModel):
-    """Gaussian splatting with an appearance head.
+    """Gaussian splatting with an appearance head. Wherever it takes a camera, that is a batch of one, [1].
 
     Args:
         config: which head, and splatfacto's options.
@@ -170,12 +170,7 @@ class NrfgsModel(SplatfactoModel):
         return Projecting(self.config.rasterize_mode, self.scene_unit, assume_finite=self.training)
 
     def project(self, camera: Cameras, splats: Mapping[str, Tensor] | None = None) -> View:
-        """Project splats into one camera (`project_view`).
-
-        Args:
-            camera: a batch of one camera, [1].
-            splats: another table than the field's.
-        """
+        """Project splats into a camera (`project_view`): the field's, or another table."""
         return project_view(self.field.splats if splats is None else splats, self.pinhole(camera), self.projecting)
 
     def composite(
@@ -188,7 +183,6 @@ class NrfgsModel(SplatfactoModel):
         """Composite visible splats as this model is configured (`composite_view`).
 
         Args:
-            view, appearance: as for `composite_view`.
             background: a colour [3] instead of the configuration's.
             photograph: the picture has the look of this one; None: the mean look.
         """
@@ -233,7 +227,6 @@ class NrfgsModel(SplatfactoModel):
 
         Args:
             field: what is drawn.
-            camera: a batch of one camera, [1].
             asked: the same field as its head is asked about it, with or without noise.
 
         Returns:
@@ -247,11 +240,7 @@ class NrfgsModel(SplatfactoModel):
     def picture(
         self, view: View, appearance: SplatAppearance, camera: Cameras, background: Tensor | None = None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite what a camera sees, with the look of its photograph in training.
-
-        Args:
-            view, appearance, background: as for `composite`.
-            camera: a batch of one camera, [1].
+        """Composite what a camera sees (`composite`), with the look of its photograph in training.
 
         Returns:
             what `get_outputs` does, and the rasterizer's `info`.
@@ -291,7 +280,6 @@ class NrfgsModel(SplatfactoModel):
         Nerfstudio moves the camera to the GPU first, where the host must wait to learn its size.
 
         Args:
-            camera: a batch of one camera, [1].
             obb_box: only splats with their centre inside are drawn, if given.
         """
         if self.viewer_panel is not None and self.viewer_panel.is_asking():
@@ -333,7 +321,6 @@ class NrfgsModel(SplatfactoModel):
         """How far the head is from adding nothing to what a camera sees, for the warm-up.
 
         Args:
-            camera: a batch of one camera, [1].
             weights: the head's shared weights.
 
         Returns:

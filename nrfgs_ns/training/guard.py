@@ -32,7 +32,6 @@ from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.errors import ForTheUser
 from nrfgs_ns.training.guard_report import Finding, report
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
-from nrfgs_ns.training.pace import Pace
 
 MAX_GRADIENT = 2.0**63
 """Largest gradient that is let through. Its square, 2^126, and Adam's mean of squares stay below float32's 2^128; from
@@ -260,15 +259,8 @@ class Guard:
 class WatchedOptimizers(LeanOptimizers):
     """The optimisers; each step is shown to the guard first."""
 
-    def __init__(
-        self,
-        config: dict[str, Any],
-        param_groups: dict[str, Any],
-        guard: Guard,
-        steps_per_log: int = 10,
-        pace: Pace | None = None,
-    ):
-        super().__init__(config, param_groups, steps_per_log, pace)
+    def __init__(self, guard: Guard, *args: Any):
+        super().__init__(*args)
         self.guard = guard
 
     def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:

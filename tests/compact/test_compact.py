@@ -7,7 +7,6 @@ import shutil
 import subprocess
 from dataclasses import replace
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +15,13 @@ import tyro
 from compact_fields import VERSION_1, field, matched, through_a_file
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
+from short_trainings import command_line, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
-from nrfgs_ns.appearance.reduce import latent_basis, with_rank
+from nrfgs_ns.appearance.reduce import build, latent_basis, with_rank
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode, wide_enough
 from nrfgs_ns.compact.entropy import encode_table
@@ -32,8 +32,8 @@ from nrfgs_ns.compact.quantise import Grid, from_morton, nearest_turn
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
-from nrfgs_ns.export.loading import load_model
-from nrfgs_ns.training.run import evaluate, parse, train
+from nrfgs_ns.export.loading import load_file, load_model
+from nrfgs_ns.training.run import evaluate, parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -164,6 +164,8 @@ def test_a_field_of_low_rank_is_written_at_its_rank(tmp_path):
         (lambda header, streams: header["grids"]["colors"].update(step=["a", 1, 1]), "grid of colors"),
         (lambda header, streams: header["grids"]["latents"].update(step=1.0), "grid of latents"),
         (lambda header, streams: header["splats"].update(view=-1), "-1"),
+        (lambda header, streams: header["head"].update(scene_unit=0), "scene_unit is 0"),
+        (lambda header, streams: header["head"].update(scene_unit="m"), "scene_unit is 'm'"),
     ],
 )
 def test_files_that_describe_no_field_are_refused(change, says, tmp_path):
@@ -172,6 +174,18 @@ def test_files_that_describe_no_field_are_refused(change, says, tmp_path):
     write_container(tmp_path / "f.nrf", header, streams)
     with pytest.raises(InputError, match=says):
         decode(tmp_path / "f.nrf")
+
+
+def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
+    one = field()
+    one.head.scene_unit = 32.0
+    header, streams = encode(one, Precision(), {"rasterize_mode": "classic", "background": [0, 0, 0]})
+    write_container(tmp_path / "f.nrf", header, streams)
+    model = load_file(tmp_path / "f.nrf")
+    rows, center = torch.arange(60), torch.tensor([40.0, 0.0, 0.0])
+    expected = build(one.head.config, model.head.state_dict(), 32.0)(model.field.splats, rows, center)
+    assert_close(model.field.head(model.field.splats, rows, center), expected)
+    assert model.projecting.scene_unit == 32.0, "the near plane is in scene units"
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -239,18 +253,12 @@ def exported(tiny_scene, tmp_path_factory):
     """config.yml of an 8-step training with a loud field, the compact file, and the report."""
     out = tmp_path_factory.mktemp("runs")
     options = {
-        "--data": tiny_scene,
-        "--output-dir": out,
-        "--max-num-iterations": 8,
-        "--vis": "tensorboard",
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
         "--pipeline.model.appearance.output-init": "default",
         "--pipeline.model.warmup-steps": 0,
         "--pipeline.model.appearance.latent-dim": 8,
         "--pipeline.model.camera-optimizer.mode": "SO3xR3",  # its poses are no part of the file
     }
-    config = Path(train(["nrfgs", *(str(w) for option in options.items() for w in option)]).config_path)
+    config = trained(command_line("nrfgs", tiny_scene, out, 8, options))
     words = ["compact", "--load-config", str(config), "--output", str(out / "small.nrf")]
     tyro.cli(Export, args=[*words, "--compact.views", "2", "--report", str(out / "report.json")]).main()
     return config, out / "small.nrf", out / "report.json"

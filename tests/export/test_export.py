@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import short_trainings
 import torch
 import tyro
 from plyfile import PlyData
+from short_trainings import command_line
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0, SplatAppearance, base_colors
@@ -30,7 +32,7 @@ from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model import harmonics_fit, harmonics_tune
 from nrfgs_ns.model.harmonics_fit import STRENGTHS, Moments, Observations, PlainSplats, fit_harmonics, observe
 from nrfgs_ns.model.harmonics_tune import fine_tune
-from nrfgs_ns.training.run import parse, train
+from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -62,16 +64,8 @@ def trained(tiny_scene, tmp_path_factory):
 
     def config_of(method: str) -> Path:
         if method not in done:
-            options = {
-                "--data": tiny_scene,
-                "--output-dir": tmp_path_factory.mktemp(method),
-                "--max-num-iterations": 8,
-                "--vis": "tensorboard",
-                "--logging.local-writer.enable": False,
-                "--logging.profiler": "none",
-                **METHODS[method],
-            }
-            done[method] = Path(train([method, *(str(w) for option in options.items() for w in option)]).config_path)
+            out = tmp_path_factory.mktemp(method)
+            done[method] = short_trainings.trained(command_line(method, tiny_scene, out, 8, METHODS[method]))
         return done[method]
 
     return config_of
@@ -463,6 +457,11 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
         Export("ply", tmp_path / "config.yml", tmp_path / "s.ply").main()
     with pytest.raises(InputError, match="is a folder"):
         Export("ply", trained("nrfgs"), tmp_path).main()
+    (tmp_path / "file").touch()
+    for kind in ("ply", "compact", "web"):  # before anything is loaded
+        for name, report in (("file/s.html", None), ("s.html", tmp_path / "file" / "report.json")):
+            with pytest.raises(InputError, match="cannot be written"):
+                Export(kind, tmp_path / "config.yml", tmp_path / name, report=report).main()
     lost = tmp_path / "config.yml"
     text = trained("nrfgs").read_text()
     lost.write_text(text.replace("timestamp: ", "timestamp: no-"))

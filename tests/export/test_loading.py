@@ -15,6 +15,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.loading import load_training
 from nrfgs_ns.export.ply import on_screen, read_splats, render_splats, write_splats
@@ -45,6 +46,9 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_pat
     found = load_training(config, "test")
     assert found.step == 2 and found.checkpoint.parent == models_of(config)
     assert found.pipeline.datamanager.get_datapath() == tmp_path / "moved" / "data"
+    Export("compact", config, tmp_path / "sent" / "small.nrf").main()
+    beside = tmp_path / "sent" / "small.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
+    assert load_training(beside, "test").pipeline.datamanager.get_datapath() == tmp_path / "moved" / "data"
 
     newest, before = find(models_of(config)).values()
     whole = torch.load(before, weights_only=True)["pipeline"]["_model.gauss_params.means"]
@@ -59,6 +63,8 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_pat
         InputError, match=r"its data set is not at .*/project/data, nor at .*/moved/data\. Put it there"
     ):
         load_training(config, "test")
+    with pytest.raises(InputError, match=r"its data set is not at .*/moved/data\. Put it there"):
+        load_training(beside, "test")
 
 
 def random_rotation(seed: int) -> torch.Tensor:

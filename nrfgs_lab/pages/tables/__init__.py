@@ -23,9 +23,7 @@ from nrfgs_lab.bench.table import COLUMNS, Row
 ROOT = Path(__file__).resolve().parents[3]
 OPENING = "<!-- table "
 BLOCK = re.compile(r"<!-- table (\w+)\.(\w+)(\([^\n]*?\))? -->(.*?)<!-- end -->", re.DOTALL)
-RUN = re.compile(
-    r"(?:(?P<part>.*)/)?runs/(?P<run>.+)-(?P<strategy>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)"
-)
+RUN = re.compile(r"runs/(?P<run>.+)-(?P<strategy>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)")
 """How a benchmark names its records. An underscore stands for a space."""
 BY_NAME = {column.name: column for column in COLUMNS}
 
@@ -64,17 +62,12 @@ def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 @cache
-def bench_rows(study: str, part: str | None = None) -> dict[tuple[str, str, str], Row]:
-    """The rows of a benchmark: (scene, strategy, run) -> its values over seeds.
-
-    Args:
-        study: a file in results/.
-        part: what stands before `runs/` in the names of the records; None for nothing.
-    """
+def bench_rows(study: str) -> dict[tuple[str, str, str], Row]:
+    """The rows of a benchmark's file in results/: (scene, strategy, run) -> its values over seeds."""
     rows: dict[tuple[str, str, str], Row] = {}
     for name, record in records(study).items():
         match = RUN.fullmatch(name)
-        if match and match["part"] == part:
+        if match:
             scene, strategy, run = match["scene"], match["strategy"], match["run"]
             row = rows.setdefault((scene, strategy, run), Row(scene, run, strategy))
             row.records[int(match["seed"])] = {"jobs": 1, **record}

@@ -16,11 +16,13 @@ BASE = "3DGS"
 METHODS = "VDGS", "GSNB", "SG", "NRF-GS", "ours"
 OF_THE_PAPER = {"VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
 """The paper's gains on bonsai, in dB, and splats in multiples of 3DGS's."""
+RULES = {"methods": "original", "budgets": "mcmc@150000"}
+"""Study -> how splats come and go in it."""
 
 
-def half(scene: str, run: str) -> Runs:
-    """A run of docs/bench/methods.yaml."""
-    row = bench_rows("methods").get((scene, "original", run))
+def half(scene: str, run: str, study: str = "methods") -> Runs:
+    """A run of docs/bench/methods.yaml, or of budgets.yaml."""
+    row = bench_rows(study).get((scene, RULES[study], run))
     return trials_of(row) if row else []
 
 
@@ -32,32 +34,49 @@ def gain(ours: Runs, theirs: Runs, metric: str) -> float:
 def every() -> str:
     """3DGS's PSNR and SSIM, and what the others gain, dB and SSIM x 1000; the median share of its splats."""
     psnr = f"{mean_of(bench_rows('paper')['bonsai', 'original', BASE], 'PSNR'):.2f}"
-    body = [[BASE, "", psnr, *(_level(half(scene, BASE)) for scene in TRAINING_VIEWS), "", ""]]
+    body = [[BASE, "", psnr, *_levels("methods"), "", ""]]
     for run in METHODS:
         paper = "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
         ours, base = ([half(scene, one)[0]["splats"] for scene in _scenes(run)] for one in (run, BASE))
         share = median(one / other for one, other in zip(ours, base, strict=True))
-        cells = [_cell(run, scene) for scene in TRAINING_VIEWS]
-        body.append([run, paper, _protocol(run), *cells, f"{share:.2f}", _ahead(run)])
+        body.append([run, paper, _protocol(run), *_gains(run, "methods"), f"{share:.2f}", _ahead(run)])
     return grid(["", "paper", "protocol", *TRAINING_VIEWS, "splats", "ahead"], body)
 
 
-def _scenes(run: str) -> list[str]:
-    return [scene for scene in TRAINING_VIEWS if half(scene, run)]
+def equal() -> str:
+    """The same with 150,000 splats each."""
+    body = [[BASE, *_levels("budgets"), ""]]
+    body += [[run, *_gains(run, "budgets"), _ahead(run, "budgets")] for run in METHODS]
+    return grid(["150,000 splats", *TRAINING_VIEWS, "ahead"], body)
 
 
-def _level(runs: Runs) -> str:
-    return f"{fmean(one['psnr'] for one in runs):.2f}/{fmean(one['ssim'] for one in runs):.3f}"
+def seeds(run: str, scene: str) -> str:
+    """Decibels between a run's best and worst seed under 3DGS's rules."""
+    found = [one["psnr"] for one in half(scene, run)]
+    return f"{max(found) - min(found):.1f}"
 
 
-def _cell(run: str, scene: str) -> str:
-    """Bold if the most decibels that are gained on the capture."""
-    base, found = half(scene, BASE), {one: half(scene, one) for one in METHODS}
-    if not found[run]:
-        return "-"
-    gains = {one: gain(runs, base, "psnr") for one, runs in found.items() if runs}
-    text = f"{signed(gains[run], 2)}/{signed(1000 * gain(found[run], base, 'ssim'), 0)}"
-    return bold(text, gains[run] == max(gains.values()) > 0)
+def _scenes(run: str, study: str = "methods") -> list[str]:
+    return [scene for scene in TRAINING_VIEWS if half(scene, run, study)]
+
+
+def _levels(study: str) -> list[str]:
+    every = [half(scene, BASE, study) for scene in TRAINING_VIEWS]
+    return [f"{fmean(one['psnr'] for one in runs):.2f}/{fmean(one['ssim'] for one in runs):.3f}" for runs in every]
+
+
+def _gains(run: str, study: str) -> list[str]:
+    """A cell for each capture, bold if the most decibels that are gained on it."""
+    cells = []
+    for scene in TRAINING_VIEWS:
+        base, found = half(scene, BASE, study), {one: half(scene, one, study) for one in METHODS}
+        gains = {one: gain(runs, base, "psnr") for one, runs in found.items() if runs}
+        if run in gains:
+            text = f"{signed(gains[run], 2)}/{signed(1000 * gain(found[run], base, 'ssim'), 0)}"
+            cells.append(bold(text, gains[run] == max(gains.values()) > 0))
+        else:
+            cells.append("-")
+    return cells
 
 
 def _protocol(run: str) -> str:
@@ -70,9 +89,9 @@ def _protocol(run: str) -> str:
     return f"{signed(mean_of(ours, 'PSNR') - mean_of(base, 'PSNR'), 2)} ({share:.2f})"
 
 
-def _ahead(run: str) -> str:
+def _ahead(run: str, study: str = "methods") -> str:
     """On how many captures a run is above 3DGS: in PSNR, in SSIM, in PSNR in the median test view."""
-    pairs = [(half(scene, run), half(scene, BASE)) for scene in _scenes(run)]
+    pairs = [(half(scene, run, study), half(scene, BASE, study)) for scene in _scenes(run, study)]
     measured = [(gain(*pair, "psnr"), gain(*pair, "ssim"), median(view_gains(*pair))) for pair in pairs]
     counts = [sum(round(gain, 3) > 0 for gain in gains) for gains in zip(*measured, strict=True)]
     return "/".join(map(str, counts))
@@ -89,13 +108,6 @@ def gains(rule: str) -> str:
         found = [f"{run} {signed(mean_of(rows[scene, rule, run], 'PSNR') - base, 2)}" for run in METHODS[:-1]]
         told.append(f"`{scene}` {', '.join(found)}")
     return "; ".join(told)
-
-
-def short_of(scene: str) -> str:
-    """What the paper's field gains with 150,000 splats in 10,000 steps, in the median test view and in how many."""
-    rows = bench_rows("comparison", "short")
-    gains = view_gains(*(trials_of(rows[scene, "mcmc@150000", run]) for run in ("NRF-GS", BASE)))
-    return f"{signed(median(gains))} dB ({sum(gain > 0 for gain in gains)} of {len(gains)})"
 
 
 def stored_opacity() -> str:

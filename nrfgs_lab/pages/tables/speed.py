@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tables of docs/speed.md."""
 
-from statistics import median
+from datetime import datetime, timedelta
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
 
 from nrfgs_lab.bench.table import Row
 from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, records
 
-TRAININGS = "splatfacto", "splatfacto-10k", "nrfgs-sh", "nrfgs", "nrfgs-fast", "nrfgs-best"
+TRAININGS = "splatfacto", "splatfacto-10k", "splatfacto-big-10k", "nrfgs-sh", "nrfgs", "nrfgs-fast", "nrfgs-best"
+SITTING = timedelta(minutes=10)
+"""Trainings that began within it were made on one machine, one behind the other."""
 VARIANTS = {
     "fused bf16": "field",
     "torch": "in PyTorch",
@@ -23,14 +28,14 @@ def _trainings() -> dict[str, Row]:
 
 
 def trainings() -> str:
-    """What whole trainings of bonsai cost: each run's seconds and PSNR, means of the rest."""
+    """What whole trainings of bonsai cost: each run's seconds, means of the rest."""
     body = []
     for run in TRAININGS:
         row = _trainings()[run]
         shares = _ratios("time s", run, "splatfacto")
-        share = f"{shares[0]:.2f}" if shares else f"{_times_of(run)[0] / _times_of('splatfacto')[0]:.2f}*"
+        share = f"{median(shares):.2f}" if shares else f"{fmean(_times_of(run)) / fmean(_times_of('splatfacto')):.2f}*"
         seconds = ", ".join(f"{value:.1f}" for value in _times_of(run))
-        psnr = ", ".join(f"{value:.2f}" for value in row.values["PSNR"].values())
+        psnr = f"{row.mean(BY_NAME['PSNR']):.2f}"
         means = [f"{row.mean(BY_NAME['splats']) / 1000:.0f}k", f"{row.mean(BY_NAME['peak MB']):.0f}"]
         frames = "/".join(f"{row.mean(BY_NAME[name]):.0f}" for name in ("FPS", "FPS 1080p"))
         body.append([f"`{run}`", seconds, share, psnr, *means, frames])
@@ -43,19 +48,29 @@ def _times_of(run: str) -> list[float]:
 
 
 def _ratios(what: str, run: str, base: str) -> list[float]:
-    """A quantity of trainings of bonsai over another's, of those made in one call: by one version of the package."""
+    """A quantity of trainings of bonsai over another's, of those made one behind the other on one machine."""
     rows = _trainings()
     return [
         rows[run].values[what][seed] / rows[base].values[what][other]
         for seed, one in rows[run].records.items()
         for other, two in rows[base].records.items()
-        if one["machine"]["source"] == two["machine"]["source"]
+        if abs(_began(one) - _began(two)) < SITTING
     ]
+
+
+def _began(record: dict[str, Any]) -> datetime:
+    """When a training began, as its folder is called."""
+    return datetime.strptime(Path(record["train"]["config_path"]).parent.name, "%Y-%m-%d_%H%M%S")
 
 
 def ratio(what: str, run: str, base: str) -> str:
     """A quantity of trainings of bonsai over others' of the same call, the median."""
     return f"{median(_ratios(what, run, base)):.2f}"
+
+
+def spread(*runs: str) -> str:
+    """By how much the slowest training of a run is above its fastest, at most."""
+    return f"{100 * max(max(_times_of(run)) / min(_times_of(run)) - 1 for run in runs):.0f} %"
 
 
 def of_training(what: str, run: str) -> str:

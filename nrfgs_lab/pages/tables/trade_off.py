@@ -13,6 +13,7 @@ PRESETS = {
     "splatfacto": "splatfacto",
     "splatfacto-10k": "the same, 10,000 steps",
     "splatfacto-big": "splatfacto-big",
+    "splatfacto-big-10k": "the same, 10,000 steps",
     "nrfgs-sh": "`nrfgs-sh`",
     "nrfgs-fast": "`nrfgs-fast`",
     "nrfgs": "`nrfgs`",
@@ -31,10 +32,9 @@ def _row(scene: str, run: str) -> tuple[Row | None, str]:
     return row, ""
 
 
-def _seconds(row: Row) -> float | None:
-    """The median of those trainings that had a GPU to themselves."""
-    seconds = list(row.values["time s"].values())
-    return median(seconds) if seconds else None
+def _seconds(row: Row) -> list[float]:
+    """Of those trainings that had a GPU to themselves."""
+    return list(row.values["time s"].values())
 
 
 def presets() -> str:
@@ -48,7 +48,7 @@ def presets() -> str:
                 cells.append("-")
                 continue
             seconds = _seconds(row)
-            time = "" if seconds is None else f", {seconds:.0f} s"
+            time = f", {_span(seconds, lambda one, _: f'{one:.0f}')} s" if seconds else ""
             splats = f"{mean_of(row, 'splats') / 1000:.0f}k"
             cells.append(f"{mean_of(row, 'PSNR'):.2f}/{mean_of(row, 'SSIM'):.3f}, {splats}{time}{mark}")
         if set(cells) != {"-"}:
@@ -67,10 +67,10 @@ def gain(run: str, base: str) -> str:
     return _span([mean_of(one, "PSNR") - mean_of(other, "PSNR") for one, other in _pairs(run, base)], signed)
 
 
-def time(run: str, base: str) -> str:
-    """The least and the largest share of another's time over captures."""
-    shares = [_seconds(one) / _seconds(other) for one, other in _pairs(run, base)]
-    return _span(shares, lambda share, digits: f"{share:.{digits + 1}f}")
+def time(scene: str, run: str, base: str) -> str:
+    """A run's share of another's time on a capture."""
+    one, other = (_seconds(_row(scene, name)[0]) for name in (run, base))
+    return f"{median(one) / median(other):.2f}"
 
 
 def _span(numbers: list[float], text) -> str:

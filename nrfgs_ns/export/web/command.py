@@ -22,7 +22,7 @@ from nrfgs_ns.export.compact import check_options, measure_file, packed, write_c
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.web.options import WebOptions
 from nrfgs_ns.export.web.page import page
-from nrfgs_ns.files import whole
+from nrfgs_ns.files import check_writable, whole
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.pinhole import pinhole
 
@@ -56,6 +56,7 @@ def export_web(
             f"--output {output} is a {'file' if output.is_file() else 'folder'}. Name a file that ends in .html, or a "
             "folder that does not."
         )
+    check_writable(output if alone else output / SCENE, "--output")
     pipeline = load_model(load_config, "test")
     model = pipeline.model
     if not isinstance(model.head, NeuralResidualField):
