@@ -23,6 +23,7 @@ from torch.nn import Parameter, ParameterDict
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification import Densification, build_densification
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
@@ -289,6 +290,11 @@ class NrfgsModel(SplatfactoModel):
         centers = cameras.camera_to_worlds[:, :3, 3]
         self.densification.see_cameras(centers)
         self.densification.see_training_views(TrainingPictures(self, attributes.pipeline.datamanager))
+        if self.config.densification == "mcmc" and self.num_points > self.config.splat_budget:
+            warn(
+                f"pipeline.model.splat_budget is {self.config.splat_budget}, but the training begins with "
+                f"{self.num_points} points, and mcmc removes none: so many splats stay."
+            )
         self.camera_spacing = camera_spacing(centers)
         self.view_noise = ViewNoise.as_long_as(self.noise_factor * self.camera_spacing, self.view_noise.seed)
 

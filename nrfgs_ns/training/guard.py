@@ -107,6 +107,14 @@ class Guard:
         if self.pipeline.graphs is None or step % PARAMETERS_EVERY == 0:
             self.settle()
         self.step = step
+        if self._is_empty():
+            raise TrainingStopped(
+                f"No splat is left in step {step}: all were pruned. Images or masks show nothing, or thresholds of the "
+                "densification are too high.",
+                step,
+                "nothing visible",
+                savable=False,
+            )
         if self._out_of_sight():
             raise TrainingStopped(
                 f"No splat has been visible in the last {PATIENCE} steps, so nothing is learnt. Poses and points are "
@@ -148,6 +156,10 @@ class Guard:
                 self._send_home(self._verdict)
         else:
             self.settle()
+
+    def _is_empty(self) -> bool:
+        """Whether no splat is left."""
+        return self.model.num_points == 0
 
     def _out_of_sight(self) -> bool:
         """Whether nothing has been visible in the last `PATIENCE` steps. The host knows how many rows there were, or

@@ -172,7 +172,7 @@ def test_unknown_head_is_refused_before_training(tiny_scene, tmp_path):
 
 
 def test_impossible_setting_is_refused_before_training(tiny_scene, tmp_path):
-    with pytest.raises(ValueError, match="num_bands is 0"):
+    with pytest.raises(InputError, match="num_bands is 0"):
         set_up(options(tiny_scene, tmp_path, "nrfgs", {"--pipeline.model.appearance.num-bands": 0}))
 
 
