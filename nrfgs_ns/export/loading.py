@@ -86,8 +86,15 @@ def find_data(config: "TrainerConfig", path: Path) -> None:
 
 
 def load_model(path: Path, mode: Literal["test", "inference"]) -> "NrfgsPipeline":
-    """The pipeline of `load_training`."""
-    return load_training(path, mode).pipeline
+    """The pipeline of `load_training`.
+
+    Raises:
+        InputError: as `load_training`; or there is nothing to look at.
+    """
+    pipeline = load_training(path, mode).pipeline
+    if pipeline.model.num_points == 0:
+        raise InputError(f"{path}: this training has lost all splats. Train again with other options or data.")
+    return pipeline
 
 
 def load_file(path: Path) -> "NrfgsModel":
