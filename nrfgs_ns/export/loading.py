@@ -160,6 +160,6 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
         if None not in scores.values():  # nothing inside the mask
             per_image.append({"image": image, **scores})
     if not per_image:
-        raise InputError("The file is written, but no test image has pixels inside its mask. Use --no-measure.")
+        raise InputError("No test image has pixels inside its mask: there is nothing to measure on. Use --no-measure.")
     means = {key: sum(one[key] for one in per_image) / len(per_image) for key in scores}
     return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}
