@@ -177,7 +177,7 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
             "scenes": [_scene(value, where) for value in as_list(content["scenes"])],
             "strategies": [str(value) for value in as_list(content.get("strategies", [OWN]))],
             "seeds": as_list(content.get("seeds", [42])),
-            "options": _words(content.get("options", ()), f"{where}: options"),
+            "options": words_of(content.get("options", ()), f"{where}: options"),
         }
     )
     for key, least in (("steps", 1), ("jobs", 1), ("gpus", 1), ("train_views", 0), ("checkpoint_every", 1)):
@@ -253,7 +253,7 @@ def strategy_options(strategy: str) -> list[str]:
     if strategy == OWN:
         return []
     known = ("splatfacto", "original", "mcmc")
-    good = name in known and (not at or (name == "mcmc" and budget.isdigit()))
+    good = name in known and (not at or (name == "mcmc" and budget.isdecimal() and int(budget) > 0))
     _require(good, f"strategy {strategy!r} is unknown; use {', '.join(known)}, mcmc@BUDGET or own.")
     return [DENSIFICATION, name, *(["--pipeline.model.splat-budget", budget] if at else [])]
 
@@ -350,7 +350,7 @@ def _method(name: str, value: Any, where: str) -> Method:
         _whole(value["steps"], 1, f"{where}: steps")
     strategies = tuple(str(one) for one in as_list(value["strategies"])) if "strategies" in value else None
     _require(strategies != (), f"{where}: strategies is empty. Name at least one, or leave it out.")
-    options = _words(value.get("options", ()), f"{where}: options")
+    options = words_of(value.get("options", ()), f"{where}: options")
     return Method(str(name), value["method"], options, strategies, value.get("steps"))
 
 
@@ -368,7 +368,7 @@ def _scene(value: Any, where: str) -> Scene:
         f"{where}: scenes: {name!r} is no folder below --scenes. Give --scenes the folder that it lies in.",
     )
     _require(name != AVERAGE, f"{where}: scenes: {name!r} is what the table calls the average over scenes; rename it.")
-    return Scene(name, downscale, _words(value.get("options", ()), f"{where}: scenes: options"))
+    return Scene(name, downscale, words_of(value.get("options", ()), f"{where}: scenes: options"))
 
 
 def as_list(value: Any) -> list[Any]:
@@ -376,7 +376,7 @@ def as_list(value: Any) -> list[Any]:
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
-def _words(value: Any, where: str) -> tuple[str, ...]:
+def words_of(value: Any, where: str) -> tuple[str, ...]:
     """Options given as one string, as in a shell, or as a list of words."""
     _require(isinstance(value, (str, list, tuple)), f"{where} must be a string or a list of words.")
     try:

@@ -80,6 +80,7 @@ def test_methods_of_others_run_as_they_are():
         ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
         ({"runs": {"NRF": {"method": "nrfgs", "speed": 1}}}, "speed"),
         ({"strategies": ["mcmc@many"]}, "mcmc@many"),
+        ({"strategies": ["mcmc@0"]}, "mcmc@0"),
         ({"strategies": ["original@5"]}, "original@5"),
         ({"steps": 0}, "steps"),
         ({"seeds": ["x"]}, "seeds"),
