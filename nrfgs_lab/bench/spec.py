@@ -139,6 +139,17 @@ class Job:
     """runs that share the GPU: times mean something only if it is 1"""
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML in which no key stands twice: the later one would silently replace the other."""
+
+    def construct_mapping(self, node, deep=False):
+        keys = [key.value for key, _ in node.value]
+        twice = next((key for key in keys if keys.count(key) > 1), None)
+        if twice is not None:
+            raise yaml.constructor.ConstructorError(problem=f"{twice!r} twice", problem_mark=node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 def load_spec(path: Path) -> dict[str, Any]:
     """The content of a YAML file: a mapping, as `make_spec` takes it.
 
@@ -146,7 +157,7 @@ def load_spec(path: Path) -> dict[str, Any]:
         InputError: the file cannot be read, or is no mapping.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        content = yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
     if not isinstance(content, dict):
