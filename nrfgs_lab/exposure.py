@@ -32,6 +32,7 @@ import numpy as np
 import tyro
 from PIL import Image
 
+from nrfgs_lab.bench.spec import QUIET
 from nrfgs_lab.lock import only_one
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
@@ -47,10 +48,6 @@ MOST_OCCLUDERS = 3
 """In such a photograph."""
 HEIGHTS, WIDTHS = (0.3, 0.6), (0.3, 0.45)
 """Of an occluder, in heights of the photograph, and in heights of itself."""
-QUIET = (
-    "--vis tensorboard --steps-per-eval-image 1000000 --steps-per-eval-all-images 1000000 "
-    "--logging.local-writer.enable False --logging.profiler none"
-).split()
 
 
 @dataclass(frozen=True)

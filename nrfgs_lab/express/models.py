@@ -9,7 +9,6 @@ look the other way (harmonics, lobes, learnt basis) differ by a reflection of th
 What a sample stores is a dictionary of tensors [S, ...]; what the samples share is the module's own parameters.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
@@ -255,12 +254,3 @@ def largest(build: Callable[[int], DirectionalModel], sizes: range, num_samples:
         if build(size).count(num_samples) <= budget:
             return size
     raise ValueError(f"no size from {sizes} fits {num_samples} samples into {budget} parameters")
-
-
-def residual_floor(degree_from: int, degree_to: int, deviation: float) -> float:
-    """Mean square that harmonics below `degree_from` cannot reach.
-
-    For targets with independent coefficients of this deviation in degrees degree_from..degree_to, averaged over the
-    sphere: each harmonic has mean square 1 / (4 pi).
-    """
-    return (num_bases(degree_to) - num_bases(degree_from - 1)) * deviation**2 / (4.0 * math.pi)

@@ -2,8 +2,7 @@
 """Time the appearance head alone on a CUDA device: the fused field beside PyTorch's and beside the other heads.
 
     python -m nrfgs_lab.timing.head_gpu --out head_gpu.json
-    python -m nrfgs_lab.timing.head_gpu --sizes 1000000 --sweep               # launch constants of the fused kernels
-    python -m nrfgs_lab.timing.head_gpu --sizes --out head_gpu_diffuse.json     # diffuse splats alone
+    python -m nrfgs_lab.timing.head_gpu --sizes --out head_gpu_diffuse.json   # diffuse splats alone
     TRITON_INTERPRET=1 python -m nrfgs_lab.timing.head_gpu --device cpu --sizes 200 --diffuse-sizes 200 --rounds 1
 
 A table of N splats of which M are visible, from one camera; M = N ("all"), and M = N / 2 picked at random ("half").
@@ -23,7 +22,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -33,12 +32,12 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE, Others  # noqa: E402
-from nrfgs_ns.appearance.gsnb import GsnbConfig  # noqa: E402
-from nrfgs_ns.appearance.nrf import NrfConfig  # noqa: E402
-from nrfgs_ns.appearance.sg import SgConfig  # noqa: E402
-from nrfgs_ns.appearance.sh import ShConfig  # noqa: E402
-from nrfgs_ns.appearance.vdgs import VdgsConfig  # noqa: E402
+from nrfgs_ns.appearance.diffuse import DIFFUSE, Others
+from nrfgs_ns.appearance.gsnb import GsnbConfig
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.sg import SgConfig
+from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.appearance.vdgs import VdgsConfig
 
 PRECISIONS = ("fp32", "tf32", "bf16", "fp16")
 ERROR_SPLATS = 100_000
@@ -87,23 +86,8 @@ class HeadBenchmark:
     """cuda; cpu only tries the script"""
     compile: bool = True
     """time torch.compile of PyTorch's head too; compiling takes a minute"""
-    sweep: bool = False
-    """time launch constants of the fused kernels instead of the variants"""
-    sweep_precisions: tuple[str, ...] = ("fp16", "bf16", "tf32")
-    """precisions in a sweep"""
-    sweep_blocks: tuple[int, ...] = (64, 128)
-    """splats that a program takes at once; every block, number of warps and of stages is compiled: 10 s for the pair"""
-    sweep_warps: tuple[int, ...] = (4, 8)
-    """warps of a program"""
-    sweep_stages: tuple[int, ...] = (1, 3)
-    """stages of the software pipeline"""
-    sweep_programs: tuple[int, ...] = (1, 2, 3, 4)
-    """programs for each multiprocessor"""
 
     def main(self) -> None:
-        if self.sweep:
-            self.save(self.sweep_launches())
-            return
         results: dict[str, list[dict]] = {"errors": self.errors() if self.sizes else [], "times": [], "diffuse": []}
         for visible, share in itertools.product(self.sizes, ("all", "half")):
             results["times"] += self.times(visible, share)
@@ -234,13 +218,13 @@ class HeadBenchmark:
     def times(self, visible: int, share: str) -> list[dict]:
         count = visible if share == "all" else 2 * visible
         labels = {"visible": visible, "share": share}
-        return self.take_turns(self.variants(*self.scene(count, visible)), labels, memory=True)
+        return self.take_turns(self.variants(*self.scene(count, visible)), labels)
 
     def diffuse_times(self, visible: int, share: float) -> list[dict]:
         labels = {"visible": visible, "share": "half", "diffuse": share}
-        return self.take_turns(self.diffuse_variants(*self.scene(2 * visible, visible), share), labels, memory=True)
+        return self.take_turns(self.diffuse_variants(*self.scene(2 * visible, visible), share), labels)
 
-    def take_turns(self, builders: dict[str, Callable[[], Variant]], labels: dict, memory: bool = False) -> list[dict]:
+    def take_turns(self, builders: dict[str, Callable[[], Variant]], labels: dict) -> list[dict]:
         """A row of medians for each variant: "forward_ms", "both_ms" and their spread, "gpu_ms", or "error".
 
         The first three are taken as a training calls them: small sizes wait for the host. "gpu_ms" replays forward and
@@ -255,7 +239,7 @@ class HeadBenchmark:
                     built[name].forward()
                     built[name].forward_backward()
                 self.synchronize()
-                if memory and self.device == "cuda":
+                if self.device == "cuda":
                     rows[name]["peak_mib"] = self.peak_memory(built[name])
             except Exception as error:  # one variant that cannot run must not lose the others
                 built.pop(name, None)
@@ -360,31 +344,6 @@ class HeadBenchmark:
         gradients = {f"d {name}": leaf.grad for name, leaf in leaves.items()}
         weights = torch.cat([weight.grad.flatten() for weight in head.parameters()])
         return {"colors": colors.detach(), "opacities": opacities.detach(), **gradients, "d weights": weights}
-
-    # Launch constants.
-
-    def sweep_launches(self) -> dict[str, list[dict]]:
-        """Times of the fused kernels under other launch constants: forward's alone, then backward's with forward."""
-        from nrfgs_ns.appearance.fused import launch
-
-        found = []
-        for visible in self.sizes:
-            scene = self.scene(visible, visible)
-            for precision, which in itertools.product(self.sweep_precisions, ("forward", "backward")):
-                ways = launch.LAUNCHES[precision]
-                grid = itertools.product(self.sweep_blocks, self.sweep_warps, self.sweep_stages, self.sweep_programs)
-                for block, warps, stages, programs in grid:
-                    how = replace(
-                        getattr(ways[0], which), block=block, warps=warps, stages=stages, programs_per_sm=programs
-                    )
-                    launch.LAUNCHES[precision] = (replace(ways[0], **{which: how}),)
-                    name = f"{precision} {which} block {block} warps {warps} stages {stages} per SM {programs}"
-                    builder = self.variants(*scene)[f"fused {precision}"]
-                    found += self.take_turns({name: builder}, {"visible": visible})
-                launch.LAUNCHES[precision] = ways
-        found.sort(key=lambda row: row.get("both_ms", float("inf")))
-        self.show(found)
-        return {"sweep": found}
 
     def show(self, rows: list[dict]) -> None:
         table = Table("variant", "visible", "of all", "forward ms", "both ms", "GPU alone ms", "peak MiB")

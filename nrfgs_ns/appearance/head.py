@@ -18,6 +18,8 @@ from typing import ClassVar, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from nrfgs_ns.errors import InputError
+
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
@@ -57,7 +59,7 @@ class AppearanceHeadConfig:
             scene_unit: world units in a scene unit.
 
         Raises:
-            ValueError: a field is out of range; the message names it.
+            InputError: a field is out of range; the message names it.
         """
         self.validate()
         head = self._target(self)
@@ -65,7 +67,7 @@ class AppearanceHeadConfig:
         return head
 
     def validate(self) -> None:
-        """Raise ValueError, naming the field and the fix, if a value cannot work."""
+        """Raise InputError, naming the field and the fix, if a value cannot work."""
 
     def trusted(self, share: float) -> "AppearanceHeadConfig":
         """The configuration of a head that the capture trusts with a share, in (0, 1], of what it may do."""
@@ -76,9 +78,9 @@ class AppearanceHeadConfig:
         return self
 
     def require(self, holds: bool, name: str, needed: str) -> None:
-        """Raise ValueError naming field `name`, its value and what is `needed`, unless the condition holds."""
+        """Raise InputError naming field `name`, its value and what is `needed`, unless the condition holds."""
         if not holds:
-            raise ValueError(
+            raise InputError(
                 f"pipeline.model.appearance.{name} is {getattr(self, name)!r}, but it must be {needed}. "
                 f"Set --pipeline.model.appearance.{name.replace('_', '-')} accordingly."
             )

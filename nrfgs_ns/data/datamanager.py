@@ -120,7 +120,12 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             )
         if config.image_memory is not None and not config.image_memory >= 0:
             raise InputError(f"--pipeline.datamanager.image-memory is {config.image_memory}. Give 0 or more gigabytes.")
-        super().__init__(config, *args, **kwargs)
+        try:
+            super().__init__(config, *args, **kwargs)
+        except FileNotFoundError as error:  # of nerfstudio's own parsers
+            raise InputError(
+                f"{error.filename}: no such file. Check the path that --data names, and what kind of data set it is."
+            ) from error
 
     def load_all_images(self) -> tuple[int, int]:
         """Decodes all images now, so that a broken one is found before the first step.

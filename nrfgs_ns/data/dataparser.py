@@ -183,6 +183,11 @@ class NrfgsDataParser(DataParser):
         check_unique(paths, f"{source}: frames")
         named = self._named_splits(meta, layout)
         splits = split_by_names(named, paths, layout.file, source) if named else split_by_rule(config, paths, source)
+        if named and "train" not in named:
+            there = next(iter(named.values()))[0]  # test_filenames, test_list.txt
+            raise InputError(
+                f"{source}: there is {there}, but no train_{there.partition('_')[2]}. Name the training images, too."
+            )
         if not len(splits["train"]):
             raise InputError(
                 f"{source}: no image is left for training. Correct train_filenames if it is there, else --eval-mode, "

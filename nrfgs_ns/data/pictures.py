@@ -163,18 +163,18 @@ def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, float | str]:
     """The same from a frame of transforms.json, as `nrfgs prepare` writes it; nothing where there is no "exif".
 
     Raises:
-        InputError: it is no dictionary, or one of its numbers is none above 0.
+        InputError: it is no dictionary, one of its numbers is none above 0, or a name is no text.
     """
     told = frame.get("exif", {})
     good = isinstance(told, dict) and all(
-        isinstance(told[name], int | float) and math.isfinite(told[name]) and told[name] > 0
-        for name in NUMBERS
-        if name in told
+        isinstance(value, str) if name in NAMES else isinstance(value, int | float) and 0 < value < math.inf
+        for name, value in told.items()
+        if name in NUMBERS or name in NAMES
     )
     if not good:
         raise InputError(
-            f'{source}: "exif" of {frame.get("file_path")} must hold numbers above 0 ({", ".join(NUMBERS)}). '
-            "Correct or remove it."
+            f'{source}: "exif" of {frame.get("file_path")} must hold numbers above 0 ({", ".join(NUMBERS)}) and text '
+            f"({', '.join(NAMES)}). Correct or remove it."
         )
     return told
 

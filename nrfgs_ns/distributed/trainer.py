@@ -100,7 +100,7 @@ class ShardedMean(ParameterMean):
             "parameter_mean", `state` with the rows of all devices on the main one, None for the splats' rows elsewhere.
             Nothing where any device has other splats than those that it is the mean of: the guard has taken some out.
         """
-        if not self.is_current(model, optimizers):
+        if not self.is_current(optimizers):
             return {}
         state = self.state()
         for name, mean in state["means"].items():
@@ -156,8 +156,11 @@ class ShardedGuard(Guard):
         self.signal = self.signal or int(sizes[-1])
         return sizes
 
-    def _out_of_sight(self) -> bool:
+    def _is_empty(self) -> bool:
         return False  # one device's shard may be, and others are not asked
+
+    def _out_of_sight(self) -> bool:
+        return False  # likewise
 
     def settle(self) -> None:
         try:
@@ -255,7 +258,7 @@ class ShardedTrainer(NrfgsTrainer):
         self.guard = ShardedGuard(self.pipeline, self.request)
         self.mean = ShardedMean() if self.config.average_steps > 0 else None
         groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
-        optimizers = ShardedOptimizers(self.optimizer_configs(), groups, self.guard, every)
+        optimizers = ShardedOptimizers(self.guard, self.optimizer_configs(), groups, every)
         if self.count_images:
             forget_faster(optimizers.optimizers, self.world_size)
         return optimizers

@@ -38,8 +38,6 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     Raises:
         InputError: there is no such training, or it is not one of this project's methods.
     """
-    import torch
-
     from nrfgs_ns.training.checkpoint_files import find, read_latest
     from nrfgs_ns.training.config_file import read_config
     from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
@@ -103,7 +101,6 @@ def load_file(path: Path) -> "NrfgsModel":
     Raises:
         InputError: as `decode`.
     """
-    import torch
     from nerfstudio.data.scene_box import SceneBox
 
     from nrfgs_ns.compact.decode import decode, model_state

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The options of the model."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -94,11 +95,16 @@ class NrfgsModelConfig(SplatfactoModelConfig):
             if getattr(self, name) not in choices:
                 fix = " or ".join(map(repr, choices))
                 raise InputError(f"pipeline.model.{name} is {getattr(self, name)!r}; use {fix}.")
-        for name in ("view_noise", "shrinkage"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"pipeline.model.{name} is {getattr(self, name)}; it must be zero or positive.")
-        if not 0 <= self.robust_loss < 1:
-            raise InputError(f"pipeline.model.robust_loss is {self.robust_loss}; it must be at least 0 and below 1.")
+        for names, low, high, needed in (
+            (("view_noise", "shrinkage", "warmup_steps"), 0, math.inf, "zero or positive"),
+            (("robust_loss",), 0, 1, "at least 0 and below 1"),
+            (("cull_alpha_thresh",), 0, 0.5, "at least 0 and below 0.5, since a reset is to twice as much"),
+            (("refine_every", "reset_alpha_every", "resolution_schedule", "num_random"), 1, math.inf, "at least 1"),
+        ):
+            for name in names:
+                value = getattr(self, name)
+                if value is not None and not low <= value < high:
+                    raise InputError(f"pipeline.model.{name} is {value}; it must be {needed}.")
 
     def trust(self, views: int) -> float:
         """How far so many training views trust the head, in (0, 1]."""

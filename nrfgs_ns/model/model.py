@@ -23,6 +23,7 @@ from torch.nn import Parameter, ParameterDict
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification import Densification, build_densification
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
@@ -48,7 +49,7 @@ VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 
 
 class NrfgsModel(SplatfactoModel):
-    """Gaussian splatting with an appearance head.
+    """Gaussian splatting with an appearance head. Wherever it takes a camera, that is a batch of one, [1].
 
     Args:
         config: which head, and splatfacto's options.
@@ -169,12 +170,7 @@ class NrfgsModel(SplatfactoModel):
         return Projecting(self.config.rasterize_mode, self.scene_unit, assume_finite=self.training)
 
     def project(self, camera: Cameras, splats: Mapping[str, Tensor] | None = None) -> View:
-        """Project splats into one camera (`project_view`).
-
-        Args:
-            camera: a batch of one camera, [1].
-            splats: another table than the field's.
-        """
+        """Project splats into a camera (`project_view`): the field's, or another table."""
         return project_view(self.field.splats if splats is None else splats, self.pinhole(camera), self.projecting)
 
     def composite(
@@ -187,7 +183,6 @@ class NrfgsModel(SplatfactoModel):
         """Composite visible splats as this model is configured (`composite_view`).
 
         Args:
-            view, appearance: as for `composite_view`.
             background: a colour [3] instead of the configuration's.
             photograph: the picture has the look of this one; None: the mean look.
         """
@@ -232,7 +227,6 @@ class NrfgsModel(SplatfactoModel):
 
         Args:
             field: what is drawn.
-            camera: a batch of one camera, [1].
             asked: the same field as its head is asked about it, with or without noise.
 
         Returns:
@@ -246,11 +240,7 @@ class NrfgsModel(SplatfactoModel):
     def picture(
         self, view: View, appearance: SplatAppearance, camera: Cameras, background: Tensor | None = None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite what a camera sees, with the look of its photograph in training.
-
-        Args:
-            view, appearance, background: as for `composite`.
-            camera: a batch of one camera, [1].
+        """Composite what a camera sees (`composite`), with the look of its photograph in training.
 
         Returns:
             what `get_outputs` does, and the rasterizer's `info`.
@@ -290,7 +280,6 @@ class NrfgsModel(SplatfactoModel):
         Nerfstudio moves the camera to the GPU first, where the host must wait to learn its size.
 
         Args:
-            camera: a batch of one camera, [1].
             obb_box: only splats with their centre inside are drawn, if given.
         """
         if self.viewer_panel is not None and self.viewer_panel.is_asking():
@@ -305,6 +294,11 @@ class NrfgsModel(SplatfactoModel):
         centers = cameras.camera_to_worlds[:, :3, 3]
         self.densification.see_cameras(centers)
         self.densification.see_training_views(TrainingPictures(self, attributes.pipeline.datamanager))
+        if self.config.densification == "mcmc" and self.num_points > self.config.splat_budget:
+            warn(
+                f"pipeline.model.splat_budget is {self.config.splat_budget}, but the training begins with "
+                f"{self.num_points} points, and mcmc removes none: so many splats stay."
+            )
         self.camera_spacing = camera_spacing(centers)
         self.view_noise = ViewNoise.as_long_as(self.noise_factor * self.camera_spacing, self.view_noise.seed)
 
@@ -327,7 +321,6 @@ class NrfgsModel(SplatfactoModel):
         """How far the head is from adding nothing to what a camera sees, for the warm-up.
 
         Args:
-            camera: a batch of one camera, [1].
             weights: the head's shared weights.
 
         Returns:

@@ -11,7 +11,6 @@ With the training set a training goes on from it as if it had never stopped; wit
 """
 
 import copy
-import dataclasses
 import json
 import tempfile
 from pathlib import Path
@@ -31,6 +30,7 @@ from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory
 from nrfgs_ns.training.checkpoint_files import read_or_refuse
 from nrfgs_ns.training.config_file import read_config
+from nrfgs_ns.training.identity import leaves
 from nrfgs_ns.training.run import parse
 from nrfgs_ns.training.trainer import NrfgsTrainer
 from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig
@@ -124,7 +124,7 @@ class Nrfgs:
             "loaded_checkpoint": None if self.checkpoint is None else str(self.checkpoint),
             "batch_size": 1,
             "eval_batch_size": 1,
-            "hparams": options_of(self.config),
+            "hparams": hparams_of(self.config),
         }
 
     def train_iteration(self, step: int) -> dict[str, float]:
@@ -248,17 +248,9 @@ def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) 
     return config
 
 
-def options_of(config: Any, prefix: str = "") -> dict[str, Any]:
+def hparams_of(config: Any) -> dict[str, Any]:
     """Dotted names and values of a configuration's fields that are numbers, strings, truth values or None."""
-    found: dict[str, Any] = {}
-    if dataclasses.is_dataclass(config):
-        config = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    for name, value in config.items():
-        if (dataclasses.is_dataclass(value) and not isinstance(value, type)) or isinstance(value, dict):
-            found |= options_of(value, f"{prefix}{name}.")
-        elif value is None or isinstance(value, (bool, int, float, str)):
-            found[f"{prefix}{name}"] = value
-    return found
+    return {name: value for name, value in leaves(config) if value is None or isinstance(value, (int, float, str))}
 
 
 def _read_config(checkpoint: Path) -> NrfgsTrainerConfig:

@@ -114,6 +114,8 @@ class Run:
     # The stages.
 
     def import_input(self) -> None:
+        if not self.is_video and (others := files.left_out(self.options.photos)):
+            self.screen.print(f"Left out, since they are not read here: {others}.", markup=False, soft_wrap=True)
         total = self.options.frames if self.is_video else len(self.inputs)
         frames = {"frames": self.options.frames} if self.is_video else {}
         with self.stage("import", "read the photographs", [self.stored], total, **frames) as advance:
@@ -128,6 +130,10 @@ class Run:
     def find_features(self) -> None:
         names, options = self.names, self.options
         one = options.camera == "single" or options.camera == "auto" and files.same_camera(self.stored, names)
+        if one and len(found := set(files.sizes(self.stored, names))) > 1:
+            raise InputError(
+                f"--camera is single, but {self.options.photos} has photographs of {len(found)} sizes. Leave it out."
+            )
         chosen = {
             "camera_model": options.camera_model,
             "one_camera": one,

@@ -5,6 +5,7 @@ import hashlib
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,6 +56,16 @@ def find_inputs(source: Path) -> list[Path]:
     return photos
 
 
+def left_out(source: Path) -> str:
+    """What of a folder `find_inputs` leaves out: how many files of each suffix, and folders; "" for nothing."""
+    kinds = Counter(
+        "folders" if path.is_dir() else path.suffix.lower() or "no suffix"
+        for path in source.iterdir()
+        if not path.name.startswith(".") and not (path.is_file() and path.suffix.lower() in PHOTOS)
+    )
+    return ", ".join(f"{kind} ({number})" for kind, number in sorted(kinds.items()))
+
+
 def _nearby(source: Path, files: list[Path]) -> str:
     """What to do about a folder without photographs."""
     if any(path.suffix.lower() in (".heic", ".heif") for path in files):
@@ -84,7 +95,9 @@ def stored_names(photos: list[Path]) -> list[str]:
     for index, path in enumerate(photos):
         suffix = path.suffix.lower() if path.suffix.lower() in KEPT else ".png"
         name = re.sub(r"[^\w.-]", "_", path.stem, flags=re.ASCII)[:LONGEST_STEM] + suffix
-        names.append(name if name not in names else f"{index:05d}_{name}")
+        while name in names:
+            name = f"{index:05d}_{name}"
+        names.append(name)
     return names
 
 
@@ -173,7 +186,8 @@ def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> No
             found, frame = reader.read() if index < total else (False, None)
             if not found or index * frames // total != piece:
                 if best[1] is not None:
-                    cv2.imwrite(str(folder / f"frame_{written:05d}.jpg"), best[1], [cv2.IMWRITE_JPEG_QUALITY, 97])
+                    coded = cv2.imencode(".jpg", best[1], [cv2.IMWRITE_JPEG_QUALITY, 97])[1]
+                    (folder / f"frame_{written:05d}.jpg").write_bytes(coded)  # imwrite is silent where the disk is full
                     written += 1
                     advance()
                 best, piece = (-1.0, None), index * frames // total

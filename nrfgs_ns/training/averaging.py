@@ -41,7 +41,7 @@ class ParameterMean:
         self._of: dict[str, Tensor] = {}
 
     @torch.no_grad()
-    def add(self, model, optimizers: Mapping[str, Optimizer]) -> None:
+    def add(self, optimizers: Mapping[str, Optimizer]) -> None:
         """Take the parameters as they are now into the mean."""
         parameters = _parameters(optimizers)
         if not self._is_of(parameters):
@@ -72,7 +72,7 @@ class ParameterMean:
         self._means = {name: mean.to(parameters[name]) for name, mean in state["means"].items()}
         self._of = parameters
 
-    def is_current(self, model, optimizers: Mapping[str, Optimizer]) -> bool:
+    def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether rows mean what they meant when it was last added to."""
         return self._is_of(_parameters(optimizers))
 

@@ -129,8 +129,10 @@ def read_or_refuse(path: Path) -> dict[str, Any]:
     """As `read`.
 
     Raises:
-        InputError: there is no such file, or it is damaged.
+        InputError: there is no such file, it is a folder, or it is damaged.
     """
+    if path.is_dir():
+        raise InputError(f"{path} is a folder. Give --load-dir a folder, and --load-checkpoint a file.")
     try:
         return read(path)
     except FileNotFoundError as error:

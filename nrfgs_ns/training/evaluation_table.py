@@ -2,7 +2,7 @@
 """An evaluation's numbers as a table, and which test views are far below the rest."""
 
 from collections.abc import Mapping, Sequence
-from statistics import median, quantiles
+from statistics import quantiles
 from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -44,10 +44,9 @@ def far_below(images: Sequence[Mapping[str, Any]]) -> list[tuple[str, float, flo
     Returns:
         name, PSNR and the median of all, for each.
     """
-    values = [image["psnr"] for image in images if image.get("psnr") is not None]
-    if len(values) < ENOUGH:
+    known = sorted((image["psnr"], image["image"]) for image in images if image.get("psnr") is not None)
+    if len(known) < ENOUGH:
         return []
-    lower, middle, upper = quantiles(values, n=4, method="inclusive")
-    fence = min(median(values) - BELOW, lower - 1.5 * (upper - lower))
-    bad = [(image["psnr"], image["image"]) for image in images if image.get("psnr") is not None]
-    return [(name, value, middle) for value, name in sorted(bad) if value < fence]
+    lower, middle, upper = quantiles((value for value, _ in known), n=4, method="inclusive")
+    fence = min(middle - BELOW, lower - 1.5 * (upper - lower))
+    return [(name, value, middle) for value, name in known if value < fence]

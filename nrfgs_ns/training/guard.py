@@ -32,7 +32,6 @@ from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.errors import ForTheUser
 from nrfgs_ns.training.guard_report import Finding, report
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
-from nrfgs_ns.training.pace import Pace
 
 MAX_GRADIENT = 2.0**63
 """Largest gradient that is let through. Its square, 2^126, and Adam's mean of squares stay below float32's 2^128; from
@@ -108,6 +107,14 @@ class Guard:
         if self.pipeline.graphs is None or step % PARAMETERS_EVERY == 0:
             self.settle()
         self.step = step
+        if self._is_empty():
+            raise TrainingStopped(
+                f"No splat is left in step {step}: all were pruned. Images or masks show nothing, or thresholds of the "
+                "densification are too high.",
+                step,
+                "nothing visible",
+                savable=False,
+            )
         if self._out_of_sight():
             raise TrainingStopped(
                 f"No splat has been visible in the last {PATIENCE} steps, so nothing is learnt. Poses and points are "
@@ -149,6 +156,10 @@ class Guard:
                 self._send_home(self._verdict)
         else:
             self.settle()
+
+    def _is_empty(self) -> bool:
+        """Whether no splat is left."""
+        return self.model.num_points == 0
 
     def _out_of_sight(self) -> bool:
         """Whether nothing has been visible in the last `PATIENCE` steps. The host knows how many rows there were, or
@@ -248,15 +259,8 @@ class Guard:
 class WatchedOptimizers(LeanOptimizers):
     """The optimisers; each step is shown to the guard first."""
 
-    def __init__(
-        self,
-        config: dict[str, Any],
-        param_groups: dict[str, Any],
-        guard: Guard,
-        steps_per_log: int = 10,
-        pace: Pace | None = None,
-    ):
-        super().__init__(config, param_groups, steps_per_log, pace)
+    def __init__(self, guard: Guard, *args: Any):
+        super().__init__(*args)
         self.guard = guard
 
     def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:

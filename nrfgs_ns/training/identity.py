@@ -52,8 +52,12 @@ def options_of(config: Any) -> dict[str, str]:
     parts = {"pipeline": config.pipeline, "optimizers": config.optimizers}
     steps = ("schedule_steps", "time_budget", "average_steps", "max_num_iterations", "gradient_accumulation_steps")
     parts |= {name: getattr(config, name) for name in steps}
-    found = dict(leaf for name, part in parts.items() for leaf in _leaves(part, name))
-    return {name: value for name, value in found.items() if not _is_among(name, NEUTRAL)}
+    found = {name: value for name, value in leaves(parts) if not _is_among(name, NEUTRAL)}
+    return {
+        name: value.__name__ if isinstance(value, type) else value if isinstance(value, str) else repr(value)
+        for name, value in found.items()
+        if not isinstance(value, (Tensor, torch.nn.Module))
+    }
 
 
 def scene_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
@@ -68,7 +72,8 @@ def scene_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
 def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: object) -> None:
     """Raise InputError where a checkpoint was trained on another data set."""
     fix = "Go on with the data set that it was trained on, or train anew."
-    gone, new = ([name for name in a if name not in b] for a, b in _pairs(written["images"], here["images"]))
+    gone = [name for name in written["images"] if name not in here["images"]]
+    new = [name for name in here["images"] if name not in written["images"]]
     if gone or new or len(written["images"]) != len(here["images"]):
         what = "; ".join(
             [f"it had {some(gone)}, which are not training images here"] * bool(gone)
@@ -113,20 +118,13 @@ def _is_among(name: str, groups: tuple[str, ...]) -> bool:
     return any(name == group or name.startswith(f"{group}.") for group in groups)
 
 
-def _pairs(one: Any, other: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-    return (one, other), (other, one)
-
-
-def _leaves(value: Any, name: str) -> Iterator[tuple[str, str]]:
-    """Options of a configuration with their values as text; classes by their name."""
+def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names and values of a configuration's options, or of a dictionary of such."""
     if is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            if not (field.name.startswith("_") and field.name != "_target"):
-                yield from _leaves(getattr(value, field.name), f"{name}.{field.name}")
-    elif isinstance(value, Mapping):
+        names = [field.name for field in fields(value) if field.name[0] != "_" or field.name == "_target"]
+        value = {name: getattr(value, name) for name in names}
+    if isinstance(value, Mapping):
         for key, inner in value.items():
-            yield from _leaves(inner, f"{name}.{key}")
-    elif isinstance(value, type):
-        yield name, value.__name__
-    elif not isinstance(value, (Tensor, torch.nn.Module)):
-        yield name, repr(value) if not isinstance(value, str) else value
+            yield from leaves(inner, f"{name}.{key}" if name else key)
+    else:
+        yield name, value

@@ -5,6 +5,7 @@ It does if the capture needs it: if EXIF says that exposure varies, or if photog
 more than their places explain (`image/overlap.py`). What they say is where it starts.
 """
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -165,8 +166,7 @@ def exposure(exif: Exif) -> float:
     """A photograph's exposure in stops, up to a constant; NaN if it cannot be told."""
     if "exposure_time" not in exif or "iso" not in exif:
         return float("nan")
-    light = exif["exposure_time"] * exif["iso"] / exif.get("f_number", 1.0) ** 2
-    return float(torch.tensor(light, dtype=torch.float64).log2())
+    return math.log2(exif["exposure_time"]) + math.log2(exif["iso"]) - 2 * math.log2(exif.get("f_number", 1.0))
 
 
 def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequence[Mapping[str, Any]]) -> Pairs:

@@ -34,6 +34,9 @@ from nrfgs_ns.training.photographs import check_same_photographs, photograph_mod
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.panel import ViewerPanel
 
+SMALLEST_SIDE = 2
+"""Pixels that an image has along each side at the lowest resolution: SSIM takes a side of one for none."""
+
 
 @dataclass
 class ShardingConfig:
@@ -92,10 +95,22 @@ class NrfgsPipeline(VanillaPipeline):
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             with tried_meanwhile(_kernel_trials(self.model), self.model.device):
                 self.datamanager.load_all_images()
+                self._check_smallest_image()
                 photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
             self.model.fit_on(self.datamanager.train_dataset.cameras)
+
+    def _check_smallest_image(self) -> None:
+        """Raise InputError where the training would begin with images that are too small for SSIM."""
+        cameras, factor = self.datamanager.train_dataset.cameras, 2 ** max(self.config.model.num_downscales, 0)
+        width, height = (int(side.min()) // factor for side in (cameras.width, cameras.height))
+        if min(width, height) < SMALLEST_SIDE:
+            raise InputError(
+                f"{self.datamanager.get_datapath()}: training would begin with images of {width} x {height} pixels. "
+                "Give a smaller --pipeline.model.num-downscales, or a larger "
+                "--pipeline.datamanager.camera-res-scale-factor."
+            )
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint, or the compact file that the configuration names.

@@ -132,7 +132,7 @@ class NrfgsTrainer(Trainer):
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self.config.pace()
         groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
-        return WatchedOptimizers(self.optimizer_configs(), groups, self.guard, every, self.pace)
+        return WatchedOptimizers(self.guard, self.optimizer_configs(), groups, every, self.pace)
 
     # Going on from a checkpoint.
 
@@ -317,7 +317,7 @@ class NrfgsTrainer(Trainer):
         if is_of_earlier_steps:
             mean.forget()
         if left < window or mean.count > 0:
-            mean.add(self.pipeline.model, self.optimizers.optimizers)
+            mean.add(self.optimizers.optimizers)
 
     # The end.
 

@@ -10,6 +10,7 @@ from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -87,11 +88,35 @@ class NrfgsTrainerConfig(TrainerConfig):
         scale = self.pipeline.datamanager.camera_res_scale_factor
         if not 0 < scale < math.inf:
             raise InputError(f"pipeline.datamanager.camera_res_scale_factor is {scale}; it must be positive.")
-        warmup = self.pipeline.model.warmup_steps
-        if warmup is not None and warmup < 0:
-            raise InputError(f"pipeline.model.warmup_steps is {warmup}; it must be zero or positive.")
+        workers = self.pipeline.datamanager.max_thread_workers
+        if workers is not None and workers < 0:
+            raise InputError(f"pipeline.datamanager.max_thread_workers is {workers}; it must be zero or positive.")
+        if self.logging.steps_per_log < 1:
+            raise InputError(f"logging.steps_per_log is {self.logging.steps_per_log}; it must be at least 1.")
+        self._check_learning_rates()
+        self.pipeline.model.check()
+        if self.load_step is not None and self.load_dir is None:
+            raise InputError(f"load_step is {self.load_step}, but there is no --load-dir. Give the folder, too.")
         if self.load_dir is not None:
             checkpoint_files.checkpoints_in(self.load_dir)
+
+    def _check_learning_rates(self) -> None:
+        """Raise InputError where a learning rate, or its schedule, is no number that a step can be made with."""
+        for name, group in self.optimizers.items():
+            numbers = {"optimizer.lr": group["optimizer"].lr}
+            schedule = group.get("scheduler")
+            lowest, needed = 0.0, "zero or positive"
+            if isinstance(schedule, ExponentialDecaySchedulerConfig):
+                lowest, needed = math.ulp(0.0), "positive, since it falls exponentially"
+                numbers["scheduler.lr_final"] = schedule.lr_final
+                if schedule.max_steps <= schedule.warmup_steps:
+                    raise InputError(
+                        f"optimizers.{name}.scheduler.max_steps is {schedule.max_steps}; it must be more than the "
+                        f"warmup_steps, {schedule.warmup_steps}."
+                    )
+            for option, value in numbers.items():
+                if value is not None and not lowest <= value < math.inf:
+                    raise InputError(f"optimizers.{name}.{option} is {value}; it must be {needed}.")
 
     def _check_thinning(self, devices: int) -> None:
         """Raise InputError where splats are to go that will not."""
@@ -152,14 +177,24 @@ class NrfgsTrainerConfig(TrainerConfig):
         CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
     def save_config(self) -> None:
-        """Save config.yml, with paths that lead to the same places from any folder."""
-        if TIME_STAMP.fullmatch(self.timestamp):
-            self._take_a_folder()
+        """Save config.yml, with paths that lead to the same places from any folder.
+
+        Raises:
+            InputError: nothing can be written there.
+        """
         data = self.pipeline.datamanager
         dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
         pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
-        whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
-        TrainerConfig.save_config(whole)
+        try:
+            if TIME_STAMP.fullmatch(self.timestamp):
+                self._take_a_folder()
+            whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
+            TrainerConfig.save_config(whole)
+        except OSError as error:
+            raise InputError(
+                f"--output-dir {self.output_dir}: {self.get_base_dir()} cannot be written ({error.strerror}). Name "
+                "another folder."
+            ) from error
 
     def _take_a_folder(self) -> None:
         """Make this training's folder; another one may have begun in the same second."""

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 from dataclasses import replace
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ import tyro
 from compact_fields import VERSION_1, field, matched, through_a_file
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
+from short_trainings import command_line, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
@@ -33,7 +33,7 @@ from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.loading import load_file, load_model
-from nrfgs_ns.training.run import evaluate, parse, train
+from nrfgs_ns.training.run import evaluate, parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -253,18 +253,12 @@ def exported(tiny_scene, tmp_path_factory):
     """config.yml of an 8-step training with a loud field, the compact file, and the report."""
     out = tmp_path_factory.mktemp("runs")
     options = {
-        "--data": tiny_scene,
-        "--output-dir": out,
-        "--max-num-iterations": 8,
-        "--vis": "tensorboard",
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
         "--pipeline.model.appearance.output-init": "default",
         "--pipeline.model.warmup-steps": 0,
         "--pipeline.model.appearance.latent-dim": 8,
         "--pipeline.model.camera-optimizer.mode": "SO3xR3",  # its poses are no part of the file
     }
-    config = Path(train(["nrfgs", *(str(w) for option in options.items() for w in option)]).config_path)
+    config = trained(command_line("nrfgs", tiny_scene, out, 8, options))
     words = ["compact", "--load-config", str(config), "--output", str(out / "small.nrf")]
     tyro.cli(Export, args=[*words, "--compact.views", "2", "--report", str(out / "report.json")]).main()
     return config, out / "small.nrf", out / "report.json"

@@ -74,6 +74,9 @@ def test_lists_of_splits(scene):
         (scene / f"{split}_list.txt").write_text("".join(f"{i:03d}.png\n" for i in numbers))
     assert [path.name for path in parse(scene).image_filenames] == ["001.png", "002.png", "005.png"]
     assert [path.name for path in parse(scene, "val").image_filenames] == ["000.png", "009.png"]
+    (scene / "train_list.txt").unlink()
+    with pytest.raises(InputError, match=r"there is test_list.txt, but no train_list.txt"):
+        parse(scene)
 
 
 def test_it_is_what_the_colmap_command_uses(scene):

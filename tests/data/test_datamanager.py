@@ -112,6 +112,14 @@ def test_truncated_image_is_named(capture, name):
         data.load_all_images()
 
 
+def test_a_file_that_another_parser_misses_is_named(tmp_path):
+    from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+
+    config = NrfgsDatamanagerConfig(dataparser=BlenderDataParserConfig(data=tmp_path))
+    with pytest.raises(InputError, match="transforms_train.json: no such file"):
+        config.setup(device="cpu")
+
+
 def test_image_of_another_size_is_named(capture):
     """Other parsers than ours do not compare sizes; here the file changes after parsing."""
     data = manager(capture)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from short_trainings import command_line
 from torch.nn import Parameter
 
 from nrfgs_ns.densification import build_densification
@@ -104,11 +105,8 @@ def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **mod
     options |= {"few-views": "off", **model}
     if densification == "splatfacto":
         options |= {"densify-grad-thresh": 1e-6, "reset-alpha-every": 6}
-    words = [word for name, value in options.items() for word in (f"--pipeline.model.{name}", str(value))]
-    words += ["--max-num-iterations", str(steps), "--output-dir", str(out), "--vis", "tensorboard"]
-    words += ["--steps-per-eval-image", "1000", "--steps-per-eval-all-images", "1000"]
-    words += ["--logging.local-writer.enable", "False", "--logging.profiler", "none"]
-    return ["nrfgs", "--data", str(scene), *words]
+    options = {f"--pipeline.model.{name}": value for name, value in options.items()}
+    return command_line("nrfgs", scene, out, steps, options)
 
 
 def trainer_of(scene: Path, out: Path, densification: str, **model):

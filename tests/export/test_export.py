@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import short_trainings
 import torch
 import tyro
 from plyfile import PlyData
+from short_trainings import command_line
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0, SplatAppearance, base_colors
@@ -30,7 +32,7 @@ from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model import harmonics_fit, harmonics_tune
 from nrfgs_ns.model.harmonics_fit import STRENGTHS, Moments, Observations, PlainSplats, fit_harmonics, observe
 from nrfgs_ns.model.harmonics_tune import fine_tune
-from nrfgs_ns.training.run import parse, train
+from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -62,16 +64,8 @@ def trained(tiny_scene, tmp_path_factory):
 
     def config_of(method: str) -> Path:
         if method not in done:
-            options = {
-                "--data": tiny_scene,
-                "--output-dir": tmp_path_factory.mktemp(method),
-                "--max-num-iterations": 8,
-                "--vis": "tensorboard",
-                "--logging.local-writer.enable": False,
-                "--logging.profiler": "none",
-                **METHODS[method],
-            }
-            done[method] = Path(train([method, *(str(w) for option in options.items() for w in option)]).config_path)
+            out = tmp_path_factory.mktemp(method)
+            done[method] = short_trainings.trained(command_line(method, tiny_scene, out, 8, METHODS[method]))
         return done[method]
 
     return config_of

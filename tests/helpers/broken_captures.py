@@ -70,7 +70,7 @@ META = {  # what is done to the data set -> what the message must say
         "009.png more than once Keep one",
     ),
     "no train images": (lambda c: c.meta.update(train_filenames=[], test_filenames=[LAST]), "train_filenames"),
-    "no train list": (lambda c: c.meta.update(test_filenames=[LAST]), "train_filenames"),
+    "no train list": (lambda c: c.meta.update(test_filenames=[LAST]), "test_filenames but no train_filenames Name"),
     "split of strangers": (
         lambda c: c.meta.update(train_filenames=[LAST], test_filenames=["images/x.png"]),
         "test_filenames x.png no frame",
@@ -79,6 +79,14 @@ META = {  # what is done to the data set -> what the message must say
     "split names twice": (
         lambda c: c.meta.update(train_filenames=[LAST, LAST]),
         "train_filenames 000.png more than once",
+    ),
+    "exif without sense": (
+        lambda c: c.meta["frames"][3].update(exif={"iso": float("inf")}),
+        "transforms.json exif 006.png numbers above 0 remove",
+    ),
+    "exif of another kind": (
+        lambda c: c.meta["frames"][3].update(exif={"model": ["a"]}),
+        "transforms.json exif 006.png text remove",
     ),
     "one mask lacking": (
         with_masks(lambda c: c.meta["frames"][4].pop("mask_path")),

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 import tyro
+from short_trainings import command_line, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.field import Field
@@ -127,16 +128,7 @@ def test_views_score_as_the_pipeline_does(loud, field):
 
 
 def test_the_command(tiny_scene, tmp_path, capsys):
-    options = {
-        "--data": tiny_scene,
-        "--output-dir": tmp_path,
-        "--max-num-iterations": 4,
-        "--vis": "tensorboard",
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
-        **LOUD,
-    }
-    config = Path(train(["nrfgs", *(str(w) for option in options.items() for w in option)]).config_path)
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path, 4, LOUD))
     tyro.cli(Inspect, args=["--load-config", str(config), "--views", "2"]).main()
     result = json.loads((config.parent / "inspect" / "inspect.json").read_text())
     assert (config.parent / "inspect" / "inspect.png").stat().st_size > 10_000

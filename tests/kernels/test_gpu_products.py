@@ -10,13 +10,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from short_trainings import command_line, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.export.command import Export, PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.rasterizer import composite
-from nrfgs_ns.training.run import evaluate, parse, train
+from nrfgs_ns.training.run import evaluate, parse
 from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture
 
 NO_GPU = "needs a CUDA device and gsplat's kernels"
@@ -92,20 +93,13 @@ def per_splat_centers(device: str, scene: Path, out: Path) -> None:
 
 def exported_files(device: str, scene: Path, out: Path) -> dict[str, dict]:
     """Train, write both files, read them back; the reports of `nrfgs export`."""
-    args = ["nrfgs", "--data", scene, "--output-dir", out, "--max-num-iterations", STEPS, "--vis", "tensorboard"]
-    args += ["--machine.device-type", device, "--logging.profiler", "none", "--logging.local-writer.enable", False]
-    args += [
-        "--pipeline.model.few-views",
-        "off",
-        "--pipeline.model.num-downscales",
-        0,
-        "--steps-per-eval-image",
-        10**5,
-        "--steps-per-eval-all-images",
-        10**5,
-    ]
-    args += ["--optimizers.field.optimizer.lr", 0.05]  # a residual that matters after a few steps
-    config = Path(train(list(map(str, args))).config_path)
+    options = {
+        "--machine.device-type": device,
+        "--pipeline.model.few-views": "off",
+        "--pipeline.model.num-downscales": 0,
+        "--optimizers.field.optimizer.lr": 0.05,  # a residual that matters after a few steps
+    }
+    config = trained(command_line("nrfgs", scene, out, STEPS, options))
     scores = evaluate(config, out / "eval.json")
     reports = {}
     kept = CompactOptions(threshold=0.0)  # so short a training could do without any view-dependent splat

@@ -91,6 +91,12 @@ def test_mcmc_has_residuals_on_the_logit(tiny_scene, tmp_path, no_cuda, capsys):
     assert NrfConfig(opacity_residual=False).for_copies() == NrfConfig(opacity_residual=False)
 
 
+def test_more_points_than_mcmc_may_have_are_told(tiny_scene, tmp_path, no_cuda, capsys):
+    mcmc = {"--pipeline.model.densification": "mcmc", "--pipeline.model.splat-budget": 299}
+    ready(tiny_scene, tmp_path, 1, mcmc)
+    assert "splat_budget is 299, but the training begins with 300 points" in capsys.readouterr().out
+
+
 def test_a_checkpoint_keeps_its_head_whatever_the_number_of_views(tiny_scene, tmp_path, no_cuda):
     for kept, asked in (("auto", "off"), ("off", "auto")):
         config = trained(

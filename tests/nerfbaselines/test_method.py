@@ -25,7 +25,7 @@ import nrfgs_ns.nerfbaselines as package
 from nrfgs_lab.pages.options import methods
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.nerfbaselines.method import Nrfgs, NrfgsFast, configure, options_of
+from nrfgs_ns.nerfbaselines.method import Nrfgs, NrfgsFast, configure, hparams_of
 from nrfgs_ns.nerfbaselines.photos import World, background_of
 
 needs_nerfbaselines = pytest.mark.skipif(
@@ -217,7 +217,7 @@ def test_options_are_typed_as_on_the_command_line():
     )
     assert config.pipeline.model.appearance.latent_dim == 16 and not config.pipeline.model.appearance.use_distance
     assert config.pipeline.model.background_color == "white"  # an override outranks the data set
-    options = options_of(config)
+    options = hparams_of(config)
     assert options["pipeline.model.appearance.latent_dim"] == 16 and options["method_name"] == "nrfgs"
 
 

@@ -392,7 +392,16 @@ def test_focal_lengths_follow_photographs_that_were_made_smaller(tmp_path, told_
 
 
 def test_names_stay_different_and_short():
-    given = ["a b.jpg", "a_b.jpg", "a_b.jpeg", "ä" * 100 + ".jpg", "ö" * 100 + ".jpg", "x" * 250 + ".jpg", "\udcff.jpg"]
+    given = [
+        "00002_a_b.jpg",
+        "a b.jpg",
+        "a_b.jpg",
+        "a_b.jpeg",
+        "ä" * 100 + ".jpg",
+        "ö" * 100 + ".jpg",
+        "x" * 250 + ".jpg",
+        "\udcff.jpg",
+    ]
     names = photos.stored_names([Path(name) for name in given])
     assert len(set(names)) == len(given)
     assert all(name.isascii() and len(name) < 150 and "?" not in name for name in names)
@@ -418,6 +427,26 @@ def test_what_is_no_photograph_is_named(tmp_path, make, said):
     make(tmp_path / "in" / "1.png")
     with pytest.raises(InputError, match=f"1.png.*{said}"):
         Run(Prepare(tmp_path / "in", tmp_path / "out"), Console(quiet=True)).import_input()
+
+
+def test_photographs_of_several_sizes_have_no_single_camera(tmp_path):
+    for i in range(3):
+        photo(tmp_path / "in" / f"{i}.jpg", (40, 30 + i))
+    run = Run(Prepare(tmp_path / "in", tmp_path / "out", camera="single"), Console(quiet=True))
+    run.import_input()
+    with pytest.raises(InputError, match="--camera is single, but .*in has photographs of 3 sizes"):
+        run.find_features()
+
+
+def test_what_is_left_out_is_counted(tmp_path):
+    for i in range(3):
+        photo(tmp_path / "in" / f"{i}.jpg")
+    for name in ("a.HEIC", "b.heic", "notes", "._a.jpg"):
+        (tmp_path / "in" / name).touch()
+    photo(tmp_path / "in" / "more" / "c.jpg")
+    screen = Console(record=True, width=200, file=io.StringIO())
+    Run(Prepare(tmp_path / "in", tmp_path / "out"), screen).import_input()
+    assert "Left out, since they are not read here: .heic (2), folders (1), no suffix (1)." in screen.export_text()
 
 
 def test_damaged_exif_is_no_reason_to_refuse_a_photograph(tmp_path):

@@ -57,19 +57,19 @@ def trainer(ready) -> NrfgsTrainer:
 
 
 def little_training(*values: float):
-    """Something like a model and its optimisers, whose one parameter has two numbers."""
+    """A parameter of two numbers, and its optimiser."""
     parameter = torch.nn.Parameter(torch.tensor(values))
-    return parameter, SimpleNamespace(densification=SimpleNamespace(state={})), {"means": torch.optim.Adam([parameter])}
+    return parameter, {"means": torch.optim.Adam([parameter])}
 
 
 def test_mean_of_known_numbers():
-    parameter, model, optimizers = little_training(0.0, 0.0)
+    parameter, optimizers = little_training(0.0, 0.0)
     mean = ParameterMean()
     mean.install()
     assert parameter.tolist() == [0.0, 0.0]  # there is none yet
     for numbers in ([1.0, 3e38], [2.0, 3e38], [6.0, 3e38]):  # whose sum float32 does not hold
         parameter.data.copy_(torch.tensor(numbers))
-        mean.add(model, optimizers)
+        mean.add(optimizers)
     assert mean.count == 3 and parameter.tolist() == [6.0, torch.tensor(3e38).item()]
     mean.install()
     # Three roundings of numbers up to 6, and of numbers up to 3e38.
@@ -115,9 +115,9 @@ def test_what_gives_rows_another_meaning_begins_anew(change, anew, trainer):
     """The real changes on a real model."""
     model, mean = trainer.pipeline.model, ParameterMean()
     for _ in range(2):
-        mean.add(model, trainer.optimizers.optimizers)
+        mean.add(trainer.optimizers.optimizers)
     change(model, trainer.pipeline.datamanager, trainer.optimizers)
-    mean.add(model, trainer.optimizers.optimizers)
+    mean.add(trainer.optimizers.optimizers)
     assert (mean.count, mean.began_anew) == ((1, True) if anew else (3, False))
     if anew:  # nothing of the earlier rows is left in it
         now = {name: value.detach().clone() for name, value in model.gauss_params.items()}

@@ -19,7 +19,17 @@ from torch.testing import assert_close
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs, nrfgs_sh
 from nrfgs_ns.training import checkpoint_files
-from nrfgs_ns.training.checkpoint_files import Damaged, DiskFull, check_seal, find, read, read_latest, seal, write
+from nrfgs_ns.training.checkpoint_files import (
+    Damaged,
+    DiskFull,
+    check_seal,
+    find,
+    read,
+    read_latest,
+    read_or_refuse,
+    seal,
+    write,
+)
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 
 
@@ -145,6 +155,11 @@ def test_a_step_that_is_not_there_is_refused(tmp_path):
     write(tmp_path, 1, content(1))
     with pytest.raises(InputError, match="no checkpoint of step 5, only of 1"):
         read_latest(tmp_path, step=5)
+
+
+def test_a_folder_in_place_of_a_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="is a folder. Give --load-dir a folder"):
+        read_or_refuse(tmp_path)
 
 
 def test_what_a_killed_process_left_is_removed_later_and_a_living_ones_is_not(tmp_path):

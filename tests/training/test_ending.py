@@ -226,13 +226,40 @@ def test_a_folder_without_checkpoints_is_refused_before_the_data_is_read(tmp_pat
     [
         ("--max-num-iterations", -1),
         ("--pipeline.model.warmup-steps", -1),
+        ("--pipeline.model.view-noise", "inf"),
+        ("--pipeline.model.cull-alpha-thresh", 0.5),
+        ("--pipeline.model.num-random", 0),
+        ("--pipeline.model.refine-every", 0),
+        ("--pipeline.model.reset-alpha-every", 0),
+        ("--pipeline.model.resolution-schedule", 0),
         ("--pipeline.datamanager.camera-res-scale-factor", 0),
+        ("--pipeline.datamanager.max-thread-workers", -1),
+        ("--logging.steps-per-log", 0),
+        ("--load-step", 5),
+        ("--optimizers.quats.optimizer.lr", -1.0),
+        ("--optimizers.quats.optimizer.lr", "nan"),
+        ("--optimizers.means.optimizer.lr", 0.0),
+        ("--optimizers.means.scheduler.lr-final", 0.0),
+        ("--optimizers.means.scheduler.max-steps", 0),
     ],
 )
 def test_options_without_sense_are_refused(option, bad, tiny_scene, tmp_path):
     config = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS, {option: bad}))
     with pytest.raises(InputError, match=f"{option[2:].replace('-', '_')} is {bad}"):
         config.setup(local_rank=0, world_size=1)
+
+
+@pytest.mark.parametrize(
+    "more", [{"--pipeline.model.num-downscales": 5}, {"--pipeline.datamanager.camera-res-scale-factor": 0.04}]
+)
+def test_images_too_small_to_begin_with_are_refused(more, tiny_scene, tmp_path):
+    with pytest.raises(InputError, match="1 x 1 pixels.*--pipeline.model.num-downscales"):
+        ready(tiny_scene, tmp_path, more)
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tiny_scene, tmp_path):
+    with pytest.raises(InputError, match="--output-dir .*transforms.json.*Not a directory"):
+        ready(tiny_scene, tiny_scene / "transforms.json")
 
 
 def test_a_training_that_is_refused_leaves_nothing(tiny_scene, tmp_path):

@@ -23,6 +23,7 @@ def device(request):
 
 NAN, INF = math.nan, math.inf
 FULL_SIZE = {"--pipeline.model.num-downscales": 0}
+NOW = {"--pipeline.model.warmup-length": 1, "--pipeline.model.refine-every": 2}
 
 
 @pytest.fixture
@@ -300,6 +301,13 @@ def test_a_training_in_which_nothing_is_visible_stops(start):
     with pytest.raises(TrainingStopped, match=f"No splat has been visible in the last {PATIENCE} steps") as stopped:
         trainer.train()
     assert stopped.value.step == PATIENCE and list(checkpoints(trainer)) == [PATIENCE]
+
+
+def test_a_training_without_splats_stops_and_saves_nothing(start):
+    trainer = start({"--pipeline.model.cull-alpha-thresh": 0.49}, NOW, steps=20)
+    with pytest.raises(TrainingStopped, match="No splat is left in step 11: all were pruned") as stopped:
+        trainer.train()
+    assert stopped.value.origin == "nothing visible" and not checkpoints(trainer)
 
 
 def test_now_and_then_a_view_may_see_nothing():

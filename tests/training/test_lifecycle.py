@@ -176,7 +176,7 @@ def test_unknown_head_is_refused_before_training(tiny_scene, tmp_path):
 
 def test_impossible_setting_is_refused_before_training(tiny_scene, tmp_path):
     config = parse(options(tiny_scene, tmp_path, "nrfgs", {"--pipeline.model.appearance.num-bands": 0}))
-    with pytest.raises(ValueError, match="num_bands is 0"):
+    with pytest.raises(InputError, match="num_bands is 0"):
         config.setup(local_rank=0, world_size=1).setup()
 
 

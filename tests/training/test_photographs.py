@@ -78,6 +78,7 @@ def test_exposure_in_stops():
     assert exposure({"exposure_time": 0.01, "iso": 100, "f_number": 2.0}) - exposure(
         {"exposure_time": 0.01, "iso": 100, "f_number": 4.0}
     ) == pytest.approx(2.0)
+    assert exposure({"exposure_time": 1e300, "iso": 1e300, "f_number": 1e-300}) == pytest.approx(1200 * math.log2(10))
     assert math.isnan(exposure({"f_number": 2.0, "iso": 100})) and math.isnan(exposure({}))
 
 

@@ -24,6 +24,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
+from short_trainings import command_line
 from torch.testing import assert_close
 from viser.infra import _infra
 from viser.transforms import SO3
@@ -422,12 +423,6 @@ STEPS = 18
 def watched_training(scene, out, each_step, **more) -> dict:
     """Train for STEPS and call each_step(trainer) after each; parameters, optimisers and random state at the end."""
     options = {
-        "--max-num-iterations": STEPS,
-        "--vis": "tensorboard",
-        "--steps-per-eval-image": 1000,
-        "--steps-per-eval-all-images": 1000,
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
         "--pipeline.model.warmup-length": 2,
         "--pipeline.model.refine-every": 4,
         "--pipeline.model.reset-alpha-every": 100,
@@ -437,8 +432,7 @@ def watched_training(scene, out, each_step, **more) -> dict:
         "--pipeline.model.few-views": "off",
         **more,
     }
-    words = [str(word) for option in options.items() for word in option]
-    config = parse(["nrfgs", "--data", str(scene), "--output-dir", str(out), *words])
+    config = parse(command_line("nrfgs", scene, out, STEPS, options))
     _set_random_seed(config.machine.seed)
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()

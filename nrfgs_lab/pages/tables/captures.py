@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tables of docs/captures.md."""
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from statistics import fmean, median
 from typing import Any
 
-from nrfgs_lab.pages.tables import grid, records
+from nrfgs_lab.pages.tables import grid, records, signed
 from nrfgs_lab.pages.tables.readme import FIELD, HOST, SHRUNK, TRAINING_VIEWS, runs_of, view_gains
 
 BASE = "harmonics: shrinkage"
-FIELDS = "field", "field: trust"
-"""The default, of this version and of one whose field was the same."""
 TRIED = {
-    "**`nrfgs`**": FIELDS,
+    "**u = V / (V + 20)**": ("field", "field: trust"),
     "u = 1": ("field: u = 1", "field: whole"),
-    "`peak`": ("field: peak",),
 }
-"""Rows of the table of held-out views, by the names of their trials."""
+"""Rows of the table of held-out views, by the names of their trials: of this version, and of one that did the same."""
+INSTEAD = (
+    ("`original`", "10,000 steps: 3DGS", "10,000 steps: field"),
+    ("`peak`", "field: peak", "field"),
+    ("`mcmc`", "mcmc: logit", "field"),
+)
+"""Rows of the second table: label, trial, and the trial of the default that it is compared with."""
 BUDGET = "nrfgs, 150,000 splats", "harmonics, 150,000 splats"
 
 
@@ -32,40 +34,47 @@ def tried() -> str:
 
 
 def gains_over(harmonics: str, rows: Mapping[str, Iterable[str]]) -> str:
-    """A table of what trials gain over others on held-out views: median dB, mean SSIM x 1000.
+    """A table of what trials gain over others on held-out views that all have: median dB, mean SSIM x 1000.
 
     Args:
         harmonics: the others' name.
         rows: names of trials, by the row's label.
     """
-    runs = list(records("held-out").values())
-    base = {(one["scene"], view[0]): view for one in runs if one["name"] == harmonics for view in one["per_image"]}
-    gains: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
-    for one in runs:
-        for view in one["per_image"]:
-            if (truth := base.get((one["scene"], view[0]))) is not None:
-                gains[one["name"], one["scene"].split("/", 1)[1]].append((view[1] - truth[1], view[2] - truth[2]))
-    scenes = list(TRAINING_VIEWS)[1:]
-    body = []
-    for label, names in rows.items():
-        found = [[pair for name in names for pair in gains[name, scene]] for scene in scenes]
-        body.append([label, *map(_gain, found)])
-    return grid(["", *scenes], body)
+    base = _views(harmonics)
+    found = {label: dict(pair for name in names for pair in _views(name).items()) for label, names in rows.items()}
+    common = [view for view in base if all(view in views for views in found.values())]
+    places = {scene: [view for view in common if view[0] == scene] for scene in list(TRAINING_VIEWS)[1:]}
+    body = [[label, *(_gain(views, base, places[scene]) for scene in places)] for label, views in found.items()]
+    return grid(["views", *(f"{scene}, {len(views)}" for scene, views in places.items())], body)
 
 
-def over(trial: str, base: str) -> str:
-    """What a trial gains over another on held-out views, as the table has it, and the median of its share of splats."""
-    table = gains_over(base, {"": (trial,)}).splitlines()
-    scenes, cells = ([cell.strip() for cell in table[line].split("|")[2:-1]] for line in (0, 2))
-    runs = list(records("held-out").values())
-    splats = [{one["scene"]: one["splats"] for one in runs if one["name"] == name} for name in (trial, base)]
-    share = median(splats[0][scene] / splats[1][scene] for scene in splats[0].keys() & splats[1].keys())
-    told = ", ".join(f"`{scene}` {cell}" for scene, cell in zip(scenes, cells, strict=True))
-    return f"{told}, with {share:.1f} times the splats"
+def _views(trial: str) -> dict[tuple[str, str, str], tuple[float, float]]:
+    """PSNR and SSIM of a trial's held-out views: (capture, which were held out, image) -> both."""
+    return {
+        (one["scene"].partition("/")[2], one["scene"].partition("/")[0], view[0]): (view[1], view[2])
+        for one in records("held-out").values()
+        if one["name"] == trial
+        for view in one["per_image"]
+    }
 
 
-def _gain(views: list[tuple[float, float]]) -> str:
-    return f"{median(a for a, _ in views):+.2f}/{1000 * fmean(b for _, b in views):+.0f}" if views else ""
+def instead() -> str:
+    """What other ways for splats to come and go gain over the default's on held-out views, and their splats."""
+    runs, scenes, body = list(records("held-out").values()), list(TRAINING_VIEWS)[1:], []
+    for label, trial, default in INSTEAD:
+        ours, theirs = _views(trial), _views(default)
+        cells = [_gain(ours, theirs, [view for view in theirs if view in ours and view[0] == one]) for one in scenes]
+        splats = [{one["scene"]: one["splats"] for one in runs if one["name"] == name} for name in (trial, default)]
+        share = median(splats[0][scene] / splats[1][scene] for scene in splats[0].keys() & splats[1].keys())
+        body.append([label, *cells, f"{share:.1f}"])
+    return grid(["", *scenes, "splats"], body)
+
+
+def _gain(ours: Mapping, theirs: Mapping, views: list) -> str:
+    if not views:
+        return ""
+    psnr, ssim = ([ours[view][number] - theirs[view][number] for view in views] for number in (0, 1))
+    return f"{signed(median(psnr), 2)}/{signed(1000 * fmean(ssim), 0)}"
 
 
 def without(trial: str) -> str:
@@ -113,7 +122,7 @@ def test_views() -> str:
     for scene, views in TRAINING_VIEWS.items():
         field, shrunk, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, HOST))
         budget = [runs_of(scene, name) for name in BUDGET]
-        cells = _cell(field), _cell(host), _cell(shrunk), _ahead(field, shrunk), f"{_gap(field)} {_gap(shrunk)}"
-        body.append([f"{scene}, {views}", *cells, " ".join(map(_cell, budget)), _ahead(*budget)])
-    head = "`nrfgs`", "splatfacto", "harmonics", "gain", "gaps", "150k", "gain"
-    return grid(["views", *head], body)
+        cells = _cell(field), _cell(host), _cell(shrunk), _ahead(field, shrunk), f"{_gap(field)}, {_gap(shrunk)}"
+        body.append([f"{scene}, {views}", *cells, ", ".join(map(_cell, budget)), _ahead(*budget)])
+    head = "`nrfgs`", "splatfacto", "harmonics", "gain", "gaps", "150k: field, harmonics", "gain there"
+    return grid(["capture, training views", *head], body)
