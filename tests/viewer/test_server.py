@@ -121,6 +121,20 @@ def test_a_busy_port_is_named_with_the_one_instead(open_viewer):
     assert f"Port {busy} is busy; the viewer is at {port}." in viewer.viewer_info
 
 
+@pytest.mark.parametrize(
+    "options, says",
+    [
+        ({"websocket_port": 65536}, "port is 65536"),
+        ({"websocket_port": -1}, "port is -1"),
+        ({"websocket_host": "192.0.2.1"}, "cannot listen on '192.0.2.1'"),  # of no machine (RFC 5737)
+        ({"websocket_host": "." * 70}, "cannot listen on"),
+    ],
+)
+def test_where_nothing_can_listen_is_told(open_viewer, options, says):
+    with pytest.raises(InputError, match=says):
+        open_viewer(LocalViewerConfig(**options))
+
+
 def test_the_network_is_served_if_it_is_asked_for(to_all, interface):
     port = to_all.viser_server.get_port()
     status, body = answer(interface, port, "/")
