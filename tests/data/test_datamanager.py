@@ -116,8 +116,15 @@ def test_a_file_that_another_parser_misses_is_named(tmp_path):
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
     config = NrfgsDatamanagerConfig(dataparser=BlenderDataParserConfig(data=tmp_path))
-    with pytest.raises(InputError, match="transforms_train.json: no such file"):
+    with pytest.raises(InputError, match="cannot be read: FileNotFoundError.*No such file"):
         config.setup(device="cpu")
+
+
+def test_a_pose_that_another_parser_lets_pass_is_named(capture):
+    outputs = capture.parse()
+    outputs.cameras.camera_to_worlds[2, 0, 0] = torch.nan
+    with pytest.raises(InputError, match="The pose of .*002.png holds NaN"):
+        NrfgsInputDataset(outputs)
 
 
 def test_image_of_another_size_is_named(capture):
