@@ -274,6 +274,18 @@ def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, pri
     assert not torch.equal(anew.cached_train[3]["image"], in_memory.cached_train[3]["image"])
 
 
+@pytest.mark.parametrize("name, content", [("image.bin", None), ("mask.bin", b""), ("about.json", b"{")])
+def test_files_that_are_lost_or_cut_are_made_anew(capture, tmp_path, monkeypatch, name, content):
+    """As those who clean a cache leave them, or a system that stopped."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    capture.add_masks()
+    before = [data["image"].clone() for data in manager(capture, image_memory=0.0).cached_train]
+    for path in (tmp_path / "cache").rglob(name):
+        path.unlink() if content is None else path.write_bytes(content)
+    for one, other in zip(manager(capture, image_memory=0.0).cached_train, before, strict=True):
+        torch.testing.assert_close(one["image"], other)
+
+
 def test_training_does_not_write_into_the_files(capture, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     image = manager(capture, image_memory=0.0).cached_train[0]["image"]
