@@ -24,7 +24,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from nrfgs_lab.bench.executor import Queue, Submitted
 from nrfgs_lab.lock import only_one
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.files import write_whole
+from nrfgs_ns.files import check_writable, write_whole
 
 CHILD = (sys.executable, "-m", "nrfgs_lab.bench.run")
 """The command that does a job; the file that describes the job is appended."""
@@ -106,9 +106,11 @@ class Bench:
         Returns:
             The `Spec` of the report, and name -> difference of the records that it could not use.
         """
+        from nrfgs_lab.bench.choice import is_method
         from nrfgs_lab.bench.report import report  # matplotlib takes a second; `nrfgs --help` should not
         from nrfgs_lab.bench.spec import steps_of
 
+        check_writable(self.out / "table.md", "--out")
         parsers = None if self.report_only else self.parsers(asked)
         stale = self.stale(asked, parsers)
         if stale and not self.report_only:
@@ -124,6 +126,9 @@ class Bench:
         jobs = self.jobs_of(asked, parsers) if parsers else {}
         pending = {name: job for name, job in jobs.items() if not self.record(name).exists()}
         own = [f"{run.name} ({steps_of(asked, run)})" for run in asked.runs if steps_of(asked, run) != asked.steps]
+        for run in asked.runs if pending else ():
+            if not is_method(run.method):
+                raise InputError(f"{self.spec}: runs: {run.name}: {run.method!r} is no method of ns-train.")
         if pending and own and self.steps is not None:
             print(f"--steps does not change runs that have their own: {', '.join(own)}.")
         if pending:

@@ -139,6 +139,17 @@ class Job:
     """runs that share the GPU: times mean something only if it is 1"""
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML in which no key stands twice: the later one would silently replace the other."""
+
+    def construct_mapping(self, node, deep=False):
+        keys = [key.value for key, _ in node.value]
+        twice = next((key for key in keys if keys.count(key) > 1), None)
+        if twice is not None:
+            raise yaml.constructor.ConstructorError(problem=f"{twice!r} twice", problem_mark=node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 def load_spec(path: Path) -> dict[str, Any]:
     """The content of a YAML file: a mapping, as `make_spec` takes it.
 
@@ -146,7 +157,7 @@ def load_spec(path: Path) -> dict[str, Any]:
         InputError: the file cannot be read, or is no mapping.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        content = yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
     if not isinstance(content, dict):
@@ -177,7 +188,7 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
             "scenes": [_scene(value, where) for value in as_list(content["scenes"])],
             "strategies": [str(value) for value in as_list(content.get("strategies", [OWN]))],
             "seeds": as_list(content.get("seeds", [42])),
-            "options": _words(content.get("options", ()), f"{where}: options"),
+            "options": words_of(content.get("options", ()), f"{where}: options"),
         }
     )
     for key, least in (("steps", 1), ("jobs", 1), ("gpus", 1), ("train_views", 0), ("checkpoint_every", 1)):
@@ -253,7 +264,7 @@ def strategy_options(strategy: str) -> list[str]:
     if strategy == OWN:
         return []
     known = ("splatfacto", "original", "mcmc")
-    good = name in known and (not at or (name == "mcmc" and budget.isdigit()))
+    good = name in known and (not at or (name == "mcmc" and budget.isdecimal() and int(budget) > 0))
     _require(good, f"strategy {strategy!r} is unknown; use {', '.join(known)}, mcmc@BUDGET or own.")
     return [DENSIFICATION, name, *(["--pipeline.model.splat-budget", budget] if at else [])]
 
@@ -350,7 +361,7 @@ def _method(name: str, value: Any, where: str) -> Method:
         _whole(value["steps"], 1, f"{where}: steps")
     strategies = tuple(str(one) for one in as_list(value["strategies"])) if "strategies" in value else None
     _require(strategies != (), f"{where}: strategies is empty. Name at least one, or leave it out.")
-    options = _words(value.get("options", ()), f"{where}: options")
+    options = words_of(value.get("options", ()), f"{where}: options")
     return Method(str(name), value["method"], options, strategies, value.get("steps"))
 
 
@@ -368,7 +379,7 @@ def _scene(value: Any, where: str) -> Scene:
         f"{where}: scenes: {name!r} is no folder below --scenes. Give --scenes the folder that it lies in.",
     )
     _require(name != AVERAGE, f"{where}: scenes: {name!r} is what the table calls the average over scenes; rename it.")
-    return Scene(name, downscale, _words(value.get("options", ()), f"{where}: scenes: options"))
+    return Scene(name, downscale, words_of(value.get("options", ()), f"{where}: scenes: options"))
 
 
 def as_list(value: Any) -> list[Any]:
@@ -376,7 +387,7 @@ def as_list(value: Any) -> list[Any]:
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
-def _words(value: Any, where: str) -> tuple[str, ...]:
+def words_of(value: Any, where: str) -> tuple[str, ...]:
     """Options given as one string, as in a shell, or as a list of words."""
     _require(isinstance(value, (str, list, tuple)), f"{where} must be a string or a list of words.")
     try:

@@ -16,10 +16,10 @@ Every other key is one of `nrfgs bench`: scenes, seeds, steps, options, ... A se
 options, and its own behind them; one that names a method has its own options only.
 """
 
-import shlex
 from dataclasses import dataclass
 from typing import Any
 
+from nrfgs_lab.bench.spec import as_list, words_of
 from nrfgs_ns.errors import InputError
 
 DEFAULT = "default"
@@ -60,9 +60,8 @@ def bench_plan(
     """
     rest = {key: value for key, value in content.items() if key not in (DEFAULT, "knobs")}
     _require("runs" not in rest, f"{where}: runs are made from {DEFAULT} and knobs. Leave runs out.")
-    strategies = rest.get("strategies", [])
     _require(
-        isinstance(strategies, str) or len(strategies) <= 1,
+        len(as_list(rest.get("strategies", []))) <= 1,
         f"{where}: strategies names several; a trade compares with one. Make the others values of a knob.",
     )
     default = content.get(DEFAULT, "nrfgs")
@@ -82,7 +81,7 @@ def bench_plan(
             names.add(setting.name)
             is_chosen = not only or str(knob) in only or setting.name in only
             if is_chosen and (cuda or not description.get("cuda", False)):
-                runs[setting.name] = _run(default, changes)
+                runs[setting.name] = _run(default, changes, f"{where}: {setting.name}")
                 settings.append(setting)
     unknown = sorted(set(only) - names - set(map(str, knobs)))
     _require(
@@ -120,10 +119,10 @@ def _values(knob: str, description: Any, where: str) -> dict[str, dict[str, Any]
     return {str(value): {one: value} for value in values}
 
 
-def _run(default: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+def _run(default: dict[str, Any], changes: dict[str, Any], where: str) -> dict[str, Any]:
     """A run of `nrfgs bench`: the default with changes."""
     run = {"method": changes["method"]} if "method" in changes else dict(default)
-    options = [*_words(run.get("options", ())), *_words(changes.get("options", ()))]
+    options = [word for one in (run, changes) for word in words_of(one.get("options", ()), f"{where}: options")]
     if options:
         run["options"] = options
     if "strategy" in changes:
@@ -131,10 +130,6 @@ def _run(default: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     if "steps" in changes:
         run["steps"] = changes["steps"]
     return run
-
-
-def _words(options: Any) -> list[str]:
-    return shlex.split(options) if isinstance(options, str) else [str(word) for word in options]
 
 
 def _require(holds: bool, message: str) -> None:

@@ -171,12 +171,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return self._view(index), self._image(index)
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
-        """The next `count` cameras in turn, as `next_train` would give them one by one, and the image of one of them.
-
-        Args:
-            count: how many.
-            own: whose image is wanted, 0 <= own < count.
-        """
+        """The next `count` cameras in turn, one by one as `next_train` gives them, and the image of number `own`."""
         indices = [self._next_index() for _ in range(count)]
         return [self._view(index) for index in indices], self._image(indices[own])
 

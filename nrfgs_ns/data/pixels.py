@@ -39,11 +39,8 @@ PAGE = 4096
 def in_parallel(
     read: Callable[[Item], Result], items: Sequence[Item], what: str, workers: int | None
 ) -> Iterator[Result]:
-    """`map` on several threads, with a bar; where one fails, those that have not begun are left out.
-
-    Args:
-        what: is done, for the bar.
-        workers: threads; None: one for each processor.
+    """`map` on so many threads (None: one for each processor), with a bar that says `what` is done; where one fails,
+    those that have not begun are left out.
     """
     columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with (
@@ -61,8 +58,6 @@ def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
     """A photograph as a pinhole would have taken it; its camera in the data set becomes that pinhole.
 
     Args:
-        dataset: a NrfgsInputDataset.
-        index: of the photograph.
         image_type: "uint8" or "float32".
 
     Returns:

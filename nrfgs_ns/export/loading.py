@@ -84,8 +84,15 @@ def find_data(config: "TrainerConfig", path: Path) -> None:
 
 
 def load_model(path: Path, mode: Literal["test", "inference"]) -> "NrfgsPipeline":
-    """The pipeline of `load_training`."""
-    return load_training(path, mode).pipeline
+    """The pipeline of `load_training`.
+
+    Raises:
+        InputError: as `load_training`; or there is nothing to look at.
+    """
+    pipeline = load_training(path, mode).pipeline
+    if pipeline.model.num_points == 0:
+        raise InputError(f"{path}: this training has lost all splats. Train again with other options or data.")
+    return pipeline
 
 
 def load_file(path: Path) -> "NrfgsModel":
@@ -150,6 +157,6 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
         if None not in scores.values():  # nothing inside the mask
             per_image.append({"image": image, **scores})
     if not per_image:
-        raise InputError("The file is written, but no test image has pixels inside its mask. Use --no-measure.")
+        raise InputError("No test image has pixels inside its mask: there is nothing to measure on. Use --no-measure.")
     means = {key: sum(one[key] for one in per_image) / len(per_image) for key in scores}
     return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}

@@ -76,5 +76,5 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
             rows = (~torch.isfinite(value)).reshape(len(value), -1).any(dim=1).nonzero().flatten().tolist()
             raise InputError(
                 f"The checkpoint's '{name}' is not finite in {len(rows)} of {len(value)} rows, first row {rows[0]}. "
-                "Load an older checkpoint (--load-step)."
+                "Go on from an older one (ns-train --load-step); other commands take it where this one is removed."
             )

@@ -3,6 +3,7 @@
 
 import os
 
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 
@@ -24,3 +25,9 @@ def look_asked_for(photograph: PhotographModel) -> int | None:
             f"{LOOK} is {name!r}, which is none of the training photographs, such as {photograph.names[0]!r}."
         )
     return photograph.names.index(name)
+
+
+def warn_if_asked() -> None:
+    """Say so where a photograph's look is asked for and the model has learnt none."""
+    if name := os.environ.get(LOOK):
+        warn(f"{LOOK} is {name!r}, but this model has learnt no photograph's exposure: all renderings have one look.")

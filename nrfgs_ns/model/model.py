@@ -35,7 +35,7 @@ from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.model.initial_splats import initial_splats
-from nrfgs_ns.model.look import look_asked_for
+from nrfgs_ns.model.look import look_asked_for, warn_if_asked
 from nrfgs_ns.model.pinhole import Pinhole, Pinholes
 from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
 from nrfgs_ns.model.training_views import TrainingPictures
@@ -240,11 +240,7 @@ class NrfgsModel(SplatfactoModel):
     def picture(
         self, view: View, appearance: SplatAppearance, camera: Cameras, background: Tensor | None = None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite what a camera sees (`composite`), with the look of its photograph in training.
-
-        Returns:
-            what `get_outputs` does, and the rasterizer's `info`.
-        """
+        """What a camera sees, composited for `get_outputs`: in training with the look of its photograph."""
         background = self._get_background_color() if background is None else background
         outputs, info = self.composite(view, appearance, background, self._photograph_of(camera))
         if self.training:
@@ -570,6 +566,7 @@ class NrfgsModel(SplatfactoModel):
         known = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
         if not known:
             self.photograph = None
+            warn_if_asked()
         elif self.photograph is None:
             self.photograph = PhotographModel.from_state(known).to(self.device)
 

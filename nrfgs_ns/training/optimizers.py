@@ -212,12 +212,7 @@ def _try_kernel(device: torch.device) -> None:
 
 
 def in_world_units(group: dict[str, Any], scene_unit: float) -> dict[str, Any]:
-    """A parameter group's configuration for lengths, its learning rates from scene units to world units.
-
-    Args:
-        group: nerfstudio's "optimizer" and "scheduler".
-        scene_unit: world units in a scene unit.
-    """
+    """A parameter group's configuration for lengths, its learning rates from scene units to world units."""
     if scene_unit == 1.0:
         return group
     optimizer, scheduler = group["optimizer"], group["scheduler"]

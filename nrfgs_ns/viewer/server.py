@@ -97,6 +97,7 @@ def _guarded(open_viewer):
     def open_guarded(self, config, *args, **options) -> None:
         if type(config) is ViewerConfig and config.websocket_host == ALL_INTERFACES:
             config = replace(config, websocket_host=LOCAL)
+        _check_address(config.websocket_host, config.websocket_port)
         open_viewer(self, config, *args, **options)
         server, tunnel = self.viser_server, self.viser_server._share_tunnel
         if tunnel is not None and tunnel.get_url():
@@ -112,6 +113,20 @@ def _guarded(open_viewer):
             self.viewer_info.append(f"Whoever reaches {config.websocket_host} can look, and steer the training.")
 
     return open_guarded
+
+
+def _check_address(host: str, port: int | None) -> None:
+    """Raise InputError where nothing can listen: viser would take each port for a busy one, or stand still."""
+    if port is not None and not 0 < port < 2**16:
+        raise InputError(f"The viewer's port is {port}; give one from 1 to {2**16 - 1}.")
+    try:
+        family, kind, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as trial:
+            trial.bind(address)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"The viewer cannot listen on {host!r} ({error}). Give 127.0.0.1, 0.0.0.0 or an address of this machine."
+        ) from error
 
 
 def _refused(*_, **__) -> None:

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
-from nrfgs_ns.export.loading import load_training
+from nrfgs_ns.export.loading import load_model, load_training, measure_loss
 from nrfgs_ns.export.ply import on_screen, read_splats, render_splats, write_splats
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 from nrfgs_ns.training.checkpoint_files import find
@@ -65,6 +66,20 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_pat
         load_training(config, "test")
     with pytest.raises(InputError, match=r"its data set is not at .*/moved/data\. Put it there"):
         load_training(beside, "test")
+
+
+def test_a_model_without_splats_is_told(monkeypatch):
+    empty = SimpleNamespace(pipeline=SimpleNamespace(model=SimpleNamespace(num_points=0)))
+    monkeypatch.setattr("nrfgs_ns.export.loading.load_training", lambda path, mode: empty)
+    with pytest.raises(InputError, match="config.yml: this training has lost all splats"):
+        load_model(Path("config.yml"), "test")
+
+
+def test_views_of_which_nothing_counts_are_told():
+    """Also before a page is written, which is after the measurement."""
+    data = SimpleNamespace(eval_dataset=SimpleNamespace(image_filenames=[]), fixed_indices_eval_dataloader=[])
+    with pytest.raises(InputError, match="^No test image has pixels inside its mask.*--no-measure"):
+        measure_loss(SimpleNamespace(model=None, datamanager=data), lambda camera: {})
 
 
 def random_rotation(seed: int) -> torch.Tensor:

@@ -13,6 +13,7 @@ from PIL import ExifTags, Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, physical_cameras, verdict
@@ -160,11 +161,14 @@ def test_resumed_is_the_unbroken_one(exposed_scene, finished, tmp_path, capsys):
     assert_same_training(checkpoint_of(finished), checkpoint_of(rest), rtol=0, atol=0)
 
 
-def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path):
+def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path, monkeypatch, capsys):
     config = trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 2, QUICK))
     checkpoint = checkpoint_of(config)
     assert not any("photograph" in name for name in checkpoint["pipeline"])
     assert "photograph" not in checkpoint["optimizers"]
+    monkeypatch.setenv("NRFGS_LOOK", "view_001.png")
+    load_model(config, "test")
+    assert "learnt no photograph's exposure" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_checkpoint_of_the_other_choice_is_refused(tiny_scene, tmp_path):

@@ -14,7 +14,7 @@ import pytest
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.viewer.viewer import Viewer
-from short_trainings import command_line, trained
+from short_trainings import command_line, set_up, trained
 from websockets.asyncio.client import connect
 
 from nrfgs_ns.compact.format import MAGIC
@@ -119,6 +119,20 @@ def test_a_busy_port_is_named_with_the_one_instead(open_viewer):
     port = viewer.viser_server.get_port()
     assert port != busy and f"http://127.0.0.1:{port}" in viewer.viewer_info[0]
     assert f"Port {busy} is busy; the viewer is at {port}." in viewer.viewer_info
+
+
+@pytest.mark.parametrize(
+    "options, says",
+    [
+        ({"websocket_port": 65536}, "port is 65536"),
+        ({"websocket_port": -1}, "port is -1"),
+        ({"websocket_host": "192.0.2.1"}, "cannot listen on '192.0.2.1'"),  # of no machine (RFC 5737)
+        ({"websocket_host": "." * 70}, "cannot listen on"),
+    ],
+)
+def test_where_nothing_can_listen_is_told(open_viewer, options, says):
+    with pytest.raises(InputError, match=says):
+        open_viewer(LocalViewerConfig(**options))
 
 
 def test_the_network_is_served_if_it_is_asked_for(to_all, interface):
@@ -319,9 +333,7 @@ def test_ns_viewer_listens_to_this_machine_alone(tiny_scene, tmp_path, monkeypat
 
 def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):
     with pytest.raises(InputError, match="legacy viewer .* Use --vis viewer"):
-        config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "viewer_legacy"])
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
+        set_up(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "viewer_legacy"])
 
 
 def test_nrfgs_view_opens_a_compact_file_alone(tiny_scene, tmp_path, monkeypatch):

@@ -99,6 +99,16 @@ def test_everything_is_run_once_and_reported(fake, capsys):
     assert len(ran(fake)) == 4, "a finished run was repeated"
 
 
+def test_what_is_no_method_is_told_before_the_first_run(fake):
+    file = spec_file(fake, "runs: {SH: nrfgs-sh, NRF: nrfgs-shh}\nscenes: [scene]\nsteps: 100\n")
+    whole = bench_in(fake, spec=file, runs=(), data=(), seeds=())
+    with pytest.raises(InputError, match="runs: NRF: 'nrfgs-shh' is no method of ns-train"):
+        whole.main()
+    assert not ran(fake)
+    bench_in(fake, spec=file, runs=("SH",), data=(), seeds=()).main()
+    assert len(ran(fake)) == 1
+
+
 def test_failures_are_listed_and_tried_again(fake):
     behave(fake, **{"NRF-own-scene-1": "fails", "NRF-own-scene-2": "silent"})
     with pytest.raises(SystemExit, match="2 of the runs FAILED: NRF-own-scene-1, NRF-own-scene-2"):

@@ -80,6 +80,7 @@ def test_methods_of_others_run_as_they_are():
         ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
         ({"runs": {"NRF": {"method": "nrfgs", "speed": 1}}}, "speed"),
         ({"strategies": ["mcmc@many"]}, "mcmc@many"),
+        ({"strategies": ["mcmc@0"]}, "mcmc@0"),
         ({"strategies": ["original@5"]}, "original@5"),
         ({"steps": 0}, "steps"),
         ({"seeds": ["x"]}, "seeds"),
@@ -133,7 +134,7 @@ def test_a_budget_may_be_an_option_where_the_strategy_names_none():
     assert [cell.strategy for cell in cells_of(spec(runs={"NRF": run}, strategies=["mcmc@9"]))] == ["mcmc@9"]
 
 
-@pytest.mark.parametrize("text", ["runs: [", "just words", None])
+@pytest.mark.parametrize("text", ["runs: [", "just words", "runs: {A: nrfgs, A: nrfgs-sh}", None])
 def test_files_that_are_no_mapping_are_named(text, tmp_path):
     file = tmp_path / "bad.yaml"
     if text is not None:

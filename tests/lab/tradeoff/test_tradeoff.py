@@ -92,6 +92,8 @@ def test_gpu_knobs_and_chosen_knobs():
         ({"knobs": {"steps": {"steps": 5}}}, "must be a list"),
         ({"knobs": {"head": {"settings": {"x": {"option": "--a"}}}}}, "x may have method"),
         ({"knobs": {"a": {"settings": {"b c": {}}}, "a b": {"settings": {"c": {}}}}}, "there twice"),
+        ({"knobs": {"head": {"settings": {"x": {"options": None}}}}}, "head x: options must be a string or a list"),
+        ({"knobs": {"head": {"settings": {"x": {"options": "'"}}}}}, "options cannot be told apart"),
         ({"default": {"options": "--a"}}, "default names no method"),
         ({"runs": {"x": "nrfgs"}}, "Leave runs out"),
         ({"strategies": ["splatfacto", "original"]}, "strategies names several"),
