@@ -315,6 +315,13 @@ def test_what_ns_train_says_before_it_begins(words, tiny_scene, tmp_path, capsys
         assert "No CUDA device" in " ".join(said) and f"--data {tiny_scene}" in said[-1]
 
 
+@pytest.mark.parametrize("option, bad", [("--machine.seed", -1), ("--machine.num-devices", 0)])
+def test_machines_without_sense_are_refused(option, bad, tiny_scene, tmp_path):
+    config = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS, {option: bad}))
+    with pytest.raises(InputError, match=f"{option[2:].replace('-', '_')} is {bad}"):
+        config.print_to_terminal()
+
+
 def test_without_data_the_working_folder_is_looked_at(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     parse(["nrfgs"]).print_to_terminal()

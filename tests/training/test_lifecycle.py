@@ -14,6 +14,7 @@ from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+from torch.testing import assert_close
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.run import evaluate, parse
@@ -146,6 +147,23 @@ def test_optimisers_hold_the_loaded_parameters(finished, tiny_scene, tmp_path):
         (held,) = trainer.optimizers.optimizers[name].param_groups[0]["params"]
         assert held is parameter
         assert trainer.optimizers.optimizers[name].state[held]["exp_avg"].shape == parameter.shape
+
+
+def test_learning_rates_of_the_command_count_where_a_training_goes_on(finished, tiny_scene, tmp_path):
+    """Those with a schedule and those without one, at the schedule's present place."""
+    load = {"--load-dir": models_of(finished("nrfgs"))}
+    faster = {f"--optimizers.{name}.optimizer.lr": 10 * lr for name, lr in (("means", 1.6e-4), ("quats", 1e-3))}
+    faster |= {"--optimizers.means.scheduler.lr-final": 1.6e-5, "--optimizers.quats.optimizer.eps": 1e-9}
+    rates = []
+    for name, more in (("same", {}), ("faster", faster)):
+        trainer = set_up(options(tiny_scene, tmp_path / name, "nrfgs", load, more, steps=22))
+        groups = {name: trainer.optimizers.optimizers[name].param_groups[0] for name in ("means", "quats")}
+        before = [group["lr"] for group in groups.values()]
+        trainer.train()
+        rates.append(torch.tensor(before + [group["lr"] for group in groups.values()]))
+    assert_close(rates[1], 10 * rates[0])
+    assert rates[0][2] < rates[0][0], "the schedule of the means fell"
+    assert groups["quats"]["eps"] == 1e-9
 
 
 @pytest.mark.parametrize(
