@@ -143,13 +143,8 @@ def quiet_worker(*args: Any) -> None:
 
 
 def work(waiting, results, scenes: Path, end: float) -> None:
-    """Take trainings from a queue while there is time.
-
-    Args:
-        waiting: queue of trials.
-        results: queue that gets pairs of a trial and its record; or {"left": why} of what was not done.
-        scenes: folder of the captures.
-        end: time.time() after which nothing may run.
+    """Take trials from the queue `waiting` until `end` (of time.time()), and put pairs of a trial and its record into
+    `results`, or {"left": why} of what was not done.
     """
     import torch
 

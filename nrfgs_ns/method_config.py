@@ -46,14 +46,7 @@ def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str,
 
 
 def method(name: str, appearance: AppearanceHeadConfig, description: str, **optimizers: Any) -> MethodSpecification:
-    """Splatfacto with another appearance head.
-
-    Args:
-        name: the command, as in `ns-train NAME`.
-        appearance: the head.
-        description: one line for `ns-train --help`.
-        optimizers: the head's own parameter groups, beside the base colour.
-    """
+    """Splatfacto with another appearance head, and with that head's own parameter groups beside the base colour."""
     return MethodSpecification(
         config=NrfgsTrainerConfig(
             method_name=name,
@@ -87,15 +80,7 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
 
 
 def preset(name: str, of: MethodSpecification, description: str, model: dict[str, Any], **trainer: Any):
-    """A method with other options.
-
-    Args:
-        name: the command.
-        of: the method.
-        description: one line for `ns-train --help`.
-        model: options of the model.
-        trainer: options of the trainer.
-    """
+    """A method with other options of its model and of its trainer."""
     pipeline = replace(of.config.pipeline, model=replace(of.config.pipeline.model, **model))
     return MethodSpecification(
         config=replace(deepcopy(of.config), method_name=name, pipeline=deepcopy(pipeline), **trainer),

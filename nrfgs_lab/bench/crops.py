@@ -112,10 +112,8 @@ def crop_side(height: int, width: int) -> int:
 
 
 def largest_disagreement(truth: Images, renders: list[Images], side: int) -> tuple[float, int, int]:
-    """The square where the runs' errors differ most, or where the error of a single run is largest.
-
-    Returns:
-        mean over the square of the deviation of the errors over the runs, and the square's top and left.
+    """The square where the runs' errors differ most, or where the error of a single run is largest: mean over it of the
+    deviation of the errors over the runs, and its top and left.
     """
     errors = np.stack([np.abs(render - truth).mean(axis=-1) for render in renders])
     map_ = errors.std(axis=0) if len(errors) > 1 else errors[0]

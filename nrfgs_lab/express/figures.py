@@ -56,11 +56,7 @@ def to_bytes(colors: Tensor) -> np.ndarray:
 
 
 def draw(summary: dict[str, Any], out: Path) -> list[Path]:
-    """Draw what the summary and the panels in `out` allow.
-
-    Returns:
-        the pictures' paths.
-    """
+    """Draw what the summary and the panels in `out` allow; returns the pictures' paths."""
     import matplotlib
     from PIL import Image
 

@@ -59,14 +59,8 @@ def fit(
     seed: int,
     on_step: Callable[[], None] = lambda: None,
 ) -> Fitted:
-    """Minimise the mean square error at the training directions.
-
-    Args:
-        build: makes the model; called under torch's seed `seed`.
-        targets: what to fit.
-        config: how.
-        seed: of the start.
-        on_step: called after each step, for progress bars.
+    """Minimise the mean square error at the training directions. `build` makes the model, under torch's seed `seed`;
+    `on_step` is called after each step.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

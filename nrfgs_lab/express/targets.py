@@ -209,14 +209,9 @@ def measured_image(
 
 
 def materials_by_gloss(networks: BrdfNetworks, least: float, most: float) -> Tensor:
-    """Indices of the materials between two quantiles of how much their colour changes with the view.
+    """Indices, increasing, of the materials between two quantiles of how much their colour changes with the view.
 
-    Args:
-        networks: the materials.
-        least, most: quantiles in [0, 1]; everything for 0 and 1, a single material where they are equal.
-
-    Returns:
-        indices, increasing.
+    Quantiles are in [0, 1]: everything for 0 and 1, a single material where they are equal.
     """
     count = len(networks)
     flat = torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3)

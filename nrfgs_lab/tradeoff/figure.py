@@ -28,12 +28,8 @@ Box = tuple[float, float, float, float]
 def draw(rows: list[Row], settings: list[Setting], path: Path) -> None:
     """PSNR against each cost, a line of panels for each scene; the front as a staircase.
 
-    The settings on the front have their names, and of the others those for which there is room.
-
-    Args:
-        rows: of all scenes.
-        settings: in the order of the legend, which leaves out knobs without any point.
-        path: where the PNG goes.
+    The settings on the front have their names, and of the others those for which there is room. The legend has the
+    settings in their order, without knobs that have no point.
     """
     import matplotlib
 
@@ -82,11 +78,7 @@ def is_point(row: Row, cost: Cost) -> bool:
 
 
 def _points(panel, rows: list[Row], cost: Cost, knob: str, number: int):
-    """A knob's settings, with their deviation over seeds.
-
-    Returns:
-        what stands for them in the legend.
-    """
+    """A knob's settings, with their deviation over seeds; returns what stands for them in the legend."""
     return panel.errorbar(
         [row.mean(cost.column) for row in rows],
         [row.mean(PSNR) for row in rows],

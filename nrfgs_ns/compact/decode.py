@@ -210,14 +210,7 @@ def _coded_splats(header: dict[str, Any], streams: dict[str, np.ndarray], rank: 
 
 
 def model_state(model, path: Path) -> dict[str, Any]:
-    """What `load_state_dict` of a model takes, from a compact file.
-
-    Args:
-        model: an NrfgsModel with the file's head.
-
-    Raises:
-        InputError: as `decode`.
-    """
+    """What `load_state_dict` of a model with the file's head takes, from a compact file; InputError as `decode`."""
     decoded = decode(path)
     splats = dict(decoded.splats)
     diffuse = splats.pop(DIFFUSE)

@@ -54,12 +54,7 @@ def prepared(field: Field, weight: Tensor) -> Field:
 
 
 class CodedSplats(nn.Module):
-    """The tables of a field (`tables.py`), each with steps that are learnt.
-
-    Args:
-        splats: the field's table.
-        precision: the steps to begin with.
-    """
+    """The tables of a field (`tables.py`), each with steps that are learnt and begin with those of `precision`."""
 
     def __init__(self, splats: Mapping[str, Tensor], precision: Precision):
         super().__init__()

@@ -80,14 +80,11 @@ class Table(NamedTuple):
 
 
 def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> int:
-    """Write a file, whole or not at all: of version 2 if it holds a Table, else of version 1.
+    """Write a file, whole or not at all, of version 2 if it holds a Table, else of version 1; returns its size.
 
     Args:
         header: what JSON can hold; "streams" is added.
         streams: arrays of DTYPES, and tables.
-
-    Returns:
-        The bytes of the file.
     """
     entries, bodies = [], []
     version = 2 if any(isinstance(stream, Table) for stream in streams.values()) else 1

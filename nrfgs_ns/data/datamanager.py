@@ -50,6 +50,10 @@ class NrfgsInputDataset(InputDataset):
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
         super().__init__(dataparser_outputs, scale_factor)
+        lost = ~torch.isfinite(self.cameras.camera_to_worlds).flatten(1).all(dim=1)
+        if lost.any():  # nerfstudio's own parsers do not look
+            names = [str(path) for path, is_lost in zip(self.image_filenames, lost.tolist(), strict=True) if is_lost]
+            raise InputError(f"The pose of {some(names)} holds NaN or Inf. Recompute it, or remove the frame.")
         # A copy: the datamanager removes entries in place, and the original is shared by all datasets of the process.
         self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
         self.metadata["scene_unit"] = scene_unit(self.cameras.camera_to_worlds[:, :3, 3])
@@ -122,9 +126,10 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             raise InputError(f"--pipeline.datamanager.image-memory is {config.image_memory}. Give 0 or more gigabytes.")
         try:
             super().__init__(config, *args, **kwargs)
-        except FileNotFoundError as error:  # of nerfstudio's own parsers
+        except (FileNotFoundError, LookupError) as error:  # of nerfstudio's own parsers
             raise InputError(
-                f"{error.filename}: no such file. Check the path that --data names, and what kind of data set it is."
+                f"{config.data or config.dataparser.data} cannot be read: {error!r}. Check the path that --data names, "
+                "and what kind of data set it is."
             ) from error
 
     def load_all_images(self) -> tuple[int, int]:
@@ -166,12 +171,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return self._view(index), self._image(index)
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
-        """The next `count` cameras in turn, as `next_train` would give them one by one, and the image of one of them.
-
-        Args:
-            count: how many.
-            own: whose image is wanted, 0 <= own < count.
-        """
+        """The next `count` cameras in turn, one by one as `next_train` gives them, and the image of number `own`."""
         indices = [self._next_index() for _ in range(count)]
         return [self._view(index) for index in indices], self._image(indices[own])
 

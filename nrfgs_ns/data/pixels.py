@@ -39,11 +39,8 @@ PAGE = 4096
 def in_parallel(
     read: Callable[[Item], Result], items: Sequence[Item], what: str, workers: int | None
 ) -> Iterator[Result]:
-    """`map` on several threads, with a bar; where one fails, those that have not begun are left out.
-
-    Args:
-        what: is done, for the bar.
-        workers: threads; None: one for each processor.
+    """`map` on so many threads (None: one for each processor), with a bar that says `what` is done; where one fails,
+    those that have not begun are left out.
     """
     columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with (
@@ -61,8 +58,6 @@ def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
     """A photograph as a pinhole would have taken it; its camera in the data set becomes that pinhole.
 
     Args:
-        dataset: a NrfgsInputDataset.
-        index: of the photograph.
         image_type: "uint8" or "float32".
 
     Returns:
@@ -94,8 +89,8 @@ def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
         InputError: there is no room for them.
     """
     folder = _folder(dataset, index, image_type)
-    about = folder / "about.json"
-    if not about.is_file():
+    found = _about(folder)
+    if found is None:
         data = undistorted(dataset, index, image_type)
         if not data.keys() <= KEPT:
             raise InputError(f"{data.keys() - KEPT} of a photograph cannot be kept in a file. Give more image-memory.")
@@ -106,7 +101,7 @@ def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
                 f"{folder} cannot be written ({error.strerror}). Make room there, set XDG_CACHE_HOME to another "
                 "folder, or give more --pipeline.datamanager.image-memory."
             ) from error
-    found = json.loads(about.read_text(encoding="utf-8"))
+        found = _about(folder)
     _set_lens(dataset.cameras, index, found["lens"])
     return {"image_idx": index} | {name: _mapped(folder, name, found[name]) for name in MAPPED if name in found}
 
@@ -139,6 +134,22 @@ def _write(folder: Path, data: dict[str, Any], lens: list[float]) -> None:
                 values.view(torch.uint8).numpy().tofile(aside)
             about[name] = [str(values.dtype).removeprefix("torch."), *values.shape]
     write_whole(folder / "about.json", json.dumps(about))  # last: with it the photograph is there
+
+
+def _about(folder: Path) -> dict[str, Any] | None:
+    """What a folder's files hold; None where they are not there or not whole, as those who clean a cache leave them."""
+    try:
+        found = json.loads((folder / "about.json").read_text(encoding="utf-8"))
+        whole_ones = [
+            (folder / f"{name}.bin").stat().st_size == _bytes(*found[name]) for name in MAPPED if name in found
+        ]
+    except (OSError, ValueError):
+        return None
+    return found if all(whole_ones) else None
+
+
+def _bytes(kind: str, *shape: int) -> int:
+    return getattr(torch, kind).itemsize * torch.Size(shape).numel()
 
 
 def _mapped(folder: Path, name: str, form: list) -> torch.Tensor:

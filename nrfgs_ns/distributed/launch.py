@@ -160,12 +160,7 @@ def work(local_rank: int, config: TrainerConfig, url: str, timeout: timedelta) -
 def join_group(
     rank: int, world: int, url: str, device_type: str, timeout: timedelta = TIMEOUT, per_machine: int | None = None
 ) -> None:
-    """Meet the other processes: NCCL on GPUs, gloo on CPUs.
-
-    Args:
-        device_type: "cuda" or "cpu".
-        per_machine: processes on each machine; None: there is one machine.
-    """
+    """Meet the other processes, `per_machine` on each machine (None: there is one): NCCL on "cuda", gloo on "cpu"."""
     per_machine = per_machine or world
     if device_type == "cuda":
         torch.cuda.set_device(rank % per_machine)

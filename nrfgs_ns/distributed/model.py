@@ -91,14 +91,7 @@ class ShardedModel(NrfgsModel):
         return self.get_outputs_everywhere([camera] * comm.world())
 
     def get_outputs_everywhere(self, cameras: list[Cameras]) -> dict[str, Tensor]:
-        """Render this device's camera.
-
-        Args:
-            cameras: those of all devices, a batch of one each, in the order of the devices. [W]
-
-        Returns:
-            See `NrfgsModel.get_outputs`.
-        """
+        """Render this device's camera (`get_outputs`), given those of all W devices in their order."""
         pinholes = [self.pinhole(camera) for camera in cameras]
         self.sizes = [(one.width, one.height) for one in pinholes]
         field = self.field

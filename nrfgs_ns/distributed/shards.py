@@ -43,11 +43,7 @@ def rows_of(rank: int, total: int, devices: int, written: list[int] | None = Non
 
 
 def cut_model_state(state: Mapping[str, Any], rows: slice) -> dict[str, Any]:
-    """A model's state with the rows of one device.
-
-    Args:
-        state: of a whole model, as `NrfgsModel.state_dict` gives it.
-    """
+    """A whole model's state with the rows of one device."""
     total = len(state[f"{PREFIX}means"])
     cut = {name: value[rows] if name.startswith(PREFIX) else value for name, value in state.items()}
     extra = dict(cut["_extra_state"])
@@ -66,11 +62,8 @@ def cut_optimizer_state(state: Mapping[str, Any], rows: slice) -> dict[str, Any]
 
 
 def gather_model_state(state: MutableMapping[str, Any], counts: list[int], prefix: str) -> None:
-    """Replace each device's rows in a pipeline's state by those of all devices, on the main one; None elsewhere.
-
-    Args:
-        state: of the pipeline; changes.
-        prefix: of the model's entries in it.
+    """Replace each device's rows in a pipeline's state, where the model's entries begin with `prefix`, by those of all
+    devices, on the main one; None elsewhere.
     """
     for name in [name for name in state if name.startswith(prefix + PREFIX)]:
         state[name] = comm.gather_rows(state[name], counts)

@@ -187,13 +187,7 @@ def choose(pipeline, load_config: Path, options: CompactOptions) -> Chosen:
 
 
 def photographs_of(model, files: Sequence[Path], chosen: Sequence[int]) -> list[int | None]:
-    """Which photographs of a model the chosen ones of the training images are; None for those that it has not learnt.
-
-    Args:
-        model: an NrfgsModel.
-        files: of the training images, in their order.
-        chosen: rows of `files`.
-    """
+    """Which photographs of a model the chosen training images are; None for those that it has not learnt."""
     known = [] if model.photograph is None else model.photograph.names
     return [i if i < len(known) and known[i] == Path(files[i]).name else None for i in chosen]
 
@@ -207,14 +201,12 @@ def stream_bytes(path: Path) -> dict[str, int]:
 
 
 def write_config(load_config: Path, output: Path) -> Path:
-    """Write what nerfstudio's commands need to find a compact file: a config.yml, and a checkpoint that says nothing.
+    """Write what nerfstudio's commands need to find a compact file: a config.yml, whose path is returned, and a
+    checkpoint that says nothing.
 
     For FILE.nrf they are in FILE.nrf.nerfstudio/METHOD/compact: a folder named FILE may be somebody's data. Paths are
     as they were given, so relative ones count from the folder in which the commands are run, as in every config.yml of
     nerfstudio.
-
-    Returns:
-        the config.yml.
     """
     config = read_config(load_config)
     find_data(config, load_config)

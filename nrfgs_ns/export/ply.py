@@ -222,14 +222,7 @@ def render_splats(
 
 
 def on_screen(means: Tensor, camera) -> Tensor:
-    """Which splats' centres lie no farther from the picture's middle than SPARKS_EDGE.
-
-    Args:
-        means: [N, 3].
-
-    Returns:
-        bool [N].
-    """
+    """Which splats' centres [N, 3] lie no farther from the picture's middle than SPARKS_EDGE, bool [N]."""
     from nrfgs_ns.model.pinhole import pinhole
 
     pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])

@@ -47,11 +47,7 @@ class View:
 
 
 def view_file(path: Path, config):
-    """Nerfstudio's viewer for a compact file alone: no photographs, no training.
-
-    Returns:
-        the viewer.
-    """
+    """Nerfstudio's viewer for a compact file alone: no photographs, no training."""
     from nerfstudio.utils.rich_utils import CONSOLE
     from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 

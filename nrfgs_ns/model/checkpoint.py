@@ -50,11 +50,11 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
         InputError: naming the first tensor that is missing, unknown, of another shape or not finite, and the fix.
     """
     written_by = state.get("_extra_state", {}).get("head", "another method")
-    same = f"Both have the '{written_by}' head, but of another size or with other switches."
+    same = f"Both have the '{written_by}' head, but of another size or with other switches of the model."
     other = f"The checkpoint was written by the '{written_by}' head and this model has the '{model.head.name}' head."
     fix = (
         f"{same if written_by == model.head.name else other} Use the config.yml that was saved beside the checkpoint "
-        "(--load-config), or the same method and --pipeline.model.appearance options as in that training."
+        "(--load-config), or the same method and --pipeline.model options as in that training."
     )
     expected = {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
     given = {name: value for name, value in state.items() if isinstance(value, Tensor)}

@@ -240,11 +240,7 @@ def choose_strength(kept: Moments, held_out: Moments) -> float:
 
 
 def observe(model, camera: Cameras) -> Observations:
-    """What one training view tells of the splats that can be seen in it.
-
-    Args:
-        camera: a batch of one, [1].
-    """
+    """What one training view tells of the splats that can be seen in it."""
     field = model.field
     view, appearance, weights = look_through(model, field, camera)
     towards = field.splats["means"].index_select(0, view.visible) - view.center

@@ -240,11 +240,7 @@ class NrfgsModel(SplatfactoModel):
     def picture(
         self, view: View, appearance: SplatAppearance, camera: Cameras, background: Tensor | None = None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite what a camera sees (`composite`), with the look of its photograph in training.
-
-        Returns:
-            what `get_outputs` does, and the rasterizer's `info`.
-        """
+        """What a camera sees, composited for `get_outputs`: in training with the look of its photograph."""
         background = self._get_background_color() if background is None else background
         outputs, info = self.composite(view, appearance, background, self._photograph_of(camera))
         if self.training:

@@ -78,9 +78,6 @@ class FixedPinholes:
 
     A camera in host memory costs no wait. To read one on the GPU the host waits for all work there, so the last ones
     are remembered until something writes to them.
-
-    Args:
-        device: where the pinholes are to be.
     """
 
     REMEMBERED: ClassVar[int] = 64

@@ -190,11 +190,7 @@ class Nrfgs:
         raise NotImplementedError
 
     def save(self, path: str) -> None:
-        """Write a checkpoint.
-
-        Args:
-            path: the folder, which is made if it is not there.
-        """
+        """Write a checkpoint into a folder, which is made if it is not there."""
         folder = Path(path)
         models = folder / MODELS
         models.mkdir(parents=True, exist_ok=True)

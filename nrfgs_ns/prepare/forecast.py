@@ -27,12 +27,7 @@ def looked_at(sizes: Sizes, longest_side: int) -> float:
 
 
 def still_to_do(sizes: Sizes, features: list[int], pairs: Pairs) -> float:
-    """The cost of all that comes after the choice of pairs.
-
-    Args:
-        features: how many each has.
-        pairs: which will be matched.
-    """
+    """The cost of all that comes after the choice of pairs."""
     first, second = np.array(pairs, dtype=int).reshape(-1, 2).T
     counts = np.array(features, dtype=float)
     pixels = sum(width * height for width, height in sizes) / 1e6

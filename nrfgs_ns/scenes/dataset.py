@@ -45,12 +45,6 @@ def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None
 
     The data set is written beside `out` and moved there when it is complete: an interrupted run leaves no half of one.
 
-    Args:
-        out: folder to write; its parents are made.
-
-    Returns:
-        `out`.
-
     Raises:
         FileExistsError: when `out` holds anything else: another scene, a damaged copy of this one, other files.
     """

@@ -63,11 +63,8 @@ class Sight(NamedTuple):
 
 @torch.no_grad()
 def look_over(model, cameras: Cameras) -> Residuals:
-    """Look at every splat from all training views. One that is diffuse already changes by nothing.
-
-    Args:
-        model: an NrfgsModel in evaluation mode.
-        cameras: the training views, [V].
+    """Look at every splat of a model in evaluation mode from all training views. One that is diffuse already changes by
+    nothing.
     """
     count, device = model.num_points, model.device
     sums = torch.zeros(count, 5, dtype=torch.float64, device=device)  # w, w y, w a

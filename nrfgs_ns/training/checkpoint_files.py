@@ -62,9 +62,6 @@ def find(folder: Path) -> dict[int, Path]:
 def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = True) -> Path:
     """Write a checkpoint beside its folder, move it there when it is on the disk, then let go of older ones.
 
-    Args:
-        folder: of the checkpoints; made if it is not there.
-
     Raises:
         DiskFull: there was no room.
     """

@@ -17,11 +17,7 @@ quartile less one and a half times the distance between the quartiles (Explorato
 
 
 def print_evaluation(result: Mapping[str, Any]) -> None:
-    """Show the means over the test views, and name the views that are far below the rest.
-
-    Args:
-        result: as of `NrfgsPipeline.get_average_eval_image_metrics`, with "per_image".
-    """
+    """Show the means over the test views, and name the views that are far below the rest."""
     names = [name for name in SHOWN if result.get(name) is not None]
     table = Table(title=f"Means over {len(result['per_image'])} test views", title_justify="left")
     for name in names:
@@ -39,11 +35,7 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
 
 
 def far_below(images: Sequence[Mapping[str, Any]]) -> list[tuple[str, float, float]]:
-    """Views whose PSNR is far below that of the rest, the worst first.
-
-    Returns:
-        name, PSNR and the median of all, for each.
-    """
+    """Views whose PSNR is far below that of the rest, the worst first: name, PSNR and the median of all, for each."""
     known = sorted((image["psnr"], image["image"]) for image in images if image.get("psnr") is not None)
     if len(known) < ENOUGH:
         return []

@@ -61,11 +61,7 @@ def options_of(config: Any) -> dict[str, str]:
 
 
 def scene_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
-    """What tells a data set from others.
-
-    Args:
-        cameras: theirs, [V].
-    """
+    """What tells a data set from others."""
     return {"images": names, "centers": cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()}
 
 

@@ -17,6 +17,7 @@ from nerfstudio.utils import writer
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
 from nrfgs_ns.kernels.trial import Gate
 from nrfgs_ns.training.pace import Pace
@@ -101,9 +102,29 @@ class LeanOptimizers(Optimizers):
         self.fuse()
 
     def load_optimizers(self, loaded_state) -> None:
+        """Load the moments; the options, learning rates among them, stay this training's."""
+        own = {
+            name: [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
+            for name, optimizer in self.optimizers.items()
+        }
         super().load_optimizers(loaded_state)
+        for name, optimizer in self.optimizers.items():
+            for group, options in zip(optimizer.param_groups, own[name], strict=True):
+                group.update(options)
         self._warm.clear()
         self.fuse()
+
+    def load_schedulers(self, loaded_state) -> None:
+        """Load the places on the schedules; the schedules are this training's."""
+        for name, state in loaded_state.items():
+            scheduler = self.schedulers[name]
+            scheduler.load_state_dict({**state, "base_lrs": scheduler.base_lrs})
+            rates = scheduler.get_last_lr()
+            if isinstance(scheduler, LambdaLR):
+                pairs = zip(scheduler.base_lrs, scheduler.lr_lambdas, strict=True)
+                rates = [base * share(scheduler.last_epoch) for base, share in pairs]
+            for group, rate in zip(self.optimizers[name].param_groups, rates, strict=True):
+                group["lr"] = rate
 
 
 def fused_adam_step(optimizers: Iterable[Optimizer]) -> None:
@@ -191,12 +212,7 @@ def _try_kernel(device: torch.device) -> None:
 
 
 def in_world_units(group: dict[str, Any], scene_unit: float) -> dict[str, Any]:
-    """A parameter group's configuration for lengths, its learning rates from scene units to world units.
-
-    Args:
-        group: nerfstudio's "optimizer" and "scheduler".
-        scene_unit: world units in a scene unit.
-    """
+    """A parameter group's configuration for lengths, its learning rates from scene units to world units."""
     if scene_unit == 1.0:
         return group
     optimizer, scheduler = group["optimizer"], group["scheduler"]

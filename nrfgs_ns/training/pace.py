@@ -46,11 +46,7 @@ def steps_for(views: int) -> int:
 
 
 class Pace:
-    """A constant rate.
-
-    Args:
-        rate: positions for each step, positive.
-    """
+    """A constant rate: positions for each step, positive."""
 
     def __init__(self, length: int, rate: float = 1.0):
         self.length = length
@@ -69,13 +65,10 @@ class Pace:
         self.position = min(self.position + self.rate, float(self.length))
 
     def step_at(self, position: float, now: int) -> int:
-        """The step of this training at which a position is reached, as things look now.
+        """The first step of this training that will have reached a position, as things look now; 0 if it lies behind.
 
         Args:
             now: the step whose position is `self.position`.
-
-        Returns:
-            The first step with at least this position; 0 if it lies behind.
         """
         ahead = (position - self.position) / self.rate
         return now + math.ceil(ahead - ROUNDING) if ahead > -ROUNDING else 0

@@ -85,7 +85,6 @@ class ProgressLine(LocalWriter):
         """Look at one of this pipeline's test views, the middle one, if it has any.
 
         Args:
-            pipeline: a NrfgsPipeline in training.
             lock: is held while looking: the viewer asks the same model for pictures.
         """
         data = pipeline.datamanager
@@ -97,11 +96,7 @@ class ProgressLine(LocalWriter):
             self._pipeline, self._lock = pipeline, lock
 
     def write_stats_log(self, step: int) -> None:
-        """Bring the line up to date, if that is due.
-
-        Args:
-            step: the step that has been made.
-        """
+        """Bring the line up to date, if that is due."""
         if not self._is_over and perf_counter() >= self._due:
             self._tell(step)
 
@@ -165,11 +160,8 @@ class ProgressLine(LocalWriter):
 
 @torch.no_grad()
 def psnr_of(pipeline: Any, index: int) -> float | None:
-    """PSNR of a test view, dB, as an evaluation would have it; None if its mask leaves nothing.
-
-    Args:
-        pipeline: a NrfgsPipeline; it is in training again afterwards.
-        index: of the view.
+    """PSNR of a test view, dB, as an evaluation would have it; None if its mask leaves nothing. The pipeline is in
+    training again afterwards.
     """
     model, data = pipeline.model, pipeline.datamanager
     pipeline.eval()

@@ -43,12 +43,8 @@ def summary(components: dict[str, Component]) -> dict[str, float]:
 
 @torch.no_grad()
 def track(model: NrfgsModel, camera: Cameras, step: int, pictures: bool) -> None:
-    """Log what the head does to the splats that one camera sees.
-
-    Args:
-        model: in evaluation mode.
-        camera: a batch of one camera, [1].
-        pictures: whether to render the base colours and each component, too.
+    """Log what the head of a model in evaluation mode does to the splats that one camera sees; with pictures, its base
+    colours and each component, too.
     """
     field = model.field
     view = model.project(camera, field.splats)

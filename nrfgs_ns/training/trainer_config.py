@@ -162,11 +162,18 @@ class NrfgsTrainerConfig(TrainerConfig):
         configuration is in config.yml, and shown with NRFGS_DEBUG=1.
 
         Raises:
-            InputError: there are fewer devices than were asked for.
+            InputError: there are fewer devices than were asked for, or none were, or the seed is none.
         """
         if DEBUG:
             super().print_to_terminal()
         machine = self.machine
+        for name, value, low, high in (
+            ("seed", machine.seed, 0, 2**32 - 1),
+            ("num_devices", machine.num_devices, 1, 2**16),
+            ("num_machines", machine.num_machines, 1, 2**16),
+        ):
+            if not low <= value <= high:
+                raise InputError(f"machine.{name} is {value}; it must be from {low} to {high}.")
         if machine.num_devices * machine.num_machines > 1:
             resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
         datamanager = self.pipeline.datamanager

@@ -54,9 +54,6 @@ class ViewerPanel(ViewerControl):
 
     Nerfstudio finds it because it is an attribute of the model. A control rather than elements: nerfstudio would put
     elements at the foot of a tab, two folders deep.
-
-    Args:
-        model: the model that is shown.
     """
 
     def __init__(self, model: "NrfgsModel"):
@@ -157,14 +154,7 @@ class ViewerPanel(ViewerControl):
         return Shown(self.mode.value, float(self.gain.value), center, float(self.stops.value), photograph)
 
     def render(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render one camera as the controls say.
-
-        Args:
-            camera: a batch of one camera, [1].
-
-        Returns:
-            As `picture`.
-        """
+        """Render one camera, a batch of one, as the controls say (`picture`)."""
         if self.installed:
             with uninterrupted():
                 if self.count.value != (count := f"{self.model.num_points:,}"):

@@ -15,7 +15,7 @@ import tyro
 from compact_fields import VERSION_1, field, matched, through_a_file
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
-from short_trainings import command_line, trained
+from short_trainings import command_line, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
@@ -33,7 +33,7 @@ from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.loading import load_file, load_model
-from nrfgs_ns.training.run import evaluate, parse
+from nrfgs_ns.training.run import evaluate
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -299,7 +299,7 @@ def test_a_training_does_not_begin_with_a_compact_file(exported, tiny_scene, tmp
     """It would have been ignored, or taken with the optimisers of other splats."""
     line = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "tensorboard"]
     with pytest.raises(InputError, match="pipeline.compact"):
-        parse([*line, "--pipeline.compact", str(exported[1])]).setup(local_rank=0, world_size=1).setup()
+        set_up([*line, "--pipeline.compact", str(exported[1])])
 
 
 def test_a_broken_file_stops_ns_eval_with_a_sentence(exported, tmp_path):

@@ -116,8 +116,15 @@ def test_a_file_that_another_parser_misses_is_named(tmp_path):
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
     config = NrfgsDatamanagerConfig(dataparser=BlenderDataParserConfig(data=tmp_path))
-    with pytest.raises(InputError, match="transforms_train.json: no such file"):
+    with pytest.raises(InputError, match="cannot be read: FileNotFoundError.*No such file"):
         config.setup(device="cpu")
+
+
+def test_a_pose_that_another_parser_lets_pass_is_named(capture):
+    outputs = capture.parse()
+    outputs.cameras.camera_to_worlds[2, 0, 0] = torch.nan
+    with pytest.raises(InputError, match="The pose of .*002.png holds NaN"):
+        NrfgsInputDataset(outputs)
 
 
 def test_image_of_another_size_is_named(capture):
@@ -265,6 +272,18 @@ def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, pri
     anew.load_all_images()
     assert len(files_of(tmp_path / "cache")) == 10 * 3 + 3
     assert not torch.equal(anew.cached_train[3]["image"], in_memory.cached_train[3]["image"])
+
+
+@pytest.mark.parametrize("name, content", [("image.bin", None), ("mask.bin", b""), ("about.json", b"{")])
+def test_files_that_are_lost_or_cut_are_made_anew(capture, tmp_path, monkeypatch, name, content):
+    """As those who clean a cache leave them, or a system that stopped."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    capture.add_masks()
+    before = [data["image"].clone() for data in manager(capture, image_memory=0.0).cached_train]
+    for path in (tmp_path / "cache").rglob(name):
+        path.unlink() if content is None else path.write_bytes(content)
+    for one, other in zip(manager(capture, image_memory=0.0).cached_train, before, strict=True):
+        torch.testing.assert_close(one["image"], other)
 
 
 def test_training_does_not_write_into_the_files(capture, tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from hard_trainings import rescale
-from nerfstudio.scripts.train import _set_random_seed
+from short_trainings import set_up
 
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
@@ -15,7 +15,6 @@ from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.views import different_views, evenly_spaced, scene_unit
 from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.optimizers import in_world_units
-from nrfgs_ns.training.run import parse
 
 
 @pytest.mark.parametrize(
@@ -131,10 +130,7 @@ def first_step(folder, factor, out, *options):
     args = ["nrfgs", "--output-dir", str(out), "--vis", "tensorboard", "--pipeline.model.num-downscales", "0"]
     args += ["--pipeline.model.background-color", "black", "--pipeline.model.appearance.output-init", "default"]
     args += [*options, "nrfgs-data", "--data", str(folder), "--auto-scale-poses", "False"]
-    config = parse(args)
-    _set_random_seed(42)
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(args)
     model = trainer.pipeline.model
     model.step_cb(trainer.optimizers, 0)
     outputs, losses, _ = trainer.pipeline.get_train_loss_dict(0)

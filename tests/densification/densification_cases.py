@@ -6,12 +6,11 @@ from pathlib import Path
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
-from short_trainings import command_line
+from short_trainings import command_line, set_up
 from torch.nn import Parameter
 
 from nrfgs_ns.densification import build_densification
 from nrfgs_ns.model.config import NrfgsModelConfig
-from nrfgs_ns.training.run import parse
 
 STRATEGIES = ("splatfacto", "original", "mcmc")
 REFINES = 1000
@@ -110,9 +109,7 @@ def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **mod
 
 
 def trainer_of(scene: Path, out: Path, densification: str, **model):
-    trainer = parse(arguments(scene, out, densification, **model)).setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
+    return set_up(arguments(scene, out, densification, **model))
 
 
 def one_step(trainer, step: int) -> dict:

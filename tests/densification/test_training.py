@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 from densification_cases import arguments, tensors, trainer_of
-from short_trainings import checkpoint_of, models_of
+from short_trainings import checkpoint_of, models_of, set_up
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE, UNSEEN
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training.run import parse, train
+from nrfgs_ns.training.run import train
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -68,6 +68,5 @@ def test_resumed_training_is_the_unbroken_one(densification, seen, tiny_scene, t
 def test_another_strategies_checkpoint_is_refused(tiny_scene, tmp_path):
     config = Path(train(arguments(tiny_scene, tmp_path / "a", "original", steps=1)).config_path)
     more = ["--load-dir", str(config.parent / "nerfstudio_models")]
-    trainer = parse([*arguments(tiny_scene, tmp_path / "b", "mcmc"), *more]).setup(local_rank=0, world_size=1)
     with pytest.raises(InputError, match="densification original"):
-        trainer.setup()
+        set_up([*arguments(tiny_scene, tmp_path / "b", "mcmc"), *more])

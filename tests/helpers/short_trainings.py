@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from nerfstudio.scripts.train import _set_random_seed
 from torch.testing import assert_close
 
 from nrfgs_ns.training.checkpoint_files import read_latest
-from nrfgs_ns.training.run import train
+from nrfgs_ns.training.run import parse, train
+from nrfgs_ns.training.trainer import NrfgsTrainer
 
 QUIET = {
     "--vis": "tensorboard",
@@ -35,6 +37,16 @@ def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict
     for more in options:
         chosen |= more
     return [method, *(str(word) for option in chosen.items() if option[1] is not None for word in option)]
+
+
+def set_up(args: list[str]) -> NrfgsTrainer:
+    """A trainer before its first step, with its config.yml and the seed that ns-train sets."""
+    config = parse(args)
+    config.save_config()
+    _set_random_seed(config.machine.seed)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
 
 
 def trained(args: list[str]) -> Path:

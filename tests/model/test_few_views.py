@@ -6,23 +6,20 @@ import shutil
 
 import pytest
 import torch
-from short_trainings import checkpoint_of, command_line, models_of, trained
+from short_trainings import checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.model.checkpoint import differences, reduced_config
 from nrfgs_ns.model.config import NrfgsModelConfig
-from nrfgs_ns.training.run import parse
 
 QUICK = {"--pipeline.model.num-downscales": 0, "--pipeline.model.warmup-length": 2, "--pipeline.model.refine-every": 4}
 
 
 def ready(scene, out, steps, *options):
     """A trainer before its first step."""
-    trainer = parse(command_line("nrfgs", scene, out, steps, QUICK, *options)).setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
+    return set_up(command_line("nrfgs", scene, out, steps, QUICK, *options))
 
 
 def test_the_fewer_the_views_the_less_the_head_is_trusted(tiny_scene, tmp_path, no_cuda, capsys):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.data.views import distinct_places
@@ -100,10 +100,7 @@ def test_training_on_is_the_unbroken_training_to_the_bit(tiny_scene, tmp_path, n
 
 
 def test_evaluation_sees_no_noise(tiny_scene, tmp_path, no_cuda):
-    from nrfgs_ns.training.run import parse
-
-    trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, 1, NRFGS)).setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, 1, NRFGS))
     model = trainer.pipeline.model
     camera = trainer.pipeline.datamanager.eval_dataset.cameras[:1]
     with torch.no_grad():
@@ -126,8 +123,6 @@ def test_evaluation_sees_no_noise(tiny_scene, tmp_path, no_cuda):
 
 def test_a_negative_length_is_refused(tiny_scene, tmp_path, no_cuda):
     from nrfgs_ns.errors import InputError
-    from nrfgs_ns.training.run import parse
 
-    config = parse(command_line("nrfgs", tiny_scene, tmp_path, 1, {"--pipeline.model.view-noise": -1}))
     with pytest.raises(InputError, match="view_noise is -1"):
-        config.setup(local_rank=0, world_size=1).setup()
+        set_up(command_line("nrfgs", tiny_scene, tmp_path, 1, {"--pipeline.model.view-noise": -1}))

@@ -8,7 +8,7 @@ import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import relocation
@@ -32,17 +32,15 @@ RESET = {"--pipeline.model.refine-every": 2, "--pipeline.model.reset-alpha-every
 """Opacity is reset at steps 0 and 8. Splats neither come nor go: they wait for longer than that after a reset."""
 
 
-def set_up(scene, out, *more: dict, steps: int = 10) -> NrfgsTrainer:
+def calm(scene, out, *more: dict, steps: int = 10) -> NrfgsTrainer:
     """A trainer that has not begun."""
-    trainer = parse(command_line("nrfgs", scene, out, steps, CALM, *more)).setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
+    return set_up(command_line("nrfgs", scene, out, steps, CALM, *more))
 
 
 @pytest.fixture(scope="module")
 def ready(tiny_scene, tmp_path_factory) -> NrfgsTrainer:
     """A trainer before its first step, whose optimisers have made one."""
-    trainer = set_up(tiny_scene, tmp_path_factory.mktemp("ready"), {"--average-steps": 4})
+    trainer = calm(tiny_scene, tmp_path_factory.mktemp("ready"), {"--average-steps": 4})
     a_step(trainer.pipeline.model, trainer.pipeline.datamanager, trainer.optimizers)
     return trainer
 
@@ -285,9 +283,9 @@ def test_checkpoints_with_and_without_a_mean_load(averaged, tiny_scene, tmp_path
     _, pipeline, _, step = eval_setup(training.config, update_config_callback=from_the_window)
     assert step == 7
     assert_close(pipeline.model.means.detach(), training.after[7]["gauss_params.means"], rtol=0, atol=0)
-    loaded = set_up(tiny_scene, tmp_path, {"--load-dir": training.kept})
+    loaded = calm(tiny_scene, tmp_path, {"--load-dir": training.kept})
     assert loaded._start_step == 8 and loaded.mean is None
-    loaded = set_up(tiny_scene, tmp_path, {"--load-dir": models_of(training.config), "--average-steps": 6}, steps=13)
+    loaded = calm(tiny_scene, tmp_path, {"--load-dir": models_of(training.config), "--average-steps": 6}, steps=13)
     assert loaded._start_step == 12 and loaded.mean.count == 0
 
 

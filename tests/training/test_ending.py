@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.checkpoint_files import DiskFull, find
 from nrfgs_ns.training.guard import TrainingStopped
-from nrfgs_ns.training.run import _set_random_seed, parse
+from nrfgs_ns.training.run import parse
 from nrfgs_ns.training.trainer import NrfgsTrainer, writer
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -34,13 +34,8 @@ BUSY = {
 
 
 def ready(scene: Path, out: Path, *more: dict, steps: int = STEPS) -> NrfgsTrainer:
-    """A trainer before its first step, with the seed that ns-train sets."""
-    config = parse(command_line("nrfgs", scene, out, steps, BUSY, *more))
-    config.save_config()
-    _set_random_seed(config.machine.seed)
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
+    """A trainer before its first step."""
+    return set_up(command_line("nrfgs", scene, out, steps, BUSY, *more))
 
 
 def at_step(trainer: NrfgsTrainer, step: int, then) -> None:
@@ -318,6 +313,13 @@ def test_what_ns_train_says_before_it_begins(words, tiny_scene, tmp_path, capsys
     assert said[0] == f"nrfgs on {tiny_scene}" and len(said) <= 3
     if config.machine.device_type == "cpu":
         assert "No CUDA device" in " ".join(said) and f"--data {tiny_scene}" in said[-1]
+
+
+@pytest.mark.parametrize("option, bad", [("--machine.seed", -1), ("--machine.num-devices", 0)])
+def test_machines_without_sense_are_refused(option, bad, tiny_scene, tmp_path):
+    config = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS, {option: bad}))
+    with pytest.raises(InputError, match=f"{option[2:].replace('-', '_')} is {bad}"):
+        config.print_to_terminal()
 
 
 def test_without_data_the_working_folder_is_looked_at(tmp_path, monkeypatch, capsys):

@@ -6,11 +6,10 @@ import sys
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from short_trainings import command_line
+from short_trainings import command_line, set_up
 
 from nrfgs_ns.kernels.trial import Gate
 from nrfgs_ns.training.photographs import compare_photographs
-from nrfgs_ns.training.run import parse
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 
@@ -23,8 +22,7 @@ def tried(model) -> dict[str, set]:
 
 
 def test_no_kernel_is_left_to_the_first_steps(tiny_scene, tmp_path):
-    trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, 3)).setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, 3))
     before = tried(trainer.pipeline.model)
     assert {"The field", "SSIM"} <= before.keys()
     trainer.train()

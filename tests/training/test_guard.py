@@ -6,12 +6,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from short_trainings import command_line
+from short_trainings import command_line, set_up
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.checkpoint_files import seal, write
 from nrfgs_ns.training.guard import MAX_GRADIENT, PARAMETERS_EVERY, PATIENCE, Guard, TrainingStopped
-from nrfgs_ns.training.run import _set_random_seed, parse
 
 
 @pytest.fixture(autouse=True)
@@ -31,10 +30,7 @@ def start(tiny_scene, tmp_path):
     """A trainer that is ready for its first step; `fused` makes its CPU optimisers skip like those on a GPU."""
 
     def trainer(*more: dict, steps: int = 10, fused: bool = False):
-        config = parse(command_line("nrfgs", tiny_scene, tmp_path, steps, FULL_SIZE, *more))
-        _set_random_seed(config.machine.seed)
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
+        trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, steps, FULL_SIZE, *more))
         if fused:
             for optimizer in trainer.optimizers.optimizers.values():
                 for group in optimizer.param_groups:

@@ -13,7 +13,8 @@ from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+from torch.testing import assert_close
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.run import evaluate, parse
@@ -141,13 +142,28 @@ def test_resumed_training_is_the_unbroken_one(method, finished, tiny_scene, tmp_
 
 def test_optimisers_hold_the_loaded_parameters(finished, tiny_scene, tmp_path):
     """The host's way, replacing parameters on load, would leave the optimisers with orphans."""
-    config = parse(options(tiny_scene, tmp_path, "nrfgs", {"--load-dir": models_of(finished("nrfgs"))}, steps=21))
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(options(tiny_scene, tmp_path, "nrfgs", {"--load-dir": models_of(finished("nrfgs"))}, steps=21))
     for name, parameter in trainer.pipeline.model.gauss_params.items():
         (held,) = trainer.optimizers.optimizers[name].param_groups[0]["params"]
         assert held is parameter
         assert trainer.optimizers.optimizers[name].state[held]["exp_avg"].shape == parameter.shape
+
+
+def test_learning_rates_of_the_command_count_where_a_training_goes_on(finished, tiny_scene, tmp_path):
+    """Those with a schedule and those without one, at the schedule's present place."""
+    load = {"--load-dir": models_of(finished("nrfgs"))}
+    faster = {f"--optimizers.{name}.optimizer.lr": 10 * lr for name, lr in (("means", 1.6e-4), ("quats", 1e-3))}
+    faster |= {"--optimizers.means.scheduler.lr-final": 1.6e-5, "--optimizers.quats.optimizer.eps": 1e-9}
+    rates = []
+    for name, more in (("same", {}), ("faster", faster)):
+        trainer = set_up(options(tiny_scene, tmp_path / name, "nrfgs", load, more, steps=22))
+        groups = {name: trainer.optimizers.optimizers[name].param_groups[0] for name in ("means", "quats")}
+        before = [group["lr"] for group in groups.values()]
+        trainer.train()
+        rates.append(torch.tensor(before + [group["lr"] for group in groups.values()]))
+    assert_close(rates[1], 10 * rates[0])
+    assert rates[0][2] < rates[0][0], "the schedule of the means fell"
+    assert groups["quats"]["eps"] == 1e-9
 
 
 @pytest.mark.parametrize(
@@ -160,10 +176,9 @@ def test_optimisers_hold_the_loaded_parameters(finished, tiny_scene, tmp_path):
     ],
 )
 def test_checkpoint_of_another_head_is_refused(method, more, says, finished, tiny_scene, tmp_path):
-    config = parse(options(tiny_scene, tmp_path, method, {"--load-dir": models_of(finished("nrfgs"))}, more))
-    trainer = config.setup(local_rank=0, world_size=1)
+    args = options(tiny_scene, tmp_path, method, {"--load-dir": models_of(finished("nrfgs"))}, more)
     with pytest.raises(InputError, match=says) as error:
-        trainer.setup()
+        set_up(args)
     assert "--load-config" in str(error.value)
 
 
@@ -175,9 +190,8 @@ def test_unknown_head_is_refused_before_training(tiny_scene, tmp_path):
 
 
 def test_impossible_setting_is_refused_before_training(tiny_scene, tmp_path):
-    config = parse(options(tiny_scene, tmp_path, "nrfgs", {"--pipeline.model.appearance.num-bands": 0}))
     with pytest.raises(InputError, match="num_bands is 0"):
-        config.setup(local_rank=0, world_size=1).setup()
+        set_up(options(tiny_scene, tmp_path, "nrfgs", {"--pipeline.model.appearance.num-bands": 0}))
 
 
 def test_saved_config_is_the_run(finished):
@@ -190,7 +204,7 @@ def test_saved_config_is_the_run(finished):
 def test_a_training_writes_into_no_log_of_an_earlier_one(tiny_scene, tmp_path):
     earlier = []
     for name in ("first", "second"):
-        parse(options(tiny_scene, tmp_path / name, steps=1)).setup(local_rank=0, world_size=1).setup()
+        set_up(options(tiny_scene, tmp_path / name, steps=1))
         assert "lost" not in [event["name"] for event in writer.EVENT_STORAGE]
         writer.put_scalar(name="lost", scalar=1.0, step=0)
         assert writer.EVENT_WRITERS and not set(map(id, earlier)) & set(map(id, writer.EVENT_WRITERS))
@@ -199,8 +213,7 @@ def test_a_training_writes_into_no_log_of_an_earlier_one(tiny_scene, tmp_path):
 
 @pytest.mark.parametrize("ends", [True, False])
 def test_the_collector_is_held_off_while_training_and_no_longer(ends, tiny_scene, tmp_path, monkeypatch):
-    trainer = parse(options(tiny_scene, tmp_path, steps=1)).setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(options(tiny_scene, tmp_path, steps=1))
     calls = []
     for name in ("collect", "freeze", "unfreeze"):
         monkeypatch.setattr(gc, name, lambda name=name: calls.append(name))
@@ -220,9 +233,7 @@ def test_the_collector_is_held_off_while_training_and_no_longer(ends, tiny_scene
 
 def test_checkpoint_is_written_aside_and_moved(tiny_scene, tmp_path, monkeypatch):
     """A save that is cut short leaves the older checkpoint, and nothing that --load-dir would take for a newer one."""
-    config = parse(options(tiny_scene, tmp_path, steps=1))
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(options(tiny_scene, tmp_path, steps=1))
     trainer.train()
     folder = trainer.checkpoint_dir
     before = sorted(folder.iterdir())

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils.eval_utils import eval_setup
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs, nrfgs_best, nrfgs_fast, nrfgs_sh
@@ -283,8 +283,7 @@ def test_bad_options_are_named(option, bad, tiny_scene, tmp_path):
 
 
 def test_without_them_there_is_no_pace(tiny_scene, tmp_path):
-    trainer = parse(options(tiny_scene, tmp_path, "nrfgs", 5)).setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(options(tiny_scene, tmp_path, "nrfgs", 5))
     assert trainer.pace is None and trainer.optimizers.pace is None
     assert trainer.pipeline.model.schedule_step == 0
 
@@ -332,10 +331,7 @@ def test_the_chosen_steps_are_made_and_an_interrupted_training_goes_on_to_their_
     assert f"{VIEWS} training views: 12 steps (1 a view, at least 12 and at most 30); " in said
     assert f" beside the camera, {0.5 * (VIEWS + 20) / VIEWS:.2g} times the distance between neighbouring" in said
 
-    config = parse(command_line("nrfgs", tiny_scene, tmp_path / "half", 0, SMALL, {"--steps-per-save": 5}))
-    config.save_config()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path / "half", 0, SMALL, {"--steps-per-save": 5}))
     step_of = trainer.train_iteration
 
     def interrupted(step):

@@ -14,7 +14,7 @@ import pytest
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.viewer.viewer import Viewer
-from short_trainings import command_line, trained
+from short_trainings import command_line, set_up, trained
 from websockets.asyncio.client import connect
 
 from nrfgs_ns.compact.format import MAGIC
@@ -333,9 +333,7 @@ def test_ns_viewer_listens_to_this_machine_alone(tiny_scene, tmp_path, monkeypat
 
 def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):
     with pytest.raises(InputError, match="legacy viewer .* Use --vis viewer"):
-        config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "viewer_legacy"])
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
+        set_up(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "viewer_legacy"])
 
 
 def test_nrfgs_view_opens_a_compact_file_alone(tiny_scene, tmp_path, monkeypatch):

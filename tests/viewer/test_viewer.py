@@ -17,14 +17,13 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.configs.base_config import ViewerConfig
-from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
-from short_trainings import command_line
+from short_trainings import command_line, set_up
 from torch.testing import assert_close
 from viser.infra import _infra
 from viser.transforms import SO3
@@ -432,10 +431,7 @@ def watched_training(scene, out, each_step, **more) -> dict:
         "--pipeline.model.few-views": "off",
         **more,
     }
-    config = parse(command_line("nrfgs", scene, out, STEPS, options))
-    _set_random_seed(config.machine.seed)
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(command_line("nrfgs", scene, out, STEPS, options))
     trainer._update_viewer_state = lambda step: each_step(trainer)
     trainer.train()
     held = [p for o in trainer.optimizers.optimizers.values() for s in o.state.values() for p in s.values()]
