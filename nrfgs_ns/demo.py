@@ -18,6 +18,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import check_writable
 from nrfgs_ns.scenes import SceneConfig, build_scene, dome_cameras, render, split_names, write_scene
 
 METHODS = {"nrfgs": "NRF", "nrfgs-sh": "SH"}
@@ -49,9 +51,15 @@ class Demo:
             self._run(Console(file=sys.__stdout__))
 
     def _run(self, screen: Console) -> None:
-        scene, steps = self.scene(), min(self.steps, 150) if self.quick else self.steps
+        if self.steps < 1:  # ns-train nrfgs would take 0 for as many as it finds right
+            raise InputError(f"--steps is {self.steps}; it must be at least 1.")
+        try:
+            scene = self.scene()
+        except ValueError as error:
+            raise InputError(f"{error}. Change --gloss or --seed.") from error
+        check_writable(self.out / "results.json", "--out")
+        steps = min(self.steps, 150) if self.quick else self.steps
         results: dict[str, dict[str, Any]] = {}
-        self.out.mkdir(parents=True, exist_ok=True)
         columns = TextColumn("{task.description:<24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=screen) as progress:
             with _bar(progress, "make the scene", scene.views) as advance:

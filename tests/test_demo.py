@@ -11,6 +11,7 @@ from PIL import Image
 
 from nrfgs_ns.cli import entrypoint
 from nrfgs_ns.demo import CELL, METHODS, Demo, SeenView, brightest_window, where_it_shines
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.scenes import SceneConfig
 
 
@@ -30,6 +31,16 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
         assert 0.02 < result["shine"]["share"] < 0.9 and 5 < result["shine"]["psnr"] < 60
     sheet = Image.open(tmp_path / "demo" / "contact_sheet.png")
     assert sheet.width >= 5 * CELL and sheet.height >= 6 * 0.7 * CELL
+
+
+@pytest.mark.parametrize(
+    "options, says",
+    [({"steps": 0}, "--steps is 0"), ({"gloss": 1.5}, "gloss must lie in"), ({"seed": -1}, "seed must be")],
+)
+def test_what_cannot_be_is_told_in_a_sentence(options, says, tmp_path):
+    with pytest.raises(InputError, match=says):
+        Demo(out=tmp_path / "demo", **options).main()
+    assert not (tmp_path / "demo").exists()
 
 
 def test_where_it_shines_is_where_gloss_changes_the_truth():

@@ -107,10 +107,15 @@ def load_file(path: Path) -> "NrfgsModel":
     from nrfgs_ns.model.config import NrfgsModelConfig
 
     decoded = decode(path)
-    means, render = decoded.splats["means"], decoded.header.get("render", {})
-    mode, background = render.get("rasterize_mode"), render.get("background")
-    if mode not in ("classic", "antialiased") or not isinstance(background, list) or len(background) != 3:
-        raise InputError(f"{path} does not say how it is rendered. Export it again with nrfgs export compact.")
+    means = decoded.splats["means"]
+    match decoded.header.get("render"):
+        case {
+            "rasterize_mode": "classic" | "antialiased" as mode,
+            "background": [int() | float(), int() | float(), int() | float()] as background,
+        }:
+            pass
+        case _:
+            raise InputError(f"{path} does not say how it is rendered. Export it again with nrfgs export compact.")
     name = {(0, 0, 0): "black", (1, 1, 1): "white"}.get(tuple(background), "random")
     config = NrfgsModelConfig(appearance=decoded.config, rasterize_mode=mode, background_color=name)
     model = config.setup(

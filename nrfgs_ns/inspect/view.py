@@ -42,6 +42,8 @@ class View:
         from nrfgs_ns.export.loading import load_training
 
         trained = load_training(self.model, "test")
+        # Where nerfstudio looks for the config.yml that it names in its command for ns-render; it writes nothing there.
+        config.relative_log_filename = str(self.model.absolute().parent / "viewer.log")
         trained.config.vis, trained.config.viewer = "viewer", config
         _start_viewer(trained.config, trained.pipeline, trained.step)
 

@@ -71,7 +71,7 @@ class Nrfgs:
             self.world = World.around(train_dataset["cameras"].poses, self.config.pipeline.datamanager.dataparser)
         else:
             self.config = _read_config(self.checkpoint)
-            record = json.loads((self.checkpoint / "world.json").read_text(encoding="utf-8"))
+            record = _read_record(self.checkpoint / "world.json")
             self.world = World(torch.tensor(record["transform"], dtype=torch.float64), record["scale"])
         if train_dataset is None:
             self.record = record
@@ -256,6 +256,15 @@ def _read_config(checkpoint: Path) -> NrfgsTrainerConfig:
     config = read_config(checkpoint / "config.yml")
     config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
     return config
+
+
+def _read_record(file: Path) -> dict[str, Any]:
+    """What `save` wrote beside the configuration."""
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        return {name: record[name] for name in ("transform", "scale", "scene_unit", "training_images")}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{file} is not what nrfgs saved ({error!r}). Copy the checkpoint again.") from error
 
 
 def _checkpoint_file(checkpoint: Path) -> Path:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nrfgs_ns.data.pictures import read_header, share_of_size
+from nrfgs_ns.data.pictures import open_picture, read_header, share_of_size
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.prepare.forecast import looked_at
 from nrfgs_ns.prepare.pairs import Pairs
@@ -98,7 +98,11 @@ def extract_features(
 def _scale_focal_lengths(database: Path, photos: Path, names: list[str]) -> None:
     """Correct what COLMAP makes of the EXIF of photographs that were made smaller."""
     with colmap().Database.open(database) as opened:
-        cameras = {opened.read_image_with_name(name).camera_id: name for name in names}
+        images = {name: opened.read_image_with_name(name) for name in names}
+        unread = [name for name, image in images.items() if image is None]
+        if unread:
+            raise InputError(f"{photos / unread[0]} is left out by COLMAP. Save it anew as JPEG or PNG, or remove it.")
+        cameras = {image.camera_id: name for name, image in images.items()}
         for number, name in cameras.items():
             camera, share = opened.read_camera(number), share_of_size(photos / name)
             if camera.has_prior_focal_length and share != 1.0:
@@ -181,9 +185,32 @@ def find_cameras(database: Path, photos: Path, folder: Path, enough: float, adva
         if _size(others)[0] > _size(models)[0]:
             models, mapping = others, "global"
     if models:
-        folder.mkdir(parents=True)
-        max(models, key=lambda model: _size([model])).write(folder)
+        write_model(max(models, key=lambda model: _size([model])), folder)
     return len(models), mapping
+
+
+def write_model(model: Any, folder: Path) -> None:
+    """Write a reconstruction into a new folder.
+
+    Raises:
+        InputError: it was not written whole, which COLMAP does not say.
+    """
+    folder.mkdir(parents=True)
+    model.write(folder)
+    _check_model(folder, model)
+
+
+def _check_model(folder: Path, model: Any) -> None:
+    try:
+        written = _size([colmap().Reconstruction(folder)])
+    except Exception:  # COLMAP lets out whatever it meets
+        written = None
+    if written != _size([model]):
+        raise _not_whole(folder)
+
+
+def _not_whole(path: Path) -> InputError:
+    return InputError(f"{path} was not written whole: the disk may be full. Make room, and run this again.")
 
 
 def _size(models: list[Any]) -> tuple[int, int]:
@@ -242,8 +269,21 @@ def _aside(folder: Path) -> Iterator[Path]:
 
 
 def undistort(model: Path, photos: Path, folder: Path) -> None:
-    """Undistorted photographs in folder/images, and their pinhole model in folder/sparse."""
+    """Undistorted photographs in folder/images, and their pinhole model in folder/sparse.
+
+    Raises:
+        InputError: they were not written whole, which COLMAP does not say.
+    """
     pycolmap = colmap()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     pycolmap.undistort_images(folder, model, photos, output_type="COLMAP", jpeg_quality=97)
+    distorted = pycolmap.Reconstruction(model)
+    _check_model(folder / "sparse", distorted)
+    for number in distorted.reg_image_ids():
+        path = folder / "images" / distorted.images[number].name
+        try:
+            with open_picture(path) as picture:
+                picture.load()
+        except (InputError, OSError, SyntaxError) as error:  # a PNG that is cut is one of syntax to PIL
+            raise _not_whole(path) from error

@@ -44,6 +44,8 @@ def read_config(path: Path) -> TrainerConfig:
         raise InputError(f"{path} is larger than {LARGEST_FILE} bytes. Name the config.yml that the training saved.")
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a configuration. Name the config.yml that the training saved.") from error
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise InputError(f"{path} is not a configuration: {' '.join(str(error).split())}.") from error
     if not isinstance(config, TrainerConfig):

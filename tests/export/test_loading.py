@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.scripts.viewer import run_viewer
 from short_trainings import command_line, models_of, trained
 from torch.testing import assert_close
 
@@ -20,6 +21,7 @@ from nrfgs_ns.export.command import Export
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.loading import load_model, load_training, measure_loss
 from nrfgs_ns.export.ply import on_screen, read_splats, render_splats, write_splats
+from nrfgs_ns.inspect.view import View
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 from nrfgs_ns.training.checkpoint_files import find
 from nrfgs_ns.training.trainer import end_earlier_logs
@@ -39,7 +41,7 @@ def project(tiny_scene, tmp_path, monkeypatch):
     return tmp_path / "project" / config
 
 
-def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_path):
+def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_path, monkeypatch):
     assert load_training(project, "test").step == 2
     shutil.move(tmp_path / "project", tmp_path / "moved")
     config = tmp_path / "moved" / project.relative_to(tmp_path / "project")
@@ -47,6 +49,10 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_pat
     found = load_training(config, "test")
     assert found.step == 2 and found.checkpoint.parent == models_of(config)
     assert found.pipeline.datamanager.get_datapath() == tmp_path / "moved" / "data"
+    viewed = []
+    monkeypatch.setattr(run_viewer, "_start_viewer", lambda config, *_: viewed.append(config))
+    View(config).main()
+    assert (viewed[0].get_base_dir() / viewed[0].viewer.relative_log_filename).parent == config.parent
     Export("compact", config, tmp_path / "sent" / "small.nrf").main()
     beside = tmp_path / "sent" / "small.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
     assert load_training(beside, "test").pipeline.datamanager.get_datapath() == tmp_path / "moved" / "data"

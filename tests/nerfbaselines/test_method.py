@@ -133,6 +133,12 @@ def test_a_checkpoint_renders_without_the_images(trained, tiny_scene, tmp_path):
     with pytest.raises(InputError, match="without a training data set"):
         loaded.train_iteration(STEPS)
     loaded.save(str(tmp_path / "again"))
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "config.yml").write_text((folder / "config.yml").read_text())
+    for text in ("{", "{}", "[]"):
+        (tmp_path / "broken" / "world.json").write_text(text)
+        with pytest.raises(InputError, match="world.json is not what nrfgs saved"):
+            Nrfgs(checkpoint=str(tmp_path / "broken"))
     for name in ("config.yml", "world.json"):
         assert (tmp_path / "again" / name).read_text() == (folder / name).read_text()
     (one,), (other,) = (list(path.rglob("*.ckpt")) for path in (folder, tmp_path / "again"))

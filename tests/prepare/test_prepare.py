@@ -347,6 +347,34 @@ def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, c
         Prepare(walls, out).main()
 
 
+@pytest.fixture
+def full_disk():
+    """Files end after so many bytes, as on a disk that is full."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_what_colmap_could_not_write_whole_is_not_built_on(prepared, tmp_path, full_disk, monkeypatch):
+    work, pycolmap = prepared / "work", structure.colmap()
+    model, undistort = pycolmap.Reconstruction(work / "model"), pycolmap.undistort_images
+
+    def cut_one(folder: Path, *args, **options) -> None:
+        undistort(folder, *args, **options)
+        path = min((folder / "images").iterdir())
+        path.write_bytes(path.read_bytes()[:20_000])
+
+    with monkeypatch.context() as patch, pytest.raises(InputError, match=r"IMG_00.png was not written whole"):
+        patch.setattr(pycolmap, "undistort_images", cut_one)
+        structure.undistort(work / "model", work / "photos", tmp_path / "cut")
+    full_disk(20_000)
+    with pytest.raises(InputError, match="model was not written whole: the disk may be full"):
+        structure.write_model(model, tmp_path / "model")
+    with pytest.raises(InputError, match="sparse was not written whole"):
+        structure.undistort(work / "model", work / "photos", tmp_path / "first")
+
+
 # Collecting.
 
 
@@ -389,6 +417,15 @@ def test_focal_lengths_follow_photographs_that_were_made_smaller(tmp_path, told_
     with structure.colmap().Database.open(database) as opened:
         (camera,) = opened.read_all_cameras()
     assert camera.has_prior_focal_length and camera.mean_focal_length() == pytest.approx(focal_length, abs=0.01)
+
+
+def test_a_photograph_that_colmap_leaves_out_is_named(tmp_path):
+    photo(tmp_path / "a.jpg", (160, 120))
+    photo(tmp_path / "b.jpg", (120, 160))  # not of the one camera
+    with pytest.raises(InputError, match="b.jpg is left out by COLMAP"):
+        structure.extract_features(
+            tmp_path / "database.db", tmp_path, ["a.jpg", "b.jpg"], "SIMPLE_RADIAL", True, 1600, 100, lambda _: None
+        )
 
 
 def test_names_stay_different_and_short():

@@ -123,5 +123,5 @@ def test_a_file_that_is_not_there_or_no_configuration(tmp_path):
     with pytest.raises(InputError, match="larger than"):
         read_config(tmp_path / "large")
     (tmp_path / "binary").write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match="not a configuration"):
+    with pytest.raises(InputError, match="not a configuration. Name the config.yml"):
         read_config(tmp_path / "binary")
