@@ -50,6 +50,10 @@ class NrfgsInputDataset(InputDataset):
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
         super().__init__(dataparser_outputs, scale_factor)
+        for name in ("width", "height"):  # as images and masks are rounded; nerfstudio does it in float32
+            full = getattr(dataparser_outputs.cameras, name).flatten().tolist()
+            sides = [[int(side * scale_factor)] for side in full]
+            setattr(self.cameras, name, torch.tensor(sides, dtype=getattr(self.cameras, name).dtype))
         lost = ~torch.isfinite(self.cameras.camera_to_worlds).flatten(1).all(dim=1)
         if lost.any():  # nerfstudio's own parsers do not look
             names = [str(path) for path, is_lost in zip(self.image_filenames, lost.tolist(), strict=True) if is_lost]
@@ -128,8 +132,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             super().__init__(config, *args, **kwargs)
         except (FileNotFoundError, LookupError) as error:  # of nerfstudio's own parsers
             raise InputError(
-                f"{config.data or config.dataparser.data} cannot be read: {error!r}. Check the path that --data names, "
-                "and what kind of data set it is."
+                f"{config.data or config.dataparser.data} cannot be read ({type(error).__name__}: {error}). Check the "
+                "path that --data names, and what kind of data set it is."
             ) from error
 
     def load_all_images(self) -> tuple[int, int]:

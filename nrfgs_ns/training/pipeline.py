@@ -94,8 +94,8 @@ class NrfgsPipeline(VanillaPipeline):
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             with tried_meanwhile(_kernel_trials(self.model), self.model.device):
-                self.datamanager.load_all_images()
                 self._check_smallest_image()
+                self.datamanager.load_all_images()
                 photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
@@ -108,8 +108,7 @@ class NrfgsPipeline(VanillaPipeline):
         if min(width, height) < SMALLEST_SIDE:
             raise InputError(
                 f"{self.datamanager.get_datapath()}: training would begin with images of {width} x {height} pixels. "
-                "Give a smaller --pipeline.model.num-downscales, or a larger "
-                "--pipeline.datamanager.camera-res-scale-factor."
+                "Give a smaller --pipeline.model.num-downscales, or larger images."
             )
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:

@@ -7,6 +7,7 @@ import torch
 import yaml
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
+from small_capture import Capture
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanager, NrfgsDatamanagerConfig, NrfgsInputDataset
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
@@ -116,8 +117,23 @@ def test_a_file_that_another_parser_misses_is_named(tmp_path):
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
     config = NrfgsDatamanagerConfig(dataparser=BlenderDataParserConfig(data=tmp_path))
-    with pytest.raises(InputError, match="cannot be read: FileNotFoundError.*No such file"):
+    with pytest.raises(InputError, match="cannot be read .FileNotFoundError.*transforms_train.json"):
         config.setup(device="cpu")
+
+
+def test_images_are_made_smaller_to_the_size_of_their_cameras(tmp_path):
+    """int(50 * 0.58) is 28, of which nerfstudio's cameras, in float32, make 29."""
+
+    class Wide(Capture):
+        width = 50
+
+    capture = Wide(tmp_path / "wide", images=10)
+    capture.meta |= {"fl_x": 40.0, "fl_y": 40.0, "cx": 25.0}
+    capture.add_masks()
+    data = manager(capture, camera_res_scale_factor=0.58)
+    data.load_all_images()
+    assert data.cached_train[0]["image"].shape == (5, 28, 3) and data.cached_train[0]["mask"].shape == (5, 28, 1)
+    assert (data.train_dataset.cameras.width == 28).all() and (data.train_dataset.cameras.height == 5).all()
 
 
 def test_a_pose_that_another_parser_lets_pass_is_named(capture):
