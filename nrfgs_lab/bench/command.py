@@ -177,7 +177,10 @@ class Bench:
             asked["runs"] = chosen_runs(self.runs, {str(name): run for name, run in of_file.items()}, where)
         if self.data:
             asked["scenes"] = chosen_scenes(self.data, file.get("scenes") or [])
-        return make_spec(asked, where), make_spec(united(file, asked), where)
+        chosen, whole = make_spec(asked, where), make_spec(united(file, asked), where)
+        if unknown := sorted(set(whole.crops) - {scene.name for scene in whole.scenes}):
+            raise InputError(f"{where}: crops: {unknown[0]!r} is none of its scenes. Correct or remove it.")
+        return chosen, whole
 
     def record(self, name: str) -> Path:
         """The file that a finished run leaves."""

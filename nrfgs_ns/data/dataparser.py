@@ -305,7 +305,13 @@ def _checked_files(
         if not shrink:
             check_unique(paths, f"{scene.source}: frames")
         expected = [size_of(scene.meta, frame) for frame in frames] if shrink else sizes
-        modes = check_headers(paths, expected, what, fixes[what])
+        fix = fixes[what]
+        if scene.factor > 1 and not shrink:
+            fix = (
+                f"Remove {paths[0].parent}, so that copies are made, or with `colmap` give "
+                "--downscale-rounding-mode round or ceil."
+            )
+        modes = check_headers(paths, expected, what, fix)
         bad = [path for path, mode in zip(paths, modes, strict=True) if mode not in MASK_MODES]
         if key == "mask_path" and bad:
             raise InputError(

@@ -61,6 +61,9 @@ def test_folders_of_the_data_set_come_first(tmp_path, cache):
         Image.new("RGB", (6, 4), (9, 99, 199)).save(capture.folder / "images_2" / path.name)
     capture.parse(downscale_factor=2)
     assert not cache.exists()
+    Image.new("RGB", (6, 5)).save(capture.folder / "images_2" / "003.png")  # 9 / 2 rounded up
+    with pytest.raises(InputError, match=r"003.png is 6 x 5, not 6 x 4.*Remove .*images_2, so that.*-mode round"):
+        capture.parse(downscale_factor=2)
     (capture.folder / "images_2" / "003.png").unlink()
     with pytest.raises(InputError, match=r"1 of 10 images are missing: .*images_2/003.png"):
         capture.parse(downscale_factor=2)

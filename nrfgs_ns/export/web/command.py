@@ -157,7 +157,7 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
     known = sorted(one["distance"] for one in photographs if one["distance"] is not None)
     typical = known[len(known) // 2] if known else model.scene_unit
     for one in photographs:
-        one["distance"] = round(typical if one["distance"] is None else one["distance"], 6)
+        one["distance"] = typical if one["distance"] is None else one["distance"]
     about = {
         "photographs": photographs,
         "start": start,
@@ -192,7 +192,8 @@ def write(path: Path, content: bytes) -> None:
 
 
 def _rounded(values: torch.Tensor) -> list[float]:
-    return [round(value, 6) for value in values.tolist()]
+    """Numbers with the digits that float32 has, whatever unit of length they are in."""
+    return [float(f"{value:.7g}") for value in values.tolist()]
 
 
 def _jpeg(picture: torch.Tensor) -> bytes:

@@ -335,3 +335,6 @@ def test_flags_have_precedence_over_the_file(fake):
     assert [run.name for run in Bench(runs=("nrfgs", "nrfgs-sh"), data=("x",)).plan().runs] == ["nrfgs", "nrfgs-sh"]
     with pytest.raises(InputError, match="runs is missing"):
         Bench().plan()
+    with pytest.raises(InputError, match="crops: 'otter' is none of its scenes"):
+        file = spec_file(fake, "runs: {A: nrfgs}\nscenes: [other]\ncrops: {other: [0], otter: [1]}\n")
+        Bench(spec=file, data=("scene",)).plan()
