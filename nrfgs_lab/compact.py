@@ -60,10 +60,6 @@ class Trade:
     """of each fine-tune"""
     others: tuple[Literal["ply", "plain", "spz", "sog"], ...] = ("ply", "plain", "spz", "sog")
     """also write what is not trained for the file: a PLY, a compact file, and splat-transform's"""
-    method: str = "nrfgs"
-    """that trains"""
-    sog_iterations: int = 10
-    """of splat-transform, to find SOG's palette"""
     settings: tuple[str, ...] = ()
     """NAME=VALUE, in JSON: other values of constants of the fine-tunes, nrfgs_ns/compact/finetune.py and
     nrfgs_ns/model/harmonics_tune.py"""
@@ -101,7 +97,7 @@ class Trade:
         with ThreadPoolExecutor() as pool:  # minutes on a CPU
             there = [(self.out / f"{name(suffix)}.json").exists() for suffix in suffixes]
             todo = [suffix for suffix, done in zip(suffixes, there, strict=True) if not done]
-            running = {suffix: pool.submit(converted, ply, suffix, self.sog_iterations) for suffix in todo}
+            running = {suffix: pool.submit(converted, ply, suffix) for suffix in todo}
             plain = files / f"{name('version-2')}.nrf"
             if "plain" in self.others:
                 options = CompactOptions()
@@ -119,16 +115,16 @@ class Trade:
         return json.loads(path.read_text(encoding="utf-8"))
 
     def trained(self, _: Path) -> dict[str, Any]:
-        args = [self.method, "--data", str(self.data), "--output-dir", str(self.work), "--machine.seed", "42"]
+        args = ["nrfgs", "--data", str(self.data), "--output-dir", str(self.work), "--machine.seed", "42"]
         args += ["--vis", "tensorboard", "--steps-per-eval-all-images", "1000000"]
         return {"machine": machine(), "train": asdict(train([*args, "nrfgs-data"]))}
 
 
-def converted(ply: Path, suffix: str, sog_iterations: int) -> dict[str, Any]:
+def converted(ply: Path, suffix: str) -> dict[str, Any]:
     """What splat-transform makes of a PLY file, and back."""
     small = ply.with_suffix(f".{suffix}")
     begin = perf_counter()
-    options = ["-w", "-g", "cpu", "-i", str(sog_iterations)]
+    options = ["-w", "-g", "cpu", "-i", "10"]  # steps that find SOG's palette
     subprocess.run([TOOL, *options, ply, small], check=True, stdout=sys.stderr)
     seconds = {"encode": perf_counter() - begin}
     subprocess.run([TOOL, "-w", small, ply.with_suffix(f".{suffix}.ply")], check=True, stdout=sys.stderr)

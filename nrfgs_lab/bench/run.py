@@ -26,11 +26,6 @@ PROGRESS_SECONDS = 1.0
 """Time between two notes of how far a training is."""
 
 
-def read_job(path: Path) -> Job:
-    """The job in a JSON file."""
-    return Job(**json.loads(Path(path).read_text(encoding="utf-8")))
-
-
 def run(job: Job) -> None:
     """Do the job, or what is left of it."""
     work, record_path = Path(job.work), Path(job.record)
@@ -133,7 +128,7 @@ def forget_other_arguments(work: Path, identity: dict[str, Any]) -> None:
 
 
 def main(argv: list[str] | None = None) -> Any:
-    run(read_job(Path((argv or sys.argv[1:])[0])))
+    run(Job(**json.loads(Path((argv or sys.argv[1:])[0]).read_text(encoding="utf-8"))))
 
 
 if __name__ == "__main__":

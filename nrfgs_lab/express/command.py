@@ -75,7 +75,8 @@ class Express:
                     count = spec.build().count(num_samples)
                     progress.console.print(f"[dim]{setup}: {label:<12} {count:>10,} parameters", highlight=False)
                 self.run_setup(setup, source, progress)
-        summary = report.summarise(read_records(self.out / "runs"))
+        records = sorted((self.out / "runs").glob("*.json"))
+        summary = report.summarise([{"name": path.stem, **json.loads(path.read_text())} for path in records])
         write_whole(self.out / "summary.json", json.dumps(summary, indent=1) + "\n")
         write_whole(self.out / "table.md", report.markdown(summary))
         screen.print(report.table(summary))
@@ -261,8 +262,3 @@ def machine(device: str) -> dict[str, str]:
     if device == "cuda":
         name = torch.cuda.get_device_name()
     return {"device": name, "python": platform.python_version(), "torch": torch.__version__}
-
-
-def read_records(folder: Path) -> list[dict[str, Any]]:
-    """All records, by name."""
-    return [{"name": path.stem, **json.loads(path.read_text())} for path in sorted(folder.glob("*.json"))]

@@ -103,12 +103,8 @@ def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> d
             continue
         difference = statistics.fmean(sample) - statistics.fmean(base)
         bound = noise_bound(deviation, freedom, len(sample), len(base))
-        result[name] = Change(math.exp(difference), _exp(bound), True) if ratio else Change(difference, bound)
+        result[name] = Change(math.exp(difference), math.exp(bound), True) if ratio else Change(difference, bound)
     return result
-
-
-def _exp(value: float) -> float:
-    return math.inf if value == math.inf else math.exp(value)
 
 
 def price(gain: Change, cost: Change, power: int = 1) -> tuple[str, float | None]:

@@ -69,14 +69,9 @@ def from_smallest_three(largest: Array, codes: Array, bits: int) -> Array:
     """Rotations of unit length [N, 4]. Each of the three is off by at most sqrt(1/2) / (2^bits - 1)."""
     others = codes / (2**bits - 1) * (2 * HALF_SQRT2) - HALF_SQRT2
     unit = np.empty((len(codes), 4))
-    unit[_others_of(largest)] = others.reshape(-1)
+    unit[np.arange(4) != largest[:, None]] = others.reshape(-1)
     unit[np.arange(len(codes)), largest] = np.sqrt(np.maximum(1.0 - (others**2).sum(axis=1), 0.0))
     return unit / np.linalg.norm(unit, axis=1, keepdims=True).clip(min=1e-12)
-
-
-def _others_of(largest: Array) -> Array:
-    """Mask [N, 4] of all components but one."""
-    return np.arange(4) != largest[:, None]
 
 
 def _octahedral() -> Array:

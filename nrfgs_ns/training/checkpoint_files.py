@@ -77,7 +77,8 @@ def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = 
         _to_disk(folder)
     except (OSError, RuntimeError) as error:  # torch says RuntimeError, and not why
         aside.unlink(missing_ok=True)
-        needed, free = _bytes_in(content), shutil.disk_usage(folder).free
+        needed = sum(leaf.nbytes for _, leaf in _leaves(content) if isinstance(leaf, Tensor))
+        free = shutil.disk_usage(folder).free
         if free < 1.01 * needed + 2**20:
             raise DiskFull(_no_room(folder, step, needed, free)) from error
         raise
@@ -218,10 +219,6 @@ def _leaves(tree: Any, path: str = "") -> list[tuple[str, Any]]:
     if isinstance(tree, (list, tuple)) and any(isinstance(value, (Tensor, Mapping, list, tuple)) for value in tree):
         return [leaf for key, value in enumerate(tree) for leaf in _leaves(value, f"{path}/{key}")]
     return [(path, tree)]
-
-
-def _bytes_in(content: Any) -> int:
-    return sum(leaf.nbytes for _, leaf in _leaves(content) if isinstance(leaf, Tensor))
 
 
 def _no_room(folder: Path, step: int, needed: int, free: int) -> str:
