@@ -229,7 +229,8 @@ def slope(pairs: Pairs, known: Tensor) -> tuple[float, float | None]:
         return 1.0, None
     factor = float((expected * seen).sum() / expected.square().sum())
     factor = min(max(factor, 0.0), 1.0)
-    return factor, max(1.0 - float((seen - factor * expected).square().sum() / seen.square().sum()), 0.0)
+    squares, left = float(seen.square().sum()), float((seen - factor * expected).square().sum())
+    return factor, max(1.0 - left / squares, 0.0) if squares > 0.0 else 0.0
 
 
 class Looks(NamedTuple):

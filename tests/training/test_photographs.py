@@ -47,6 +47,7 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
         ("auto", SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF says that exposure is almost the same"),
         # The light changed, and the camera followed it.
         ("auto", SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of their difference"),
+        ("auto", pairs_with([0.0] * 10), [0.0, 0.9] * 5 + [0.0], False, "which explains 0% of their difference"),
         (
             "auto",
             DIFFERENT,
