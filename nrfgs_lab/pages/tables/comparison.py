@@ -16,13 +16,14 @@ BASE = "3DGS"
 METHODS = "VDGS", "GSNB", "SG", "NRF-GS", "ours"
 OF_THE_PAPER = {"VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
 """The paper's gains on bonsai, in dB, and splats in multiples of 3DGS's."""
-RULES = {"methods": "original", "budgets": "mcmc@150000"}
-"""Study -> how splats come and go in it."""
+ORIGINAL = "original"
+"""3DGS's rules for how splats come and go: docs/bench/methods.yaml. All others are budgets.yaml's."""
+BUDGETS = "mcmc@150000", "mcmc@75000"
 
 
-def half(scene: str, run: str, study: str = "methods") -> Runs:
+def half(scene: str, run: str, rule: str = ORIGINAL) -> Runs:
     """A run of docs/bench/methods.yaml, or of budgets.yaml."""
-    row = bench_rows(study).get((scene, RULES[study], run))
+    row = bench_rows("methods" if rule == ORIGINAL else "budgets").get((scene, rule, run))
     return trials_of(row) if row else []
 
 
@@ -34,20 +35,23 @@ def gain(ours: Runs, theirs: Runs, metric: str) -> float:
 def every() -> str:
     """3DGS's PSNR and SSIM, and what the others gain, dB and SSIM x 1000; the median share of its splats."""
     psnr = f"{mean_of(bench_rows('paper')['bonsai', 'original', BASE], 'PSNR'):.2f}"
-    body = [[BASE, "", psnr, *_levels("methods"), "", ""]]
+    body = [[BASE, "", psnr, *_levels(), "", ""]]
     for run in METHODS:
         paper = "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
-        ours, base = ([half(scene, one)[0]["splats"] for scene in _scenes(run)] for one in (run, BASE))
+        ours, base = ([half(scene, one)[0]["splats"] for scene in TRAINING_VIEWS] for one in (run, BASE))
         share = median(one / other for one, other in zip(ours, base, strict=True))
-        body.append([run, paper, _protocol(run), *_gains(run, "methods"), f"{share:.2f}", _ahead(run)])
+        body.append([run, paper, _protocol(run), *_gains(run), f"{share:.2f}", _ahead(run)])
     return grid(["", "paper", "protocol", *TRAINING_VIEWS, "splats", "ahead"], body)
 
 
 def equal() -> str:
-    """The same with 150,000 splats each."""
-    body = [[BASE, *_levels("budgets"), ""]]
-    body += [[run, *_gains(run, "budgets"), _ahead(run, "budgets")] for run in METHODS]
-    return grid(["150,000 splats", *TRAINING_VIEWS, "ahead"], body)
+    """3DGS's PSNR with 150,000 and 75,000 splats, and what the others gain."""
+    levels = zip(*([level.partition("/")[0] for level in _levels(rule)] for rule in BUDGETS), strict=True)
+    body = [[BASE, *map(", ".join, levels), ""]]
+    for run in METHODS:
+        gains = zip(*(_gains(run, rule, ssim=False) for rule in BUDGETS), strict=True)
+        body.append([run, *map(", ".join, gains), ", ".join(_ahead(run, rule) for rule in BUDGETS)])
+    return grid(["150,000, 75,000 splats", *TRAINING_VIEWS, "ahead"], body)
 
 
 def seeds(run: str, scene: str) -> str:
@@ -56,26 +60,21 @@ def seeds(run: str, scene: str) -> str:
     return f"{max(found) - min(found):.1f}"
 
 
-def _scenes(run: str, study: str = "methods") -> list[str]:
-    return [scene for scene in TRAINING_VIEWS if half(scene, run, study)]
-
-
-def _levels(study: str) -> list[str]:
-    every = [half(scene, BASE, study) for scene in TRAINING_VIEWS]
+def _levels(rule: str = ORIGINAL) -> list[str]:
+    every = [half(scene, BASE, rule) for scene in TRAINING_VIEWS]
     return [f"{fmean(one['psnr'] for one in runs):.2f}/{fmean(one['ssim'] for one in runs):.3f}" for runs in every]
 
 
-def _gains(run: str, study: str) -> list[str]:
+def _gains(run: str, rule: str = ORIGINAL, ssim: bool = True) -> list[str]:
     """A cell for each capture, bold if the most decibels that are gained on it."""
     cells = []
     for scene in TRAINING_VIEWS:
-        base, found = half(scene, BASE, study), {one: half(scene, one, study) for one in METHODS}
-        gains = {one: gain(runs, base, "psnr") for one, runs in found.items() if runs}
-        if run in gains:
-            text = f"{signed(gains[run], 2)}/{signed(1000 * gain(found[run], base, 'ssim'), 0)}"
-            cells.append(bold(text, gains[run] == max(gains.values()) > 0))
-        else:
-            cells.append("-")
+        base = half(scene, BASE, rule)
+        gains = {one: gain(half(scene, one, rule), base, "psnr") for one in METHODS}
+        text = signed(gains[run], 2)
+        if ssim:
+            text += f"/{signed(1000 * gain(half(scene, run, rule), base, 'ssim'), 0)}"
+        cells.append(bold(text, gains[run] == max(gains.values()) > 0))
     return cells
 
 
@@ -89,9 +88,9 @@ def _protocol(run: str) -> str:
     return f"{signed(mean_of(ours, 'PSNR') - mean_of(base, 'PSNR'), 2)} ({share:.2f})"
 
 
-def _ahead(run: str, study: str = "methods") -> str:
+def _ahead(run: str, rule: str = ORIGINAL) -> str:
     """On how many captures a run is above 3DGS: in PSNR, in SSIM, in PSNR in the median test view."""
-    pairs = [(half(scene, run, study), half(scene, BASE, study)) for scene in _scenes(run, study)]
+    pairs = [(half(scene, run, rule), half(scene, BASE, rule)) for scene in TRAINING_VIEWS]
     measured = [(gain(*pair, "psnr"), gain(*pair, "ssim"), median(view_gains(*pair))) for pair in pairs]
     counts = [sum(round(gain, 3) > 0 for gain in gains) for gains in zip(*measured, strict=True)]
     return "/".join(map(str, counts))

@@ -31,16 +31,19 @@ def test_verdicts_in_words_are_those_of_the_records():
     def ahead(runs, ours: str, theirs: str, metric: str = "psnr", scenes=tuple(TRAINING_VIEWS)) -> int:
         return sum(round(gain(runs(scene, ours), runs(scene, theirs), metric), 3) > 0 for scene in scenes)
 
-    def equal(scene: str, run: str):
-        return half(scene, run, "budgets")
+    def equal(budget: int):
+        return lambda scene, run: half(scene, run, f"mcmc@{budget}")
 
     few = [scene for scene in TRAINING_VIEWS if scene != "bonsai"]
     every = len(TRAINING_VIEWS)
+    larger, smaller = equal(150_000), equal(75_000)
     assert ahead(half, "NRF-GS", "3DGS", scenes=few) == ahead(half, "VDGS", "NRF-GS", scenes=few) == 5
-    assert ahead(equal, "NRF-GS", "3DGS", scenes=few) == 3
-    assert ahead(half, "ours", "3DGS") == ahead(half, "ours", "3DGS", "ssim") == every
-    assert ahead(equal, "ours", "3DGS") == 5
-    assert sum(gain(equal(scene, "3DGS"), half(scene, "ours"), "psnr") > 0 for scene in TRAINING_VIEWS) == 3
+    assert ahead(larger, "NRF-GS", "3DGS", scenes=few) == 3 and ahead(smaller, "NRF-GS", "3DGS", scenes=few) == 2
+    assert ahead(half, "ours", "3DGS") == every and ahead(half, "ours", "3DGS", "ssim") == every - 1
+    assert ahead(larger, "ours", "3DGS") == 5 and ahead(larger, "ours", "3DGS", scenes=few) == 4
+    assert ahead(smaller, "ours", "3DGS") == ahead(smaller, "ours", "3DGS", scenes=["bonsai", "goldcape"]) == 2
+    assert ahead(smaller, "ours", "3DGS", scenes=few) == 1
+    assert sum(gain(larger(scene, "3DGS"), half(scene, "ours"), "psnr") > 0 for scene in TRAINING_VIEWS) == 3
     assert ahead(runs_of, "nrfgs", "splatfacto") == ahead(runs_of, "nrfgs", "splatfacto", "ssim") == every
     field, harmonics = "nrfgs, 150,000 splats", "harmonics, 150,000 splats"
     assert ahead(runs_of, field, harmonics) == 4
