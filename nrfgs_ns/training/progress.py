@@ -80,6 +80,7 @@ class ProgressLine(LocalWriter):
         self._due = 0.0
         self._told = -1.0
         """share of the steps at the last line in a file"""
+        self._first = 0
 
     def watch(self, pipeline: Any, lock: Lock) -> None:
         """Look at one of this pipeline's test views, the middle one, if it has any.
@@ -95,10 +96,14 @@ class ProgressLine(LocalWriter):
             self._view = index, f"{kind} view {views[index].name}"
             self._pipeline, self._lock = pipeline, lock
 
+    def begin(self, step: int) -> None:
+        """The training begins with this step; nerfstudio names 0 with what it has logged before."""
+        self._first = step
+
     def write_stats_log(self, step: int) -> None:
         """Bring the line up to date, if that is due."""
         if not self._is_over and perf_counter() >= self._due:
-            self._tell(step)
+            self._tell(max(step, self._first))
 
     def finish(self, step: int) -> None:
         """Say what has become of it after the last step, and leave the line there."""

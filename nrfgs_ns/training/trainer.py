@@ -244,6 +244,8 @@ class NrfgsTrainer(Trainer):
             self.guard.before_first_step(self._start_step, self.optimizers)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
             self.config = replace(self.config, max_num_iterations=sys.maxsize // 2)
+        if self.line is not None:
+            self.line.begin(self._start_step)
         gc.collect()
         gc.freeze()  # what is there now stays: the collector need not walk through it again and again
         try:

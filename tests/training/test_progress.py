@@ -6,7 +6,7 @@ import re
 
 import pytest
 from rich.console import Console
-from short_trainings import assert_same_training, checkpoint_of, command_line, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_ns.training import pipeline, progress
 from nrfgs_ns.training.progress import duration
@@ -58,6 +58,16 @@ def test_on_a_terminal_the_line_makes_room_for_an_evaluation(screen, tiny_scene,
     text = said.getvalue()
     assert "Evaluating" in text and "\x1b[" in text
     assert text.index("Evaluating") < text.index("step 5 of 6") < text.index("step 6 of 6 (100 %)")
+
+
+def test_a_continued_training_begins_at_its_step(screen, tiny_scene, tmp_path):
+    """Though nerfstudio names step 0 with what it logs before the first one."""
+    first = trained(command_line("nrfgs", tiny_scene, tmp_path / "first", 4))
+    said = screen(terminal=False)
+    more = {"--load-dir": models_of(first), "--vis": "tensorboard"}
+    trained(command_line("nrfgs", tiny_scene, tmp_path / "more", 8, SPOKEN, more))
+    steps = [int(line.split()[1]) for line in said.getvalue().splitlines() if line.startswith("step ")]
+    assert steps == [5, 6, 7, 8, 8]
 
 
 def test_in_a_file_lines_are_few(screen, tiny_scene, tmp_path):
