@@ -41,6 +41,7 @@ from nrfgs_ns.data.pictures import smaller_copies, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
+from nrfgs_ns.data.views import repeated_views
 from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.start import with_data_parsers
@@ -202,7 +203,20 @@ class NrfgsDataParser(DataParser):
                 f"{source}: --downscale-factor {factor} leaves images of {cameras.width.min()} x "
                 f"{cameras.height.min()} pixels. Give a smaller one."
             )
+        self._tell_repeated(cameras.camera_to_worlds, splits, paths, source)
         return Scene(meta, source, layout, splits, factor, cameras, transform, self._to_frames(meta, layout), scale)
+
+    def _tell_repeated(self, poses: torch.Tensor, splits: Rows, paths: list[Path], source: Path) -> None:
+        """Warn of images for evaluation alone that were taken from where a training image was."""
+        train = splits["train"]
+        evaluated = np.setdiff1d(np.union1d(splits["val"], splits["test"]), train)
+        repeated = repeated_views(poses, evaluated, train)
+        if repeated:
+            warn(
+                f"{source}: {some([paths[row].name for row in repeated])}, for evaluation, show what training images "
+                "show from the same place, which flatters the results. Remove copies, and frames of a camera that "
+                "stands still."
+            )
 
     def _placed(self, meta: dict[str, Any], source: Path) -> tuple[torch.Tensor, torch.Tensor, float]:
         """Poses in the world that is trained in, and the way there (`world.place`)."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # `nrfgs prepare` does without torch
@@ -63,15 +64,36 @@ def different_views(poses: Tensor) -> int:
     Args:
         poses: camera-to-world, [V, 3 or 4, 4].
     """
+    return len(_first_of_each(_places_and_directions(poses)))
+
+
+def repeated_views(poses: Tensor, rows: Sequence[int], of: Sequence[int]) -> list[int]:
+    """Which of some cameras stand where one of others does, and look where that one looks.
+
+    Args:
+        poses: of the whole capture, camera-to-world, [V, 3 or 4, 4].
+        rows, of: of `poses`.
+    """
     import torch
 
-    poses = poses.double()
-    return len(_first_of_each(torch.cat([_in_reaches(poses[:, :3, 3]), poses[:, :3, 2]], dim=1)))
+    if not (len(rows) and len(of)):
+        return []
+    places = _places_and_directions(poses)
+    nearest = torch.cdist(places[list(rows)], places[list(of)]).amin(dim=1)
+    return [int(row) for row, distance in zip(rows, nearest.tolist(), strict=True) if distance <= SAME_PLACE]
 
 
 def distinct_places(centers: Tensor) -> Tensor:
     """Cameras [V, 3] without those that stand where an earlier one does, [P, 3]."""
     return centers[_first_of_each(_in_reaches(centers))]
+
+
+def _places_and_directions(poses: Tensor) -> Tensor:
+    """Where cameras are and which way they look, [V, 6], so that `SAME_PLACE` holds for both."""
+    import torch
+
+    poses = poses.double()
+    return torch.cat([_in_reaches(poses[:, :3, 3]), poses[:, :3, 2]], dim=1)
 
 
 def _in_reaches(centers: Tensor) -> Tensor:

@@ -131,6 +131,17 @@ def test_overlapping_splits_are_mentioned(capture, printed):
     assert "008.png" in (text := printed()) and "for training and for evaluation" in text
 
 
+def test_test_images_that_training_images_repeat_are_mentioned(capture, printed):
+    """A copy of a photograph beside it, or a video whose camera stands still."""
+    assert names(capture.parse("test")) == [4] and "flatters" not in printed()
+    frames = {Path(frame["file_path"]).stem: frame for frame in capture.meta["frames"]}
+    frames["003"]["transform_matrix"] = frames["004"]["transform_matrix"]
+    capture.parse("test")
+    assert "flatters" in (text := printed()) and "004" in text and "003" not in text
+    capture.parse("test", eval_mode="all")  # where that is asked for
+    assert "flatters" not in printed()
+
+
 @pytest.mark.parametrize("orientation", ["pca", "up", "vertical", "none"])
 @pytest.mark.parametrize("center", ["poses", "focus", "none"])
 @pytest.mark.parametrize("mode", ["interior", "interval", "fraction", "all"])
