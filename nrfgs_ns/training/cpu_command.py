@@ -9,10 +9,12 @@ LONGEST_SIDE = 240
 """Pixels to which photographs are made smaller: as many as two CPU cores train on in minutes."""
 
 
-def ten_minute_command(data: Path) -> str:
-    """What to type for the data set in a folder, or for its transforms.json."""
+def ten_minute_command(data: Path, parser: str | None = None) -> str:
+    """What to type for the data set in a folder, or for its transforms.json; with the name of its parser, if that is
+    to be named."""
     words = ["ns-train", "nrfgs-fast", "--data", str(data), "--time-budget", "10"]
-    return shlex.join([*words, "--pipeline.datamanager.camera-res-scale-factor", f"{scale_for(data):g}"])
+    words += ["--pipeline.datamanager.camera-res-scale-factor", f"{scale_for(data):g}"]
+    return shlex.join([*words, parser] if parser else words)
 
 
 def scale_for(data: Path) -> float:

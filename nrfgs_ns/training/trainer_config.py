@@ -10,10 +10,13 @@ from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 
+from nerfstudio.configs.dataparser_configs import all_dataparsers
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.densification.thinning import ROUNDS
 from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
@@ -180,7 +183,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         data = self.data or datamanager.data or _absolute(datamanager.dataparser.data)
         lines = [f"{self.method_name} on {data}"]
         if machine.device_type == "cpu" and self.time_budget is None:
-            lines.append(f"No CUDA device: the CPU trains. A result in ten minutes: {ten_minute_command(data)}")
+            command = ten_minute_command(data, _name_of(datamanager.dataparser))
+            lines.append(f"No CUDA device: the CPU trains. A result in ten minutes: {command}")
         CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
     def save_config(self) -> None:
@@ -212,6 +216,12 @@ class NrfgsTrainerConfig(TrainerConfig):
                 return
             except FileExistsError:
                 self.timestamp = f"{first}_{number}"
+
+
+def _name_of(parser: DataParserConfig) -> str | None:
+    """What a command calls a parser that it must name; None for ours, and for one that it cannot name."""
+    named = (name for name, known in all_dataparsers.items() if type(known) is type(parser))
+    return None if isinstance(parser, NrfgsDataParserConfig) else next(named, None)
 
 
 def _absolute(path: Path | None) -> Path | None:

@@ -313,6 +313,7 @@ def test_what_ns_train_says_before_it_begins(words, tiny_scene, tmp_path, capsys
     assert said[0] == f"nrfgs on {tiny_scene}" and len(said) <= 3
     if config.machine.device_type == "cpu":
         assert "No CUDA device" in " ".join(said) and f"--data {tiny_scene}" in said[-1]
+        assert said[-1].endswith(" colmap") == (words == ["colmap"]), "what is not the default must be named"
 
 
 @pytest.mark.parametrize("option, bad", [("--machine.seed", -1), ("--machine.num-devices", 0)])
