@@ -34,7 +34,7 @@ from nrfgs_ns.appearance.opacity_bound import OPACITY_BOUNDS, OpacityBound, boun
 
 @dataclass
 class NrfConfig(AppearanceHeadConfig):
-    """Neural residual field. The defaults are the paper's, but for zero outputs and the straight-through bound."""
+    """Neural residual field. The defaults are the paper's, except for zero outputs and the straight-through bound."""
 
     _target: type = field(default_factory=lambda: NeuralResidualField)
     """the head class that this configuration builds"""
@@ -62,7 +62,7 @@ class NrfConfig(AppearanceHeadConfig):
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound | None = None
     """how base + residual stays in [0, 1] (docs/opacity.md). clamp: no gradient beyond the ends. straight-through: the
-    gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with round corners. None:
+    gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with rounded corners. None:
     logit for mcmc, otherwise straight-through"""
     geometry_gradient: bool = True
     """direction and distance send gradients to means and cameras"""
