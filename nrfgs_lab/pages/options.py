@@ -31,7 +31,7 @@ APPEARANCE = "pipeline.model.appearance."
 INTRODUCTION = """# Options
 
 What this package adds to nerfstudio's options, or sets in its own way; `ns-train nrfgs --help` lists all. Written by
-`python -m nrfgs_lab.pages.options`. Defaults are `nrfgs`'s. The other heads have no `view-noise`, `few-views` and
+`python -m nrfgs_lab.pages.options`. Defaults are `nrfgs`'s. The other heads have no `view-noise`, `few-views` or
 `shrinkage`; they train for 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
 """
 RULES = "original", "mcmc"

@@ -34,7 +34,7 @@ from nrfgs_ns.appearance.opacity_bound import OPACITY_BOUNDS, OpacityBound, boun
 
 @dataclass
 class NrfConfig(AppearanceHeadConfig):
-    """Neural residual field. The defaults are the paper's, but for zero outputs and the straight-through bound."""
+    """Neural residual field. The defaults are the paper's, except for zero outputs and the straight-through bound."""
 
     _target: type = field(default_factory=lambda: NeuralResidualField)
     """the head class that this configuration builds"""
@@ -62,10 +62,8 @@ class NrfConfig(AppearanceHeadConfig):
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound | None = None
     """how base + residual stays in [0, 1] (docs/opacity.md). clamp: no gradient beyond the ends. straight-through: the
-    gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with round corners. None:
+    gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with rounded corners. None:
     logit for mcmc, otherwise straight-through"""
-    geometry_gradient: bool = True
-    """direction and distance send gradients to means and cameras"""
     implementation: Literal["auto", "torch", "fused"] = "auto"
     """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere. fused: an error instead of PyTorch"""
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"
@@ -216,8 +214,6 @@ class NeuralResidualField(AppearanceHead):
         means = splats["means"].index_select(0, visible)
         latents = splats["latents"].index_select(0, visible)
         directions, log_distance = view_geometry(means, camera_centers, self.config.distance_eps, self.scene_unit)
-        if not self.config.geometry_gradient:
-            directions, log_distance = directions.detach(), log_distance.detach()
         low, high = fourier_bands(directions, self.config.num_bands)
 
         shared = [latents, color] + ([log_distance] if self.config.use_distance else [])

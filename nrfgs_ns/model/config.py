@@ -41,24 +41,24 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     """noise on the camera centre from which the head sees each splat in training, in distances between neighbouring
     training cameras (docs/captures.md)"""
     few_views: Literal["auto", "off"] = "off"
-    """auto: V different training views trust the head with u = V / (V + 20): noise is longer by 1 / u, its opacity
-    residual is u times as large (docs/captures.md)"""
+    """auto: V different training views give the head the trust u = V / (V + 20), which divides the noise and multiplies
+    the opacity residual (docs/captures.md)"""
     shrinkage: float = 0.0
-    """weight in the loss of the splats' mean opacity and mean size, in percent, halved with every 12 training views
+    """weight in the loss of the splats' mean opacity and mean size, in percent, halved for every 12 training views
     (docs/captures.md). mcmc has its own instead"""
     warmup_steps: int | None = None
-    """steps before training in which a head with a residual at its start learns to have none. None: one for each
-    training view"""
+    """steps before training in which a head that starts with a residual unlearns it. None: one for each training
+    view"""
     densification: Strategy = "splatfacto"
-    """how splats come and go. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
+    """how splats are added and removed. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
     splat_budget"""
     splat_budget: int = 1_000_000
-    """mcmc: the number of splats that it grows to and keeps"""
+    """mcmc: the number of splats to grow to and to keep"""
     opacity_seen_by_densification: OpacitySeen | None = None
     """opacity by which splats are pruned or moved (docs/opacity.md). base: stored. peak: largest shown since the last
     refinement. None: peak for mcmc, otherwise base"""
     keep: float = 1.0
-    """share of the splats that is kept after growth; those that the training views would miss least are removed
+    """share of the splats to keep after growth; those that the training views would miss least are removed
     (docs/fewer-splats.md)"""
     original: OriginalDensification = field(default_factory=OriginalDensification)
     """thresholds of the densification 'original'"""
@@ -70,7 +70,7 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
     """what is learnt, of each photograph (exposure, white-balance) or camera (vignetting, response)"""
     robust_loss: float = 0.0
-    """largest share of the pixels that the loss ignores, those with the largest residuals: people passing by
+    """largest share of pixels that the loss ignores, those with the largest residuals, such as passers-by
     (docs/exposure.md)"""
     # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
     sh_degree: tyro.conf.Suppress[int] = 3

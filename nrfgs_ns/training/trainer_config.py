@@ -51,10 +51,10 @@ class NrfgsTrainerConfig(TrainerConfig):
     """training steps. 0: 120 for each training view, from 10,000 to 30,000, with schedules stretched to them
     (docs/captures.md)"""
     time_budget: float | None = None
-    """minutes for all steps; schedules are stretched to as many as fit"""
+    """minutes for all steps; schedules are stretched to the steps that fit"""
     schedule_steps: int | None = None
-    """steps for which schedules are given, which are stretched to the steps that are made. None: not stretched; with a
-    time budget max_num_iterations"""
+    """steps for which schedules are given; they are stretched to the actual steps. None: not stretched; with a time
+    budget: max_num_iterations"""
     average_steps: int | None = None
     """last steps over which the model's parameters are averaged. 0: none. None: 200 if max_num_iterations is 0,
     otherwise 0"""

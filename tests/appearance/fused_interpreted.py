@@ -59,7 +59,6 @@ def test_without_gradients_the_values_are_the_same(diffuse):
     split_bands=st.booleans(),
     opacity_residual=st.booleans(),
     use_distance=st.booleans(),
-    geometry_gradient=st.booleans(),
     latent_dim=st.sampled_from([1, 7, 16, 33]),
     hidden_width=st.sampled_from([3, 16, 40]),
     visible=st.integers(0, 70),

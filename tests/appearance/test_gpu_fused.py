@@ -36,7 +36,6 @@ def test_values_and_gradients(opacity_bound, visible, repeated):
         {"split_bands": False},
         {"opacity_residual": False},
         {"use_distance": False},
-        {"geometry_gradient": False},
         {"num_bands": 1},
         {"num_bands": 2, "latent_dim": 7, "hidden_width": 20},
         {"latent_dim": 16, "hidden_width": 8},

@@ -179,17 +179,6 @@ def test_smooth_bound_is_the_clamp_away_from_its_corners():
     assert (off <= (torch.exp(-SHARPNESS * corner) + math.exp(-20)) / SHARPNESS).all()
 
 
-def test_geometry_without_gradient():
-    for geometry_gradient in (True, False):
-        head = awake(geometry_gradient=geometry_gradient)
-        splats, visible, centers = scene(head)
-        splats = {name: value.requires_grad_() for name, value in splats.items()}
-        colors, opacities = head(splats, visible, centers.requires_grad_())
-        (colors.sum() + opacities.sum()).backward()
-        assert (splats["means"].grad is not None) == (centers.grad is not None) == geometry_gradient
-        assert splats["latents"].grad is not None
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**31), st.floats(-12, 12), st.floats(-3, 3), st.floats(-40, 40))
 def test_float32_stays_finite_bounded_and_near_float64(seed, log_size, color, logit):

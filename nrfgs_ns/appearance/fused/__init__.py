@@ -141,6 +141,5 @@ class FusedField:
             distance_eps=config.distance_eps * scene_unit,
             log_unit=math.log(scene_unit),
             bound=config.bound if config.opacity_residual else "none",
-            geometry_gradient=config.geometry_gradient,
             precision=config.precision,
         )

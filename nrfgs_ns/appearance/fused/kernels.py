@@ -244,7 +244,7 @@ def backward_kernel(
     d_means, d_latents, d_features_dc, d_logits, d_centers, partials,
     count, eps_squared, log_unit, color_scale, opacity_scale, sh_c0,
     D: tl.constexpr, P: tl.constexpr, H: tl.constexpr, BANDS: tl.constexpr, B: tl.constexpr, COLUMNS: tl.constexpr,
-    SLOTS: tl.constexpr, ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, GEOMETRY: tl.constexpr, CENTER: tl.constexpr,
+    SLOTS: tl.constexpr, ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, CENTER: tl.constexpr,
     KIND: tl.constexpr, GRADIENT_KIND: tl.constexpr, DIFFUSE: tl.constexpr,
 ):  # fmt: skip
     """Gradients of everything, from those of colours and opacities.
@@ -349,18 +349,17 @@ def backward_kernel(
         give(d_logits + rows + (lanes - 3), d_stored, valid & (lanes == 3), ONE_CENTER)
 
         # Geometry: d = v / r and log r, where r is floored and has no slope below the floor.
-        if GEOMETRY:
-            radial = tl.sum(tl.where(lanes < 3, -d_view * d, d_view), axis=1)[:, None]
-            radial = tl.where(above, radial, 0.0)
-            d_v = inverse * (d_view + radial * d)
-            if DIFFUSE:
-                d_v = tl.where(is_diffuse, 0.0, d_v)
-            mask = valid & (lanes < 3)
-            give(d_means + rows * 3 + lanes, deal(-d_v, B), mask, ONE_CENTER)
-            if CENTER and ONE_CENTER:
-                d_center += d_v  # 0 beyond `count`, where d_out is
-            if CENTER and not ONE_CENTER:
-                tl.store(d_centers + items * 3 + lanes, deal(d_v, B), mask=mask)
+        radial = tl.sum(tl.where(lanes < 3, -d_view * d, d_view), axis=1)[:, None]
+        radial = tl.where(above, radial, 0.0)
+        d_v = inverse * (d_view + radial * d)
+        if DIFFUSE:
+            d_v = tl.where(is_diffuse, 0.0, d_v)
+        mask = valid & (lanes < 3)
+        give(d_means + rows * 3 + lanes, deal(-d_v, B), mask, ONE_CENTER)
+        if CENTER and ONE_CENTER:
+            d_center += d_v  # 0 beyond `count`, where d_out is
+        if CENTER and not ONE_CENTER:
+            tl.store(d_centers + items * 3 + lanes, deal(d_v, B), mask=mask)
 
     mine = partials + tl.program_id(0) * SLOTS
     second = mine + 2 * P * H

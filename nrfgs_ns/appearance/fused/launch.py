@@ -122,7 +122,6 @@ class FieldOptions:
     """log of the world units in a scene unit"""
     bound: str
     """an OpacityBound, or "none" for a field without opacity residual"""
-    geometry_gradient: bool
     precision: str
 
 
@@ -149,7 +148,7 @@ class FusedFunction(torch.autograd.Function):
         packing, how, options = ctx.packing, ctx.how, ctx.options
         *tables, flags, visible, centers, packed = ctx.saved_tensors
         count, rows, device = len(visible), len(tables[0]), visible.device
-        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[9] and options.geometry_gradient
+        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[9]
         zero = not one_center or count < rows or flags is not None
         d_tables = _tables(rows, packing.latent_dim, device, zero)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
@@ -165,7 +164,7 @@ class FusedFunction(torch.autograd.Function):
                 count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
                 D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
                 B=how.block, COLUMNS=how.columns, SLOTS=partials.shape[1],
-                ONE_CENTER=one_center, BOUND=options.bound, GEOMETRY=options.geometry_gradient, CENTER=wants_center,
+                ONE_CENTER=one_center, BOUND=options.bound, CENTER=wants_center,
                 KIND=kind, GRADIENT_KIND=gradient_kind, DIFFUSE=flags is not None,
                 **how.options(packing.hidden),
             )  # fmt: skip
@@ -176,9 +175,8 @@ class FusedFunction(torch.autograd.Function):
             d_centers = sums[packing.size : packing.size + 3]
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
-        d_means = d_tables[0] if options.geometry_gradient else None
         d_centers = d_centers if wants_center else None
-        return None, None, None, d_means, *d_tables[1:], None, None, d_centers, *d_weights
+        return None, None, None, *d_tables, None, None, d_centers, *d_weights
 
 
 def packed_weights(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
