@@ -90,7 +90,7 @@ def explain(error: Exception, config: TrainerConfig) -> str:
         f"The last checkpoint is {last}, whole; with --load-dir {folder} training goes on from it, on any number of "
         "devices."
         if last
-        else "No checkpoint had been written."
+        else "This training has written no checkpoint."
     )
     total = machine.num_devices * machine.num_machines
     return f"Training stopped: the process of device {device} of {total} {what}{why}\nThe others were ended. {rest}"

@@ -392,7 +392,7 @@ class NrfgsTrainer(Trainer):
         """Save the state after the last step that was made, if it is one; what came of it."""
         self._is_ending = True
         last = next(iter(checkpoint_files.find(self.checkpoint_dir).values()), None)
-        kept = f"The last checkpoint is {last}." if last else "No checkpoint had been written."
+        kept = f"The last checkpoint is {last}." if last else "This training has written no checkpoint."
         if self._made < self._start_step:
             return f"No step had been made. {kept}"
         self.optimizers.zero_grad_some(list(self.optimizers.optimizers))

@@ -27,7 +27,7 @@ def config(tmp_path):
 
 def test_a_killed_process_is_named_and_the_checkpoint_shown(config):
     error = ProcessExitedException("died", error_index=1, error_pid=7, exit_code=-9, signal_name="SIGKILL")
-    assert "No checkpoint had been written." in launch.explain(error, config)
+    assert "This training has written no checkpoint." in launch.explain(error, config)
     config.get_checkpoint_dir().mkdir(parents=True)
     (config.get_checkpoint_dir() / "step-000000010.ckpt").touch()
     said = launch.explain(error, config)
