@@ -33,6 +33,8 @@ WIDTHS = dict(zip(COLUMNS, (1, 3, 3, 3), strict=True))
 """Columns of each table in the stream "splats"."""
 LONGEST = 200
 """Characters of what a message quotes."""
+RETIRED = "geometry_gradient"
+"""An option of the head in files of older versions. It was for training alone."""
 
 
 class Decoded(NamedTuple):
@@ -75,10 +77,10 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     if head["name"] != "nrf":
         raise ValueError(f"a head named {head['name']!r}")
     known = {field.name for field in fields(NrfConfig)} - {"_target"}
-    unknown = set(head["config"]) - known
-    if unknown:
+    options = {name: value for name, value in head["config"].items() if name != RETIRED}
+    if unknown := options.keys() - known:
         raise ValueError(f"an unknown option {sorted(unknown)[0]!r} of the head")
-    config = NrfConfig(**head["config"])
+    config = NrfConfig(**options)
     usual = NrfConfig(opacity_bound=NrfConfig().bound)
     for name in known:
         value, default = getattr(config, name), getattr(usual, name)
