@@ -6,12 +6,12 @@ pixels (a cut-off within rounding error) the image may further move by `Image.ju
 could flip.
 
 Gradients. The upstream gradient is 0 at undecided pixels, so no step enters. How far rounding can move each entry is
-measured and not guessed: the twin is run again, in float64, with every input and every projected quantity off by a
-random 8 rounding units (8 operations deep is about what either stage is), and the tolerance is 8 times the largest
-change in 6 such runs (the largest of 6 normal-like draws falls short of 1/8 of the extreme once in > 1e6), plus 64
-units of the tensor's largest entry for sums over hundreds of terms. Two known losses of gsplat enter as noise too: it
-restores T from 1 - alpha, which costs unit / T relative, and its determinant is a difference of products, which costs
-(a c / det) units.
+measured and not guessed: the twin is run again, in float64, with every input, every projected quantity and every
+pixel's offset from a splat (`reference.HELD`) off by a random 8 rounding units (8 operations deep is about what either
+stage is), and the tolerance is 8 times the largest change in 6 such runs (the largest of 6 normal-like draws falls
+short of 1/8 of the extreme once in > 1e6), plus 64 units of the tensor's largest entry for sums over hundreds of terms.
+Two known losses of gsplat enter as noise too: it restores T from 1 - alpha, which costs unit / T relative, and its
+determinant is a difference of products, which costs (a c / det) units.
 """
 
 from __future__ import annotations

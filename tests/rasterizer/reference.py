@@ -17,6 +17,10 @@ import torch
 from torch import Tensor
 
 MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE = 1 / 255, 0.999, 1e-4
+HELD = 4.0
+"""Pixels. The arithmetic to be judged may hold positions about the centre of a tile this far from its sides: positions
+and their products then lose roundings of HELD and of HELD^2, however near a pixel is to a splat's centre.
+"""
 
 
 @dataclass
@@ -151,6 +155,7 @@ def composite(
     unit: float = 2.0**-24,
     opacity_error: Tensor | float = 0.0,
     order: Tensor | None = None,
+    perturb: Callable[[Tensor], Tensor] = lambda t: t,
 ) -> Image:
     """Blend N splats into one image.
 
@@ -162,7 +167,12 @@ def composite(
             `undecided` and `jump` only, never the image.
         opacity_error: relative error of the opacities beyond rounding, in the same role. [N]
         order: visible splats from front to back, where noise in the depths must not break ties; by default, sorted. [n]
+        perturb: see `rasterization`.
     """
+
+    def held(t: Tensor, size: float) -> Tensor:
+        return t + (perturb(torch.full_like(t, size)) - size)
+
     if order is None:
         order = torch.argsort(screen.depths.detach(), stable=True)
         order = order[screen.visible[order]]
@@ -175,8 +185,8 @@ def composite(
     if pixel_means2d.requires_grad:
         pixel_means2d = pixel_means2d.clone()
         pixel_means2d.retain_grad()
-    d = torch.stack([x, y], -1).double() - pixel_means2d  # [n, H, W, 2]
-    sigma = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", d, conics, d)
+    d = held(torch.stack([x, y], -1).double() - pixel_means2d, HELD)  # [n, H, W, 2]
+    sigma = 0.5 * torch.einsum("nij,nhwij->nhw", conics, held(d[..., :, None] * d[..., None, :], HELD**2))
     raw = opacities * torch.exp(-sigma)
 
     def reach(sides: Tensor, shift: Tensor | float = 0.0) -> Tensor:
@@ -185,7 +195,7 @@ def composite(
         return rows[:, :, None] & columns[:, None, :]
 
     within = reach(sides.ceil())
-    counts = within & (raw >= MIN_ALPHA) & (sigma >= 0)
+    counts = within & (raw >= MIN_ALPHA)
     alpha = torch.where(counts, raw.clamp(max=MAX_ALPHA), 0.0)
     after = torch.cumprod(1 - alpha, dim=0)
     drawn = after > MIN_TRANSMITTANCE
@@ -198,12 +208,14 @@ def composite(
 
     with torch.no_grad():
         # Error of l in roundings: 8 in opacity and exp; 8 in each entry of the conic, whose terms may cancel; 8 in the
-        # determinant as a difference of products (a c / det of them); 8 in positions, times the slope of sigma there.
+        # determinant as a difference of products (a c / det of them); 8 in positions, times the slope of sigma there;
+        # 8 in the products of positions about a tile's centre.
         terms = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", d.abs(), conics.abs(), d.abs())
         cancelled = (conics[:, 0, 0] * conics[:, 1, 1] / torch.linalg.det(conics))[:, None, None]
         slope = torch.einsum("nij,nhwj->nhwi", conics, d).abs().sum(-1)
         where = means2d.abs().amax(-1)[:, None, None] + max(width, height)
-        error = 8 * unit * (1 + terms + cancelled * sigma + slope * where) + opacity_error
+        products = 0.5 * HELD**2 * conics.abs().sum((1, 2))[:, None, None]
+        error = 8 * unit * (1 + terms + cancelled * sigma + slope * where + products) + opacity_error
         rounding = 2 * (weights * error).sum(0) + 8 * unit
         lost = torch.cumsum(torch.where(counts, alpha / (1 - alpha) * error, 0.0), 0) + 8 * unit  # relative error of T
 
@@ -245,9 +257,9 @@ def rasterization(
     """The twin of `gsplat_call.rasterization`, camera by camera.
 
     Args:
-        perturb: applied to the projected means, depths, conics and compensations, and to the transmittance that
-            expected depth is divided by; with noise of a few rounding units it shows what rounding does to the image
-            and to its gradients.
+        perturb: applied to the projected means, depths, conics and compensations, to pixels' offsets and their products
+            (`HELD`), and to the transmittance that expected depth is divided by; with noise of a few rounding units it
+            shows what rounding does to the image and to its gradients.
         orders: see `composite`; one per camera.
         limits: near_plane, far_plane, radius_clip, eps2d, packed, bounds.
 
@@ -283,6 +295,7 @@ def rasterization(
             unit=unit,
             opacity_error=opacity_error,
             order=order,
+            perturb=perturb,
         )
         render = image.render
         if render_mode in ("ED", "RGB+ED"):
