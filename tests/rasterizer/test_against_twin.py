@@ -56,6 +56,26 @@ def test_tile_sizes(tile_size):
     check(case)
 
 
+@pytest.mark.parametrize("offset", [0.0, 1e-3, 0.02])
+def test_points_beside_pixel_centres(offset):
+    """A tile's corners, where what is linear and square in the pixel's place cancels most."""
+    centres = torch.tensor([[0.5, 0.5], [7.5, 0.5], [0.5, 7.5], [7.5, 7.5]]) + offset
+    case = Case(
+        means=torch.cat([(centres - 4) / 5, torch.full((4, 1), 2.0)], 1),
+        quats=torch.tensor([[1.0, 0.2, 0.3, 0.4]]).repeat(4, 1),
+        scales=torch.tensor([[1e-4, 8e-5, 6e-5]]).repeat(4, 1),
+        opacities=torch.full((4,), 0.5),
+        colors=torch.tensor([[-0.9], [-0.2], [0.4], [1.1]]),
+        viewmats=torch.eye(4)[None],
+        Ks=torch.tensor([[[10.0, 0.0, 4.0], [0.0, 10.0, 4.0], [0.0, 0.0, 1.0]]]),
+        width=8,
+        height=8,
+        options={"eps2d": 0.1},
+    )
+    check(case)
+    check(case, torch.float64)
+
+
 @st.composite
 def scenes(draw) -> Case:
     """Clouds from opaque to transparent, from dust to planets, round to needle-like, near and far, 1 or 2 cameras."""
