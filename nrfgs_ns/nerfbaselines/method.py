@@ -10,8 +10,10 @@ A checkpoint is a folder:
 With the training set a training goes on from it as if it had never stopped; without, it renders.
 """
 
+import contextlib
 import copy
 import json
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -75,9 +77,9 @@ class Nrfgs:
             self.world = World(torch.tensor(record["transform"], dtype=torch.float64), record["scale"])
         if train_dataset is None:
             self.record = record
-            self.loaded = read_or_refuse(_checkpoint_file(self.checkpoint))
-            self.model = _build_model(copy.deepcopy(self.config), record, self.loaded)
-            self.step = self.loaded["step"] + 1
+            loaded = read_or_refuse(_checkpoint_file(self.checkpoint))
+            self.model = _build_model(copy.deepcopy(self.config), record, loaded)
+            self.step = loaded["step"] + 1
         else:
             self._set_up_training(train_dataset)
         self.loaded_step = None if self.checkpoint is None else self.step
@@ -197,7 +199,9 @@ class Nrfgs:
         (folder / "config.yml").write_text(yaml.dump(self.config), encoding="utf-8")
         (folder / "world.json").write_text(json.dumps(self.record, indent=1) + "\n", encoding="utf-8")
         if self.trainer is None:
-            torch.save(self.loaded, models / _checkpoint_file(self.checkpoint).name)
+            file = _checkpoint_file(self.checkpoint)
+            with contextlib.suppress(shutil.SameFileError):
+                shutil.copyfile(file, models / file.name)  # nerfbaselines asks for the same bytes
             return
         self.trainer.checkpoint_dir = models
         self.trainer.save_checkpoint(self.step - 1)
