@@ -7,11 +7,11 @@ could flip.
 
 Gradients. The upstream gradient is 0 at undecided pixels, so no step enters. How far rounding can move each entry is
 measured and not guessed: the twin is run again, in float64, with every input, every projected quantity and every
-pixel's offset from a splat (`reference.HELD`) off by a random 8 rounding units (8 operations deep is about what either
-stage is), and the tolerance is 8 times the largest change in 6 such runs (the largest of 6 normal-like draws falls
-short of 1/8 of the extreme once in > 1e6), plus 64 units of the tensor's largest entry for sums over hundreds of terms.
-Two known losses of gsplat enter as noise too: it restores T from 1 - alpha, which costs unit / T relative, and its
-determinant is a difference of products, which costs (a c / det) units.
+pixel's offset from a splat (`reference.HELD`) off by a random 8 rounding units, and so each gradient on its way back (8
+operations deep is about what either stage is). The tolerance is 8 times the largest change in 6 such runs (the largest
+of 6 normal-like draws falls short of 1/8 of the extreme once in > 1e6), plus 64 units of the tensor's largest entry for
+sums over hundreds of terms. Two known losses of gsplat enter as noise too: it restores T from 1 - alpha, which costs
+unit / T relative, and its determinant is a difference of products, which costs (a c / det) units.
 """
 
 from __future__ import annotations
@@ -57,7 +57,11 @@ def _run(
         if t.dim() == 3 and t.shape[-1] == 2:  # conics
             condition = (t[:, 0, 0] * t[:, 1, 1] / torch.linalg.det(t)).detach()
             xi = 0.5 * (xi + xi.mT) + (condition * (2 * torch.rand(len(t), generator=noise) - 1))[:, None, None]
-        return t * (1 + 8 * unit * xi)
+        noisy = t * (1 + 8 * unit * xi)
+        if noisy.requires_grad:  # by itself: near the camera what centre and conic pass to the depth cancels
+            own = 1 + 8 * unit * (2 * torch.rand(t.shape, generator=noise, dtype=torch.float64) - 1)
+            noisy.register_hook(lambda grad: grad * own)
+        return noisy
 
     inputs = [shaken(getattr(case, name).double()).clone().requires_grad_() for name in PARAMETERS]
     render, alphas, screens, images = reference.rasterization(

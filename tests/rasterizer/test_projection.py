@@ -84,6 +84,28 @@ def test_flat_splat_has_finite_gradients():
     assert p.compensations.item() == 0 and torch.isfinite(scales.grad).all()
 
 
+@pytest.mark.parametrize("near", [0.012, 0.1, 1.0])
+def test_gradients_of_compensations_near_the_camera(near):
+    """What the blur adds to the determinant of a large splat is below float32's rounding of either determinant.
+
+    Each entry is a sum of some ten products: it may be off by 64 rounding units of the largest.
+    """
+    g = torch.Generator().manual_seed(0)
+    depth = near * (1 + torch.rand(500, generator=g))
+    means = torch.cat([0.3 * depth[:, None] * torch.randn(500, 2, generator=g), depth[:, None]], 1)
+    quats, scales = torch.randn(500, 4, generator=g), torch.exp(0.5 * torch.randn(500, 3, generator=g))
+
+    def gradients(dtype: torch.dtype) -> list[torch.Tensor]:
+        splats = [one.to(dtype, copy=True).requires_grad_() for one in (means, quats, scales)]
+        camera = torch.eye(4, dtype=dtype)[None], _camera(W, H)[None].to(dtype)
+        found = project(*splats, *camera, W, H, rasterize_mode="antialiased")
+        found.compensations.sum().backward()
+        return [one.grad.double() for one in splats]
+
+    for ours, exact in zip(gradients(torch.float32), gradients(torch.float64), strict=True):
+        assert (ours - exact).abs().max() <= 64 * 2**-24 * exact.abs().max()
+
+
 def test_long_needles_keep_a_definite_conic():
     """Ten thousand pixels long, a third of a pixel wide: the covariance's determinant is 1e-9 of its products."""
     p = one(z=1.0, scale=1e-6)

@@ -203,9 +203,13 @@ def _back_to_camera(
     # The slope of the root is held as in gsplat, 1 / (2 (sqrt(x) + 1e-6)): finite where a flat splat has x = 0.
     root = _compensations(screen)
     by_ratio = (by_compensations * 0.5 / (root + COMPENSATION_EPS)) / screen.det_blurred
-    by_det_blurred = -(by_conics * _conics(screen).t()).sum(0) - by_ratio * root * root
-    by_det = by_det_blurred + by_ratio
-    by_xx, by_yy = by_xx + eps2d * by_det_blurred, by_yy + eps2d * by_det_blurred
+    by_inverse = -(by_conics * _conics(screen).t()).sum(0)
+    # Of det(cov2d) by itself and as a part of det(cov2d + eps2d I): the difference of the two, which is nearly nothing
+    # for a large splat, is 1 - root^2, written as what the blur adds.
+    xx, _, yy = screen.blurred
+    by_det = by_inverse + by_ratio * (eps2d * (xx + yy - eps2d) / screen.det_blurred)
+    by_trace = eps2d * (by_inverse - by_ratio * root * root)
+    by_xx, by_yy = by_xx + by_trace, by_yy + by_trace
 
     by_normal = 2 * by_det * screen.normal
     by_a0 = torch.linalg.cross(a1, by_normal, dim=0) + 2 * by_xx * a0 + by_xy * a1
