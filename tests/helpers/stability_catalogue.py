@@ -27,7 +27,7 @@ from nrfgs_ns.rasterizer.torch_cpu.projection import LARGEST_RADIUS, MIN_QUATERN
 from nrfgs_ns.training.guard import MAX_GRADIENT
 
 HEAD, RASTER = "tests/appearance/test_stability_head.py", "tests/rasterizer/test_stability_rasterizer.py"
-GUARD = "tests/training/test_guard.py"
+GUARD, PROJECTION = "tests/training/test_guard.py", "tests/rasterizer/test_projection.py"
 SIDE = 16
 """Pixels along a side of the image that the checks draw."""
 
@@ -77,10 +77,17 @@ def camera() -> tuple[Tensor, Tensor, int, int]:
     return torch.eye(4)[None], K[None], SIDE, SIDE
 
 
-def sees(**changed: list[float]) -> Projection:
+def sees(mode: str = "classic", **changed: list[float]) -> Projection:
     """Projection of one splat."""
     values = {"means": [0.0, 0.0, 2.0], "quats": [1.0, 0.0, 0.0, 0.0], "scales": [0.1] * 3}
-    return project(*(torch.tensor([changed.get(name, value)]) for name, value in values.items()), *camera())
+    splat = (torch.tensor([changed.get(name, value)]) for name, value in values.items())
+    return project(*splat, *camera(), rasterize_mode=mode)
+
+
+def within_one(**changed: list[float]) -> bool:
+    """Whether a splat's antialiasing factor is in [0, 1]."""
+    factors = sees("antialiased", **changed).compensations
+    return len(factors) == 1 and bool(((factors >= 0) & (factors <= 1)).all())
 
 
 def harmless(**changed: list[float] | float) -> bool:
@@ -284,6 +291,17 @@ CATALOGUE = [
             bool((sees(scales=[0.0] * 3).conics <= 1 / 0.3 * (1 + 1e-6)).all())
             and finite(sees(scales=[1e15] * 3).conics)
         ),
+    ),
+    Quantity(
+        "antialiasing factor",
+        "[0, 1]",
+        "0 for a flat splat seen from its edge: the root's slope is held",
+        "1 for a splat on the lens: gradients are right to rounding",
+        (
+            f"{PROJECTION}::test_flat_splat_has_finite_gradients",
+            f"{PROJECTION}::test_gradients_of_compensations_near_the_camera",
+        ),
+        lambda: within_one(scales=[0.0] * 3) and within_one(means=[0.0, 0.0, 0.01], scales=[1e3] * 3),
     ),
     Quantity(
         "alpha",
