@@ -295,7 +295,7 @@ CATALOGUE = [
     Quantity(
         "antialiasing factor",
         "[0, 1]",
-        "0 for a flat splat seen from its edge: the root's slope is held",
+        "0 for a point, or a flat splat seen from its edge: the root's slope is held",
         "1 for a splat on the lens: gradients are right to rounding",
         (
             f"{PROJECTION}::test_flat_splat_has_finite_gradients",
