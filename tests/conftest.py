@@ -55,7 +55,7 @@ def captures() -> Path:
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory) -> Path:
     """A procedural data set of 10 views, 48 x 36, with 300 points."""
-    from nrfgs_ns.scenes import SceneConfig, write_scene
+    from nrfgs_lab.scenes import SceneConfig, write_scene
 
     config = SceneConfig(views=10, width=48, height=36, points=300, samples=1)
     return write_scene(config, tmp_path_factory.mktemp("data") / "tiny")

@@ -14,12 +14,12 @@ import pytest
 import yaml
 
 import nrfgs_ns
+from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.densification import build_densification
 from nrfgs_ns.export.command import Export, PlyOptions
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.ply import read_splats
-from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.run import evaluate
 from nrfgs_ns.training.trainer import NrfgsTrainer
 

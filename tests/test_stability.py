@@ -10,7 +10,7 @@ import pytest
 from hard_trainings import SCENE, hard_trainings, run, table
 from stability_catalogue import CATALOGUE
 
-from nrfgs_ns.scenes import write_scene
+from nrfgs_lab.scenes import write_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
 
 from nrfgs_ns.data.checks import exists, shown, warn
 from nrfgs_ns.data.colmap import read_points
@@ -47,6 +47,15 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if rgb.dtype.kind not in "iuf":
         raise InputError(f"{path}: its colours are not numbers. {fix}")
     return _finite(xyz, rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0), path)
+
+
+def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    """Writes a .ply of points [N, 3], stored as float32, with colours uint8 [N, 3]."""
+    names = ("x", "y", "z", "red", "green", "blue")
+    vertices = np.empty(len(xyz), dtype=list(zip(names, ["<f4"] * 3 + ["u1"] * 3, strict=True)))
+    for name, values in zip(names, (*xyz.T, *rgb.T), strict=True):
+        vertices[name] = values
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
 
 
 def _check_counts(path: Path) -> None:

@@ -18,6 +18,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from nrfgs_ns.data.pictures import exif_of, exif_of_copy, known, open_picture
+from nrfgs_ns.data.points import write_ply
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare.structure import colmap
@@ -60,7 +61,7 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[]
     points = list(model.points3D.values())
     xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
     rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
-    write_points(out / "sparse.ply", xyz, rgb)
+    write_ply(out / "sparse.ply", xyz, rgb)
     write_whole(out / "transforms.json", json.dumps(transforms(model, images, taken), indent=1) + "\n")
 
 

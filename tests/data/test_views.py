@@ -9,11 +9,11 @@ import torch
 from hard_trainings import rescale
 from short_trainings import set_up
 
+from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.views import different_views, evenly_spaced, scene_unit
-from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.optimizers import in_world_units
 
 

@@ -68,7 +68,7 @@ def psnr(method: str, data: Path, out: Path, steps: int, options: dict[str, Any]
 def main(scenes: Path, work: Path) -> None:
     """Run all cases and write the file."""
     from nrfgs_lab.results import write
-    from nrfgs_ns.scenes import SceneConfig, write_scene
+    from nrfgs_lab.scenes import SceneConfig, write_scene
 
     tiny = write_scene(SceneConfig(views=10, width=48, height=36, points=300, samples=1), work / "tiny")
     records = {}

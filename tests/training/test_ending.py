@@ -271,7 +271,7 @@ def test_a_training_that_is_refused_leaves_nothing(tiny_scene, tmp_path):
 
 
 def test_another_scene_and_other_options_are_refused(whole, tiny_scene, tmp_path):
-    from nrfgs_ns.scenes import SceneConfig, write_scene
+    from nrfgs_lab.scenes import SceneConfig, write_scene
 
     folder = models_of(trained(command_line("nrfgs", tiny_scene, tmp_path / "a", 1, BUSY)))
     other = write_scene(SceneConfig(views=10, width=48, height=36, points=300, samples=1, seed=5), tmp_path / "other")

@@ -113,7 +113,7 @@ def test_cameras_are_told_apart_by_exif_or_by_their_angle():
 def exposed_scene(tmp_path_factory):
     """A procedural data set of 24 photographs, 128 x 96, with known stops, and those stops by name."""
     from nrfgs_lab.exposure import exposed as exposed_bytes
-    from nrfgs_ns.scenes import SceneConfig, write_scene
+    from nrfgs_lab.scenes import SceneConfig, write_scene
 
     config = SceneConfig(views=24, width=128, height=96, points=4000, samples=1)
     scene = write_scene(config, tmp_path_factory.mktemp("data") / "exposed")

@@ -17,7 +17,7 @@ from short_trainings import assert_same_training, command_line, trained
 from smoke_runs import PLAIN, after_one_step, bound, cases, gain_bound
 from smoke_runs import STEPS as SHORT
 
-from nrfgs_ns.scenes import SceneConfig, write_scene
+from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.checkpoint_files import find, read_latest
 from nrfgs_ns.training.run import evaluate, train
 

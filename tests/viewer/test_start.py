@@ -11,9 +11,9 @@ from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
 from viser import _icons
 
+from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.run import parse
 from nrfgs_ns.viewer import start
 

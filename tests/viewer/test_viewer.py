@@ -29,6 +29,7 @@ from viser.infra import _infra
 from viser.transforms import SO3
 
 import nrfgs_ns.training.trainer
+from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.gsnb import GsnbConfig
@@ -41,7 +42,6 @@ from nrfgs_ns.export.command import Export, PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
-from nrfgs_ns.scenes import SceneConfig, write_scene
 from nrfgs_ns.training.run import parse
 from nrfgs_ns.viewer.pictures import (
     BASE,

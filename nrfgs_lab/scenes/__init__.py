@@ -5,7 +5,7 @@ A textured diffuse floor, glossy and mirror-like spheres and a box, three colour
 gloss 0 every surface point has one colour from everywhere; view dependence grows with the dial. The scene can be
 written as a nerfstudio data set, or asked for its colour along any ray:
 
-    from nrfgs_ns.scenes import SceneConfig, build_scene, write_scene
+    from nrfgs_lab.scenes import SceneConfig, build_scene, write_scene
 
     write_scene(SceneConfig(gloss=0.5), Path("data/spheres"))
     scene = build_scene(SceneConfig(gloss=0.5))

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 
-from nrfgs_ns.scenes import (
+from nrfgs_lab.scenes import (
     FIRST_SOLID,
     SceneConfig,
     build_scene,
@@ -20,7 +20,7 @@ from nrfgs_ns.scenes import (
     tone_curve,
     write_scene,
 )
-from nrfgs_ns.scenes.dataset import sparse_points
+from nrfgs_lab.scenes.dataset import sparse_points
 
 MATT = SceneConfig(gloss=0.0, views=10, width=96, height=72, points=1500)
 GLOSSY = SceneConfig(gloss=1.0, views=9, width=24, height=18, points=50)

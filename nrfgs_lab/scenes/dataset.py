@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 from .cameras import camera_rays, dome_cameras, project, render
 from .config import SceneConfig
@@ -107,6 +106,8 @@ def _sees(scene: Scene, camera: Array, points: Array) -> Array:
 
 
 def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
+    from nrfgs_ns.data.points import write_ply  # imports nerfstudio: seconds, for work alone
+
     config = scene.config
     cameras = dome_cameras(config)
     train, test = split_names(config)
@@ -120,7 +121,7 @@ def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
 
     is_train = np.isin(names, train)
     points, colours = sparse_points(scene, cameras[is_train])
-    write_points(folder / "sparse.ply", points, np.round(255.0 * colours).astype(np.uint8))
+    write_ply(folder / "sparse.ply", points, np.round(255.0 * colours).astype(np.uint8))
     transforms = {
         "camera_model": "OPENCV",
         "w": config.width,
@@ -140,15 +141,6 @@ def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
         ],
     }
     _write_json(folder / "transforms.json", transforms)
-
-
-def write_points(path: Path, points: Array, colours: Array) -> None:
-    """Write a .ply of points float32 [P, 3] with colours uint8 [P, 3]."""
-    names = ("x", "y", "z", "red", "green", "blue")
-    vertices = np.empty(len(points), dtype=list(zip(names, ["<f4"] * 3 + ["u1"] * 3, strict=True)))
-    for name, values in zip(names, (*points.T, *colours.T), strict=True):
-        vertices[name] = values
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
 
 
 def _write_json(path: Path, content: dict) -> None:

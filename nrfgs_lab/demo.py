@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from nrfgs_lab.scenes import SceneConfig, build_scene, dome_cameras, render, split_names, write_scene
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable
-from nrfgs_ns.scenes import SceneConfig, build_scene, dome_cameras, render, split_names, write_scene
 
 METHODS = {"nrfgs": "NRF", "nrfgs-sh": "SH"}
 RESIDUAL_GAIN = 4.0

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.scenes import FIRST_SOLID, GROUND, SKY, SceneConfig, build_scene, camera_rays, dome_cameras
-from nrfgs_ns.scenes.geometry import CAMERA, Box, Sphere, World, smoothstep
-from nrfgs_ns.scenes.shading import (
+from nrfgs_lab.scenes import FIRST_SOLID, GROUND, SKY, SceneConfig, build_scene, camera_rays, dome_cameras
+from nrfgs_lab.scenes.geometry import CAMERA, Box, Sphere, World, smoothstep
+from nrfgs_lab.scenes.shading import (
     Ambient,
     Finish,
     fresnel,
@@ -20,7 +20,7 @@ from nrfgs_ns.scenes.shading import (
     mirror_direction,
     tone_curve,
 )
-from nrfgs_ns.scenes.textures import Waves
+from nrfgs_lab.scenes.textures import Waves
 
 
 @pytest.mark.parametrize(
