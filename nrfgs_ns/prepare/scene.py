@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 from nrfgs_ns.data.pictures import exif_of, exif_of_copy, known, open_picture
 from nrfgs_ns.data.points import write_ply
@@ -63,15 +62,6 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[]
     rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     write_ply(out / "sparse.ply", xyz, rgb)
     write_whole(out / "transforms.json", json.dumps(transforms(model, images, taken), indent=1) + "\n")
-
-
-def write_points(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
-    """Write a .ply of points float32 [P, 3] with colours uint8 [P, 3]."""
-    names = ("x", "y", "z", "red", "green", "blue")
-    vertices = np.empty(len(points), dtype=list(zip(names, ["<f4"] * 3 + ["u1"] * 3, strict=True)))
-    for name, values in zip(names, (*points.T, *colours.T), strict=True):
-        vertices[name] = values
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
 
 
 def transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float | str]]) -> dict[str, Any]:
