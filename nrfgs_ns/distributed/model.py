@@ -120,8 +120,8 @@ class ShardedModel(NrfgsModel):
         """This device's splats in all cameras; at once if they have the same size."""
         if len(set(self.sizes)) == 1:
             viewmats, Ks = torch.cat([one.viewmat for one in pinholes]), torch.cat([one.K for one in pinholes])
-            return project_splats(splats, viewmats, Ks, *self.sizes[0], self.projecting)
-        parts = [project_view(splats, one, self.projecting).projection for one in pinholes]
+            return project_splats(splats, viewmats, Ks, *self.sizes[0], self.projection_options)
+        parts = [project_view(splats, one, self.projection_options).projection for one in pinholes]
         for index, part in enumerate(parts):
             part.camera_ids = torch.full_like(part.camera_ids, index)
         names = ("camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics")

@@ -212,12 +212,13 @@ def render_splats(
     from nrfgs_ns.appearance.field import Field
     from nrfgs_ns.appearance.sh import ShConfig
     from nrfgs_ns.model.pinhole import pinhole
-    from nrfgs_ns.model.renderer import Projecting, composite_view, project_view
+    from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
 
     device = splats.means.device
     pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
     field = Field(ShConfig(degree=3).setup(), splats._asdict())
-    view = project_view(field.splats, pinhole(camera, pose.to(device), 1), Projecting(rasterize_mode, scene_unit))
+    options = projection_options(rasterize_mode, scene_unit)
+    view = project_view(field.splats, pinhole(camera, pose.to(device), 1), options)
     return composite_view(view, field.seen_from(view), background.to(device))[0]["rgb"]
 
 

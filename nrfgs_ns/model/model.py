@@ -37,10 +37,11 @@ from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.model.initial_splats import initial_splats
 from nrfgs_ns.model.look import look_asked_for, warn_if_asked
 from nrfgs_ns.model.pinhole import Pinhole, Pinholes
-from nrfgs_ns.model.renderer import Projecting, View, composite_view, project_view
+from nrfgs_ns.model.renderer import View, composite_view, project_view, projection_options
 from nrfgs_ns.model.training_views import TrainingPictures
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
+from nrfgs_ns.rasterizer import ProjectionOptions
 
 __all__ = ["NrfgsModel", "NrfgsModelConfig"]  # a config.yml names both here
 
@@ -164,14 +165,15 @@ class NrfgsModel(SplatfactoModel):
         return Field(self.head, splats)
 
     @property
-    def projecting(self) -> Projecting:
+    def projection_options(self) -> ProjectionOptions:
         """How this model projects its splats."""
         # In training the guard looks for what is not finite.
-        return Projecting(self.config.rasterize_mode, self.scene_unit, assume_finite=self.training)
+        return projection_options(self.config.rasterize_mode, self.scene_unit, assume_finite=self.training)
 
     def project(self, camera: Cameras, splats: Mapping[str, Tensor] | None = None) -> View:
         """Project splats into a camera (`project_view`): the field's, or another table."""
-        return project_view(self.field.splats if splats is None else splats, self.pinhole(camera), self.projecting)
+        splats = self.field.splats if splats is None else splats
+        return project_view(splats, self.pinhole(camera), self.projection_options)
 
     def composite(
         self,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a camera is rendered, as functions of values: geometry -> appearance -> rasterizer -> image.
 
-    view = project_view(field.splats, seen_from, projecting)      # which splats, and where
-    appearance = field.seen_from(view)                             # what they look like (`appearance/field.py`)
+    view = project_view(field.splats, pinhole, options)            # which splats, and where
+    appearance = field.seen_from(view)                             # their colours and opacities (`appearance/field.py`)
     outputs, info = composite_view(view, appearance, background)   # the image
 
 Nothing here needs CUDA.
@@ -16,23 +16,19 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.model.pinhole import Pinhole
-from nrfgs_ns.rasterizer import Projection, RasterizeMode, composite, project
+from nrfgs_ns.rasterizer import Projection, ProjectionOptions, RasterizeMode, composite, project
 
 NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 """Depths between which splats are drawn, in scene units: splatfacto's."""
 
 
-class Projecting(NamedTuple):
-    """What can be chosen about a projection."""
-
-    rasterize_mode: RasterizeMode = "classic"
-    """classic: splats are blurred and not dimmed for it. antialiased: they are"""
-    scene_unit: float = 1.0
-    """world units in a scene unit, in which the near plane is 0.01"""
-    assume_finite: bool = False
-    """do not look for splats that are not finite, which costs a GPU a wait"""
-    every_row: bool = False
-    """rows for splats that are not visible, too, as `rasterizer.project` says"""
+def projection_options(
+    rasterize_mode: RasterizeMode, scene_unit: float, *, assume_finite: bool = False
+) -> ProjectionOptions:
+    """Options of a projection whose planes are splatfacto's, in scene units of `scene_unit` world units."""
+    return ProjectionOptions(
+        rasterize_mode, NEAR_PLANE * scene_unit, FAR_PLANE * scene_unit, assume_finite=assume_finite
+    )
 
 
 class View(NamedTuple):
@@ -50,29 +46,26 @@ class View(NamedTuple):
 
 
 def project_splats(
-    splats: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor, width: int, height: int, projecting: Projecting
+    splats: Mapping[str, Tensor],
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    options: ProjectionOptions = ProjectionOptions(),  # noqa: B008
 ) -> Projection:
-    """Project a table of splats (of "scales" the logarithms) into cameras [C, 4, 4], [C, 3, 3] of one size."""
-    return project(
-        splats["means"],
-        splats["quats"],
-        splats["scales"].exp(),
-        viewmats,
-        Ks,
-        width,
-        height,
-        near_plane=NEAR_PLANE * projecting.scene_unit,
-        far_plane=FAR_PLANE * projecting.scene_unit,
-        rasterize_mode=projecting.rasterize_mode,
-        assume_finite=projecting.assume_finite,
-        every_row=projecting.every_row,
-    )
+    """Project a table of splats ("scales" are logarithms) into cameras [C, 4, 4], [C, 3, 3] of one size."""
+    geometry = splats["means"], splats["quats"], splats["scales"].exp()
+    return project(*geometry, viewmats, Ks, width, height, options)
 
 
-def project_view(splats: Mapping[str, Tensor], seen_from: Pinhole, projecting: Projecting = Projecting()) -> View:  # noqa: B008
+def project_view(
+    splats: Mapping[str, Tensor],
+    pinhole: Pinhole,
+    options: ProjectionOptions = ProjectionOptions(),  # noqa: B008
+) -> View:
     """Project a table of splats into one camera."""
-    projection = project_splats(splats, seen_from.viewmat, seen_from.K, seen_from.width, seen_from.height, projecting)
-    return View(projection, seen_from.center)
+    projection = project_splats(splats, pinhole.viewmat, pinhole.K, pinhole.width, pinhole.height, options)
+    return View(projection, pinhole.center)
 
 
 def composite_view(
@@ -105,7 +98,7 @@ def composite_view(
         appearance.colors,
         appearance.opacities,
         backgrounds=background[None],
-        render_mode="RGB+ED" if with_depth else "RGB",
+        with_depth=with_depth,
         absgrad=absgrad,
         assume_finite=assume_finite,
     )

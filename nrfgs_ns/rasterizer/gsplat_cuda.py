@@ -17,7 +17,7 @@ from torch import Tensor
 from nrfgs_ns.host import GSPLAT, gsplat_version
 from nrfgs_ns.kernels.trial import Gate
 
-from .contract import Projection
+from .contract import EPS2D, TILE_SIZE, Projection, ProjectionOptions
 
 if TYPE_CHECKING:  # imports Triton
     from .tile_lists import Room
@@ -26,7 +26,6 @@ HAS_BATCHES = gsplat_version() >= (1, 5)
 if HAS_BATCHES and gsplat_version() < (1, 5, 3):
     raise ImportError(f"gsplat {'.'.join(map(str, gsplat_version()))} is not known here; use {' or '.join(GSPLAT)}.")
 
-CHANNEL_CHUNK = 32  # more channels at once slow the kernels down
 MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` look through
 MOST_TILES = 2**15  # those beyond have no 16-bit number, as `tile_lists.py` wants
 
@@ -45,15 +44,7 @@ def project(
     Ks: Tensor,
     width: int,
     height: int,
-    *,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
-    rasterize_mode: str,
-    packed: bool = True,
-    assume_finite: bool = False,
-    every_row: bool = False,
+    options: ProjectionOptions,
 ) -> Projection:
     """See `nrfgs_ns.rasterizer.project`.
 
@@ -61,42 +52,51 @@ def project(
     turn into NaN gradients of its shared weights. Where that happens the projection is repeated without those splats;
     to find out costs three sums and one wait, right after gsplat's own wait for the number of rows.
     """
-    settings = dict(
-        eps2d=eps2d,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        calc_compensations=rasterize_mode == "antialiased",
-    )
-    geometry = (means, quats, scales)
-    if every_row:
-        return _every_row(geometry, viewmats, Ks, width, height, **settings)
-    settings["packed"] = packed
-    rows = _visible_rows(*geometry, viewmats, Ks, width, height, **settings)
-    if not (assume_finite or _finite(rows)):
+    geometry, cameras = (means, quats, scales), (viewmats, Ks, width, height)
+    if options.every_row:
+        return _every_row(geometry, cameras, options)
+    rows = _visible_rows(geometry, cameras, options)
+    if not (options.assume_finite or _finite(rows)):
         camera_ids, gaussian_ids, _, means2d, depths, conics, _, _ = rows
         bad = ~torch.isfinite(torch.cat([means2d, depths[:, None], conics], dim=1)).all(dim=1)
         keep = torch.ones(len(means), dtype=torch.bool, device=means.device)
         keep[gaussian_ids[bad]] = False
         kept = keep.nonzero().squeeze(1)
-        geometry = (table.index_select(0, kept) for table in geometry)
-        camera_ids, gaussian_ids, *seen = _visible_rows(*geometry, viewmats, Ks, width, height, **settings)
+        geometry = tuple(table.index_select(0, kept) for table in geometry)
+        camera_ids, gaussian_ids, *seen = _visible_rows(geometry, cameras, options)
         rows = (camera_ids, kept.index_select(0, gaussian_ids), *seen)
     *columns, extents = rows
     return Projection(*columns, width=width, height=height, n_cameras=viewmats.shape[0], extents=extents)
 
 
-def _every_row(geometry: tuple[Tensor, ...], viewmats, Ks, width, height, **settings) -> Projection:
-    """One camera's rows of all splats; those that it does not see have radius 0, and numbers that mean nothing."""
+def _kernel(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions, *, packed: bool) -> tuple:
+    """Gsplat's projection. Its dense kernel (not packed) has rows for all splats, and another radius formula."""
     means, quats, scales = geometry
-    rows = fully_fused_projection(means, None, quats, scales, viewmats, Ks, width, height, packed=False, **settings)
+    return fully_fused_projection(
+        means,
+        None,
+        quats,
+        scales,
+        *cameras,
+        eps2d=EPS2D,
+        near_plane=options.near_plane,
+        far_plane=options.far_plane,
+        calc_compensations=options.rasterize_mode == "antialiased",
+        packed=packed,
+    )
+
+
+def _every_row(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> Projection:
+    """One camera's rows of all splats. Invisible rows have radius 0, and meaningless numbers otherwise."""
+    rows = _kernel(geometry, cameras, options, packed=False)
     radii, means2d, depths, conics, compensations = (None if part is None else part.squeeze(0) for part in rows)
-    row = torch.arange(len(means), device=means.device)
+    row = torch.arange(len(geometry[0]), device=geometry[0].device)
     extents = radii if HAS_BATCHES else None
     if HAS_BATCHES:
         radii = radii.amax(dim=-1)
     else:
         radii = _packed_radii(radii, conics.detach())
+    _, _, width, height = cameras
     return Projection(
         torch.zeros_like(row), row, radii, means2d, depths, conics, compensations,
         width=width, height=height, n_cameras=1, extents=extents,
@@ -120,36 +120,19 @@ def _finite(rows: tuple) -> bool:
     return bool(torch.isfinite(total))
 
 
-def _visible_rows(means, quats, scales, viewmats, Ks, width, height, *, packed: bool, **settings) -> tuple:
-    """Gsplat's projection as packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, and
-    extents where it has them."""
+def _visible_rows(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> tuple:
+    """Gsplat's packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, and extents, which
+    gsplat 1.4 does not have."""
+    means, _, scales = geometry
     if len(means) == 0:  # gsplat 1.5.3 divides by the number of splats, which ends the process
         ids = torch.empty(0, dtype=torch.int64, device=means.device)
-        compensations = means[:, 2] if settings["calc_compensations"] else None
+        compensations = means[:, 2] if options.rasterize_mode == "antialiased" else None
         sides = ids.new_empty((0, 2), dtype=torch.int32) if HAS_BATCHES else None
         return ids, ids, ids.int(), means[:, :2], means[:, 2], scales, compensations, sides
-    rows = fully_fused_projection(
-        means,
-        None,
-        quats,
-        scales,
-        viewmats,
-        Ks,
-        width,
-        height,
-        packed=packed,
-        **settings,
-    )
-    if not packed:
-        visible = (rows[0] > 0).all(dim=-1) if HAS_BATCHES else rows[0] > 0
-        camera_ids, gaussian_ids = visible.nonzero(as_tuple=True)
-        seen = (None if dense is None else dense[camera_ids, gaussian_ids] for dense in rows)
-        rows = (camera_ids, gaussian_ids, *seen)
-    elif HAS_BATCHES:
-        rows = rows[1:]  # one batch
+    rows = _kernel(geometry, cameras, options, packed=True)
     if not HAS_BATCHES:
         return (*rows, None)
-    camera_ids, gaussian_ids, extents, *others = rows
+    camera_ids, gaussian_ids, extents, *others = rows[1:]  # one batch
     return camera_ids, gaussian_ids, extents.amax(dim=-1), *others, extents
 
 
@@ -157,79 +140,67 @@ def composite(
     projection: Projection,
     colors: Tensor,
     opacities: Tensor,
-    *,
     backgrounds: Tensor | None,
-    tile_size: int,
     absgrad: bool,
-    leave_out: bool = False,
+    leave_out: bool,
 ) -> tuple[Tensor, Tensor, dict]:
     """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`.
 
     Args:
-        leave_out: rows that are not finite, if `leaves_out` says that this can be.
+        leave_out: do not draw rows that are not finite; only if `leaves_out` allows it.
     """
     room = None
-    if len(opacities) > 0 and _kernels_take(projection, opacities, tile_size):
+    if len(opacities) > 0 and _kernels_take(projection, opacities):
         from .tile_lists import room_on
 
         room = room_on(opacities.device)
     while True:
-        lists = _lists(projection, opacities, tile_size, room, colors if leave_out else None)
-        render, alphas = _blend_all(projection, colors, opacities, backgrounds, tile_size, absgrad, lists)
+        lists = _lists(projection, opacities, room, colors if leave_out else None)
+        render, alphas = _blend(projection, colors, opacities, backgrounds, absgrad, lists)
         if room is None or room.was_enough():
             return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1]}
 
 
-def _blend_all(
+def _blend(
     projection: Projection,
     colors: Tensor,
     opacities: Tensor,
     backgrounds: Tensor | None,
-    tile_size: int,
     absgrad: bool,
     lists: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     """Render and alphas from the tiles' lists, as for `composite`."""
     isect_offsets, flatten_ids = lists
-
-    def blend(colors: Tensor, backgrounds: Tensor | None) -> tuple[Tensor, Tensor]:
-        behind = backgrounds
-        if HAS_BATCHES and behind is not None:  # its check knows one image only, and sends that one no gradient
-            behind = behind[0] if len(behind) == 1 and not behind.requires_grad else None
-        render, alphas = rasterize_to_pixels(
-            projection.means2d,
-            projection.conics,
-            colors,
-            opacities,
-            projection.width,
-            projection.height,
-            tile_size,
-            isect_offsets,
-            flatten_ids,
-            backgrounds=behind,
-            packed=True,
-            absgrad=absgrad,
-        )
-        if backgrounds is not None and behind is None:
-            render = render + (1.0 - alphas) * backgrounds[:, None, None]
-        return render, alphas
-
-    if colors.shape[-1] <= CHANNEL_CHUNK:  # nothing to cut, and nothing to put together
-        return blend(colors, backgrounds)
-    chunks = colors.split(CHANNEL_CHUNK, dim=-1)
-    behind = [None] * len(chunks) if backgrounds is None else backgrounds.split(CHANNEL_CHUNK, dim=-1)
-    parts = [blend(*part) for part in zip(chunks, behind, strict=True)]
-    return torch.cat([part for part, _ in parts], dim=-1), parts[0][1]
+    behind = backgrounds
+    if HAS_BATCHES and behind is not None:  # its check knows one image only, and sends that one no gradient
+        behind = behind[0] if len(behind) == 1 and not behind.requires_grad else None
+    render, alphas = rasterize_to_pixels(
+        projection.means2d,
+        projection.conics,
+        colors,
+        opacities,
+        projection.width,
+        projection.height,
+        TILE_SIZE,
+        isect_offsets,
+        flatten_ids,
+        backgrounds=behind,
+        packed=True,
+        absgrad=absgrad,
+    )
+    if backgrounds is not None and behind is None:
+        render = render + (1.0 - alphas) * backgrounds[:, None, None]
+    return render, alphas
 
 
-def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor, tile_size: int) -> bool:
+def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
     """Whether `composite` can leave out rows that are not finite. Their gradients would not all be 0."""
     few = colors.shape[-1] <= MOST_CHECKED
-    return few and not torch.is_grad_enabled() and _kernels_take(projection, opacities, tile_size)
+    return few and not torch.is_grad_enabled() and _kernels_take(projection, opacities)
 
 
 def _lists(
-    projection: Projection, opacities: Tensor, tile_size: int, room: Room | None, finite: Tensor | None
+    projection: Projection, opacities: Tensor, room: Room | None, finite: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Which splats each tile draws, as gsplat's kernels take it: offsets into a list of rows, and the list.
 
@@ -237,7 +208,7 @@ def _lists(
         room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
         finite: leave out the rows of which one of these, [M, D], or another number is not finite.
     """
-    tile_width, tile_height = -(-projection.width // tile_size), -(-projection.height // tile_size)
+    tile_width, tile_height = -(-projection.width // TILE_SIZE), -(-projection.height // TILE_SIZE)
     bounds = projection.radii
     if HAS_BATCHES:
         extents = projection.extents  # a square where another device has projected them
@@ -248,7 +219,7 @@ def _lists(
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
         colors = None if finite is None else finite.detach().contiguous()
-        return tile_lists(*tables, tile_width, tile_height, tile_size, colors, room)
+        return tile_lists(*tables, tile_width, tile_height, TILE_SIZE, colors, room)
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
@@ -256,7 +227,7 @@ def _lists(
         means2d,
         bounds,
         depths,
-        tile_size,
+        TILE_SIZE,
         tile_width,
         tile_height,
         packed=True,
@@ -269,9 +240,9 @@ def _lists(
 _GATE = Gate("The list of each tile's splats")
 
 
-def _kernels_take(projection: Projection, opacities: Tensor, tile_size: int) -> bool:
+def _kernels_take(projection: Projection, opacities: Tensor) -> bool:
     """Whether the kernels of `tile_lists.py` make the lists."""
-    tiles = -(-projection.width // tile_size) * (-(-projection.height // tile_size) + 1)
+    tiles = -(-projection.width // TILE_SIZE) * (-(-projection.height // TILE_SIZE) + 1)
     device = opacities.device
     return (
         projection.n_cameras == 1
@@ -292,4 +263,4 @@ def _try_kernels(device: torch.device) -> None:
 
     ones = torch.ones(1, 3, device=device)
     radii = torch.ones(1, 2, dtype=torch.int32, device=device) if HAS_BATCHES else ones[0, :1].int()
-    tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, 16)
+    tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, TILE_SIZE)

@@ -13,6 +13,7 @@ farthest splats were missing from that step, and there is more room from then on
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -270,7 +271,7 @@ class _StepGraph:
             shot = self.shot.detach().requires_grad_()
             look = lambda rgb: functional_call(model.photograph, {"shots": shot}, (rgb, 0))  # noqa: E731
         with torch.enable_grad(), self.room.in_use():
-            view = project_view(splats, self.seen_from, model.projecting._replace(every_row=True))
+            view = project_view(splats, self.seen_from, replace(model.projection_options, every_row=True))
             asked = model.view_noise.moved_by(splats, self.noise)
             appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
             background = model._get_background_color()

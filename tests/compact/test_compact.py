@@ -185,7 +185,7 @@ def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
     rows, center = torch.arange(60), torch.tensor([40.0, 0.0, 0.0])
     expected = build(one.head.config, model.head.state_dict(), 32.0)(model.field.splats, rows, center)
     assert_close(model.field.head(model.field.splats, rows, center), expected)
-    assert model.projecting.scene_unit == 32.0, "the near plane is in scene units"
+    assert model.projection_options.near_plane == 0.32, "the near plane is in scene units"
     for render in (None, {"rasterize_mode": "classic"}, {"rasterize_mode": "classic", "background": [0, 0, "black"]}):
         write_container(tmp_path / "f.nrf", {**header, "render": render}, streams)
         with pytest.raises(InputError, match="does not say how it is rendered"):

@@ -36,7 +36,7 @@ from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.export.web.page import page as page_of
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
-from nrfgs_ns.model.renderer import Projecting, composite_view, project_view
+from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
 from nrfgs_ns.viewer.pictures import AMPLIFICATION, GREY, OPACITY_AXIS, with_gain
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
@@ -171,7 +171,8 @@ def rendered(scene: Path, photograph: dict, mode: str = "full", gain: float = 1.
     fx, fy, cx, cy = photograph["lens"]
     lens = torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]])
     camera = Pinhole(world_to_camera(pose), lens, *photograph["size"], pose[0, :, 3])
-    view = project_view(field.splats, camera, Projecting(decoded.header["render"]["rasterize_mode"], head.scene_unit))
+    options = projection_options(decoded.header["render"]["rasterize_mode"], head.scene_unit)
+    view = project_view(field.splats, camera, options)
     appearance = with_gain(field, view, 0.0 if mode == "base" else gain)
     background = torch.tensor(decoded.header["render"]["background"])
     if mode.endswith("residual"):

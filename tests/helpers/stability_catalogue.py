@@ -22,7 +22,7 @@ from nrfgs_ns.appearance.encoding import fourier_bands, view_geometry
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 from nrfgs_ns.appearance.opacity_bound import OPACITY_BOUNDS, bounded_opacity
-from nrfgs_ns.rasterizer import Projection, project
+from nrfgs_ns.rasterizer import Projection, ProjectionOptions, project
 from nrfgs_ns.rasterizer.torch_cpu.projection import LARGEST_RADIUS, MIN_QUATERNION
 from nrfgs_ns.training.guard import MAX_GRADIENT
 
@@ -81,7 +81,7 @@ def sees(mode: str = "classic", **changed: list[float]) -> Projection:
     """Projection of one splat."""
     values = {"means": [0.0, 0.0, 2.0], "quats": [1.0, 0.0, 0.0, 0.0], "scales": [0.1] * 3}
     splat = (torch.tensor([changed.get(name, value)]) for name, value in values.items())
-    return project(*splat, *camera(), rasterize_mode=mode)
+    return project(*splat, *camera(), ProjectionOptions(mode))
 
 
 def within_one(**changed: list[float]) -> bool:

@@ -17,6 +17,7 @@ unit / T relative, and its determinant is a difference of products, which costs 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import reference
 import torch
@@ -46,7 +47,7 @@ def _run(
     unit: float,
     noise: torch.Generator | None = None,
     orders: list[Tensor] | None = None,
-    bounds: str = "square",
+    **limits: Any,
 ) -> tuple[dict[str, Tensor], list[reference.Screen], list[reference.Image]]:
     """The twin, forward and backward; with `noise`, in the order of the run without (equal depths must stay equal)."""
 
@@ -70,11 +71,10 @@ def _run(
         case.width,
         case.height,
         **case.options,
-        packed=False,
+        **limits,
         unit=unit,
         perturb=shaken,
         orders=orders,
-        bounds=bounds,
     )
     weight = torch.ones_like(alphas)
     if noise is not None:
@@ -106,13 +106,13 @@ def _largest(t: Tensor) -> Tensor:
     return t.abs().amax() if t.numel() else t.sum()
 
 
-def judge(case: Case, grads: tuple[Tensor, Tensor], unit: float = FLOAT32, bounds: str = "square") -> Verdict:
+def judge(case: Case, grads: tuple[Tensor, Tensor], unit: float = FLOAT32, **limits: Any) -> Verdict:
     """Values and tolerances of everything a rasterizer computes for a case in an arithmetic of the given rounding
-    unit; `bounds` as in `reference.project`.
+    unit; limits: eps2d, floor and bounds of `reference.project`.
     """
-    values, screens, images = _run(case, grads, unit, bounds=bounds)
+    values, screens, images = _run(case, grads, unit, **limits)
     noise = torch.Generator().manual_seed(0)
-    shaken = [_run(case, grads, unit, noise, [image.order for image in images], bounds)[0] for _ in range(RUNS)]
+    shaken = [_run(case, grads, unit, noise, [image.order for image in images], **limits)[0] for _ in range(RUNS)]
     tolerances = {}
     for name, value in values.items():
         spread = torch.stack([(other[name] - value).abs() for other in shaken]).amax(0)
@@ -129,13 +129,11 @@ def judge(case: Case, grads: tuple[Tensor, Tensor], unit: float = FLOAT32, bound
     depth = (
         torch.stack([_largest(s.depths[s.visible]) for s in screens]).detach()[:, None, None, None].expand_as(alphas)
     )
-    if mode in ("ED", "RGB+ED"):  # the quotient of two sums: each error counts once, divided by the smaller sum
-        depth = 2 * depth / alphas.clamp(min=1e-10)
+    depth = 2 * depth / alphas.clamp(min=1e-10)  # a quotient: each sum's error counts, divided by the smaller sum
     color = _largest(case.colors).double()
     if "backgrounds" in case.options:
         color = color + _largest(case.options["backgrounds"])
-    channels = [] if mode in ("D", "ED") else [color.expand_as(alphas)] * case.colors.shape[-1]
-    channels += [depth] if mode != "RGB" else []
+    channels = [color.expand_as(alphas)] * case.colors.shape[-1] + [depth] * (mode == "RGB+ED")
     tolerances["render"] = moves * torch.cat(channels, -1)
     return Verdict(
         values,

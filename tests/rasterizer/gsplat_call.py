@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nrfgs_ns.rasterizer import composite, project
+from nrfgs_ns.rasterizer import ProjectionOptions, composite, project
 
 
 def rasterization(
@@ -24,21 +24,21 @@ def rasterization(
     packed: bool = True,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
-    tile_size: int = 16,
     absgrad: bool = False,
-    **projecting: Any,
+    **options: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """`project`, then `composite` with the same arguments.
+    """`project`, then `composite`.
 
     Args:
         opacities: one per splat. [N]
         colors: one per splat, or per camera and splat. [N, D] or [C, N, D]
         packed: False gives `info` gsplat's dense layout: radii, means2d, depths, conics and opacities with leading
             dimensions [C, N] and zeros where a splat is not visible; camera_ids and gaussian_ids are None.
-        projecting: more for `project`.
+        render_mode: "RGB" or "RGB+ED".
+        options: fields of `ProjectionOptions`.
     """
     n, c = len(means), len(viewmats)
-    projection = project(means, quats, scales, viewmats, Ks, width, height, packed=packed, **projecting)
+    projection = project(means, quats, scales, viewmats, Ks, width, height, ProjectionOptions(**options))
     cell = (projection.camera_ids, projection.gaussian_ids)
     if not packed:
         dense_means2d = means.new_zeros(c, n, 2).index_put(cell, projection.means2d)
@@ -48,8 +48,7 @@ def rasterization(
         colors[cell] if colors.dim() == 3 else colors[projection.gaussian_ids],
         opacities[projection.gaussian_ids],
         backgrounds=backgrounds,
-        render_mode=render_mode,
-        tile_size=tile_size,
+        with_depth=render_mode == "RGB+ED",
         absgrad=absgrad,
     )
     if not packed:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE = 1 / 255, 0.999, 1e-4
+MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, TILE_SIZE = 1 / 255, 0.999, 1e-4, 16
 HELD = 4.0
 """Pixels. The arithmetic to be judged may hold positions about the centre of a tile this far from its sides: positions
 and their products then lose roundings of HELD and of HELD^2, however near a pixel is to a splat's centre.
@@ -76,14 +76,14 @@ def project(
     *,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
-    radius_clip: float = 0.0,
     eps2d: float = 0.3,
-    packed: bool = True,
+    floor: float = 0.1,
     bounds: Literal["square", "rectangle"] = "square",
 ) -> Screen:
     """Project N splats into one camera: cov2d = J W Sigma W^T J^T + eps2d I. Everything in float64.
 
     Args:
+        floor: under the root of the eigenvalue formula: 0.1 in gsplat 1.4's packed kernel, 0.01 in its dense one.
         bounds: what cuts a splat off. square: of three standard deviations along its longest axis, as gsplat 1.4 does
             it. rectangle: of 3.33 along each axis of the image, as gsplat 1.5.
     """
@@ -126,20 +126,20 @@ def project(
 
     variances = torch.diagonal(blurred, dim1=-2, dim2=-1)
     half_trace = 0.5 * (blurred[:, 0, 0] + blurred[:, 1, 1])
-    longest = half_trace + (half_trace**2 - torch.linalg.det(blurred)).clamp(min=0.1 if packed else 0.01).sqrt()
+    longest = half_trace + (half_trace**2 - torch.linalg.det(blurred)).clamp(min=floor).sqrt()
     reach = 3.33 * variances.sqrt() if bounds == "rectangle" else 3 * longest.sqrt()[:, None].expand(-1, 2)
     sides = reach.ceil()
     size = torch.tensor([width, height])
     on_image = ((means2d + sides > 0) & (means2d - sides < size)).all(-1)
-    visible = in_range & on_image & (sides.amax(-1) > radius_clip)
+    visible = in_range & on_image & (sides.amax(-1) > 0)
     return Screen(means2d, depths, torch.linalg.inv(blurred), compensations, condition, reach, visible)
 
 
-def _covered(centre: Tensor, radius: Tensor, n_pixels: int, tile_size: int) -> Tensor:
+def _covered(centre: Tensor, radius: Tensor, n_pixels: int) -> Tensor:
     """Whether each pixel of an axis lies in a tile that [centre - radius, centre + radius] meets. [N, n_pixels]"""
-    tile = torch.arange(n_pixels) // tile_size
-    first = ((centre - radius) / tile_size).floor()[:, None]
-    end = ((centre + radius) / tile_size).ceil()[:, None]
+    tile = torch.arange(n_pixels) // TILE_SIZE
+    first = ((centre - radius) / TILE_SIZE).floor()[:, None]
+    end = ((centre + radius) / TILE_SIZE).ceil()[:, None]
     return (tile >= first) & (tile < end)
 
 
@@ -151,7 +151,6 @@ def composite(
     height: int,
     *,
     background: Tensor | None = None,
-    tile_size: int = 16,
     unit: float = 2.0**-24,
     opacity_error: Tensor | float = 0.0,
     order: Tensor | None = None,
@@ -190,8 +189,8 @@ def composite(
     raw = opacities * torch.exp(-sigma)
 
     def reach(sides: Tensor, shift: Tensor | float = 0.0) -> Tensor:
-        columns = _covered(means2d[:, 0].detach(), sides[:, 0] + shift, width, tile_size)
-        rows = _covered(means2d[:, 1].detach(), sides[:, 1] + shift, height, tile_size)
+        columns = _covered(means2d[:, 0].detach(), sides[:, 0] + shift, width)
+        rows = _covered(means2d[:, 1].detach(), sides[:, 1] + shift, height)
         return rows[:, :, None] & columns[:, None, :]
 
     within = reach(sides.ceil())
@@ -248,7 +247,6 @@ def rasterization(
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
-    tile_size: int = 16,
     unit: float = 2.0**-24,
     perturb: Callable[[Tensor], Tensor] = lambda t: t,
     orders: list[Tensor] | None = None,
@@ -261,7 +259,7 @@ def rasterization(
             (`HELD`), and to the transmittance that expected depth is divided by; with noise of a few rounding units it
             shows what rounding does to the image and to its gradients.
         orders: see `composite`; one per camera.
-        limits: near_plane, far_plane, radius_clip, eps2d, packed, bounds.
+        limits: near_plane, far_plane, eps2d, floor, bounds.
 
     Returns:
         render [C, H, W, X], alphas [C, H, W, 1], and the screens and images of the C cameras.
@@ -275,9 +273,7 @@ def rasterization(
         color = (colors[camera] if colors.dim() == 3 else colors).double()
         background = None if backgrounds is None else backgrounds[camera].double()
         depths = screen.depths[:, None]
-        if render_mode in ("D", "ED"):
-            color, background = depths, None
-        elif render_mode in ("RGB+D", "RGB+ED"):
+        if render_mode == "RGB+ED":
             color = torch.cat([color, depths], -1)
             background = None if background is None else torch.cat([background, background.new_zeros(1)])
         opacity, opacity_error = opacities, 0.0
@@ -291,14 +287,13 @@ def rasterization(
             width,
             height,
             background=background,
-            tile_size=tile_size,
             unit=unit,
             opacity_error=opacity_error,
             order=order,
             perturb=perturb,
         )
         render = image.render
-        if render_mode in ("ED", "RGB+ED"):
+        if render_mode == "RGB+ED":
             alphas = 1 - perturb(1 - image.alphas)
             render = torch.cat([render[..., :-1], render[..., -1:] / alphas.clamp(min=1e-10)], -1)
         renders.append(render)

@@ -12,16 +12,16 @@ from make_gsplat_fixtures import CASES, Case, upstream
 from test_against_twin import scenes
 
 from nrfgs_ns.host import gsplat_version
-from nrfgs_ns.rasterizer import Projection, contributions, project
+from nrfgs_ns.rasterizer import Projection, ProjectionOptions, contributions, project
 
-PROJECTING = ("near_plane", "far_plane", "radius_clip", "eps2d", "rasterize_mode")
+PROJECTING = ("near_plane", "far_plane", "rasterize_mode")
 
 
 def of_case(case: Case, device: str = "cpu") -> tuple[Projection, torch.Tensor]:
     """Its projection, and what each row contributes; both without gradients."""
     means, quats, scales, opacities, _, viewmats, Ks = (t.to(device) for t in case.arguments()[:-2])
     options = {name: value for name, value in case.options.items() if name in PROJECTING}
-    projection = project(means, quats, scales, viewmats, Ks, case.width, case.height, packed=False, **options)
+    projection = project(means, quats, scales, viewmats, Ks, case.width, case.height, ProjectionOptions(**options))
     return projection, contributions(projection, opacities[projection.gaussian_ids])
 
 
@@ -30,7 +30,7 @@ def check(case: Case, device: str = "cpu", bounds: str = "square") -> None:
     1."""
     case = replace(case, options={name: value for name, value in case.options.items() if name in PROJECTING})
     upper, alphas = upstream(case, bounds=bounds)  # 0 at such pixels, else +-1
-    verdict = judge(case, (upper.abs(), torch.zeros_like(alphas)), FLOAT32, bounds)
+    verdict = judge(case, (upper.abs(), torch.zeros_like(alphas)), FLOAT32, bounds=bounds)
     projection, shares = of_case(case, device)
     rows, cameras, shares = projection.gaussian_ids.cpu(), projection.camera_ids.cpu(), shares.cpu().double()
     assert not shares.requires_grad

@@ -8,14 +8,15 @@ import pytest
 import torch
 from make_gsplat_fixtures import CASES, _camera
 
-from nrfgs_ns.rasterizer import project
+from nrfgs_ns.rasterizer import ProjectionOptions, project
 
 W, H = 40, 28
+ANTIALIASED = ProjectionOptions("antialiased")
 
 
 def one(z=2.0, x=0.0, y=0.0, scale=0.1, **options):
     splat = [torch.tensor([[x, y, z]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), scale)]
-    return project(*splat, torch.eye(4)[None], _camera(W, H)[None], W, H, **options)
+    return project(*splat, torch.eye(4)[None], _camera(W, H)[None], W, H, ProjectionOptions(**options))
 
 
 @pytest.mark.parametrize(
@@ -26,12 +27,6 @@ def test_near_and_far_planes_are_inclusive(z, seen):
     assert len(one(z, near_plane=0.25, far_plane=4.0).radii) == seen
 
 
-def test_radius_clip_is_exclusive():
-    radius = int(one().radii[0])
-    assert len(one(radius_clip=float(radius)).radii) == 0
-    assert len(one(radius_clip=radius - 0.5).radii) == 1
-
-
 def test_square_must_overlap_the_image():
     """A point has radius 3. Its centre is at x = 20 + f / 2 times its offset at depth 2; it is seen if x + 3 > 0."""
     edge = -23 * 2 / float(_camera(W, H)[0, 0])
@@ -40,12 +35,8 @@ def test_square_must_overlap_the_image():
 
 
 def test_radius_of_a_point_comes_from_the_blur():
-    """cov = 0.3 I: b^2 - det = 0 is floored at 0.1 by gsplat's packed kernel and at 0.01 by the other one.
-
-    r = ceil(3 sqrt(0.3 + sqrt 0.1)) = ceil(2.355) = 3, or ceil(3 sqrt(0.3 + sqrt 0.01)) = ceil(1.897) = 2.
-    """
+    """cov = 0.3 I: b^2 - det = 0 is floored at 0.1, so r = ceil(3 sqrt(0.3 + sqrt 0.1)) = ceil(2.355) = 3."""
     assert int(one(scale=1e-6).radii[0]) == 3
-    assert int(one(scale=1e-6, packed=False).radii[0]) == 2
 
 
 @pytest.mark.parametrize("field", ["means", "quats", "scales"])
@@ -59,9 +50,7 @@ def test_invisible_and_invalid_splats_send_no_nan_back(field):
     quats[3], scales[4], scales[5] = 0.0, float("inf"), float("nan")
     tensors = {"means": means, "quats": quats, "scales": scales}
     leaf = tensors[field].requires_grad_()
-    p = project(
-        **tensors, viewmats=torch.eye(4)[None], Ks=_camera(W, H)[None], width=W, height=H, rasterize_mode="antialiased"
-    )
+    p = project(**tensors, viewmats=torch.eye(4)[None], Ks=_camera(W, H)[None], width=W, height=H, options=ANTIALIASED)
     assert p.gaussian_ids.tolist() == [0]
     (p.means2d.sum() + p.conics.sum() + p.depths.sum() + p.compensations.sum()).backward()
     assert torch.isfinite(leaf.grad).all() and (leaf.grad[1:] == 0).all()
@@ -78,7 +67,7 @@ def test_flat_splat_has_finite_gradients():
         _camera(W, H)[None],
         W,
         H,
-        rasterize_mode="antialiased",
+        ANTIALIASED,
     )
     p.compensations.sum().backward()
     assert p.compensations.item() == 0 and torch.isfinite(scales.grad).all()
@@ -98,7 +87,7 @@ def test_gradients_of_compensations_near_the_camera(near):
     def gradients(dtype: torch.dtype) -> list[torch.Tensor]:
         splats = [one.to(dtype, copy=True).requires_grad_() for one in (means, quats, scales)]
         camera = torch.eye(4, dtype=dtype)[None], _camera(W, H)[None].to(dtype)
-        found = project(*splats, *camera, W, H, rasterize_mode="antialiased")
+        found = project(*splats, *camera, W, H, ANTIALIASED)
         found.compensations.sum().backward()
         return [one.grad.double() for one in splats]
 
@@ -139,7 +128,7 @@ def test_agrees_with_gsplats_torch_projection():
     _, means2d, depths, conics, compensations = torch_impl._fully_fused_projection(
         tensors[0], covars, *tensors[3:], *size, calc_compensations=True
     )
-    p = project(*tensors, *size, rasterize_mode="antialiased")
+    p = project(*tensors, *size, ANTIALIASED)
     for ours, theirs in (
         (p.means2d, means2d),
         (p.depths, depths),

@@ -12,7 +12,7 @@ from gsplat_call import rasterization
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.rasterizer import composite, project
+from nrfgs_ns.rasterizer import ProjectionOptions, composite, project
 from nrfgs_ns.rasterizer.torch_cpu import compositing, tiles
 from nrfgs_ns.rasterizer.torch_cpu.projection import MIN_QUATERNION
 
@@ -220,17 +220,15 @@ def test_rows_that_gsplat_lets_through_as_nan_are_projected_away(monkeypatch):
         return p.camera_ids, p.gaussian_ids, p.radii, p.means2d, p.depths, conics, None
 
     monkeypatch.setattr(gsplat_cuda, "fully_fused_projection", kernel)
-    options = dict(near_plane=0.01, far_plane=1e10, radius_clip=0.0, eps2d=0.3, rasterize_mode="classic", packed=True)
-    options["assume_finite"] = False
     splats = cloud(means=math.nan)
-    p = gsplat_cuda.project(*(splats[name] for name in NAMES[:3]), *camera(), **options)
+    p = gsplat_cuda.project(*(splats[name] for name in NAMES[:3]), *camera(), ProjectionOptions())
     assert p.gaussian_ids.tolist() == [1, 2, 3, 4, 5] and calls == [6, 5]
     assert torch.isfinite(p.conics).all()
     sound = cloud()
-    gsplat_cuda.project(*(sound[name] for name in NAMES[:3]), *camera(), **options)
+    gsplat_cuda.project(*(sound[name] for name in NAMES[:3]), *camera(), ProjectionOptions())
     assert calls == [6, 5, 6]  # no second look where nothing is wrong
-    options["assume_finite"] = True  # as in a training, whose guard watches
-    gsplat_cuda.project(*(splats[name] for name in NAMES[:3]), *camera(), **options)
+    in_training = ProjectionOptions(assume_finite=True)  # a training's guard finds such splats
+    gsplat_cuda.project(*(splats[name] for name in NAMES[:3]), *camera(), in_training)
     assert calls == [6, 5, 6, 6]
 
 
@@ -252,17 +250,7 @@ def test_gsplats_projection_never_sees_an_empty_table(monkeypatch, mode, bad):
     splats = {name: value.detach()[:count].requires_grad_() for name, value in cloud().items()}
     if bad is not None:
         splats["means"] = torch.full((2, 3), bad, requires_grad=True)
-    p = gsplat_cuda.project(
-        *(splats[name] for name in NAMES[:3]),
-        *camera(),
-        near_plane=0.01,
-        far_plane=1e10,
-        radius_clip=0.0,
-        eps2d=0.3,
-        rasterize_mode=mode,
-        packed=True,
-        assume_finite=False,
-    )
+    p = gsplat_cuda.project(*(splats[name] for name in NAMES[:3]), *camera(), ProjectionOptions(mode))
     assert p.gaussian_ids.shape == (0,) and p.means2d.shape == (0, 2) and p.conics.shape == (0, 3)
     assert p.radii.shape == (0,) and p.radii.dtype == torch.int32
     assert (p.compensations is None) == (mode == "classic")
@@ -297,14 +285,14 @@ def test_indices_of_16_million_splats():
 
     One splat in each sub-tile of an image of 32,768 x 32,768 pixels: 2^24 footprints, 2^24 pairs.
     """
-    edge, side = 8, 4096
+    edge, side = tiles.SUB_TILE, 4096
     count = side * side
     row = torch.arange(count) // side
     column = torch.arange(count) % side
     centre = torch.stack([column, row]).double() * edge + edge / 2
     shape = torch.cat([centre, torch.tensor([[1.0], [0.0], [1.0], [-0.5]], dtype=torch.float64).expand(4, count)])
     spans = torch.stack([row, row + 1, column, column + 1])
-    prints = tiles.Footprints(edge, side, side, torch.arange(count), shape, spans)
+    prints = tiles.Footprints(side, side, torch.arange(count), shape, spans)
     lists = tiles.list_tiles(prints, prints.whole)
     assert torch.equal(lists.tiles, torch.arange(count))
     assert torch.equal(lists.splat[:-1], torch.arange(count))

@@ -83,14 +83,15 @@ def drawn(
     means, quats, scales, colors, opacities, width, height, mode="RGB", rasterize_mode="classic", focal=200.0
 ) -> tuple[torch.Tensor, int, torch.Tensor]:
     """The image of splats before a camera, how many pairs of splats and tiles it took, and the splats' radii."""
-    from nrfgs_ns.rasterizer import composite, project
+    from nrfgs_ns.rasterizer import ProjectionOptions, composite, project
 
     K = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]]).cuda()
     view = torch.eye(4).cuda()[None]
-    seen = project(means, quats, scales, view, K, width, height, rasterize_mode=rasterize_mode, assume_finite=True)
+    options = ProjectionOptions(rasterize_mode, assume_finite=True)
+    seen = project(means, quats, scales, view, K, width, height, options)
     rows, background = seen.gaussian_ids, torch.full((1, 3), 0.3).cuda()
     image, _, info = composite(
-        seen, colors[rows], opacities[rows], render_mode=mode, assume_finite=True, backgrounds=background
+        seen, colors[rows], opacities[rows], with_depth=mode == "RGB+ED", assume_finite=True, backgrounds=background
     )
     offsets, pairs = info["isect_offsets"], len(info["flatten_ids"])
     if offsets.shape[1] > info["tile_height"]:  # the row below the image has what there is only room for

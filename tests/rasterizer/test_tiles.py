@@ -9,10 +9,9 @@ from gsplat_call import rasterization
 from make_gsplat_fixtures import CASES
 
 from nrfgs_ns.rasterizer import project
+from nrfgs_ns.rasterizer.contract import TILE_SIZE as TILE
 from nrfgs_ns.rasterizer.torch_cpu import compositing
-from nrfgs_ns.rasterizer.torch_cpu.tiles import MIN_ALPHA, Block, footprints, list_tiles, split_into_blocks
-
-TILE = 16
+from nrfgs_ns.rasterizer.torch_cpu.tiles import MIN_ALPHA, SUB_TILE, Block, footprints, list_tiles, split_into_blocks
 
 
 def brute_force(projection, opacities):
@@ -36,12 +35,12 @@ def setup(name):
     with torch.no_grad():
         projection = project(case.means, case.quats, case.scales, case.viewmats, case.Ks, case.width, case.height)
     opacities = case.opacities[projection.gaussian_ids]
-    return projection, opacities, footprints(projection, opacities, TILE)
+    return projection, opacities, footprints(projection, opacities)
 
 
 def tile_maxima(alpha, prints):
     """Largest alpha of each row in each sub-tile. [M, C * tiles]"""
-    edge = prints.edge
+    edge = SUB_TILE
     pad = (0, prints.tiles_x * edge - alpha.shape[-1], 0, prints.tiles_y * edge - alpha.shape[-2])
     return torch.nn.functional.max_pool2d(torch.nn.functional.pad(alpha, pad), edge).flatten(1)
 
@@ -115,8 +114,8 @@ def test_faint_splats_are_not_listed():
     """Below 1/255 nothing is drawn, whatever the pixel."""
     projection, _, _ = setup("ordinary")
     m = len(projection.radii)
-    assert len(footprints(projection, torch.full((m,), 0.0039), TILE).rows) == 0
-    assert len(footprints(projection, torch.full((m,), 0.5), TILE).rows) > 0.9 * m
+    assert len(footprints(projection, torch.full((m,), 0.0039)).rows) == 0
+    assert len(footprints(projection, torch.full((m,), 0.5)).rows) > 0.9 * m
 
 
 def test_blocks_without_a_pair(monkeypatch):

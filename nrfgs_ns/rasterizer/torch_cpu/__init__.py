@@ -12,7 +12,7 @@ from .projection import project
 __all__ = ["composite", "leaves_out", "project"]
 
 
-def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor, tile_size: int) -> bool:
+def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
     """Whether `composite` can leave out rows that are not finite."""
     return False
 
@@ -21,14 +21,12 @@ def composite(
     projection: Projection,
     colors: Tensor,
     opacities: Tensor,
-    *,
     backgrounds: Tensor | None,
-    tile_size: int,
     absgrad: bool,
-    leave_out: bool = False,
+    leave_out: bool,
 ) -> tuple[Tensor, Tensor, dict]:
     """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and no lists to add to `info`."""
-    render, transmittance = compositing.composite(projection, colors, opacities, tile_size=tile_size, absgrad=absgrad)
+    render, transmittance = compositing.composite(projection, colors, opacities, absgrad)
     if backgrounds is not None:
         render = render + transmittance * backgrounds[:, None, None, :]
     return render, 1 - transmittance, {}

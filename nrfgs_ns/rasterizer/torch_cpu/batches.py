@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from .tiles import Footprints, TileLists
+from .tiles import SUB_TILE, Footprints, TileLists
 
 SLAB = 16  # splats of depth between two looks at which tiles are finished
 BATCH_ELEMENTS = 2**19  # pixels x splats in flight per thread; four float arrays of this size exist at a time (8 MiB)
@@ -48,7 +48,7 @@ class Sheet:
 
     def __init__(self, prints: Footprints, colors: Tensor, n_cameras: int, width: int, height: int) -> None:
         self.prints = prints
-        edge, dtype = prints.edge, colors.dtype
+        edge, dtype = SUB_TILE, colors.dtype
         # Conic and ln(o) divided by ln 2, because exp2 is three times faster than exp.
         shape = torch.cat([prints.shape[:2], prints.shape[2:] / LN_2])  # [6, F], float64
         padding = shape.new_tensor([[0.0, 0.0, 0.0, 0.0, 0.0, NOTHING]])
@@ -70,17 +70,17 @@ class Sheet:
         """Centres x, y of tiles in pixels, y counted from the top of the first image. [L] -> [2, L, 1], float64"""
         tiles_x = self.prints.tiles_x
         corners = torch.stack([tiles % tiles_x, tiles // tiles_x])[..., None]
-        return (corners.double() + 0.5) * self.prints.edge
+        return (corners.double() + 0.5) * SUB_TILE
 
     def image(self, values: Tensor, n_cameras: int, width: int, height: int) -> Tensor:
         """Put tiles back into images. [C * tiles, D, P] -> [C, H, W, D]"""
-        edge, tiles_x, tiles_y = self.prints.edge, self.prints.tiles_x, self.prints.tiles_y
+        edge, tiles_x, tiles_y = SUB_TILE, self.prints.tiles_x, self.prints.tiles_y
         values = values.view(n_cameras, tiles_y, tiles_x, -1, edge, edge).permute(0, 1, 4, 2, 5, 3)
         return values.reshape(n_cameras, tiles_y * edge, tiles_x * edge, -1)[:, :height, :width].contiguous()
 
     def tiled(self, images: Tensor) -> Tensor:
         """Inverse of `image`, 0 outside the images. [C, H, W, D] -> [C * tiles, D, P]"""
-        edge, tiles_x, tiles_y = self.prints.edge, self.prints.tiles_x, self.prints.tiles_y
+        edge, tiles_x, tiles_y = SUB_TILE, self.prints.tiles_x, self.prints.tiles_y
         n_cameras, height, width, channels = images.shape
         images = F.pad(images, (0, 0, 0, tiles_x * edge - width, 0, tiles_y * edge - height))
         images = images.view(n_cameras, tiles_y, edge, tiles_x, edge, channels).permute(0, 1, 3, 5, 2, 4)

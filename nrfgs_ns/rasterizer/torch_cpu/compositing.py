@@ -255,8 +255,8 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @full_precision()
-    def forward(ctx, means2d, conics, opacities, colors, projection: Projection, tile_size: int, absgrad: bool):
-        prints = footprints(projection, opacities, tile_size)
+    def forward(ctx, means2d, conics, opacities, colors, projection: Projection, absgrad: bool):
+        prints = footprints(projection, opacities)
         size = (projection.n_cameras, projection.width, projection.height)
         sheet = Sheet(prints, colors.index_select(0, prints.rows), *size)
         final = torch.ones_like(sheet.inside)
@@ -295,11 +295,9 @@ class _Composite(torch.autograd.Function):
             means2d.absgrad = total[:, -2:].contiguous()
         grad_opacities = total[:, 5] / opacities.where(opacities > 0, 1.0)
         grad_colors = total[:, 6 : 6 + channels]
-        return total[:, :2].contiguous(), total[:, 2:5].contiguous(), grad_opacities, grad_colors, None, None, None
+        return total[:, :2].contiguous(), total[:, 2:5].contiguous(), grad_opacities, grad_colors, None, None
 
 
-def composite(
-    projection: Projection, colors: Tensor, opacities: Tensor, *, tile_size: int, absgrad: bool
-) -> tuple[Tensor, Tensor]:
+def composite(projection: Projection, colors: Tensor, opacities: Tensor, absgrad: bool) -> tuple[Tensor, Tensor]:
     """Blend colours front to back. Colours [M, D], opacities [M] -> render [C, H, W, D], transmittance [C, H, W, 1]."""
-    return _Composite.apply(projection.means2d, projection.conics, opacities, colors, projection, tile_size, absgrad)
+    return _Composite.apply(projection.means2d, projection.conics, opacities, colors, projection, absgrad)

@@ -11,13 +11,13 @@ Its covariance is R_q diag(s^2) R_q^T. The camera flattens it with the Jacobian 
                                                                [ 0            f_y / p_z    -f_y v / p_z ]
 
 where (u, v) = (p_x, p_y) / p_z, held within 0.3 tan(fov / 2) beyond the image edges: the linearisation is useless
-further out. A blur of `eps2d` square pixels keeps every splat at least a pixel wide: cov2d + eps2d I.
+further out. A blur of e = 0.3 square pixels keeps every splat at least a pixel wide: cov2d + e I.
 
 Two determinants decide everything that follows, and both are differences of large numbers for a needle. Written with
 the rows a_0, a_1 of A they are not:
 
-    det(cov2d)           = |a_0 x a_1|^2
-    det(cov2d + eps2d I) = det(cov2d) + eps2d trace(cov2d) + eps2d^2.
+    det(cov2d)       = |a_0 x a_1|^2
+    det(cov2d + e I) = det(cov2d) + e trace(cov2d) + e^2.
 
 Backward, writing g(y) for dL/dy: each equation above, in reverse. The two less usual ones are
 
@@ -36,12 +36,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..contract import Projection
+from ..contract import EPS2D, Projection, ProjectionOptions
 
 FOV_MARGIN = 0.3  # how far beyond the image edge J may be evaluated, in units of tan(fov / 2)
 RADIUS_SIGMAS = 3.0  # a splat ends at this many standard deviations
-# Floor under the square root of the eigenvalue formula, in pixel^4. gsplat's two projection kernels differ in it.
-MIN_DISCRIMINANT_PACKED, MIN_DISCRIMINANT_DENSE = 0.1, 0.01
+MIN_DISCRIMINANT = 0.1  # floor under the square root of the eigenvalue formula, in pixel^4, of gsplat's packed kernel
 COMPENSATION_EPS = 1e-6  # bounds the slope of sqrt at 0 in the backward pass
 MAX_RADIUS = float(2**30)  # in pixels: representable in int32 and far beyond every image
 LARGEST_RADIUS = float(2**63)  # in pixels: products of two lengths on the image plane stay below float32's 2^128
@@ -53,9 +52,9 @@ class _Screen(NamedTuple):
 
     means2d: Tensor  # [2, n]
     depths: Tensor  # [n]
-    blurred: tuple[Tensor, Tensor, Tensor]  # xx, xy, yy of cov2d + eps2d I, [n] each
+    blurred: tuple[Tensor, Tensor, Tensor]  # xx, xy, yy of cov2d + e I, [n] each
     det: Tensor  # det(cov2d), [n]
-    det_blurred: Tensor  # det(cov2d + eps2d I), [n]
+    det_blurred: Tensor  # det(cov2d + e I), [n]
     slopes: tuple[Tensor, Tensor]  # p_x / p_z, p_y / p_z, [n] each
     held: tuple[Tensor, Tensor]  # u, v, [n] each
     directions: Tensor  # quaternions of length 1, [4, n]
@@ -92,7 +91,7 @@ def _rotate(W: Tensor, rows: Sequence[Tensor] | Tensor) -> list[Tensor]:
 
 
 def _to_screen(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, eps2d: float
+    means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int
 ) -> _Screen:
     """The equations of the module docstring for one camera: means [n, 3], quats [n, 4], scales [n, 3]."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -115,17 +114,17 @@ def _to_screen(
     xx, xy, yy = (a0 * a0).sum(0), (a0 * a1).sum(0), (a1 * a1).sum(0)
     normal = torch.linalg.cross(a0, a1, dim=0)
     det = normal.square().sum(0)
-    det_blurred = det + eps2d * (xx + yy) + eps2d**2
-    blurred = xx + eps2d, xy, yy + eps2d
+    det_blurred = det + EPS2D * (xx + yy) + EPS2D**2
+    blurred = xx + EPS2D, xy, yy + EPS2D
     axes = right, down, forward
     return _Screen(means2d, pz, blurred, det, det_blurred, slopes, (u, v), unit, rotations, axes, (a0, a1), normal)
 
 
-def _radii(screen: _Screen, min_discriminant: float) -> Tensor:
+def _radii(screen: _Screen) -> Tensor:
     """Three standard deviations along the longer axis, rounded up: ceil(3 sqrt(lambda_max)). [n]"""
     xx, xy, yy = screen.blurred
     spread = torch.hypot(0.5 * (xx - yy), xy)  # no square, which would overflow from 4e9 pixels
-    longest = 0.5 * (xx + yy) + spread.clamp(min=math.sqrt(min_discriminant))
+    longest = 0.5 * (xx + yy) + spread.clamp(min=math.sqrt(MIN_DISCRIMINANT))
     return (RADIUS_SIGMAS * longest.sqrt()).ceil()
 
 
@@ -149,11 +148,11 @@ class _Project(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, means, quats, scales, viewmat, K, size: tuple[int, int], eps2d: float, visible):
-        screen = _to_screen(means, quats, scales, viewmat, K, *size, eps2d)
+    def forward(ctx, means, quats, scales, viewmat, K, size: tuple[int, int], visible):
+        screen = _to_screen(means, quats, scales, viewmat, K, *size)
         radii, ids = visible(screen)
         ctx.save_for_backward(means, quats, scales, viewmat, K, ids)
-        ctx.size, ctx.eps2d = size, eps2d
+        ctx.size = size
         radii = radii.index_select(0, ids).clamp(max=MAX_RADIUS).to(torch.int32)
         ctx.mark_non_differentiable(ids, radii)
         projected = screen.means2d.t(), screen.depths, _conics(screen), _compensations(screen)
@@ -164,8 +163,8 @@ class _Project(torch.autograd.Function):
     def backward(ctx, _ids, _radii, by_means2d, by_depths, by_conics, by_compensations):
         means, quats, scales, viewmat, K, ids = ctx.saved_tensors
         seen = [table.index_select(0, ids) for table in (means, quats, scales)]
-        screen = _to_screen(*seen, viewmat, K, *ctx.size, ctx.eps2d)
-        by_position, by_axes = _back_to_camera(screen, K, ctx.eps2d, by_means2d, by_depths, by_conics, by_compensations)
+        screen = _to_screen(*seen, viewmat, K, *ctx.size)
+        by_position, by_axes = _back_to_camera(screen, K, by_means2d, by_depths, by_conics, by_compensations)
         W = viewmat[:3, :3]
         by_means = torch.stack(_rotate(W.t(), by_position), -1)
         scaled = seen[2].t()
@@ -181,13 +180,12 @@ class _Project(torch.autograd.Function):
             for i in range(3):
                 by_viewmat[i, :3] = (by_position[i][:, None] * seen[0]).sum(0) + (by_axes[i] * local).sum((1, 2))
                 by_viewmat[i, 3] = by_position[i].sum()
-        return *by_tables, by_viewmat, None, None, None, None
+        return *by_tables, by_viewmat, None, None, None
 
 
 def _back_to_camera(
     screen: _Screen,
     K: Tensor,
-    eps2d: float,
     by_means2d: Tensor,
     by_depths: Tensor,
     by_conics: Tensor,
@@ -204,11 +202,11 @@ def _back_to_camera(
     root = _compensations(screen)
     by_ratio = (by_compensations * 0.5 / (root + COMPENSATION_EPS)) / screen.det_blurred
     by_inverse = -(by_conics * _conics(screen).t()).sum(0)
-    # Of det(cov2d) by itself and as a part of det(cov2d + eps2d I): the difference of the two, which is nearly nothing
+    # Of det(cov2d) by itself and as a part of det(cov2d + e I): the difference of the two, which is nearly nothing
     # for a large splat, is 1 - root^2, written as what the blur adds.
     xx, _, yy = screen.blurred
-    by_det = by_inverse + by_ratio * (eps2d * (xx + yy - eps2d) / screen.det_blurred)
-    by_trace = eps2d * (by_inverse - by_ratio * root * root)
+    by_det = by_inverse + by_ratio * (EPS2D * (xx + yy - EPS2D) / screen.det_blurred)
+    by_trace = EPS2D * (by_inverse - by_ratio * root * root)
     by_xx, by_yy = by_xx + by_trace, by_yy + by_trace
 
     by_normal = 2 * by_det * screen.normal
@@ -251,39 +249,28 @@ def project(
     Ks: Tensor,
     width: int,
     height: int,
-    *,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = 0.3,
-    rasterize_mode: str = "classic",
-    packed: bool = True,
-    assume_finite: bool = False,
+    options: ProjectionOptions,
 ) -> Projection:
     """Find the visible splats of each camera and project them; see `nrfgs_ns.rasterizer.project`.
 
-    A splat is visible when near <= depth <= far, its radius exceeds `radius_clip`, and its square touches the image. A
-    splat whose projection is not finite (a zero
-    quaternion, an infinite scale, a NaN anywhere) fails these comparisons and is invisible, for nothing: here
-    `assume_finite` saves no work and changes nothing.
+    A projection that is not finite fails the comparisons below, so `assume_finite` saves no work and changes nothing.
     """
-    min_discriminant = MIN_DISCRIMINANT_PACKED if packed else MIN_DISCRIMINANT_DENSE
 
     def visible(screen: _Screen) -> tuple[Tensor, Tensor]:
-        radii = _radii(screen, min_discriminant)
+        radii = _radii(screen)
         x, y = screen.means2d
-        seen = (screen.depths >= near_plane) & (screen.depths <= far_plane)
-        seen &= (screen.det_blurred > 0) & (radii > radius_clip) & (radii < LARGEST_RADIUS)
+        seen = (screen.depths >= options.near_plane) & (screen.depths <= options.far_plane)
+        seen &= (screen.det_blurred > 0) & (radii > 0) & (radii < LARGEST_RADIUS)
         seen &= (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
         return radii, seen.nonzero().squeeze(1)
 
     cameras = [
-        _Project.apply(means, quats, scales, viewmat, K, (width, height), eps2d, visible)
+        _Project.apply(means, quats, scales, viewmat, K, (width, height), visible)
         for viewmat, K in zip(viewmats, Ks, strict=True)
     ]
     ids, radii, means2d, depths, conics, compensations = (torch.cat(rows) for rows in zip(*cameras, strict=True))
     camera_ids = torch.cat([torch.full_like(camera[0], index) for index, camera in enumerate(cameras)])
-    if rasterize_mode != "antialiased":
+    if options.rasterize_mode != "antialiased":
         compensations = None
     return Projection(
         *(camera_ids, ids, radii, means2d, depths, conics, compensations), width, height, n_cameras=len(viewmats)

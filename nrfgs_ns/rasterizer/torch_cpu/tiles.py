@@ -30,9 +30,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ..contract import Projection
+from ..contract import TILE_SIZE, Projection
 
-SUB_TILE = 8  # pixels; smaller wastes work on lists, larger on pixels that a splat does not reach
+SUB_TILE = 8  # pixels, a divisor of TILE_SIZE; smaller wastes work on lists, larger on pixels out of a splat's reach
 MIN_ALPHA = 1.0 / 255.0
 FLATTEST = 1e-30  # conic entries of a splat so large that they underflow; keeps its ellipse finite
 REACH_SLACK = 1e-3  # added to s: covers the rounding of sigma in float32 (below 1e-4), so that no pair is lost
@@ -51,8 +51,6 @@ class Block(NamedTuple):
 class Footprints:
     """The splats that can leave a mark, in depth order, and the sub-tiles around them; F of the M projected rows."""
 
-    edge: int
-    """Side of a sub-tile in pixels."""
     tiles_x: int
     """Sub-tiles per image row."""
     tiles_y: int
@@ -99,25 +97,24 @@ class TileLists:
         return self.splat.numel() - 1
 
 
-def _inclusive_range(low: Tensor, high: Tensor, edge: int) -> tuple[Tensor, Tensor]:
+def _inclusive_range(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """Sub-tiles [first, end) that have a pixel centre in [low, high] (pixels, float64). Centres lie at +0.5."""
-    first = torch.ceil((low - (edge - 0.5)) / edge)
-    end = torch.floor((high - 0.5) / edge) + 1
+    first = torch.ceil((low - (SUB_TILE - 0.5)) / SUB_TILE)
+    end = torch.floor((high - 0.5) / SUB_TILE) + 1
     return first, end
 
 
-def _square_range(centre: Tensor, radius: Tensor, tile_size: int, n_tiles: int) -> tuple[Tensor, Tensor]:
+def _square_range(centre: Tensor, radius: Tensor, n_tiles: int) -> tuple[Tensor, Tensor]:
     """Gsplat's rule: tiles [floor((m - r) / size), ceil((m + r) / size)), in the precision of the input."""
-    centre, radius = centre / tile_size, radius / tile_size
+    centre, radius = centre / TILE_SIZE, radius / TILE_SIZE
     return (centre - radius).floor().clamp(0, n_tiles), (centre + radius).ceil().clamp(0, n_tiles)
 
 
-def footprints(projection: Projection, opacities: Tensor, tile_size: int) -> Footprints:
+def footprints(projection: Projection, opacities: Tensor) -> Footprints:
     """Bound every splat: where gsplat's tiles and its own 1/255 ellipse allow it to be seen. Opacities: [M]."""
-    edge = math.gcd(tile_size, SUB_TILE)
-    per_tile = tile_size // edge
+    per_tile = TILE_SIZE // SUB_TILE
     width, height = projection.width, projection.height
-    tiles_x, tiles_y = -(-width // edge), -(-height // edge)
+    tiles_x, tiles_y = -(-width // SUB_TILE), -(-height // SUB_TILE)
 
     # The bits of a positive float sort like the float; the integer sort is an order of magnitude faster.
     bits = projection.depths.view(torch.int32 if projection.depths.dtype == torch.float32 else torch.int64)
@@ -127,8 +124,8 @@ def footprints(projection: Projection, opacities: Tensor, tile_size: int) -> Foo
     means2d = projection.means2d.index_select(0, order)
     radii = projection.radii.index_select(0, order).to(means2d.dtype)
     x, y = means2d.t()
-    x0, x1 = _square_range(x, radii, tile_size, -(-width // tile_size))
-    y0, y1 = _square_range(y, radii, tile_size, -(-height // tile_size))
+    x0, x1 = _square_range(x, radii, -(-width // TILE_SIZE))
+    y0, y1 = _square_range(y, radii, -(-height // TILE_SIZE))
 
     a, b, c = projection.conics.index_select(0, order).double().t()
     a, c = a.clamp(min=FLATTEST), c.clamp(min=FLATTEST)
@@ -141,8 +138,8 @@ def footprints(projection: Projection, opacities: Tensor, tile_size: int) -> Foo
     det = a * c - b * b
     reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
     half_x, half_y = (reach * c / det).sqrt(), (reach * a / det).sqrt()
-    col0, col1 = _inclusive_range(shape[0] - half_x, shape[0] + half_x, edge)
-    row0, row1 = _inclusive_range(shape[1] - half_y, shape[1] + half_y, edge)
+    col0, col1 = _inclusive_range(shape[0] - half_x, shape[0] + half_x)
+    row0, row1 = _inclusive_range(shape[1] - half_y, shape[1] + half_y)
     col0, col1 = col0.maximum(x0 * per_tile), col1.minimum((x1 * per_tile).clamp(max=tiles_x))
     row0, row1 = row0.maximum(y0 * per_tile), row1.minimum((y1 * per_tile).clamp(max=tiles_y))
 
@@ -151,8 +148,8 @@ def footprints(projection: Projection, opacities: Tensor, tile_size: int) -> Foo
     order, shape = order.index_select(0, kept), shape.index_select(1, kept)
     images_above = projection.camera_ids.index_select(0, order)
     spans[:2] += images_above * tiles_y
-    shape[1] += images_above * (tiles_y * edge)
-    return Footprints(edge, tiles_x, tiles_y, order, shape, spans)
+    shape[1] += images_above * (tiles_y * SUB_TILE)
+    return Footprints(tiles_x, tiles_y, order, shape, spans)
 
 
 def _clip(spans: Tensor, block: Block) -> Tensor:
@@ -185,7 +182,6 @@ def split_into_blocks(prints: Footprints, max_pairs: int) -> list[Block]:
 
 def list_tiles(prints: Footprints, block: Block) -> TileLists:
     """List the splats of each sub-tile of a block, front to back. Two expansions: splat -> rows -> columns."""
-    edge = prints.edge
     row0, row1, col0, col1 = _clip(prints.spans, block)
 
     # (splat, row) pairs, splat by splat.
@@ -203,14 +199,14 @@ def list_tiles(prints: Footprints, block: Block) -> TileLists:
     rightmost = -(b / c) * (reach * c / det).sqrt()
     ellipse = torch.stack([x, y, rightmost, -b / a, reach / a, det / (a * a)])
     x, y, rightmost, slope, widest, narrowing = (column.index_select(0, splat) for column in ellipse)
-    y0 = (row * edge + 0.5) - y
-    y1 = y0 + (edge - 1)
+    y0 = (row * SUB_TILE + 0.5) - y
+    y1 = y0 + (SUB_TILE - 1)
     ends = []
     for side in (-1, 1):
         dy = (side * rightmost).clamp(y0, y1)
         half = torch.addcmul(widest, narrowing, dy * dy, value=-1).clamp_(min=0).sqrt_()
         ends.append(torch.addcmul(x, slope, dy).add_(half, alpha=side))
-    first, end = _inclusive_range(*ends, edge)
+    first, end = _inclusive_range(*ends)
     first = first.maximum(col0.index_select(0, splat)).long()
     n_cols = (end.minimum(col1.index_select(0, splat)).long() - first).clamp(min=0)
 
