@@ -61,7 +61,9 @@ def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
 def _check_counts(path: Path) -> None:
     """No element announces more entries than the file has bytes: room is made for them before they are read."""
     with path.open("rb") as file:
-        header = file.read(LONGEST_HEADER).partition(b"end_header")[0]
+        header, end, _ = file.read(LONGEST_HEADER).partition(b"end_header")
+    if not end:
+        raise ValueError(f"no end_header in its first {LONGEST_HEADER} bytes")
     for line in header.split(b"\n"):
         words = line.split()
         if words[:1] == [b"element"] and len(words) == 3 and int(words[2]) > path.stat().st_size:

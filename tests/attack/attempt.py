@@ -2,26 +2,28 @@
 """One hostile input, and what comes of it.
 
 The promise (docs/stability.md): an input that cannot be used is refused with one clear sentence, at once, before
-anything is written, in less than a second of computing and a gigabyte of memory. Attempts are made in a child
-process, which may be killed.
+anything is written, with a bounded number of calls and less than a gigabyte of memory. Work is counted, not timed, so
+that the outcome does not depend on the machine. Attempts are made in a child process, which may be killed.
 """
 
 import contextlib
+import functools
 import json
 import os
 import resource
 import select
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-SECONDS = 1.0
-"""Of computing (not of waiting for a busy machine) that an input may take."""
-PATIENCE = 30.0
-"""Seconds after which an attempt hangs."""
+CALLS = 300_000
+"""Calls of functions, Python's and C's, that an input may take: a tenth of a second or two."""
+PATIENCE = 300.0
+"""Seconds without any answer after which an attempt counts as endless."""
 BYTES = 2**30
 """Of memory, beyond what the program had before."""
 LONGEST = 1000
@@ -45,8 +47,35 @@ class Outcome(NamedTuple):
 
     kind: str
     """refused (one clear sentence); read; silent (hostile, and read without a word); traceback; unclear (refused, but
-    not in one printable sentence); slow; large; wrote; hang"""
+    not in one printable sentence); slow (too many calls); large; wrote; hang"""
     said: str = ""
+    calls: int = 0
+    """calls of functions in the main thread"""
+    size: int = 0
+    """growth of the process's memory, bytes"""
+
+
+class TooManyCalls(BaseException):
+    """Reading takes more than `CALLS`. No `except Exception` stops it."""
+
+
+class _Counter:
+    """Count calls of functions in this thread."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __enter__(self):
+        sys.setprofile(self._on_event)
+        return self
+
+    def __exit__(self, *_):
+        sys.setprofile(None)
+
+    def _on_event(self, frame, event, arg) -> None:
+        self.calls += event in ("call", "c_call")
+        if self.calls > CALLS:
+            raise TooManyCalls
 
 
 def attempt(case: Case) -> Outcome:
@@ -56,10 +85,27 @@ def attempt(case: Case) -> Outcome:
 
 def attempts(cases: Sequence[Case]) -> list[Outcome]:
     """Let a child process read the inputs, one after the other; another one goes on where it hangs or dies."""
+    _warm_up()
     outcomes: list[Outcome] = []
     while len(outcomes) < len(cases):
         outcomes += _in_one_process(cases[len(outcomes) :])
     return outcomes
+
+
+@functools.cache
+def _warm_up() -> None:
+    """Import what reading imports, once and not in every child, whose calls are counted."""
+    from small_capture import Capture
+
+    import nrfgs_ns.compact.decode  # noqa: F401
+    from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+    from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+
+    with tempfile.TemporaryDirectory() as folder:
+        capture = Capture(Path(folder) / "capture", images=2)
+        capture.save()
+        config = NrfgsDataParserConfig(data=capture.folder, load_3D_points=False)
+        NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu").load_all_images()
 
 
 def _in_one_process(cases: Sequence[Case]) -> list[Outcome]:
@@ -109,7 +155,7 @@ def _child(cases: Sequence[Case], send: int) -> None:
         os.write(send, json.dumps(outcome).encode("ascii") + b"\n")
 
 
-def _read(case: Case, folder: Path) -> tuple[str, str]:
+def _read(case: Case, folder: Path) -> Outcome:
     from nrfgs_ns.errors import InputError
 
     data, work = folder / "data", folder / "work"
@@ -119,31 +165,30 @@ def _read(case: Case, folder: Path) -> tuple[str, str]:
     try:
         read = case.build(data)
     except Exception as error:
-        return "broken case", f"{type(error).__name__}: {error}"
+        return Outcome("broken case", f"{type(error).__name__}: {error}")
     os.chdir(work)
-    before, start = _listing(folder), resource.getrusage(resource.RUSAGE_SELF)
+    before, largest = _listing(folder), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     kind, said = "read", ""
     try:
-        read()
+        with _Counter() as counter:
+            read()
     except InputError as error:
         said = str(error)
         clear = len(said) <= LONGEST and said.isprintable() and said.encode("utf-8", "replace").decode() == said
         kind = "refused" if clear else "unclear"
+    except TooManyCalls:
+        kind = "slow"
     except BaseException as error:  # SystemExit of a library, too
         kind, said = "traceback", f"{type(error).__name__}: {error}"
-    end = resource.getrusage(resource.RUSAGE_SELF)
-    seconds = end.ru_utime + end.ru_stime - start.ru_utime - start.ru_stime
-    size = 1024 * (end.ru_maxrss - start.ru_maxrss)
+    size = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest)
     if kind in GOOD:
         if kind == "read" and case.hostile:
             kind = "silent"
-        elif seconds > SECONDS:
-            kind, said = "slow", f"{seconds:.1f} s; {said}"
         elif size > BYTES:
             kind, said = "large", f"{size / 2**20:.0f} MiB; {said}"
         elif _listing(folder) != before:
             kind = "wrote"
-    return kind, said.replace(str(folder), "FOLDER")[: 2 * LONGEST]
+    return Outcome(kind, said.replace(str(folder), "FOLDER")[: 2 * LONGEST], counter.calls, size)
 
 
 def _listing(folder: Path) -> dict[str, tuple[int, int]]:

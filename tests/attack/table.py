@@ -87,6 +87,8 @@ def main() -> None:
     if options.record:
         record = {
             area: {
+                "most calls": max(outcome.calls for _, outcome in outcomes),
+                "most bytes": max(outcome.size for _, outcome in outcomes),
                 "outcomes": Counter(outcome.kind for _, outcome in outcomes),
                 "did not hold": [[n, o.kind, o.said[:200]] for n, o in outcomes if o.kind not in ("refused", "read")],
             }
@@ -100,7 +102,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    import nrfgs_ns.compact.decode
-    import nrfgs_ns.data.datamanager  # noqa: F401  (once, not in every child)
-
     main()
