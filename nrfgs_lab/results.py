@@ -3,12 +3,11 @@
 
     python -m nrfgs_lab.results pack OUT results/NAME.json       # all records and tables of a study's folder
     python -m nrfgs_lab.results unpack results/NAME.json OUT     # the folder again: `nrfgs bench` reports from it
-    python -m nrfgs_lab.results lines OUT.jsonl results/NAME.json  # what `nrfgs_lab.trials` wrote, added to the file
 
 {"study": NAME, "records": {path without .json: record}, "texts": {path: lines}}, a line for each record. Numbers are
 kept to seven significant digits, as many as float32 has. Figures and the tables of other formats are not kept: the
-commands draw them anew from the records. Nor is what ns-eval says of each image, where `bench/measure.py` says it too;
-numbers of splats are kept each 500 steps.
+commands draw them anew from the records. Nor are ns-eval's values of each image, where `bench/measure.py` has them,
+too; numbers of splats are kept every 500 steps.
 """
 
 import json
@@ -19,11 +18,11 @@ from typing import Any
 from nrfgs_ns.files import write_whole
 
 TEXTS = ".md", ".yaml"
-"""Endings of what is kept as text."""
+"""Endings of files that are kept as text."""
 
 
 def rounded(content: Any) -> Any:
-    """The same with numbers of seven significant digits."""
+    """The content, its numbers with seven significant digits."""
     if isinstance(content, dict):
         return {name: rounded(value) for name, value in content.items()}
     if isinstance(content, list):
@@ -56,15 +55,6 @@ def pack(folder: Path, file: Path) -> None:
     write(file, records, texts)
 
 
-def lines(source: Path, file: Path) -> None:
-    """Add trials to a study's file, which need not be there; of trials of one name, scene and seed the last stays."""
-    content = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {"records": {}}
-    for line in source.read_text(encoding="utf-8").splitlines():
-        one = json.loads(line)
-        content["records"]["{name}/{scene}-{seed}".format(**one)] = one
-    write(file, dict(sorted(content["records"].items())), content.get("texts"))
-
-
 def write(file: Path, records: dict[str, Any], texts: dict[str, list[str]] | None = None) -> None:
     """Write a study's file; its name is the study's."""
 
@@ -86,4 +76,4 @@ def unpack(file: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    {"pack": pack, "unpack": unpack, "lines": lines}[sys.argv[1]](*map(Path, sys.argv[2:]))
+    {"pack": pack, "unpack": unpack}[sys.argv[1]](*map(Path, sys.argv[2:]))

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """`nrfgs bench`: methods x strategies x scenes x seeds, one table, one figure, one sheet of crops for each scene.
 
-Each training is a process of its own (`bench_run.py`) that leaves OUT/runs/NAME.json when it is finished. What is there
-is not repeated, what was cut off goes on from its checkpoint, what failed is tried again at the next call and listed
-as FAILED until then. A record that was made with other arguments is never mixed in: the benchmark stops and names it.
+Each training is a process of its own (`run.py`) that leaves OUT/runs/NAME.json when it is finished. Finished ones are
+not repeated, interrupted ones go on from their checkpoint, failed ones are tried again at the next call and listed as
+FAILED until then. A record that was made with other arguments is never mixed in: the benchmark stops and names it.
+
+A file may be worked off in parts, by several commands, some of them at once. All of them report in the same folder, so
+a report has the trainings that its command chose, and whatever else of the file has left records there.
 """
 
 import contextlib
@@ -15,7 +18,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Annotated, Literal
+from typing import IO, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -38,14 +41,12 @@ class Running:
     name: str
     process: "subprocess.Popen | Submitted"
     log: IO
-    work: Path
-    record: Path
-    identity: dict
+    job: Any
 
     def steps(self) -> int:
-        """How far its training is, as far as it said."""
+        """Training steps so far, as noted by the child."""
         try:
-            return int(json.loads((self.work / "progress.json").read_text(encoding="utf-8"))["step"])
+            return int(json.loads((Path(self.job.work) / "progress.json").read_text(encoding="utf-8"))["step"])
         except (OSError, ValueError, KeyError):
             return 0
 
@@ -55,7 +56,7 @@ class Bench:
     """Compare methods over strategies, scenes and seeds: train all, and report. See docs/bench.md."""
 
     spec: Annotated[Path | None, tyro.conf.Positional] = None
-    """YAML file with runs, strategies, scenes, seeds, ...; options given here override it"""
+    """YAML file with runs or knobs, strategies, scenes, seeds, ...; options given here override it"""
     scenes: Path = Path(".")
     """folder in which the data sets lie"""
     out: Path = Path("bench")
@@ -65,13 +66,13 @@ class Bench:
     data: tuple[str, ...] = ()
     """data sets: folders in --scenes; the file may say how to read them"""
     runs: tuple[str, ...] = ()
-    """runs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
+    """runs or knobs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
     strategies: tuple[str, ...] = ()
     """densification: splatfacto, original, mcmc, mcmc@BUDGET, own"""
     seeds: tuple[int, ...] = ()
     """seeds (--machine.seed), one training for each"""
     steps: int | None = None
-    """training steps, except of runs and presets that have their own"""
+    """training steps, except of scenes, runs and presets that have their own"""
     options: str | None = None
     """options of ns-train for every run"""
     train_views: int | None = None
@@ -80,6 +81,8 @@ class Bench:
     """runs at once on each GPU, or on the CPU; times are reported only with 1"""
     gpus: int | None = None
     """GPUs to spread the runs over"""
+    minutes: float | None = None
+    """stop after this time; the next call goes on"""
     executor: Literal["local", "slurm"] | None = None
     """run each training as a task of submitit: on this machine, or in a Slurm queue. None: as a child process"""
     slurm: tuple[str, ...] = ()
@@ -92,27 +95,13 @@ class Bench:
     """rename records of other arguments to NAME.stale, and run them again"""
 
     def main(self) -> None:
-        asked, whole = self.plans()
-        self.carry_out(asked, whole)
-        self.complain(asked)
-
-    def carry_out(self, asked, whole):
-        """Train what is missing of what is asked for, and report.
-
-        Args:
-            asked: a `Spec`.
-            whole: the same with everything else of its file, which is reported as far as it is there.
-
-        Returns:
-            The `Spec` of the report, and name -> difference of the records that it could not use.
-        """
-        from nrfgs_lab.bench.choice import is_method
         from nrfgs_lab.bench.report import report  # matplotlib takes a second; `nrfgs --help` should not
         from nrfgs_lab.bench.spec import steps_of
 
+        plan, chosen = self.plan()
         check_writable(self.out / "table.md", "--out")
-        parsers = None if self.report_only else self.parsers(asked)
-        stale = self.stale(asked, parsers)
+        parsers = None if self.report_only else self.parsers(chosen)
+        stale = self.stale(plan, chosen, parsers)
         if stale and not self.report_only:
             if not self.redo_stale:
                 name, difference = next(iter(stale.items()))
@@ -123,64 +112,71 @@ class Bench:
             for name in stale:
                 with contextlib.suppress(FileNotFoundError):  # another command has done it
                     os.replace(self.record(name), self.record(name).with_suffix(".stale"))
-        jobs = self.jobs_of(asked, parsers) if parsers else {}
+        jobs = self.jobs_of(plan, chosen, parsers) if parsers else {}
         pending = {name: job for name, job in jobs.items() if not self.record(name).exists()}
-        own = [f"{run.name} ({steps_of(asked, run)})" for run in asked.runs if steps_of(asked, run) != asked.steps]
-        for run in asked.runs if pending else ():
-            if not is_method(run.method):
-                raise InputError(f"{self.spec}: runs: {run.name}: {run.method!r} is no method of ns-train.")
-        if pending and own and self.steps is not None:
-            print(f"--steps does not change runs that have their own: {', '.join(own)}.")
         if pending:
+            methods = {cell.run: steps_of(plan, cell.run, cell.scene) for cell in chosen}
+            for run in methods:
+                if not is_method(run.method):
+                    raise InputError(f"{self.spec}: runs: {run.name}: {run.method!r} is no method of ns-train.")
+            own = [f"{run.name} ({steps})" for run, steps in methods.items() if steps not in (self.steps, None)]
+            if own and self.steps is not None:
+                print(f"--steps does not change runs that have their own: {', '.join(own)}.")
             # A terminated benchmark must not leave its children behind; an exception reaches the `finally` below.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-            self.run_all(pending, asked)
+            self.run_all(pending, plan)
         # Another command may end at this moment: whoever reports last must have read the records of both.
         with only_one(self.out / ".lock", "Another command reports here; waiting for it to end."):
-            shown = self.shown(asked, whole)
-            stale = self.stale(shown, parsers)
-            report(shown, self.out, self.work, stale)
-        return shown, stale
-
-    def shown(self, asked, whole):
-        """The `Spec` of what a report shows now."""
-        from nrfgs_lab.bench.choice import with_records
-
-        return with_records(whole, asked, lambda name: self.record(name).exists() or self.has_failed(name))
-
-    def complain(self, asked) -> None:
-        """End with status 1 if a training that was asked for has failed."""
-        from nrfgs_lab.bench.spec import cells_of
-
-        failed = [cell.name for cell in cells_of(asked) if self.has_failed(cell.name)]
+            cells = self.shown(plan, chosen)
+            report(plan, cells, self.out, self.work, self.stale(plan, cells, parsers))
+        failed = [cell.name for cell in chosen if self.has_failed(cell.name)]
         if failed and not self.report_only:
             sys.exit(f"nrfgs: {len(failed)} of the runs FAILED: {', '.join(failed)}. Logs: {self.work}/NAME.log")
 
     def plan(self):
-        """The `Spec` that is asked for: the file, with this command's options over it."""
-        return self.plans()[0]
-
-    def plans(self):
-        """The `Spec` that is asked for, and that with all of its file."""
-        from nrfgs_lab.bench.choice import chosen_runs, chosen_scenes, united
-        from nrfgs_lab.bench.spec import load_spec, make_spec
+        """The whole benchmark, `Spec`, and the trainings that this command asks for, list of `Cell`."""
+        from nrfgs_lab.bench.spec import DEFAULT, OWN, as_list, cells_of, load_spec, make_spec, scene_path
 
         where = str(self.spec or "nrfgs bench")
-        file = load_spec(self.spec) if self.spec else {}
-        given = {"strategies": self.strategies, "seeds": self.seeds, "steps": self.steps, "options": self.options}
-        given |= {"train_views": self.train_views, "jobs": self.jobs, "gpus": self.gpus}
-        asked = {**file, **{key: value for key, value in given.items() if value not in (None, ())}}
-        if self.runs:
-            of_file = file.get("runs") or {}
-            if not isinstance(of_file, dict):
-                raise InputError(f"{where}: runs must map names to methods.")
-            asked["runs"] = chosen_runs(self.runs, {str(name): run for name, run in of_file.items()}, where)
-        if self.data:
-            asked["scenes"] = chosen_scenes(self.data, file.get("scenes") or [])
-        chosen, whole = make_spec(asked, where), make_spec(united(file, asked), where)
-        if unknown := sorted(set(whole.crops) - {scene.name for scene in whole.scenes}):
-            raise InputError(f"{where}: crops: {unknown[0]!r} is none of its scenes. Correct or remove it.")
-        return chosen, whole
+        content = load_spec(self.spec) if self.spec else {}
+        given = {"steps": self.steps, "options": self.options, "train_views": self.train_views, "jobs": self.jobs}
+        content |= {key: value for key, value in {**given, "gpus": self.gpus}.items() if value is not None}
+        data, of_file = [scene_path(name) for name in self.data], as_list(content.get("scenes") or [])
+        content["scenes"] = of_file + [name for name in data if name not in map(scene_path, of_file)]
+        for key, default in (("strategies", OWN), ("seeds", 42)):
+            if values := getattr(self, key):
+                of_file = as_list(content.get(key, default)) if self.spec else []
+                content[key] = of_file + [value for value in values if value not in of_file]
+        runs = content.get("runs") or {}
+        known = set(map(str, runs))
+        if "knobs" in content:
+            known = {name for run in make_spec(content, where).runs for name in (run.name, run.knob)}
+        new = dict(named_run(word, known, where) for word in self.runs if word not in known)
+        if new:
+            content["runs"] = {**{str(name): run for name, run in runs.items()}, **new}
+        plan = make_spec(content, where)
+        names = {*self.runs, *new, *([DEFAULT] if "knobs" in content else [])}
+
+        def is_chosen(cell) -> bool:
+            follows = cell.run.strategies is None and cell.run.method.startswith("nrfgs")
+            return (
+                (not self.runs or cell.run.name in names or cell.run.knob in names)
+                and (not data or cell.scene.path in data)
+                and (not self.seeds or cell.seed in self.seeds)
+                and (not self.strategies or not follows or cell.strategy in self.strategies)
+            )
+
+        return plan, [cell for cell in cells_of(plan) if is_chosen(cell)]
+
+    def shown(self, plan, chosen):
+        """The trainings of a report: the chosen ones, and all others of the file that have left something."""
+        from nrfgs_lab.bench.spec import cells_of
+
+        every = cells_of(plan)
+        rows = list(dict.fromkeys((cell.scene, cell.strategy, cell.run) for cell in every))  # seeds stand together
+        there = [cell for cell in every if self.record(cell.name).exists() or self.has_failed(cell.name)]
+        cells = {*chosen, *there}
+        return sorted(cells, key=lambda cell: (rows.index((cell.scene, cell.strategy, cell.run)), cell.seed))
 
     def record(self, name: str) -> Path:
         """The file that a finished run leaves."""
@@ -190,35 +186,38 @@ class Bench:
         """Whether a run's last attempt failed."""
         return failure(self.record(name)).exists() and not self.record(name).exists()
 
-    def parsers(self, plan) -> dict:
+    def parsers(self, cells) -> dict:
         """Scene -> the data parser and its options. A data set that cannot be read fails now."""
         from nrfgs_lab.bench.data import parser_options
 
-        return {scene: parser_options(self.scenes, scene, self.work / "scenes") for scene in plan.scenes}
+        scenes = dict.fromkeys(cell.scene for cell in cells)
+        return {scene: parser_options(self.scenes, scene, self.work / "scenes") for scene in scenes}
 
-    def jobs_of(self, plan, parsers: dict) -> dict:
+    def jobs_of(self, plan, cells, parsers: dict) -> dict:
         """Name -> `Job` of every training."""
-        from nrfgs_lab.bench.spec import Job, cells_of, command, identity, steps_of
+        from nrfgs_lab.bench.spec import Job, command, identity, steps_of
 
         return {
             cell.name: Job(
                 args=command(plan, cell, parsers[cell.scene], self.work / cell.name),
+                cell={"run": cell.run.name, "strategy": cell.strategy, "scene": cell.scene.name, "seed": cell.seed},
                 identity=identity(plan, cell, parsers[cell.scene]),
-                steps=steps_of(plan, cell.run),
+                steps=steps_of(plan, cell.run, cell.scene),
                 record=str(self.record(cell.name)),
                 work=str(self.work / cell.name),
                 train_views=plan.train_views,
                 jobs=plan.jobs,
+                quick=plan.quick,
             )
-            for cell in cells_of(plan)
+            for cell in cells
         }
 
-    def stale(self, plan, parsers: dict | None) -> dict[str, str]:
+    def stale(self, plan, cells, parsers: dict | None) -> dict[str, str]:
         """Name -> difference, of the records whose arguments are not those of the plan."""
-        from nrfgs_lab.bench.spec import cells_of, differences, identity, read_record
+        from nrfgs_lab.bench.spec import differences, identity, read_record
 
         result = {}
-        for cell in cells_of(plan):
+        for cell in cells:
             if self.record(cell.name).exists():
                 made_with = read_record(self.record(cell.name))["identity"]
                 wanted = identity(plan, cell, parsers.get(cell.scene) if parsers else None)
@@ -238,32 +237,36 @@ class Bench:
             slots = [gpu for _ in range(plan.jobs) for gpu in gpu_names(plan.gpus)]
         # A training on a GPU needs few CPU threads, but torch takes all cores: side by side they wait for each other.
         threads = max(1, (os.cpu_count() or 1) // len(slots))
+        end = float("inf") if self.minutes is None else time.monotonic() + 60 * self.minutes
         columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
         with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
 
             def say(text: str) -> None:
                 progress.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-            bar = progress.add_task("", total=sum(job.steps for job in pending.values()))
+            bar = progress.add_task("", total=sum(job.steps or 1 for job in pending.values()))
             try:
                 while waiting or running:
+                    if time.monotonic() > end:
+                        say(f"Time is up: {len(waiting) + len(running)} runs are left for the next call.")
+                        break
                     for slot, gpu in enumerate(slots):
                         if slot in running and running[slot].process.poll() is not None:
                             done = running.pop(slot)
                             done.log.close()
-                            finished, steps_finished = finished + 1, steps_finished + pending[done.name].steps
-                            good = done.process.returncode == 0 and done.record.exists()
+                            finished, steps_finished = finished + 1, steps_finished + (done.job.steps or 1)
+                            record = Path(done.job.record)
+                            good = done.process.returncode == 0 and record.exists()
                             say(f"{done.name}: {'done' if good else 'FAILED'}")
                             if not good:
-                                note = {"returncode": done.process.returncode, "identity": done.identity}
-                                write_whole(failure(done.record), json.dumps(note, indent=1) + "\n")
+                                note = {"returncode": done.process.returncode, "identity": done.job.identity}
+                                write_whole(failure(record), json.dumps(note, indent=1) + "\n")
                                 say(f"  see {done.log.name}")
                         if slot not in running and waiting:
                             running[slot] = self.start(*waiting.pop(0), gpu, threads, queue)
                             say(f"{running[slot].name}: started")
                     steps = steps_finished + sum(child.steps() for child in running.values())
-                    label = f"{finished} of {len(pending)} runs"
-                    progress.update(bar, completed=steps, description=label)
+                    progress.update(bar, completed=steps, description=f"{finished} of {len(pending)} runs")
                     time.sleep(POLL_SECONDS)
             finally:
                 for child in running.values():
@@ -280,11 +283,40 @@ class Bench:
         log = (self.work / f"{name}.log").open("a")
         if queue is not None:
             command, note = [*CHILD, str(file.resolve())], self.work / f"{name}.task.json"
-            process = queue.start(name, command, Path(log.name), gpu, note)
-            return Running(name, process, log, Path(job.work), self.record(name), job.identity)
+            return Running(name, queue.start(name, command, Path(log.name), gpu, note), log, job)
         environment = {"OMP_NUM_THREADS": str(threads), **os.environ, "CUDA_VISIBLE_DEVICES": gpu}
         process = subprocess.Popen([*CHILD, str(file)], stdout=log, stderr=subprocess.STDOUT, env=environment)
-        return Running(name, process, log, Path(job.work), self.record(name), job.identity)
+        return Running(name, process, log, job)
+
+
+def named_run(word: str, known: set[str], where: str) -> tuple[str, dict[str, str]]:
+    """Name and run of METHOD OPTIONS or NAME=METHOD OPTIONS; options may have "=" too.
+
+    Raises:
+        InputError: there is no such method.
+    """
+    name, equals, rest = word.partition("=")
+    if not equals or " -" in name:
+        name, rest = word, word
+    method, _, options = rest.strip().partition(" ")
+    if not is_method(method):
+        listed = f", and {where} has no run of that name. It has {', '.join(sorted(known))}" if known else ""
+        raise InputError(
+            f"--runs {word!r}: {method!r} is no method of ns-train{listed}. "
+            'Give the name of a run, METHOD, or "NAME=METHOD OPTIONS".'
+        )
+    return name.strip(), {"method": method, "options": options}
+
+
+def is_method(name: str) -> bool:
+    """Whether ns-train has a method of this name."""
+    from importlib.metadata import entry_points
+
+    if name in {plugin.name for plugin in entry_points(group="nerfstudio.method_configs")}:
+        return True
+    from nerfstudio.configs.method_configs import all_methods  # takes seconds, and is only needed for others' methods
+
+    return name in all_methods
 
 
 def failure(record: Path) -> Path:

@@ -1,23 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which data parser reads a folder, so that every 8th image by name is a test image.
+"""The data parser that reads a folder, so that every 8th image by name is a test image.
 
 - `transforms.json`: `nrfgs-data`. The data set's own split if it names one, else every 8th image.
 - `sparse/0` (or `colmap/sparse/0`, or `sparse`) with COLMAP's text or binary files: nerfstudio's `colmap`. That one
   counts images in the order of COLMAP's numbers, which is not the order of names. So the folder is mirrored by links
-  into the work folder, with lists of names that say which image is what; the data set itself is not touched.
+  into the work folder, with lists of the names of each split; the data set itself is not touched.
+- Held out: a data set of the training views alone, at half the size, some of which are its test views, for choosing
+  settings without looking at test views. It is written into the work folder.
 """
 
 import json
+import shutil
 import struct
 from pathlib import Path
 
 from PIL import Image
 
 from nrfgs_lab.bench.spec import Scene
+from nrfgs_lab.lock import only_one
+from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole, write_whole
 
 TEST_EVERY = 8
+QUALITY = 92
+"""Quality of the JPEGs of held-out data sets."""
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
 """Where a COLMAP reconstruction may lie."""
 ROUNDINGS = {
@@ -34,12 +41,17 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     Args:
         root: folder of the scenes.
         scene: which one.
-        mirrors: folder for mirrored COLMAP data sets.
+        mirrors: folder for mirrored COLMAP data sets and held-out ones.
 
     Raises:
         InputError: the folder is in neither layout, or the downscaled images are missing or of an unknown size.
     """
-    folder = Path(root) / scene.name
+    folder, mirror = Path(root) / scene.path, mirrors / scene.name
+    if scene.held_out is not None:
+        with only_one(mirror.with_name(f"{mirror.name}.lock"), f"Another process makes {mirror}; waiting for it."):
+            if not (mirror / "transforms.json").exists():
+                make_held_out(folder, mirror, scene.held_out, scene.views)
+        return ["nrfgs-data", "--data", str(mirror), *scene.options]
     if (folder / "transforms.json").is_file():
         scale = [] if scene.downscale is None else ["--downscale-factor", str(scene.downscale)]
         split = [] if names_its_split(folder / "transforms.json") else ["--eval-mode", "interval"]
@@ -51,7 +63,6 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
             "or cameras.txt). Give a folder in one of these layouts (--scenes ROOT, and scenes: in the file)."
         )
     factor = scene.downscale or 1
-    mirror = mirrors / scene.name
     mirror_with_split(folder, model, mirror)
     return [
         *("colmap", "--data", str(mirror), "--colmap-path", model),
@@ -59,6 +70,50 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
         *(["--downscale-rounding-mode", rounding(folder, factor, model)] if factor > 1 else []),
         *scene.options,
     ]
+
+
+def held_out_views(names: list[str], first: int) -> list[str]:
+    """The training views to hold out: every 8th; every 6th of fewer than 30 if every 8th leaves fewer than three."""
+    chosen = names[first::TEST_EVERY]
+    return names[first::6] if len(names) < 30 and len(chosen) < 3 else chosen
+
+
+def make_held_out(folder: Path, out: Path, first: int, views: int | None = None) -> None:
+    """Write the data set of a capture's training views at half the size.
+
+    Args:
+        folder: the capture, with a transforms.json that names its split.
+        out: folder of the data set.
+        first: first of the held-out views among the training views in the order of their names.
+        views: number of the others that stay training views, evenly spaced; None: all.
+
+    Raises:
+        InputError: the capture names no training views.
+    """
+    file = folder / "transforms.json"
+    meta = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    if not meta.get("train_filenames"):
+        raise InputError(f"{file} names no train_filenames. Give a capture that names its split (nrfgs prepare does).")
+    training = set(meta["train_filenames"])
+    frames = sorted((one for one in meta["frames"] if one["file_path"] in training), key=lambda one: one["file_path"])
+    size = meta["w"] // 2, meta["h"] // 2
+    for frame in frames:
+        for key in {"file_path", "mask_path"} & frame.keys():
+            target = out / frame[key]
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with Image.open(folder / frame[key]) as picture:
+                small = picture.convert("RGB" if key == "file_path" else "L").resize(size, Image.Resampling.BOX)
+                small.save(target, quality=QUALITY)
+    names = [frame["file_path"] for frame in frames]
+    test = held_out_views(names, first)
+    others = [name for name in names if name not in test]
+    for keys, factor in ((("fl_x", "cx"), size[0] / meta["w"]), (("fl_y", "cy"), size[1] / meta["h"])):
+        meta |= {key: meta[key] * factor for key in keys}
+    meta |= {"w": size[0], "h": size[1], "frames": frames, "test_filenames": test, "val_filenames": test}
+    meta["train_filenames"] = [others[i] for i in evenly_spaced(len(others), views or len(others))]
+    if "ply_file_path" in meta:
+        shutil.copy(folder / meta["ply_file_path"], out / meta["ply_file_path"])
+    write_whole(out / "transforms.json", json.dumps(meta, indent=1))
 
 
 def names_its_split(transforms: Path) -> bool:

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs of a benchmark as tasks of submitit: on this machine, or in the queue of a Slurm cluster.
 
-A task does what a child process of `nrfgs bench` does: it runs the command that does one job, whose record then lies
-in a folder that all machines share. What is told apart here is only where the command runs. A task that the cluster
-interrupts (preemption, time limit) is queued again by submitit and goes on from the last checkpoint.
-
-Tasks in a queue outlive the benchmark that put them there. Their numbers are noted beside the jobs, and the next call
-waits for those that are still there instead of queueing the runs twice.
+A task runs the command that a child process of `nrfgs bench` would run; its record lies in a folder that all machines
+share. A task that the cluster interrupts (preemption, time limit) is queued again by submitit and goes on from the last
+checkpoint. Tasks in a queue outlive the benchmark. Their numbers are noted beside the jobs: the next call waits for
+those that are still there instead of queueing the runs twice.
 """
 
 import json
@@ -19,14 +17,14 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
 
 GENERIC = ("timeout_min", "mem_gb", "cpus_per_task", "gpus_per_node")
-"""Parameters that submitit knows for every executor; the others are Slurm's own."""
+"""Parameters that submitit knows for every executor; others are Slurm's own."""
 LOCAL_TIMEOUT_MIN = 60 * 24 * 30
-"""submitit ends local tasks after minutes unless it is told otherwise; here a run takes as long as it takes."""
+"""Long enough for any run: by default submitit ends local tasks after minutes."""
 
 
 @dataclass
 class Task:
-    """What submitit carries to where the work is done, and calls there."""
+    """The command of one job, as submitit calls it on another machine."""
 
     command: list[str]
     """of one job"""
@@ -56,7 +54,7 @@ class Task:
             self.child.wait()
 
     def checkpoint(self) -> Any:
-        """What submitit calls when the cluster is about to interrupt the task: the same command, later."""
+        """The same command, later: called by submitit before the cluster interrupts the task."""
         from submitit.helpers import DelayedSubmission
 
         self.end()
@@ -64,7 +62,7 @@ class Task:
 
 
 class Submitted:
-    """A task of submitit, looked at like a child process.
+    """A task of submitit with the interface of a child process.
 
     Args:
         job: submitit's.
@@ -94,7 +92,7 @@ class Submitted:
 
 
 class Queue:
-    """Where tasks are handed in.
+    """A queue of tasks.
 
     Args:
         name: "local" or "slurm".
@@ -113,19 +111,19 @@ class Queue:
         self.name = name
         self.folder = folder.resolve() / "submitit"
         self.executor = submitit.AutoExecutor(folder=self.folder, cluster=name)
-        given = {"timeout_min": LOCAL_TIMEOUT_MIN} if name == "local" else {}
+        options = {"timeout_min": LOCAL_TIMEOUT_MIN} if name == "local" else {}
         for parameter in parameters:
             key, equals, value = parameter.partition("=")
             if not equals:
                 raise InputError(f"--slurm {parameter}: give KEY=VALUE, such as partition=gpu.")
-            given[key if key in GENERIC else f"slurm_{key}"] = int(value) if value.isdigit() else value
+            options[key if key in GENERIC else f"slurm_{key}"] = int(value) if value.isdigit() else value
         try:
-            self.executor.update_parameters(stderr_to_stdout=True, **given)
+            self.executor.update_parameters(stderr_to_stdout=True, **options)
         except (NameError, AssertionError) as error:
             raise InputError(f"--slurm: {error}") from error
 
     def start(self, name: str, command: list[str], log: Path, gpu: str, note: Path) -> Submitted:
-        """Hand in a task, or find the one that an earlier benchmark handed in and that is still there.
+        """Submit a task, or return the one that an earlier benchmark submitted and that is still there.
 
         Args:
             name: of the run.
@@ -145,13 +143,13 @@ class Queue:
         return Submitted(job, lives_on=self.name == "slurm")
 
     def _earlier(self, note: Path):
-        """The task that a note tells of, if it still waits or runs."""
+        """The task of a note, if it still waits or runs."""
         import submitit
 
         if not note.exists():
             return None
-        told = json.loads(note.read_text(encoding="utf-8"))
-        if told["executor"] != self.name:
+        task = json.loads(note.read_text(encoding="utf-8"))
+        if task["executor"] != self.name:
             return None
-        job = submitit.SlurmJob(folder=self.folder, job_id=told["job"])
+        job = submitit.SlurmJob(folder=self.folder, job_id=task["job"])
         return None if job.done(force_check=True) else job

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a trained model is worth, measured alike for every method: on test views, on training views, in time and bytes.
+"""Measurements of a trained model, the same for every method: on test views, on training views, in time and bytes.
 
 `ns-eval` reports what a method chooses to report; nerfstudio's own splatfacto has neither L1 nor MS-SSIM, ignores masks
 and takes its frames per second without waiting for the GPU. Here one piece of code looks at the renderings of all.
@@ -11,12 +11,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
 
-from nrfgs_lab.flip import flip
 from nrfgs_ns.data.views import evenly_spaced
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.metrics import METRIC_NAMES, image_metrics
 
 TIMED_CAMERAS = 20
@@ -97,8 +98,36 @@ def over_views(model, views: Iterable, flip: Callable | None = None) -> dict[str
     return {**means, "per_image": per_image}
 
 
+def flip(pred: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float | None:
+    """Mean FLIP (Andersson et al., PACMCGIT 3(2), 2020): how different two pictures look, lower is better.
+
+    The package `flip-evaluator` computes it, at its 67 pixels a degree.
+
+    Args:
+        pred, truth: sRGB images [H, W, 3] in [0, 1].
+        mask: bool [H, W], True inside: outside, the prediction is replaced by the truth, and left out of the mean.
+
+    Returns:
+        In [0, 1]; None if nothing is inside.
+
+    Raises:
+        InputError: `flip-evaluator` is missing.
+    """
+    try:
+        import flip_evaluator
+    except ImportError as error:
+        raise InputError("FLIP needs the package flip-evaluator: pip install flip-evaluator") from error
+    if mask is not None:
+        if not mask.any():
+            return None
+        pred = np.where(mask[..., None], pred, truth)
+    images = (np.ascontiguousarray(image, dtype=np.float32) for image in (truth, pred))
+    errors = np.squeeze(flip_evaluator.evaluate(*images, "LDR", applyMagma=False)[0], axis=-1)
+    return float(errors.mean() if mask is None else errors[mask].mean())
+
+
 def at_size(camera: Cameras, width: int, height: int) -> Cameras:
-    """The camera [1] with another image: of the same vertical angle, and as much to the sides as there is room for."""
+    """The camera [1] with another image size: the same vertical angle, and a horizontal one that fits."""
     scale = height / camera.height
     size = {"width": torch.full_like(camera.width, width), "height": torch.full_like(camera.height, height)}
     return Cameras(camera.camera_to_worlds, camera.fx * scale, camera.fy * scale, width / 2, height / 2, **size).to(

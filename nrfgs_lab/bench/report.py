@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a benchmark, from the records that are there: tables, numbers of splats over steps, crops."""
+"""The report of a benchmark from its records: tables, numbers of splats over steps, crops, and a trade's figure."""
 
 import json
 from pathlib import Path
@@ -7,8 +7,9 @@ from typing import Any
 
 from rich.console import Console
 
+from nrfgs_lab.bench import trade
 from nrfgs_lab.bench.crops import crop_sheet, numbered
-from nrfgs_lab.bench.spec import Cell, Scene, Spec, cells_of, read_record, rows_of
+from nrfgs_lab.bench.spec import OWN, Cell, Spec, read_record
 from nrfgs_lab.bench.table import (
     COLUMNS,
     FAILED,
@@ -16,66 +17,69 @@ from nrfgs_lab.bench.table import (
     STALE,
     Row,
     as_csv,
-    latex,
     markdown,
+    plain_label,
     views_as_csv,
     with_averages,
 )
 from nrfgs_ns.files import whole, write_whole
 
 
-def report(spec: Spec, out: Path, work: Path, stale: dict[str, str]) -> None:
-    """Write OUT/table.{md,csv,tex}, views.csv, summary.json, splats.{png,svg} and crops/SCENE.png, and print the table.
+def report(spec: Spec, cells: list[Cell], out: Path, work: Path, stale: dict[str, str]) -> None:
+    """Write OUT/table.{md,csv}, views.csv, summary.json, splats.{png,svg}, crops/SCENE.png, and print the table.
+
+    A plan with knobs gets OUT/tradeoff.{md,json,png}, too.
 
     Args:
         spec: the benchmark.
+        cells: the trainings to report.
         out: folder of the report; its runs/ holds the records.
         work: folder of the trainings, for their pictures; without them there are no crops.
         stale: names of records that are not to be used, with the reason.
     """
-    rows = rows_from_records(spec, out / "runs", stale)
+    rows = rows_from_records(cells, out / "runs", stale)
     for name, difference in stale.items():
         print(f"{name} is stale: it was made with {difference}")
     everything = with_averages(rows)
     table = markdown(everything)
     write_whole(out / "table.md", table)
     write_whole(out / "table.csv", as_csv(everything))
-    write_whole(out / "table.tex", latex(everything))
     write_whole(out / "views.csv", views_as_csv(rows))
     write_whole(out / "summary.json", json.dumps([summary(row) for row in everything], indent=1) + "\n")
     if any(row.records for row in rows):
         draw_splats(rows, out)
-    for scene in spec.scenes:
-        path = out / "crops" / f"{scene.name.replace('/', '_')}.png"
+    for scene in dict.fromkeys(cell.scene.name for cell in cells):
+        here = [cell for cell in cells if cell.scene.name == scene and cell.name not in stale]
+        path = out / "crops" / f"{scene.replace('/', '_')}.png"
         try:
-            crop_sheet(pictures_of(spec, scene, out / "runs", work, stale), path, spec.crops.get(scene.name))
+            crop_sheet(pictures_of(here, out / "runs", work), path, spec.crops.get(scene))
         except OSError as error:
-            print(f"No crops of {scene.name}: {error}")
+            print(f"No crops of {scene}: {error}")
+    knobs = {run.name: run.knob for run in spec.runs if run.knob}
+    if knobs:
+        trade.report(everything, knobs, out)
     Console(soft_wrap=True, markup=False, highlight=False).print(table)
     print(f"Report: {out}")
 
 
-def pictures_of(spec: Spec, scene: Scene, runs: Path, work: Path, stale: dict[str, str]) -> dict[str, Path]:
-    """Label -> folder of ns-eval's pictures of each run on a scene, of its first seed that has some.
+def pictures_of(cells: list[Cell], runs: Path, work: Path) -> dict[str, Path]:
+    """Label -> folder of ns-eval's pictures of each run on one scene, of its first seed that has some.
 
     The labels name the seeds if the runs have not all the same one.
     """
-    found = []
-    for strategy, run in rows_of(spec):
-        for seed in spec.seeds:
-            name = Cell(run, strategy, scene, seed).name
-            folder = work / name / "pictures"
-            if name not in stale and (runs / f"{name}.json").exists() and numbered(folder):
-                found.append((label(run.name, strategy), seed, folder))
-                break
-    several = len({seed for _, seed, _ in found}) > 1
-    return {f"{text}, seed {seed}" if several else text: folder for text, seed, folder in found}
+    first: dict[str, tuple[int, Path]] = {}
+    for cell in cells:
+        folder = work / cell.name / "pictures"
+        if (runs / f"{cell.name}.json").exists() and numbered(folder):
+            first.setdefault(label(cell.run.name, cell.strategy), (cell.seed, folder))
+    several = len({seed for seed, _ in first.values()}) > 1
+    return {f"{text}, seed {seed}" if several else text: folder for text, (seed, folder) in first.items()}
 
 
-def rows_from_records(spec: Spec, runs: Path, stale: dict[str, str]) -> list[Row]:
+def rows_from_records(cells: list[Cell], runs: Path, stale: dict[str, str]) -> list[Row]:
     """One row for each scene, strategy and run, whether or not it has records."""
     by_place: dict[tuple[str, str, str], Row] = {}
-    for cell in cells_of(spec):
+    for cell in cells:
         place = (cell.scene.name, cell.run.name, cell.strategy)
         row = by_place.setdefault(place, Row(*place))
         file = runs / f"{cell.name}.json"
@@ -102,13 +106,8 @@ def summary(row: Row) -> dict[str, Any]:
 
 
 def label(run: str, strategy: str) -> str:
-    """What a run under a strategy is called in pictures."""
-    return run if strategy == "own" else f"{run} {strategy}"
-
-
-def plain_label(text: str) -> str:
-    """A name as matplotlib writes it out: `$` begins no formula, and a leading underscore keeps it in the legend."""
-    return ("\N{ZERO WIDTH SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")
+    """Name of a run under a strategy in pictures."""
+    return run if strategy == OWN else f"{run} {strategy}"
 
 
 def draw_splats(rows: list[Row], out: Path) -> None:
@@ -150,13 +149,13 @@ def draw_splats(rows: list[Row], out: Path) -> None:
 
 
 STYLES = "-", "--", ":", "-."
-"""Of lines: the next one when the ten colours are used up."""
+"""Styles of lines: the next one when the ten colours are used up."""
 
 
 def draw_counts(panel, row: Row, number: int) -> None:
     """One row's numbers of splats over steps, in the colour and style of its run's number."""
-    told = [record["train"].get("splats") for record in row.records.values()]
-    curves = [dict(map(tuple, pairs)) for pairs in told if pairs]
+    counts = [record["train"].get("splats") for record in row.records.values()]
+    curves = [dict(map(tuple, pairs)) for pairs in counts if pairs]
     if not curves:
         return
     steps = sorted(set.intersection(*(set(curve) for curve in curves)))

@@ -1,29 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run of a benchmark, in a process of its own: train, `ns-eval`, measure, leave a record.
+"""One training of a benchmark, in a process of its own: train, `ns-eval`, measure, leave a record.
 
     python -m nrfgs_lab.bench.run JOB.json
 
 It may be killed at any time and started again. What is finished is not repeated; a training goes on from its last
-checkpoint if that was made with the same arguments. Two processes never work on the same run.
+checkpoint if that was made with the same arguments. Two processes never work on the same training.
 """
 
 import contextlib
 import json
 import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import torch
+from torch import nn
+
 from nrfgs_lab.bench.spec import Job
 from nrfgs_lab.lock import only_one
-from nrfgs_lab.run import host_without_downloads
 from nrfgs_ns.files import write_whole
+from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.training.run import TrainRecord, evaluate, machine, train
 
 PROGRESS_SECONDS = 1.0
-"""Time between two notes of how far a training is."""
+"""Time between two notes of a training's step."""
 
 
 def run(job: Job) -> None:
@@ -41,9 +45,10 @@ def run(job: Job) -> None:
 
             record = train_or_continue(job, work)
             config = Path(record.config_path)
-            results = evaluate(config, work / "eval.json", work / "pictures")
-            measured = measure(config, job.train_views, timed=job.jobs == 1)
+            results = {} if job.quick else {"eval": evaluate(config, work / "eval.json", work / "pictures")}
+            measured = measure(config, job.train_views, timed=job.jobs == 1 and not job.quick)
         content = {
+            "cell": job.cell,
             "identity": job.identity,
             "machine": machine(),
             "jobs": job.jobs,
@@ -53,17 +58,50 @@ def run(job: Job) -> None:
                 "args": job.identity["options"],
                 "config_path": config.relative_to(work).as_posix(),
             },
-            "eval": results,
+            **results,
             "measured": measured,
         }
         write_whole(record_path, json.dumps(content, indent=1) + "\n")
+        if job.quick:
+            shutil.rmtree(work, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def host_without_downloads(method: str) -> Iterator[None]:
+    """Let nerfstudio's own methods run offline, for comparisons.
+
+    They build LPIPS, and download its weights, with the model. For the time of a run it is replaced by one that gives
+    NaN, unless the weights are on disk. Their checkpoints need torch's leave to be read. This project's methods need no
+    such thing.
+    """
+    from torchvision.models import AlexNet_Weights
+
+    allow_nerfstudio_checkpoints()
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.DEFAULT.url).name
+    if method.startswith("nrfgs") or weights.is_file():
+        yield
+        return
+    import torchmetrics.image.lpip as lpip
+
+    class NoLpips(nn.Module):
+        def __init__(self, **_: Any):
+            super().__init__()
+
+        def forward(self, *_: Any) -> torch.Tensor:
+            return torch.tensor(float("nan"))
+
+    original, lpip.LearnedPerceptualImagePatchSimilarity = lpip.LearnedPerceptualImagePatchSimilarity, NoLpips
+    try:
+        yield
+    finally:
+        lpip.LearnedPerceptualImagePatchSimilarity = original
 
 
 def train_or_continue(job: Job, work: Path) -> TrainRecord:
     """Train from the last checkpoint, or from the start.
 
-    Only this project's methods continue: nerfstudio's own splatfacto loses its optimisers' hold of the parameters when
-    it loads a checkpoint, and may leave a torn one.
+    Only this project's methods with a given number of steps continue: nerfstudio's own splatfacto loses its optimisers'
+    hold of the parameters when it loads a checkpoint, and may leave a torn one.
     """
 
     def saved(record: TrainRecord) -> None:
@@ -79,7 +117,7 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
             noted = perf_counter()
 
     args, earlier = job.args, None
-    checkpoint = last_checkpoint(work) if args[0].startswith("nrfgs") else None
+    checkpoint = last_checkpoint(work) if args[0].startswith("nrfgs") and job.steps else None
     if checkpoint is not None:
         earlier = record_until(work / "train.json", checkpoint)
     if earlier is not None:
@@ -92,15 +130,15 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
 
 def last_checkpoint(work: Path) -> Path | None:
     """The checkpoint of the latest step anywhere below a folder."""
-    found = work.rglob("nerfstudio_models/step-*.ckpt")
-    return max(found, key=lambda path: (path.name, path.stat().st_mtime), default=None)
+    files = work.rglob("nerfstudio_models/step-*.ckpt")
+    return max(files, key=lambda path: (path.name, path.stat().st_mtime), default=None)
 
 
 def record_until(path: Path, checkpoint: Path) -> TrainRecord | None:
-    """The training's record as it was when a checkpoint was saved; None if there is none that can be read."""
+    """The training's record as it was when a checkpoint was saved; None if it cannot be read or lacks the step."""
     try:
         record = TrainRecord(**json.loads(path.read_text(encoding="utf-8")))
-    except (FileNotFoundError, ValueError, TypeError):  # an earlier version's has other fields
+    except (FileNotFoundError, ValueError):
         return None
     step = int(checkpoint.stem.split("-")[1])
     seconds = [seconds for at, seconds in record.saved if at == step]
@@ -127,9 +165,5 @@ def forget_other_arguments(work: Path, identity: dict[str, Any]) -> None:
     write_whole(note, json.dumps(identity))
 
 
-def main(argv: list[str] | None = None) -> Any:
-    run(Job(**json.loads(Path((argv or sys.argv[1:])[0]).read_text(encoding="utf-8"))))
-
-
 if __name__ == "__main__":
-    main()
+    run(Job(**json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))))

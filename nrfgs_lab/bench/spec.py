@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a benchmark consists of: runs x strategies x scenes x seeds, from a YAML file, and the command of each.
+"""The plan of a benchmark: runs x strategies x scenes x seeds from a YAML file, and the command of each training.
 
     runs:                                   # name -> method of ns-train, or method and options
       SH: nrfgs-sh
@@ -10,13 +10,28 @@
     seeds: [42, 43]
     steps: 30000
 
-All keys of a file are fields of `Spec`.
+All keys are fields of `Spec`; those of a run are fields of `Method`, those of a scene are fields of `Scene`.
+
+Instead of runs a plan may have a default and knobs. Each knob is turned away from the default alone, and the report
+says what each setting buys and what it costs (`trade.py`):
+
+    default: nrfgs
+    knobs:
+      D: {option: --pipeline.model.appearance.latent-dim, values: [4, 8, 16]}
+      steps: {steps: [7000, 15000]}
+      budget: {strategies: [mcmc@200000, mcmc@1000000]}
+      head: {settings: {SH: nrfgs-sh, one branch: {options: --pipeline.model.appearance.split-bands False}}}
+
+A setting has the default's method and options, and its own after them; if it names a method, only its own.
+
+With `held_out: [4]` trainings see no test view: each scene is replaced by its training views at half the size, of which
+every eighth, from the fourth on, is a test view (`data.py`). Such scenes are called 4/bonsai.
 """
 
 import json
 import re
 import shlex
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,49 +45,65 @@ QUIET = (
 ).split()
 """Options that keep evaluation, the viewer and the terminal table out of the timing."""
 OWN = "own"
-"""The strategy of a method that is run as it is."""
+"""As a strategy or a number of steps: the method's own, no option."""
+DEFAULT = "default"
+"""The run that a plan with knobs compares all others with."""
 DENSIFICATION = "--pipeline.model.densification"
-"""The option by which a strategy is told."""
+"""The option that chooses a strategy."""
 AVERAGE = "average"
-"""What stands for the scene in the rows of averages over scenes."""
+"""Name in place of the scene's in rows of averages over scenes."""
 PRESET_STEPS = {"nrfgs-fast": 10_000}
-"""Method -> training steps, of methods that are what they are by the number of their steps."""
+"""Method -> training steps, of presets that differ from their method by the number of steps."""
 SET_HERE = {
     **dict.fromkeys(("--output-dir", "--experiment-name", "--load-dir"), "leave it out"),
     **dict.fromkeys(("--max-num-iterations", "--time-budget"), "use steps, of the file or of a run"),
     "--steps-per-save": "use checkpoint_every",
     "--machine.seed": "use seeds",
 }
-"""Options of ns-train that a run cannot have, because the benchmark gives them; what to use instead."""
+"""Options of ns-train that the benchmark gives itself -> the key to use instead."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the table: a method of ns-train, and options."""
+    """A run: a row of the table."""
 
     name: str
     method: str
+    """method of ns-train"""
     options: tuple[str, ...] = ()
+    """its options"""
     strategies: tuple[str, ...] | None = None
-    """instead of the benchmark's; a method that is not of this project has `own` only, unless it says otherwise"""
-    steps: int | None = None
-    """instead of the benchmark's, or of the preset's"""
+    """instead of the benchmark's; a method of another project has `own` only, unless it says otherwise"""
+    steps: int | str | None = None
+    """instead of the scene's, the preset's or the benchmark's; own: what the method chooses"""
+    scenes: tuple[str, ...] | None = None
+    """only these scenes"""
+    knob: str = ""
+    """the knob that it turns"""
 
 
 @dataclass(frozen=True)
 class Scene:
     """A data set: a folder below the root, and how it is read."""
 
-    name: str
+    path: str
+    """the folder"""
     downscale: int | None = None
     """use the images of images_N; None: nerfstudio's layout decides by size, COLMAP's takes the full size"""
     options: tuple[str, ...] = ()
     """options of the data parser"""
+    steps: int | None = None
+    """training steps, instead of the benchmark's"""
+    views: int | None = None
+    """held out: number of the other training views to keep, evenly spaced"""
+    held_out: int | None = None
+    """first of the training views that are held out"""
 
     @property
-    def short_name(self) -> str:
-        """Last part of the path, which tables show."""
-        return Path(self.name).name
+    def name(self) -> str:
+        """Name in tables and records."""
+        parts = [self.held_out, self.views, self.path]
+        return self.path if self.held_out is None else "/".join(str(part) for part in parts if part is not None)
 
 
 @dataclass
@@ -88,9 +119,13 @@ class Spec:
     seeds: list[int] = field(default_factory=lambda: [42])
     """--machine.seed of each repetition"""
     steps: int = 30_000
-    """training steps, except of runs and presets that have their own"""
+    """training steps, except of scenes, presets and runs that have their own"""
     options: tuple[str, ...] = ()
     """options of ns-train for every run"""
+    held_out: list[int] = field(default_factory=list)
+    """choose settings without test views: for each number, views held out of the training views from this one on"""
+    quick: bool = False
+    """quality alone: no ns-eval, no pictures, no frame rates; the training's files are removed"""
     train_views: int = 16
     """training images, evenly spaced, that are evaluated beside the test images"""
     checkpoint_every: int = 5_000
@@ -121,14 +156,16 @@ class Cell:
 
 @dataclass
 class Job:
-    """What the benchmark asks of a run."""
+    """A training to make, and where its results go."""
 
     args: list[str]
     """command line of ns-train"""
+    cell: dict[str, Any]
+    """its run, strategy, scene and seed"""
     identity: dict[str, Any]
     """what decides the result, without paths: a record is compared with it"""
-    steps: int
-    """training steps in all"""
+    steps: int | None
+    """training steps in all; None: the method chooses them"""
     record: str
     """file to write"""
     work: str
@@ -137,6 +174,8 @@ class Job:
     """training images to evaluate"""
     jobs: int
     """runs that share the GPU: times mean something only if it is 1"""
+    quick: bool = False
+    """no ns-eval, no pictures, no frame rates; the work folder is removed"""
 
 
 class _Loader(yaml.SafeLoader):
@@ -160,8 +199,7 @@ def load_spec(path: Path) -> dict[str, Any]:
         content = yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md for an example.")
+    _require(isinstance(content, dict), f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md.")
     return content
 
 
@@ -175,6 +213,8 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     Raises:
         InputError: naming the key and the fix.
     """
+    if "knobs" in content:
+        content = _with_runs_of_knobs(content, where)
     known = [one.name for one in fields(Spec)]
     for key in content:
         _require(key in known, f"{where}: unknown key {key!r}. Known are {', '.join(known)}.")
@@ -188,6 +228,7 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
             "scenes": [_scene(value, where) for value in as_list(content["scenes"])],
             "strategies": [str(value) for value in as_list(content.get("strategies", [OWN]))],
             "seeds": as_list(content.get("seeds", [42])),
+            "held_out": as_list(content.get("held_out", [])),
             "options": words_of(content.get("options", ()), f"{where}: options"),
         }
     )
@@ -195,31 +236,20 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
         _whole(getattr(spec, key), least, f"{where}: {key}")
     for key in ("strategies", "seeds"):
         _require(bool(getattr(spec, key)), f"{where}: {key} is empty. Name at least one, or leave it out.")
-    views = isinstance(spec.crops, dict) and all(
-        isinstance(chosen, list) and all(isinstance(view, int) for view in chosen) for chosen in spec.crops.values()
-    )
+    for key in ("seeds", "held_out"):
+        for value in getattr(spec, key):
+            _whole(value, 0, f"{where}: {key}")
+    if spec.held_out:
+        spec.scenes = [replace(scene, held_out=first) for first in spec.held_out for scene in spec.scenes]
+    crops = spec.crops.values() if isinstance(spec.crops, dict) else [None]
+    views = all(isinstance(chosen, list) and all(isinstance(view, int) for view in chosen) for chosen in crops)
     _require(views, f"{where}: crops must map scenes to lists of numbers of test views, such as {{bonsai: [0, 5]}}.")
-    for seed in spec.seeds:
-        _whole(seed, 0, f"{where}: seeds")
-    _require_free(spec.options, f"{where}: options")
+    for name in spec.crops:
+        _require(any(name == scene.name for scene in spec.scenes), f"{where}: crops: {name!r} is none of its scenes.")
+    _require_free(spec.options, SET_HERE, f"{where}: options")
     for run in spec.runs:
-        _require_free(run.options, f"{where}: runs: {run.name}: options")
-        for strategy in run.strategies or spec.strategies:
-            options = strategy_options(strategy)
-            own = {option_name(word) for word in (*spec.options, *run.options) if word.startswith("--")}
-            twice = ", ".join(sorted(own.intersection(options)))
-            _require(
-                not twice,
-                f"{where}: runs: {run.name}: {twice} is what strategy {strategy} gives; leave it out, or use strategy "
-                "own.",
-            )
-            _require(
-                not (run.strategies and options) or run.method.startswith("nrfgs"),
-                f"{where}: runs: {run.name}: {run.method} knows no strategy {strategy!r}; only this project's methods "
-                "do. Use own, and the method's options.",
-            )
-    cells = cells_of(spec)
-    names = [cell.name for cell in cells]
+        _check_run(run, spec, f"{where}: runs: {run.name}")
+    names = [cell.name for cell in cells_of(spec)]
     twice = sorted({name for name in names if names.count(name) > 1})
     _require(
         not twice,
@@ -229,29 +259,41 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     return spec
 
 
+def _check_run(run: Method, spec: Spec, where: str) -> None:
+    _require_free(run.options, SET_HERE, f"{where}: options")
+    for strategy in strategies_of(run, spec):
+        options = strategy_options(strategy)
+        given = dict.fromkeys(options, f"strategy {strategy} gives it; use strategy own")
+        _require_free((*spec.options, *run.options), given, where)
+        _require(
+            run.method.startswith("nrfgs") or not options,
+            f"{where}: {run.method} knows no strategy {strategy!r}; only this project's methods do. Use own, and the "
+            "method's options.",
+        )
+
+
 def cells_of(spec: Spec) -> list[Cell]:
-    """All trainings, the first seed of everything before the second."""
+    """All trainings: the first seed of everything before the second, strategy by strategy on each scene."""
+    order = dict.fromkeys([*spec.strategies, *(name for run in spec.runs for name in strategies_of(run, spec))])
     return [
         Cell(run, strategy, scene, seed)
         for seed in spec.seeds
         for scene in spec.scenes
-        for strategy, run in rows_of(spec)
+        for strategy in order
+        for run in spec.runs
+        if strategy in strategies_of(run, spec) and (run.scenes is None or {scene.name, scene.path} & set(run.scenes))
     ]
 
 
-def rows_of(spec: Spec) -> list[tuple[str, Method]]:
-    """Pairs (strategy, run): the rows of the table for each scene, strategy by strategy."""
-
-    def strategies(run: Method) -> list[str]:
-        return list(run.strategies or (spec.strategies if run.method.startswith("nrfgs") else [OWN]))
-
-    order = list(dict.fromkeys([*spec.strategies, *(name for run in spec.runs for name in strategies(run))]))
-    return [(strategy, run) for strategy in order for run in spec.runs if strategy in strategies(run)]
+def strategies_of(run: Method, spec: Spec) -> tuple[str, ...]:
+    """The strategies of a run."""
+    return run.strategies or (tuple(spec.strategies) if run.method.startswith("nrfgs") else (OWN,))
 
 
-def steps_of(spec: Spec, run: Method) -> int:
-    """Training steps of a run: its own, those of its preset, or the benchmark's."""
-    return PRESET_STEPS.get(run.method, spec.steps) if run.steps is None else run.steps
+def steps_of(spec: Spec, run: Method, scene: Scene) -> int | None:
+    """Training steps: the run's, its preset's, the scene's, or the benchmark's; None if the method chooses them."""
+    steps = run.steps or PRESET_STEPS.get(run.method) or scene.steps or spec.steps
+    return None if steps == OWN else steps
 
 
 def strategy_options(strategy: str) -> list[str]:
@@ -273,16 +315,17 @@ def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
     """The command line of ns-train for one training.
 
     Args:
-        parser: the data parser and its options (see `bench_data`).
+        parser: the data parser and its options (see `data.py`).
         work: folder for checkpoints.
     """
+    steps = steps_of(spec, cell.run, cell.scene)
     # Only this project's methods go on from a checkpoint.
-    steps = steps_of(spec, cell.run)
-    every = spec.checkpoint_every if cell.run.method.startswith("nrfgs") else steps
+    every = spec.checkpoint_every if cell.run.method.startswith("nrfgs") and steps else 10**9
     return [
         cell.run.method,
-        *("--output-dir", str(work), "--experiment-name", cell.scene.short_name),
-        *("--max-num-iterations", str(steps), "--steps-per-save", str(min(every, steps))),
+        *("--output-dir", str(work), "--experiment-name", Path(cell.scene.path).name),
+        *([] if steps is None else ["--max-num-iterations", str(steps)]),
+        *("--steps-per-save", str(min(every, steps or every))),
         *("--machine.seed", str(cell.seed)),
         *QUIET,
         *spec.options,
@@ -309,7 +352,7 @@ def identity(spec: Spec, cell: Cell, parser: list[str] | None) -> dict[str, Any]
 
 
 def differences(made_with: dict[str, Any], wanted: dict[str, Any]) -> str:
-    """In which words a record's fingerprint differs from the wanted one; empty if it does not."""
+    """Words in which a record's fingerprint differs from the wanted one; empty if it does not."""
     words = []
     for key, value in wanted.items():
         had = made_with.get(key)
@@ -328,58 +371,96 @@ def settings(words: list[str]) -> list[str]:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """What a finished run left.
+    """The record of a finished run.
 
     Raises:
         InputError: the file is not a record.
     """
+    kinds = {"identity": dict, "machine": dict, "jobs": int, "train": dict, "measured": dict}
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path} is not a record of a run ({error}). Remove it to have the run made anew.") from error
-    kinds = {"identity": dict, "machine": dict, "jobs": int, "train": dict, "measured": dict}
-    found = record if isinstance(record, dict) else {}
-    lacks = ", ".join(key for key, kind in kinds.items() if not isinstance(found.get(key), kind))
-    _require(not lacks, f"{path} is no whole record: it lacks {lacks}. Remove it to have the run made anew.")
+        lacks = [key for key, kind in kinds.items() if not isinstance(record[key], kind)]
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path} is no record of a run ({error!r}). Remove it to have the run made anew.") from error
+    _require(not lacks, f"{path} is no record of a run: it lacks {', '.join(lacks)}. Remove it.")
     return record
 
 
-def scene_name(value: Any) -> str:
+def scene_path(value: Any) -> str:
     """The folder of a scene as a file gives it."""
     return Path(str(value.get("path", value) if isinstance(value, dict) else value)).as_posix()
 
 
-def _method(name: str, value: Any, where: str) -> Method:
+def _method(name: Any, value: Any, where: str) -> Method:
     value = {"method": value} if isinstance(value, str) else value
     where = f"{where}: runs: {name}"
     _require(isinstance(value, dict) and isinstance(value.get("method"), str), f"{where} names no method.")
-    one = len(value["method"].split()) == 1
-    _require(one, f"{where}: {value['method']!r} is no single word; use {{method: METHOD, options: OPTIONS}}.")
-    unknown = sorted(set(value) - {"method", "options", "strategies", "steps"})
-    _require(not unknown, f"{where}: unknown key {unknown}. Known are method, options, strategies, steps.")
-    if value.get("steps") is not None:
+    single = len(value["method"].split()) == 1
+    _require(single, f"{where}: {value['method']!r} is no single word; use {{method: METHOD, options: OPTIONS}}.")
+    _known(value, Method, where)
+    value = {**value, "options": words_of(value.get("options", ()), f"{where}: options")}
+    if value.get("steps") not in (None, OWN):
         _whole(value["steps"], 1, f"{where}: steps")
-    strategies = tuple(str(one) for one in as_list(value["strategies"])) if "strategies" in value else None
-    _require(strategies != (), f"{where}: strategies is empty. Name at least one, or leave it out.")
-    options = words_of(value.get("options", ()), f"{where}: options")
-    return Method(str(name), value["method"], options, strategies, value.get("steps"))
+    for key in {"strategies", "scenes"} & set(value):
+        value[key] = tuple(str(word) for word in as_list(value[key]))
+        _require(value[key] != (), f"{where}: {key} is empty. Name at least one, or leave it out.")
+    return Method(**{**value, "name": str(name)})
 
 
 def _scene(value: Any, where: str) -> Scene:
     value = {"path": value} if isinstance(value, (str, Path)) else value
     _require(isinstance(value, dict) and "path" in value, f"{where}: scenes: {value!r} is neither a path nor has one.")
-    unknown = sorted(set(value) - {"path", "downscale", "options"})
-    _require(not unknown, f"{where}: scenes: unknown key {unknown}. Known are path, downscale, options.")
-    downscale = value.get("downscale")
-    if downscale is not None:
-        _whole(downscale, 1, f"{where}: scenes: downscale")
-    name = scene_name(value)
+    _known(value, Scene, f"{where}: scenes")
+    for key in ("downscale", "steps", "views"):
+        if value.get(key) is not None:
+            _whole(value[key], 1, f"{where}: scenes: {key}")
+    path = scene_path(value)
     _require(
-        not Path(name).is_absolute() and name != "." and ".." not in Path(name).parts,
-        f"{where}: scenes: {name!r} is no folder below --scenes. Give --scenes the folder that it lies in.",
+        not Path(path).is_absolute() and path != "." and ".." not in Path(path).parts,
+        f"{where}: scenes: {path!r} is no folder below --scenes. Give --scenes the folder that it lies in.",
     )
-    _require(name != AVERAGE, f"{where}: scenes: {name!r} is what the table calls the average over scenes; rename it.")
-    return Scene(name, downscale, words_of(value.get("options", ()), f"{where}: scenes: options"))
+    _require(path != AVERAGE, f"{where}: scenes: {path!r} is what the table calls the average over scenes; rename it.")
+    return Scene(**{**value, "path": path, "options": words_of(value.get("options", ()), f"{where}: scenes: options")})
+
+
+def _with_runs_of_knobs(content: dict[str, Any], where: str) -> dict[str, Any]:
+    """A plan of runs: the default, and each knob at each of its values."""
+    _require("runs" not in content, f"{where}: runs are made from {DEFAULT} and knobs. Leave runs out.")
+    several = len(as_list(content.get("strategies", []))) > 1
+    _require(not several, f"{where}: strategies names several. Make the others values of a knob.")
+    default = content.get(DEFAULT, "nrfgs")
+    default = {"method": default} if isinstance(default, str) else default
+    _require(isinstance(default, dict) and "method" in default, f"{where}: {DEFAULT} names no method.")
+    knobs = content["knobs"]
+    _require(isinstance(knobs, dict) and bool(knobs), f"{where}: knobs is empty. Name at least one.")
+    runs = {DEFAULT: {**default, "knob": DEFAULT}}
+    for knob, description in knobs.items():
+        for value, changes in _values(description, f"{where}: knobs: {knob}").items():
+            name = f"{knob} {value}"
+            _require(name not in runs, f"{where}: {name!r} is there twice. Give knobs distinct names.")
+            changes = {"method": changes} if isinstance(changes, str) else changes
+            _require(isinstance(changes, dict), f"{where}: {name} must be a method, or map keys of a run to values.")
+            base = {} if "method" in changes else default
+            options = [words_of(one.get("options", ()), f"{where}: {name}: options") for one in (base, changes)]
+            runs[name] = {**base, **changes, "options": options[0] + options[1], "knob": str(knob)}
+    return {**{key: value for key, value in content.items() if key not in (DEFAULT, "knobs")}, "runs": runs}
+
+
+def _values(description: Any, where: str) -> dict[str, Any]:
+    """Value of a knob -> the keys of a run that it changes."""
+    kinds = {"option": {"option", "values"}, "steps": {"steps"}, "strategies": {"strategies"}, "settings": {"settings"}}
+    kind = next(
+        (kind for kind, keys in kinds.items() if isinstance(description, dict) and set(description) == keys), ""
+    )
+    _require(bool(kind), f"{where} needs option and values, or one of steps, strategies, settings.")
+    values = description["values" if kind == "option" else kind]
+    if kind == "settings":
+        _require(isinstance(values, dict) and bool(values), f"{where}: settings must map names to runs.")
+        return {str(name): changes for name, changes in values.items()}
+    _require(isinstance(values, list) and bool(values), f"{where}: the values must be a list.")
+    if kind == "option":
+        return {str(value): {"options": [description["option"], str(value)]} for value in values}
+    return {str(value): {kind: value if kind == "steps" else [value]} for value in values}
 
 
 def as_list(value: Any) -> list[Any]:
@@ -393,19 +474,21 @@ def words_of(value: Any, where: str) -> tuple[str, ...]:
     try:
         return tuple(shlex.split(value)) if isinstance(value, str) else tuple(str(word) for word in value)
     except ValueError as error:
-        raise InputError(f"{where} cannot be told apart into words ({error}).") from error
+        raise InputError(f"{where} cannot be split into words ({error}).") from error
 
 
-def option_name(word: str) -> str:
-    """The option in a word of a command line, as `ns-train --help` writes it."""
-    return word.partition("=")[0].replace("_", "-")
-
-
-def _require_free(options: tuple[str, ...], where: str) -> None:
+def _require_free(options: tuple[str, ...], given: dict[str, str], where: str) -> None:
     """Refuse options that the benchmark gives itself: ns-train would take the later one."""
     for word in options:
-        name = option_name(word)
-        _require(name not in SET_HERE, f"{where}: {name} is given by the benchmark; {SET_HERE.get(name)}.")
+        name = word.partition("=")[0].replace("_", "-")
+        if name.startswith("--"):
+            _require(name not in given, f"{where}: {name} is given by the benchmark; {given.get(name)}.")
+
+
+def _known(value: dict[str, Any], kind: type, where: str) -> None:
+    known = [one.name for one in fields(kind) if one.name not in ("name", "held_out")]
+    unknown = sorted(set(value) - set(known))
+    _require(not unknown, f"{where}: unknown key {unknown}. Known are {', '.join(known)}.")
 
 
 def _whole(value: Any, least: int, where: str) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of a benchmark: means and deviations over seeds, per scene and over scenes, as Markdown, CSV and LaTeX."""
+"""The table of a benchmark: means and deviations over seeds, per scene and over scenes, as Markdown and CSV."""
 
 import csv
 import io
@@ -24,57 +24,65 @@ class Column:
     """its value in a run's record, None where there is none"""
     form: str
     """how it is written"""
-    unit: float = 1.0
-    """values are divided by this"""
     better: int = 0
     """1: more is better, -1: less is better, 0: no ranking"""
+    unit: float = 1.0
+    """values are divided by this"""
     is_time: bool = False
     """means something only for a run that had its GPU to itself, and beside others of the same machine"""
     in_files_only: bool = False
     """in the CSV and summary.json, not in the table that is read"""
 
 
-def _in(part: str, key: str) -> Callable[[Record], float | None]:
-    """A value of a record; None in those that an earlier version wrote without it."""
-    return lambda record: record[part].get(key)
+def _at(*keys: str) -> Callable[[Record], float | None]:
+    """The value of nested keys; None where one is missing or null."""
 
+    def value(record: Record) -> float | None:
+        for key in keys:
+            record = record.get(key)
+            if record is None:
+                return None
+        return record
 
-def _measured(part: str, key: str) -> Callable[[Record], float | None]:
-    return lambda record: (record["measured"].get(part) or {}).get(key)
+    return value
 
 
 def _gap(record: Record) -> float | None:
-    train, test = _measured("train", "psnr")(record), _measured("test", "psnr")(record)
+    train, test = _at("measured", "train", "psnr")(record), _at("measured", "test", "psnr")(record)
     return None if train is None or test is None else train - test
 
 
+METRICS = {"PSNR": ("{:.2f}", 1), "SSIM": ("{:.4f}", 1), "MS-SSIM": ("{:.4f}", 1), "LPIPS": ("{:.4f}", -1)}
+METRICS |= {"FLIP": ("{:.4f}", -1), "L1": ("{:.4f}", -1)}
+"""Metric of an image -> form, and 1 where more is better."""
+NAMES = *METRICS, *(f"cc {name}" for name in METRICS)
+KEYS = {name: name.lower().replace("-", "_").replace(" ", "_") for name in NAMES}
+"""Metric, plain or colour-corrected -> its key in a record."""
+
+
+def _metric(name: str, **more: bool) -> Column:
+    return Column(name, _at("measured", "test", KEYS[name]), *METRICS[name.removeprefix("cc ")], **more)
+
+
 COLUMNS = (
-    Column("splats", _in("measured", "splats"), "{:,.0f}", better=-1),
-    Column("time s", _in("train", "seconds"), "{:.1f}", better=-1, is_time=True),
-    Column("SSIM", _measured("test", "ssim"), "{:.4f}", better=1),
-    Column("MS-SSIM", _measured("test", "ms_ssim"), "{:.4f}", better=1),
-    Column("LPIPS", _measured("test", "lpips"), "{:.4f}", better=-1),
-    Column("FLIP", _measured("test", "flip"), "{:.4f}", better=-1),
-    Column("L1", _measured("test", "l1"), "{:.4f}", better=-1),
-    Column("PSNR", _measured("test", "psnr"), "{:.2f}", better=1),
-    Column("cc PSNR", _measured("test", "cc_psnr"), "{:.2f}", better=1),
-    Column("cc SSIM", _measured("test", "cc_ssim"), "{:.4f}", better=1),
-    Column("FPS", _in("measured", "fps"), "{:.1f}", better=1, is_time=True),
-    Column("FPS 1080p", _in("measured", "fps_1080p"), "{:.1f}", better=1, is_time=True),
-    Column("MB", _in("measured", "parameter_bytes"), "{:.2f}", 1e6, better=-1),
-    Column("ckpt MB", _in("measured", "checkpoint_bytes"), "{:.2f}", 1e6, better=-1),
-    Column("peak MB", _in("train", "peak_memory_bytes"), "{:.1f}", 1e6, better=-1),
-    Column("train PSNR", _measured("train", "psnr"), "{:.2f}"),
+    Column("splats", _at("measured", "splats"), "{:,.0f}", -1),
+    Column("time s", _at("train", "seconds"), "{:.1f}", -1, is_time=True),
+    *map(_metric, ("SSIM", "MS-SSIM", "LPIPS", "FLIP", "L1", "PSNR", "cc PSNR", "cc SSIM")),
+    Column("FPS", _at("measured", "fps"), "{:.1f}", 1, is_time=True),
+    Column("FPS 1080p", _at("measured", "fps_1080p"), "{:.1f}", 1, is_time=True),
+    Column("MB", _at("measured", "parameter_bytes"), "{:.2f}", -1, 1e6),
+    Column("ckpt MB", _at("measured", "checkpoint_bytes"), "{:.2f}", -1, 1e6),
+    Column("peak MB", _at("train", "peak_memory_bytes"), "{:.1f}", -1, 1e6),
+    Column("train PSNR", _at("measured", "train", "psnr"), "{:.2f}"),
     Column("gap", _gap, "{:.2f}"),
-    Column("cc MS-SSIM", _measured("test", "cc_ms_ssim"), "{:.4f}", better=1, in_files_only=True),
-    Column("cc LPIPS", _measured("test", "cc_lpips"), "{:.4f}", better=-1, in_files_only=True),
-    Column("cc L1", _measured("test", "cc_l1"), "{:.4f}", better=-1, in_files_only=True),
-    Column("train cc PSNR", _measured("train", "cc_psnr"), "{:.2f}", in_files_only=True),
-    Column("train SSIM", _measured("train", "ssim"), "{:.4f}", in_files_only=True),
-    Column("train MS-SSIM", _measured("train", "ms_ssim"), "{:.4f}", in_files_only=True),
-    Column("train LPIPS", _measured("train", "lpips"), "{:.4f}", in_files_only=True),
-    Column("train L1", _measured("train", "l1"), "{:.4f}", in_files_only=True),
+    *(_metric(name, in_files_only=True) for name in ("cc MS-SSIM", "cc LPIPS", "cc L1")),
+    *(
+        Column(f"train {name}", _at("measured", "train", key), "{:.4f}", in_files_only=True)
+        for name, key in KEYS.items()
+        if name in ("SSIM", "MS-SSIM", "LPIPS", "L1", "cc PSNR")
+    ),
 )
+BY_NAME = {column.name: column for column in COLUMNS}
 SHOWN = tuple(column for column in COLUMNS if not column.in_files_only)
 """The columns of the table that is read."""
 MISSING, STALE, FAILED = "missing", "stale", "FAILED"
@@ -96,7 +104,7 @@ class Row:
     values: dict[str, dict[int, float]] = field(default_factory=dict)
     """column -> seed -> value"""
     devices: set[str] = field(default_factory=set)
-    """what the records were made on"""
+    """machines of the records"""
 
     def fill(self) -> "Row":
         """Read the columns' values from the records."""
@@ -122,7 +130,7 @@ class Row:
 
     @property
     def seeds(self) -> str:
-        """How many seeds the row rests on, and what became of the others."""
+        """Number of seeds with a record, and why the others have none."""
         reasons = [f"{list(self.absent.values()).count(why)} {why}" for why in dict.fromkeys(self.absent.values())]
         return f"{len(self.records)}" + (f" ({', '.join(reasons)})" if reasons else "")
 
@@ -180,27 +188,8 @@ def ranks(rows: list[Row], column: Column) -> dict[int, int]:
 
 
 def has_run(row: Row) -> bool:
-    """Whether there is anything to say of a row: a record, a failure, or a record that cannot be used."""
+    """Whether a row has a record, a failure, or a record that cannot be used."""
     return bool(row.records) or any(why != MISSING for why in row.absent.values())
-
-
-def cells(rows: list[Row], best: Callable[[str], str], second: Callable[[str], str]) -> list[list[str]]:
-    """The body of the table that is read; best and second of each scene and strategy are marked.
-
-    Rows of which nothing was run are left out; `not_run` names them.
-    """
-    body: list[list[str]] = []
-    shown = [row for row in rows if has_run(row)]
-    for place in dict.fromkeys((row.scene, row.strategy) for row in shown):
-        group = [row for row in shown if (row.scene, row.strategy) == place]
-        ranked = {column.name: ranks(group, column) for column in SHOWN}
-        for number, row in enumerate(group):
-            line = [row.scene, row.run, row.strategy, row.seeds]
-            for column in SHOWN:
-                mark = {1: best, 2: second}.get(ranked[column.name].get(number), str)
-                line.append(mark(row.text(column)))
-            body.append(line)
-    return body
 
 
 HEAD = ["scene", "run", "strategy", "seeds"]
@@ -236,7 +225,7 @@ def notes(rows: list[Row]) -> list[str]:
 
 
 def not_run(rows: list[Row]) -> list[str]:
-    """A sentence that names the rows of which nothing was run, if there are any."""
+    """A sentence that names the rows without any run, if there are any."""
     places: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row.scene != AVERAGE and not has_run(row):
@@ -246,54 +235,31 @@ def not_run(rows: list[Row]) -> list[str]:
 
 
 def markdown(rows: list[Row]) -> str:
-    """The table in Markdown: best bold, second in italics."""
-    head = HEAD + [column.name for column in SHOWN]
-    body = cells(rows, lambda text: f"**{text}**", lambda text: f"_{text}_")
-    body = [[*map(plain_markdown, line[: len(HEAD)]), *line[len(HEAD) :]] for line in body]
-    lines = [head, ["---"] * len(HEAD) + ["---:"] * len(SHOWN), *body]
+    """The table in Markdown: best of each scene and strategy bold, second in italics.
+
+    Rows of which nothing was run are left out; `not_run` names them.
+    """
+    body = []
+    present = [row for row in rows if has_run(row)]
+    for place in dict.fromkeys((row.scene, row.strategy) for row in present):
+        group = [row for row in present if (row.scene, row.strategy) == place]
+        ranked = {column.name: ranks(group, column) for column in SHOWN}
+        for number, row in enumerate(group):
+            mark = {1: "**{}**", 2: "_{}_"}
+            cells = [mark.get(ranked[one.name].get(number), "{}").format(row.text(one)) for one in SHOWN]
+            body.append([*map(plain_markdown, [row.scene, row.run, row.strategy, row.seeds]), *cells])
+    lines = [HEAD + [column.name for column in SHOWN], ["---"] * len(HEAD) + ["---:"] * len(SHOWN), *body]
     text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
     return text + "".join(f"\n{note}\n" for note in [*map(plain_markdown, not_run(rows)), *notes(rows)])
 
 
 def plain_markdown(text: str) -> str:
-    """A name as Markdown writes it out, in a cell of a table. An underscore between letters is one."""
+    """A name escaped for a cell of a Markdown table. An underscore between letters needs no escape."""
     return re.sub(r"[\\`*|<\[]|(?<!\w)_|_(?!\w)", r"\\\g<0>", " ".join(text.split()))
 
 
-def latex(rows: list[Row]) -> str:
-    """The table as a LaTeX tabular: best bold, second underlined, a line between scenes and strategies; notes below."""
-    body = cells(rows, lambda text: f"\\textbf{{{text}}}", lambda text: f"\\underline{{{text}}}")
-    lines = [f"\\begin{{tabular}}{{{'l' * len(HEAD)}{'r' * len(SHOWN)}}}", "\\hline"]
-    lines.append(" & ".join([*HEAD, *(column.name for column in SHOWN)]) + r" \\")
-    place = None
-    for line in body:
-        if (line[0], line[2]) != place:
-            lines.append("\\hline")
-        place = line[0], line[2]
-        escaped = [_escaped(word) for word in line[: len(HEAD)]]
-        numbers = [re.sub(r"-(?=\d)", "$-$", word).replace("±", r"$\pm$") for word in line[len(HEAD) :]]
-        lines.append(" & ".join([*escaped, *numbers]) + r" \\")
-    lines += ["\\hline", "\\end{tabular}"]
-    lines += [f"\n\\noindent {_escaped(note)}" for note in [*not_run(rows), *notes(rows)]]
-    return "\n".join(lines) + "\n"
-
-
-LATEX = {
-    **{letter: f"\\{letter}" for letter in "_&%#${}"},
-    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
-    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"},
-    **{letter: f"{{{letter}}}" for letter in "[*"},
-}
-"""Letter -> what writes it out. Behind a line's end `[` and `*` would be read as its arguments."""
-
-
-def _escaped(text: str) -> str:
-    escaped = "".join(LATEX.get(letter, letter) for letter in " ".join(text.split()))
-    return re.sub(r"-(?=-)", "-{}", escaped)  # two would be printed as a dash
-
-
 def as_csv(rows: list[Row]) -> str:
-    """Means and deviations as plain numbers, empty where there is none; all rows, and numbers of absent seeds."""
+    """Means and deviations as plain numbers, empty where unknown; all rows, with counts of absent seeds."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     titles = [title for column in COLUMNS for title in (column.name, f"{column.name} deviation")]
@@ -305,11 +271,7 @@ def as_csv(rows: list[Row]) -> str:
     return file.getvalue()
 
 
-PER_VIEW = {
-    **{"PSNR": "psnr", "SSIM": "ssim", "MS-SSIM": "ms_ssim", "LPIPS": "lpips", "L1": "l1"},
-    **{"FLIP": "flip", "cc PSNR": "cc_psnr", "cc SSIM": "cc_ssim"},
-}
-"""Column -> its key in a view's measurement."""
+PER_VIEW = ("PSNR", "SSIM", "MS-SSIM", "LPIPS", "L1", "FLIP", "cc PSNR", "cc SSIM")
 
 
 def views_as_csv(rows: list[Row]) -> str:
@@ -320,7 +282,12 @@ def views_as_csv(rows: list[Row]) -> str:
     for row in rows:
         for seed, record in sorted(row.records.items()):
             for view in (record["measured"].get("test") or {}).get("per_image", ()):
-                numbers = (view.get(key) for key in PER_VIEW.values())
+                numbers = (view.get(KEYS[name]) for name in PER_VIEW)
                 place = (row.scene, row.run, row.strategy, seed, view["image"])
                 writer.writerow([*place, *("" if n is None else f"{n:.6g}" for n in numbers)])
     return file.getvalue()
+
+
+def plain_label(text: str) -> str:
+    """A name escaped for matplotlib: `$` begins no formula, and a leading underscore keeps it in the legend."""
+    return ("\N{ZERO WIDTH SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")

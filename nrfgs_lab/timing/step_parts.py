@@ -31,7 +31,7 @@ from rich.table import Table
 from torch.profiler import ProfilerActivity, profile
 
 from nrfgs_lab.bench.measure import FULL_HD, at_size, frames_per_second
-from nrfgs_lab.run import host_without_downloads
+from nrfgs_lab.bench.run import host_without_downloads
 from nrfgs_ns.densification import statistics as growth
 from nrfgs_ns.kernels.trial import Gate
 from nrfgs_ns.rasterizer import gsplat_cuda

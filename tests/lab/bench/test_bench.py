@@ -24,16 +24,19 @@ import json, os, sys, time
 from pathlib import Path
 
 job = json.loads(Path(sys.argv[1]).read_text())
-name = Path(job["record"]).stem
-behaviour = json.loads((Path(__file__).parent / "behaviour.json").read_text()).get(name, "good")
-start = time.time()
+name, here = Path(job["record"]).stem, Path(__file__).parent
+behaviours = json.loads((here / "behaviour.json").read_text())
+behaviour = behaviours.get(name, behaviours.get("all", "good"))
 Path(job["work"]).mkdir(parents=True, exist_ok=True)
 if behaviour == "fails":
     sys.exit(3)
 if behaviour == "hangs":
     (Path(job["work"]) / "pid").write_text(str(os.getpid()))
     time.sleep(600)
-time.sleep(0.3)
+if behaviour == "meets 4":
+    (here / f"{name}.there").touch()
+    while len(list(here.glob("*.there"))) < 4:
+        time.sleep(0.01)
 seed = int(job["args"][job["args"].index("--machine.seed") + 1])
 metrics = {"psnr": 20.0 + seed, "ssim": 0.9, "ms_ssim": None, "l1": 0.1, "lpips": None}
 record = {
@@ -43,8 +46,8 @@ record = {
 }
 if behaviour != "silent":
     Path(job["record"]).write_text(json.dumps(record))
-with (Path(__file__).parent / "ran.txt").open("a") as file:
-    file.write(f"{name} {os.environ.get('CUDA_VISIBLE_DEVICES')} {start} {time.time()}\\n")
+with (here / "ran.txt").open("a") as file:
+    file.write(f"{name} {os.environ.get('CUDA_VISIBLE_DEVICES')}\\n")
 """
 
 
@@ -68,7 +71,7 @@ def bench_in(folder: Path, **more) -> Bench:
 
 
 def ran(folder: Path) -> list[list[str]]:
-    """name, GPU, start, end of each child that came to its end."""
+    """Name and GPU of each child that came to its end."""
     file = folder / "ran.txt"
     return [line.split() for line in file.read_text().splitlines()] if file.exists() else []
 
@@ -82,18 +85,16 @@ ALL = {"SH-own-scene-1", "NRF-own-scene-1", "SH-own-scene-2", "NRF-own-scene-2"}
 
 def test_everything_is_run_once_and_reported(fake, capsys):
     bench_in(fake).main()
-    assert [name for name, *_ in ran(fake)] == [
+    assert [name for name, _ in ran(fake)] == [
         "SH-own-scene-1",
         "NRF-own-scene-1",
         "SH-own-scene-2",
         "NRF-own-scene-2",
     ]
-    intervals = sorted((float(start), float(end)) for _, _, start, end in ran(fake))
-    assert all(end <= start for (_, end), (start, _) in zip(intervals, intervals[1:], strict=False))
     table = (fake / "out" / "table.md").read_text()
     assert table in capsys.readouterr().out
     assert "| scene | NRF | own | 2 |" in table and "21.50 ± 0.71" in table
-    for file in ("table.csv", "table.tex", "summary.json", "splats.png", "splats.svg"):
+    for file in ("table.csv", "summary.json", "splats.png", "splats.svg"):
         assert (fake / "out" / file).stat().st_size > 0
     bench_in(fake).main()
     assert len(ran(fake)) == 4, "a finished run was repeated"
@@ -118,7 +119,7 @@ def test_failures_are_listed_and_tried_again(fake):
     behave(fake)
     bench_in(fake).main()
     assert "| scene | NRF | own | 2 |" in (fake / "out" / "table.md").read_text()
-    assert sorted(name for name, *_ in ran(fake)).count("SH-own-scene-1") == 1
+    assert sorted(name for name, _ in ran(fake)).count("SH-own-scene-1") == 1
     assert not list((fake / "out" / "runs").glob("*.failed"))
 
 
@@ -224,18 +225,20 @@ def test_a_broken_record_is_named(text, fake):
         bench_in(fake, seeds=(1,)).main()
 
 
-def test_of_two_that_end_together_the_last_one_reports_both(fake):
+def test_of_two_that_end_together_the_last_one_reports_both(fake, monkeypatch):
     """A report waits for one that is being made, and reads the records only then."""
     bench_in(fake, seeds=(1,)).main()
     record = fake / "out" / "runs" / "NRF-own-scene-1.json"
     kept = record.read_text()
     record.unlink()
-    waits = threading.Thread(target=bench_in(fake, seeds=(1,), report_only=True).main)
+    waiting = threading.Event()
+    monkeypatch.setattr("nrfgs_lab.lock.print", lambda *_, **__: waiting.set(), raising=False)
+    other = threading.Thread(target=bench_in(fake, seeds=(1,), report_only=True).main)
     with only_one(fake / "out" / ".lock", ""):
-        waits.start()
-        waits.join(0.5)
+        other.start()
+        assert waiting.wait(300)
         record.write_text(kept)
-    waits.join(60.0)
+    other.join()
     assert "| scene | NRF | own | 1 |" in (fake / "out" / "table.md").read_text()
 
 
@@ -271,10 +274,9 @@ def test_records_of_other_arguments_are_refused_named_and_redone(fake, capsys):
 
 def test_runs_share_gpus_as_they_are_told(fake, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7,9")
+    behave(fake, all="meets 4")  # each waits for the three others
     bench_in(fake, jobs=2, gpus=2).main()
-    assert sorted(gpu for _, gpu, *_ in ran(fake)) == ["5", "5", "7", "7"]
-    starts, ends = [float(line[2]) for line in ran(fake)], [float(line[3]) for line in ran(fake)]
-    assert max(starts) < min(ends), "they did not run at once"
+    assert sorted(gpu for _, gpu in ran(fake)) == ["5", "5", "7", "7"]
     table = (fake / "out" / "table.md").read_text()
     assert "10.0" not in table and "Time and FPS are left out" in table
 
@@ -312,29 +314,98 @@ def test_a_terminated_benchmark_takes_its_children_along(fake):
     )
     process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
     pid = fake / "work" / "NRF-own-scene-1" / "pid"
-    deadline = time.time() + 120
-    while not (pid.exists() and pid.read_text()) and time.time() < deadline:
+    while not (pid.exists() and pid.read_text()):
+        assert process.poll() is None
         time.sleep(0.05)
     child = int(pid.read_text())
     process.terminate()
-    process.wait(timeout=30)
+    process.wait()
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
     assert (fake / "out" / "runs" / "SH-own-scene-1.json").exists()
     behave(fake)
     bench_in(fake, seeds=(1,)).main()
-    assert [name for name, *_ in ran(fake)] == ["SH-own-scene-1", "NRF-own-scene-1"]
+    assert [name for name, _ in ran(fake)] == ["SH-own-scene-1", "NRF-own-scene-1"]
 
 
 def test_flags_have_precedence_over_the_file(fake):
     (fake / "spec.yaml").write_text("runs: {A: nrfgs}\nscenes: [other]\nsteps: 5\nseeds: [9]\njobs: 3\n")
-    plan = Bench(spec=fake / "spec.yaml", data=("scene",), steps=7, runs=("B=nrfgs-sh --x 1",)).plan()
-    assert (plan.steps, plan.seeds, plan.jobs) == (7, [9], 3)
-    assert [scene.name for scene in plan.scenes] == ["scene"]
-    assert [(run.name, run.method, run.options) for run in plan.runs] == [("B", "nrfgs-sh", ("--x", "1"))]
-    assert [run.name for run in Bench(runs=("nrfgs", "nrfgs-sh"), data=("x",)).plan().runs] == ["nrfgs", "nrfgs-sh"]
+    plan, (cell,) = Bench(spec=fake / "spec.yaml", data=("scene",), steps=7, runs=("B=nrfgs-sh --x 1",)).plan()
+    assert (plan.steps, plan.seeds, plan.jobs) == (7, [9], 3) and cell.scene.name == "scene"
+    assert (cell.run.name, cell.run.method, cell.run.options) == ("B", "nrfgs-sh", ("--x", "1"))
+    assert chosen_runs(runs=("nrfgs", "nrfgs-sh"), data=("x",)) == [
+        ("nrfgs", "nrfgs", ()),
+        ("nrfgs-sh", "nrfgs-sh", ()),
+    ]
     with pytest.raises(InputError, match="runs is missing"):
-        Bench().plan()
-    with pytest.raises(InputError, match="crops: 'otter' is none of its scenes"):
-        file = spec_file(fake, "runs: {A: nrfgs}\nscenes: [other]\ncrops: {other: [0], otter: [1]}\n")
-        Bench(spec=file, data=("scene",)).plan()
+        Bench(data=("x",)).plan()
+
+
+def chosen_runs(**options) -> list[tuple]:
+    """Name, method and options of each chosen run."""
+    _, cells = Bench(**options).plan()
+    return list(dict.fromkeys((cell.run.name, cell.run.method, cell.run.options) for cell in cells))
+
+
+FILE = """
+runs:
+  no split: {method: nrfgs, options: --x False, steps: 9}
+  NRF-GS: nrfgs
+  nrfgs-sh: {method: nrfgs-sh, options: --degree 1}
+  5: nrfgs-vdgs
+scenes: [{path: garden, downscale: 4}, other]
+"""
+
+
+def test_runs_are_chosen_by_name(tmp_path):
+    """A run of the file, with its options; else a method. A name that is both is the file's."""
+    file = spec_file(tmp_path, FILE)
+
+    def runs(*words):
+        return chosen_runs(spec=file, runs=words)
+
+    assert runs("no split", "NRF-GS") == [("no split", "nrfgs", ("--x", "False")), ("NRF-GS", "nrfgs", ())]
+    assert runs("nrfgs-sh", "5") == [("nrfgs-sh", "nrfgs-sh", ("--degree", "1")), ("5", "nrfgs-vdgs", ())]
+    assert runs("nrfgs", "nrfgs-sg --y 1") == [("nrfgs", "nrfgs", ()), ("nrfgs-sg --y 1", "nrfgs-sg", ("--y", "1"))]
+    assert runs("no split=nrfgs --x True") == [("no split", "nrfgs", ("--x", "True"))]
+    assert runs("a=nrfgs --machine.x=3") == [("a", "nrfgs", ("--machine.x=3",))]
+    for word in ("no opacity", "a=nrf"):
+        with pytest.raises(InputError, match="no method of ns-train.*has no run of that name. It has 5, NRF-GS, no sp"):
+            runs("NRF-GS", word)
+    assert chosen_runs(runs=("splatfacto",), data=("x",)) == [("splatfacto", "splatfacto", ())]
+    whole, part = Bench(spec=file).plan(), Bench(spec=file, runs=("no split",), data=("./garden/",)).plan()
+    assert part[1] == whole[1][:1] and part[1][0].scene.downscale == 4
+
+
+def test_time_that_is_up_leaves_the_rest_for_the_next_call(fake, capsys):
+    behave(fake, **{"NRF-own-scene-1": "hangs"})
+
+    class Clock:
+        sleep, monotonic = staticmethod(time.sleep), staticmethod(lambda: 0.0 if not hung.exists() else 61.0)
+
+    hung = fake / "work" / "NRF-own-scene-1" / "pid"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench, "time", Clock)
+        bench_in(fake, minutes=1.0).main()
+    assert [name for name, _ in ran(fake)] == ["SH-own-scene-1"] and "3 runs are left" in capsys.readouterr().err
+    behave(fake)
+    bench_in(fake).main()
+    assert sorted(name for name, _ in ran(fake)) == sorted(ALL)
+
+
+def test_a_plan_with_knobs_reports_the_trade(fake):
+    """A knob or a single setting is chosen by its name; the default is always there."""
+    knobs = "default: nrfgs\nscenes: [scene]\nseeds: [1, 2]\nsteps: 100\n"
+    knobs += "knobs: {D: {option: --d, values: [4, 8]}, head: {settings: {SH: nrfgs-sh}}, steps: {steps: [50]}}\n"
+    file = spec_file(fake, knobs)
+    bench_in(fake, spec=file, runs=("D 8", "head"), data=(), seeds=(), steps=None).main()
+    assert {name for name, _ in ran(fake)} == {
+        f"{run}-own-scene-{seed}" for run in ("default", "D_8", "head_SH") for seed in (1, 2)
+    }
+    (result,) = json.loads((fake / "out" / "tradeoff.json").read_text())
+    assert [one["run"] for one in result["settings"]] == ["default", "D 8", "head SH"]
+    assert (fake / "out" / "tradeoff.png").exists() and "| D 8 | 2 | (+0.00)" in (fake / "out/tradeoff.md").read_text()
+    with pytest.raises(
+        InputError, match="'E' is no method.*It has D, D 4, D 8, default, head, head SH, steps, steps 50"
+    ):
+        Bench(spec=file, runs=("E",)).plan()

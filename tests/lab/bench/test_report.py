@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables, figure and crops from records made by hand."""
+"""Tables, figure and crops from hand-made records."""
 
 import csv
 import io
@@ -19,7 +19,6 @@ from nrfgs_lab.bench.table import (
     SHOWN,
     Row,
     as_csv,
-    latex,
     markdown,
     ranks,
     views_as_csv,
@@ -78,14 +77,6 @@ def test_markdown():
     assert body["s", "SH"][8] == "-", "LPIPS was not measured"
 
 
-def test_latex():
-    text = latex(rows())
-    assert r"\textbf{33.00 $\pm$ 1.41}" in text and r"\underline{30.50 $\pm$ 0.71}" in text
-    assert "t\\_1 & SH & mcmc & 2 & " in text
-    width = text.splitlines()[2].count("&")
-    assert all(line.count(" & ") == width for line in text.splitlines() if line.endswith(r"\\"))
-
-
 def test_csv_has_plain_numbers():
     lines = list(csv.DictReader(io.StringIO(as_csv(rows()))))
     assert float(lines[1]["PSNR"]) == 33.0 and float(lines[1]["PSNR deviation"]) == pytest.approx(2**0.5)
@@ -122,13 +113,6 @@ def test_strange_names_break_no_table(tmp_path):
         *(r"a\|b", "50%", r"\_x\_", "a & b", "f_1 {2} ~^", "$w^$", r"a\*b\*", r"\<0.1>", r"back\\slash", "two lines"),
         *(r"\[x](y)", r"\*a--b"),
     ]
-    text = latex(strange_rows())
-    for name in (
-        *("a\\textbar{}b", "50\\%", "\\_x\\_", "a \\& b", "f\\_1 \\{2\\} \\textasciitilde{}\\textasciicircum{}"),
-        *("\\$w\\textasciicircum{}\\$", "\\textless{}0.1\\textgreater{}", "back\\textbackslash{}slash", "two lines"),
-        *("{[}x](y)", "{*}a-{}-b"),
-    ):
-        assert f"s & {name} & own & " in text
     assert [line["run"] for line in csv.DictReader(io.StringIO(as_csv(strange_rows())))] == STRANGE
     draw_splats([*strange_rows(), Row("$^$", "elsewhere", "own", {1: record(30.0)}).fill()], tmp_path)
     svg = (tmp_path / "splats.svg").read_text()
@@ -176,8 +160,6 @@ def test_marks_are_among_rows_of_one_strategy():
     body, _ = table_of(group)
     assert body["s", "SH", "mcmc@9"]["splats"] == "9" and body["s", "SH", "mcmc@9"]["PSNR"] == "20.00"
     assert body["s", "SH", "original"]["splats"] == "_900_" and body["s", "NRF", "original"]["PSNR"] == "**31.00**"
-    lines = latex(group).splitlines()
-    assert lines[lines.index(r"\hline", 4) + 1].startswith("s & SH & mcmc@9"), "no line between the strategies"
 
 
 def test_times_of_different_machines_are_not_ranked():
@@ -216,8 +198,6 @@ def test_what_failed_is_in_the_table_and_what_was_not_run_is_named_below():
     assert list(body) == [("s", "done", "own"), ("s", "broke", "own")]
     assert body["s", "broke", "own"]["seeds"] == "0 (1 FAILED)"
     assert below[0] == "Not run yet, and in no row: s, own: not_yet."
-    text = latex(rows)
-    assert "s & broke & own & 0 (1 FAILED) & -" in text and r"Not run yet, and in no row: s, own: not\_yet." in text
     lines = list(csv.DictReader(io.StringIO(as_csv(rows))))
     counts = [(line["run"], line["seeds"], line["FAILED"], line["missing"], line["stale"]) for line in lines]
     assert counts == [("done", "1", "0", "0", "0"), ("broke", "0", "1", "0", "0"), ("not_yet", "0", "0", "1", "0")]
@@ -227,10 +207,6 @@ def test_numbers_of_fewer_seeds_than_their_row_are_told():
     rows = [Row("s", "SH", "own", {1: record(30.0, lpips=0.1), 2: record(31.0)}).fill()]
     assert "fewer seeds than their row, on those that have them: LPIPS." in markdown(rows)
     assert "fewer seeds" not in markdown([Row("s", "SH", "own", {1: record(30.0), 2: record(31.0)}).fill()])
-
-
-def test_negative_numbers_have_a_minus_in_latex():
-    assert "& $-$1.00 " in latex([Row("s", "SH", "own", {1: record(31.0, train=30.0)}).fill()])
 
 
 def test_every_test_view_has_a_line():
@@ -248,28 +224,6 @@ def test_every_test_view_has_a_line():
     ]
     assert {(line["scene"], line["run"], line["strategy"]) for line in found} == {("s", "A", "own")}
     assert found[1]["SSIM"] == "" and found[1]["L1"] == ""
-
-
-def test_metrics_of_training_views_are_in_the_files():
-    one = record(30.0, train=31.0)
-    one["measured"]["train"] |= {"ssim": 0.95, "l1": 0.02}
-    (line,) = csv.DictReader(io.StringIO(as_csv([Row("s", "SH", "own", {1: one}).fill()])))
-    assert (line["train SSIM"], line["train L1"], line["train LPIPS"]) == ("0.95", "0.02", "")
-    assert "train SSIM" not in markdown([Row("s", "SH", "own", {1: one}).fill()])
-
-
-def test_records_of_an_earlier_version_are_reported(tmp_path):
-    """What they lack is not there, and nothing else is lost."""
-    old = {"machine": {}, "jobs": 1, "train": {}, "measured": {"test": {"psnr": 30.0}}}
-    rows = [Row("s", "old", "own", {1: old}).fill(), Row("s", "new", "own", {1: record(31.0)}).fill()]
-    body, below = table_of(rows)
-    assert body["s", "old", "own"]["PSNR"] == "_30.00_" and body["s", "old", "own"]["time s"] == "-"
-    assert "Made on: unknown, torch unknown; a card, torch 2.11." in below
-    assert "same version" not in " ".join(below), "of neither is the version known"
-    rows[1].records[1]["machine"] = {**rows[1].records[1]["machine"], "source": "0123456789ab"}
-    assert "Not all were made with the same version of this package" in " ".join(table_of(rows)[1])
-    draw_splats(rows, tmp_path)
-    assert (tmp_path / "splats.png").exists()
 
 
 def test_one_scene_needs_no_average():
@@ -405,30 +359,16 @@ def test_crops_are_of_the_seed_that_was_run(tmp_path, pictures):
     runs, work = tmp_path / "runs", tmp_path / "work"
     runs.mkdir()
 
-    def found(*names, stale=()):
+    def labels(*names):
         for name in names:
             (runs / f"{name}.json").touch()
             if name[0] != "C":
                 shutil.copytree(pictures[name[0]], work / name / "pictures")
-        shown = pictures_of(spec, spec.scenes[0], runs, work, dict.fromkeys(stale, "other options"))
-        return {text: folder.parent.name for text, folder in shown.items()}
+        return {text: folder.parent.name for text, folder in pictures_of(cells_of(spec), runs, work).items()}
 
-    assert found() == {}
-    assert found("A-own-s-43", "B-own-s-43", "C-own-s-42") == {"A": "A-own-s-43", "B": "B-own-s-43"}
-    assert found("B-own-s-42") == {"A, seed 43": "A-own-s-43", "B, seed 42": "B-own-s-42"}
-    assert found(stale=["B-own-s-42"]) == {"A": "A-own-s-43", "B": "B-own-s-43"}
-
-
-def test_a_picture_that_cannot_be_read_breaks_no_report(tmp_path, pictures, capsys):
-    spec = make_spec({"runs": {"A": "nrfgs"}, "scenes": ["s"]}, "test")
-    (tmp_path / "out" / "runs").mkdir(parents=True)
-    (tmp_path / "out" / "runs" / "A-own-s-42.json").write_text(json.dumps({**record(30.0), "identity": {}}))
-    (tmp_path / "work" / "A-own-s-42").mkdir(parents=True)
-    pictures["A"].rename(tmp_path / "work" / "A-own-s-42" / "pictures")
-    next((tmp_path / "work").rglob("eval_img_0001*.png")).write_bytes(b"torn")
-    report(spec, tmp_path / "out", tmp_path / "work", {})
-    said = capsys.readouterr().out
-    assert "No crops of s: cannot identify image file" in said and "30.00" in said
+    assert labels() == {}
+    assert labels("A-own-s-43", "B-own-s-43", "C-own-s-42") == {"A": "A-own-s-43", "B": "B-own-s-43"}
+    assert labels("B-own-s-42") == {"A, seed 43": "A-own-s-43", "B, seed 42": "B-own-s-42"}
 
 
 def test_report_of_hand_made_records(tmp_path, pictures, capsys):
@@ -439,7 +379,7 @@ def test_report_of_hand_made_records(tmp_path, pictures, capsys):
         (tmp_path / "out" / "runs" / f"{cell.name}.json").write_text(json.dumps(content))
         (tmp_path / "work" / cell.name).mkdir(parents=True)
         pictures[cell.run.name].rename(tmp_path / "work" / cell.name / "pictures")
-    report(spec, tmp_path / "out", tmp_path / "work", {})
+    report(spec, cells_of(spec), tmp_path / "out", tmp_path / "work", {})
     assert (tmp_path / "out" / "crops" / "x_s.png").exists()
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [row["PSNR"] for row in summary] == [[30.0, None], [31.0, None]]
@@ -447,5 +387,6 @@ def test_report_of_hand_made_records(tmp_path, pictures, capsys):
     assert "**31.00**" in capsys.readouterr().out
     # Pictures of records that are not to be used are not shown beside the others.
     (tmp_path / "out" / "crops" / "x_s.png").unlink()
-    report(spec, tmp_path / "out", tmp_path / "work", {cell.name: "other options" for cell in cells_of(spec)})
+    stale = {cell.name: "other options" for cell in cells_of(spec)}
+    report(spec, cells_of(spec), tmp_path / "out", tmp_path / "work", stale)
     assert not (tmp_path / "out" / "crops" / "x_s.png").exists()

@@ -13,7 +13,7 @@ import torch
 from nerfstudio.utils.eval_utils import eval_setup  # noqa: F401  (registers the data parsers once, before the timing)
 from PIL import Image
 
-from nrfgs_lab.bench.data import parser_options
+from nrfgs_lab.bench.data import held_out_views, parser_options
 from nrfgs_lab.bench.spec import (
     PRESET_STEPS,
     Scene,
@@ -23,7 +23,6 @@ from nrfgs_lab.bench.spec import (
     identity,
     load_spec,
     make_spec,
-    rows_of,
     settings,
     steps_of,
 )
@@ -43,12 +42,11 @@ def spec(**more):
 # The file.
 
 
-@pytest.mark.parametrize("name", ["tiny", "paper", "heads", "deviations", "methods", "comparison", "mcmc-opacity"])
-def test_shipped_files_are_valid(name):
-    plan = make_spec(load_spec(ROOT / "docs" / "bench" / f"{name}.yaml"), name)
-    rows, cells = rows_of(plan), cells_of(plan)
-    assert len(cells) == len(rows) * len(plan.scenes) * len(plan.seeds)
-    assert {strategy for strategy, _ in rows} == set(plan.strategies)
+@pytest.mark.parametrize("file", sorted((ROOT / "docs" / "bench").glob("*.yaml")), ids=lambda file: file.stem)
+def test_shipped_files_are_valid(file):
+    plan = make_spec(load_spec(file), file.name)
+    cells = cells_of(plan)
+    assert {cell.run for cell in cells} == set(plan.runs) and {cell.scene for cell in cells} == set(plan.scenes)
 
 
 def test_seeds_come_one_after_the_other_and_strategies_together():
@@ -64,11 +62,17 @@ def test_seeds_come_one_after_the_other_and_strategies_together():
 
 def test_methods_of_others_run_as_they_are():
     plan = spec(runs={"NRF": "nrfgs", "host": "splatfacto"}, strategies=["original", "mcmc"])
-    assert [(strategy, run.name) for strategy, run in rows_of(plan)] == [
-        ("original", "NRF"),
-        ("mcmc", "NRF"),
-        ("own", "host"),
-    ]
+    rows = [(cell.strategy, cell.run.name) for cell in cells_of(plan)]
+    assert rows == [("original", "NRF"), ("mcmc", "NRF"), ("own", "host")]
+
+
+def test_a_run_may_have_its_own_scenes_and_a_scene_its_own_steps():
+    runs = {"NRF": {"method": "nrfgs", "steps": "own", "scenes": ["b"]}, "SH": "nrfgs-sh"}
+    plan = spec(runs=runs, scenes=["a", {"path": "b", "steps": 7}], steps=9)
+    cells = cells_of(plan)
+    assert [cell.name for cell in cells] == ["SH-own-a-42", "NRF-own-b-42", "SH-own-b-42"]
+    assert [steps_of(plan, cell.run, cell.scene) for cell in cells] == [9, None, 7]
+    assert "--max-num-iterations" not in command(plan, cells[1], [], Path())
 
 
 @pytest.mark.parametrize(
@@ -106,32 +110,23 @@ def test_methods_of_others_run_as_they_are():
         ({"scenes": ["/data/bonsai"]}, "no folder below --scenes"),
         ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
         ({"scenes": ["."]}, "no folder below --scenes"),
-        ({"strategies": ["mcmc"], "options": "--pipeline.model.densification original"}, "densification is what.*mcmc"),
-        ({"strategies": ["mcmc@9"], "options": "--pipeline.model.splat_budget 5"}, "splat-budget is what.*mcmc@9"),
+        (
+            {"strategies": ["mcmc"], "options": "--pipeline.model.densification original"},
+            "densification is given.*mcmc",
+        ),
+        ({"strategies": ["mcmc@9"], "options": "--pipeline.model.splat_budget 5"}, "splat-budget is given.*mcmc@9"),
         (
             {
                 "strategies": ["mcmc@9"],
                 "runs": {"N": {"method": "nrfgs", "options": "--pipeline.model.splat-budget=5"}},
             },
-            "N: --pipeline.model.splat-budget is what.*mcmc@9",
+            "N: --pipeline.model.splat-budget is given.*mcmc@9",
         ),
     ],
 )
 def test_what_is_wrong_is_named(content, says):
     with pytest.raises(InputError, match=says):
         spec(**content)
-
-
-def test_a_run_as_it_is_may_choose_its_densification():
-    run = {"method": "nrfgs", "options": "--pipeline.model.densification mcmc"}
-    assert [cell.strategy for cell in cells_of(spec(runs={"NRF": run}))] == ["own"]
-
-
-def test_a_budget_may_be_an_option_where_the_strategy_names_none():
-    run = {"method": "nrfgs", "options": "--pipeline.model.splat-budget 5"}
-    assert [cell.strategy for cell in cells_of(spec(runs={"NRF": run}, strategies=["mcmc"]))] == ["mcmc"]
-    run["options"] = "--pipeline.model.appearance.latent-dim 9"  # the budget's number, but another option's
-    assert [cell.strategy for cell in cells_of(spec(runs={"NRF": run}, strategies=["mcmc@9"]))] == ["mcmc@9"]
 
 
 @pytest.mark.parametrize("text", ["runs: [", "just words", "runs: {A: nrfgs, A: nrfgs-sh}", None])
@@ -147,7 +142,7 @@ def test_files_that_are_no_mapping_are_named(text, tmp_path):
 def test_a_preset_keeps_its_steps(given, trained):
     """nrfgs-fast at the benchmark's 30,000 steps would be nrfgs under another name."""
     plan = spec(runs={"fast": {"method": "nrfgs-fast", **given}, "NRF": "nrfgs"}, steps=30_000)
-    assert [steps_of(plan, run) for run in plan.runs] == [trained, 30_000]
+    assert [steps_of(plan, run, plan.scenes[0]) for run in plan.runs] == [trained, 30_000]
     fast = command(plan, cells_of(plan)[0], [], Path())
     assert fast[fast.index("--max-num-iterations") + 1] == str(trained)
 
@@ -397,6 +392,42 @@ def test_both_layouts_of_a_capture_have_the_same_test_images(captures, tmp_path)
     parser_options(tmp_path / "data", Scene("fox"), tmp_path / "mirrors")
     listed = (tmp_path / "mirrors" / "fox" / "test_list.txt").read_text().split()
     assert sorted(Path(name).name for name in meta["test_filenames"]) == listed
+
+
+def test_every_eighth_is_held_out_and_more_of_few():
+    names = [f"{i:03}" for i in range(74)]
+    assert held_out_views(names, 4) == ["004", "012", "020", "028", "036", "044", "052", "060", "068"]
+    assert held_out_views(names[:17], 4) == ["004", "010", "016"]
+    assert not set(held_out_views(names[:26], 0)) & set(held_out_views(names[:26], 4))
+
+
+def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size(tiny_scene, tmp_path):
+    whole = json.loads((tiny_scene / "transforms.json").read_text())
+    names = sorted(frame["file_path"] for frame in whole["frames"])
+    whole |= {"train_filenames": names[1:], "test_filenames": names[:1]}
+    source = tmp_path / "captures" / "tiny"
+    shutil.copytree(tiny_scene, source)
+    (source / "transforms.json").write_text(json.dumps(whole))
+    plan = spec(scenes=["tiny", {"path": "tiny", "views": 2}], held_out=[2])
+    assert [scene.name for scene in plan.scenes] == ["2/tiny", "2/2/tiny"]
+
+    def made(scene) -> tuple[Path, dict]:
+        name, _, folder = parser_options(source.parent, scene, tmp_path / "mirrors")
+        assert name == "nrfgs-data"
+        return Path(folder), json.loads((Path(folder) / "transforms.json").read_text())
+
+    (folder, meta), (_, thin) = map(made, plan.scenes)
+    assert meta["test_filenames"] == names[1:][2::6]
+    assert sorted(meta["train_filenames"] + meta["test_filenames"]) == names[1:]
+    assert (meta["w"], meta["fl_x"]) == (whole["w"] // 2, pytest.approx(whole["fl_x"] / 2))
+    with Image.open(folder / names[1]) as image:
+        assert image.size == (meta["w"], meta["h"])
+    assert not (folder / names[0]).exists()
+    left = meta["train_filenames"]
+    assert thin == {**meta, "train_filenames": [left[0], left[len(left) // 2]]}
+    (source / "transforms.json").write_text(json.dumps({**whole, "train_filenames": []}))
+    with pytest.raises(InputError, match="train_filenames"):
+        parser_options(source.parent, Scene("tiny", held_out=3), tmp_path / "mirrors")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trade of speed and size for accuracy: what each setting of a plan with knobs changes against the default.
+
+**Noise.** Two or three seeds say little about the spread of one setting, so the spread is pooled over all settings of a
+scene: s^2 = sum (n_i - 1) s_i^2 / sum (n_i - 1). A difference of means over n and m seeds is noise unless it exceeds
+
+    t s sqrt(1 / n + 1 / m),    t = the 97.5 % quantile of Student's t with sum (n_i - 1) degrees of freedom.
+
+Where nothing changed, one comparison in twenty is still called a difference. Costs (time, frames, bytes) are compared
+as ratios: all of this is done with their logarithms. Without a second seed anywhere, everything counts as noise.
+
+**Price.** What a setting buys is dB of PSNR for each doubling of a cost, (PSNR - PSNR_0) / log2(cost / cost_0). That
+has a meaning only for a trade, where both go up or both go down; the rest is better, worse, or within the noise.
+"""
+
+import json
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from nrfgs_lab.bench.spec import DEFAULT
+from nrfgs_lab.bench.table import BY_NAME, Column, Row, notes, plain_label, plain_markdown
+from nrfgs_ns.files import whole, write_whole
+
+LEVEL = 0.975
+PSNR = BY_NAME["PSNR"]
+COSTS = {"training time": ("time s", 1), "time for a frame": ("FPS", -1), "bytes": ("MB", 1)}
+"""Cost -> a column, and the power of its values that is the cost: -1 where more is better."""
+RATIOS = ("time s", "FPS", "MB", "peak MB", "splats")
+SHOWN = ("PSNR", "SSIM", "LPIPS", *RATIOS)
+HEAD = ["", "seeds", "PSNR", "SSIM", "LPIPS", "training time", "FPS", "MB", "peak memory", "splats"]
+WORDS = {
+    "same": "unclear",
+    "noise": "PSNR unclear",
+    "gain": "gain, cost unclear",
+    "loss": "loss, cost unclear",
+    "better": "better and cheaper",
+    "worse": "worse and more expensive",
+}
+LEGEND = (
+    "Changes are against the default; times, frames, bytes, memory and splats as factors. (Round brackets): within the "
+    "noise, estimated from the spread over seeds, pooled over all settings of the scene, at 95 %; one comparison in "
+    "twenty is wrong. [Square brackets]: too few seeds to tell.",
+    "dB per doubling: what PSNR a doubling of that cost buys, or a halving loses. Unclear: not distinguishable from "
+    "the default. ★: on the Pareto front of the means, which ignores noise.",
+)
+
+
+@dataclass(frozen=True)
+class Change:
+    """The change of one quantity against the default."""
+
+    value: float
+    """difference, or ratio where `is_ratio`"""
+    noise: float
+    """a difference up to this, or a ratio within [1 / noise, noise], is noise; infinite if the spread is unknown"""
+    is_ratio: bool = False
+
+    @property
+    def is_noise(self) -> bool:
+        if self.is_ratio:
+            return abs(math.log(self.value)) <= math.log(self.noise)
+        return abs(self.value) <= self.noise
+
+
+def pooled_deviation(samples: Sequence[Sequence[float]]) -> tuple[float | None, int]:
+    """Deviation common to all samples, and its degrees of freedom; None and 0 if no sample has two values."""
+    several = [sample for sample in samples if len(sample) > 1]
+    freedom = sum(len(sample) - 1 for sample in several)
+    if freedom == 0:
+        return None, 0
+    squares = sum((len(sample) - 1) * statistics.variance(sample) for sample in several)
+    return math.sqrt(squares / freedom), freedom
+
+
+def noise_bound(deviation: float | None, freedom: int, n: int, m: int) -> float:
+    """The largest difference of means over n and m values that counts as noise."""
+    if deviation is None:
+        return math.inf
+    from scipy.stats import t
+
+    return float(t.ppf(LEVEL, freedom)) * deviation * math.sqrt(1.0 / n + 1.0 / m)
+
+
+def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> dict[str, Change]:
+    """Each row's change of one column against the default's, by name of the run.
+
+    Args:
+        rows: those of one scene, the default among them.
+        default: the row to compare with.
+        column: what is compared. Rows without a value, and a default without one, give no change.
+        ratio: compare as ratios, of those values that are positive.
+    """
+    samples = {row.run: list(row.values[column.name].values()) for row in rows}
+    if ratio:  # a training that lost its last splat has no ratio
+        samples = {run: [math.log(value) for value in values if value > 0] for run, values in samples.items()}
+    deviation, freedom = pooled_deviation(list(samples.values()))
+    base, result = samples[default.run], {}
+    for name, sample in samples.items():
+        if not sample or not base:
+            continue
+        difference = statistics.fmean(sample) - statistics.fmean(base)
+        bound = noise_bound(deviation, freedom, len(sample), len(base))
+        result[name] = Change(math.exp(difference), math.exp(bound), True) if ratio else Change(difference, bound)
+    return result
+
+
+def price(gain: Change, cost: Change, power: int = 1) -> tuple[str, float | None]:
+    """What a setting buys for its cost.
+
+    Args:
+        gain: change of PSNR, dB.
+        cost: change of the cost's column, a ratio.
+        power: the cost is the column to this power.
+
+    Returns:
+        "same" (both within the noise), "noise" (PSNR within it, the cost not), "gain" and "loss" (the cost within it,
+        PSNR not), "better" and "worse" (both changed, for the better or the worse), or "trade" with dB for each
+        doubling of the cost.
+    """
+    if gain.is_noise:
+        return ("same" if cost.is_noise else "noise"), None
+    if cost.is_noise:
+        return ("gain" if gain.value > 0 else "loss"), None
+    doublings = power * math.log2(cost.value)
+    if (gain.value > 0) == (doublings > 0):
+        return "trade", gain.value / doublings
+    return ("better" if gain.value > 0 else "worse"), None
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points (cost, quality) that no other beats, by rising cost.
+
+    A point is beaten by one that costs no more and is worth no less, and differs in one of the two. Of equal points
+    none beats the other.
+    """
+    order = sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1]))
+    front: list[int] = []
+    for i in order:
+        if not front or points[i][1] > points[front[-1]][1] or points[i] == points[front[-1]]:
+            front.append(i)
+    return front
+
+
+def front_of(rows: Sequence[Row], cost: str) -> list[str]:
+    """Names of the runs on the front of PSNR against a cost, by rising cost."""
+    column, power = COSTS[cost]
+    points = {row.run: (row.mean(BY_NAME[column]), row.mean(PSNR)) for row in rows}
+    known = {name: (paid**power, quality) for name, (paid, quality) in points.items() if None not in (paid, quality)}
+    return [list(known)[i] for i in pareto_front(list(known.values()))]
+
+
+def report(rows: list[Row], knobs: dict[str, str], out: Path) -> None:
+    """Write OUT/tradeoff.{md,json,png} and print the table.
+
+    Args:
+        rows: those of a plan with knobs, and their averages over scenes.
+        knobs: run -> knob.
+    """
+    results, texts = [], []
+    for scene in dict.fromkeys(row.scene for row in rows):
+        of_scene = [row for row in rows if row.scene == scene]
+        default = next((row for row in of_scene if row.run == DEFAULT), None)
+        if default is not None:
+            result = compare(of_scene, default, knobs)
+            results.append({"scene": scene, **result})
+            texts.append(f"### {plain_markdown(scene)}\n\n{table(of_scene, default, result)}")
+    text = "\n".join([*texts, *(f"{note}\n" for note in [*LEGEND, *notes(rows)])])
+    write_whole(out / "tradeoff.md", text)
+    write_whole(out / "tradeoff.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
+    if any(row.records for row in rows):
+        draw(rows, knobs, out / "tradeoff.png")
+    Console(soft_wrap=True, markup=False, highlight=False).print(text)
+    print(f"Trade: {out / 'tradeoff.md'}, {out / 'tradeoff.png'}")
+
+
+def compare(rows: list[Row], default: Row, knobs: dict[str, str]) -> dict[str, Any]:
+    """All settings of one scene against the default, as plain data.
+
+    Returns:
+        "fronts": cost -> names by rising cost; "settings": for each its knob, seeds, means with deviations, changes
+        with their noise (null if unknown), and prices by cost.
+    """
+    changed = {name: changes(rows, default, BY_NAME[name], name in RATIOS) for name in SHOWN}
+
+    def plain(change: Change | None) -> dict[str, Any] | None:
+        if change is None:
+            return None
+        noise = change.noise if change.noise < math.inf else None
+        return {"value": change.value, "noise": noise, "is_noise": change.is_noise}
+
+    settings = []
+    for row in rows:
+        prices = {}
+        for cost, (column, power) in COSTS.items():
+            gain, paid = changed["PSNR"].get(row.run), changed[column].get(row.run)
+            if row is not default and gain is not None and paid is not None:
+                prices[cost] = price(gain, paid, power)
+        settings.append(
+            {
+                "knob": knobs[row.run],
+                "run": row.run,
+                "strategy": row.strategy,
+                "seeds": sorted(row.records),
+                "absent": {str(seed): why for seed, why in row.absent.items()},
+                "values": {name: [row.mean(BY_NAME[name]), row.deviation(BY_NAME[name])] for name in SHOWN},
+                "changes": {name: plain(changed[name].get(row.run)) for name in SHOWN},
+                "prices": prices,
+            }
+        )
+    return {"fronts": {cost: front_of(rows, cost) for cost in COSTS}, "settings": settings}
+
+
+def table(rows: list[Row], default: Row, result: dict[str, Any]) -> str:
+    """One scene's table in Markdown: the default in absolute numbers, the settings as changes."""
+    head = [*HEAD, *(f"dB per doubling of {cost}" for cost in COSTS)]
+    lines = [head, ["---"] * 2 + ["---:"] * (len(head) - 2)]
+    for row, plain in zip(rows, result["settings"], strict=True):
+        if row is default:
+            cells, prices = [row.text(BY_NAME[name]) for name in SHOWN], [""] * len(COSTS)
+        else:
+            cells = [change_text(plain["changes"][name], name) for name in SHOWN]
+            prices = [price_text(plain["prices"].get(cost)) for cost in COSTS]
+        stars = [" ★" if row.run in result["fronts"][cost] else "" for cost in COSTS]
+        prices = [(text + star).strip() for text, star in zip(prices, stars, strict=True)]
+        name = plain_markdown(row.run)
+        lines.append([f"**{name}**" if row is default else name, row.seeds, *cells, *prices])
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def change_text(change: dict[str, Any] | None, name: str) -> str:
+    """A change in a cell of the table."""
+    if change is None:
+        return "-"
+    value = change["value"]
+    text = f"x {value:.2f}" if name in RATIOS else f"{value:+.2f}" if name == "PSNR" else f"{value:+.4f}"
+    if not change["is_noise"]:
+        return text
+    return f"[{text}]" if change["noise"] is None else f"({text})"
+
+
+def price_text(priced: tuple[str, float | None] | None) -> str:
+    """A price in a cell of the table."""
+    if priced is None:
+        return "-"
+    kind, number = priced
+    return f"{number:.2f}" if number is not None else WORDS[kind]
+
+
+def draw(rows: list[Row], knobs: dict[str, str], path: Path) -> None:
+    """PSNR against each cost, a line of panels for each scene; the front as a staircase, with names."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    scenes, names = (list(dict.fromkeys(values)) for values in ((row.scene for row in rows), knobs.values()))
+    with pyplot.rc_context({"font.size": 8}):
+        size = 4.2 * len(COSTS), 3.2 * len(scenes) + 0.5
+        figure, panels = pyplot.subplots(
+            len(scenes), len(COSTS), figsize=size, dpi=110, squeeze=False, layout="constrained"
+        )
+        handles: dict[str, Any] = {}
+        for line, scene in zip(panels, scenes, strict=True):
+            for panel, (cost, (column, _)) in zip(line, COSTS.items(), strict=True):
+                of_scene = [row for row in rows if row.scene == scene]
+                points = {row.run: (row.mean(BY_NAME[column]), row.mean(PSNR)) for row in of_scene}
+                points = {run: point for run, point in points.items() if None not in point}
+                for row in of_scene:
+                    if row.run in points:
+                        is_default, number = row.run == DEFAULT, names.index(knobs[row.run])
+                        errors = (row.deviation(one) or 0.0 for one in (BY_NAME[column], PSNR))
+                        handles[knobs[row.run]] = panel.errorbar(
+                            *points[row.run],
+                            **dict(zip(("xerr", "yerr"), errors, strict=True)),
+                            color="black" if is_default else f"C{number % 10}",
+                            marker="*osD^v<>phX"[number % 11],
+                            markersize=10 if is_default else 4,
+                            elinewidth=0.6,
+                            linestyle="none",
+                        )
+                front = front_of(of_scene, cost)
+                panel.step(
+                    *zip(*(points[run] for run in front), strict=True), where="post", color="grey", linewidth=0.8
+                )
+                for number, run in enumerate(front):
+                    offset = 3, (4, -9)[number % 2]
+                    panel.annotate(plain_label(run), points[run], offset, textcoords="offset points", fontsize=6)
+                panel.set(title=plain_label(scene), xlabel=column, ylabel="PSNR", xscale="log")
+                panel.margins(0.12)
+                panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+                panel.xaxis.set_major_formatter("{x:g}")
+                panel.xaxis.set_minor_formatter(NullFormatter())
+                panel.grid(alpha=0.3, which="both", linewidth=0.4)
+        labels = [knob for knob in names if knob in handles]
+        legend = [handles[knob] for knob in labels], list(map(plain_label, labels))
+        figure.legend(*legend, loc="outside lower center", ncols=8, fontsize=7)
+        with whole(path) as aside:
+            figure.savefig(aside, format="png", metadata={"Software": None})
+        pyplot.close(figure)
