@@ -83,8 +83,6 @@ def over_views(model, views: Iterable, flip: Callable | None = None) -> dict[str
     per_image = []
     for name, (camera, batch) in views:
         outputs = model.get_outputs_for_camera(camera)
-        if hasattr(model, "as_photographed"):
-            outputs = model.as_photographed(outputs, camera)
         truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
         mask = batch["mask"].to(model.device).float() >= 0.5 if "mask" in batch else None
         per_image.append({"image": name, **image_metrics(outputs["rgb"], truth, mask)})

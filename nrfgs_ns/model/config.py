@@ -12,7 +12,6 @@ from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import McmcDensification, OpacitySeen, OriginalDensification, Strategy
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.image.photograph import Part
 from nrfgs_ns.model.retired import RETIRED
 
 PRIOR_VIEWS = 20
@@ -67,8 +66,6 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     photographs: Literal["auto", "on", "off"] = "auto"
     """learn each photograph's exposure and white balance. auto: if photographs or EXIF show that they vary
     (docs/exposure.md)"""
-    photograph_parts: tuple[Part, ...] = ("exposure", "white-balance")
-    """what is learnt, of each photograph (exposure, white-balance) or camera (vignetting, response)"""
     robust_loss: float = 0.0
     """largest share of pixels that the loss ignores, those with the largest residuals, such as passers-by
     (docs/exposure.md)"""

@@ -361,8 +361,6 @@ class NrfgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
             losses |= self.densification.regularisation(self.gauss_params) | self.shrinking()
-            if self.photograph is not None and self.photograph.has_penalty and self.step % 10 == 0:
-                losses["photograph"] = 10.0 * self.photograph.penalty(batch["image_idx"])
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")
@@ -434,15 +432,6 @@ class NrfgsModel(SplatfactoModel):
             {name: value for name, value in metrics.items() if value is not None},
             {"img": torch.cat([truth, rgb], dim=1)},
         )
-
-    def as_photographed(self, outputs: dict[str, Tensor], camera: Cameras) -> dict[str, Tensor]:
-        """What the mean look becomes in the camera that took a test photograph: its vignetting and response, if learnt.
-        Exposure and white balance of that photograph stay unknown."""
-        if self.photograph is None:
-            return outputs
-        sizes = (float(value.flatten()[0]) for value in (camera.width, camera.height, camera.fx, camera.fy))
-        rgb = self.photograph.by_camera(outputs["rgb"], self.photograph.camera_like(*sizes))
-        return {**outputs, "rgb": rgb.clamp(0.0, 1.0)}
 
     # Viewer and exporter. The exporter reads splats with spherical harmonics, whatever the head is. Where `fit_on` was
     # called, as neither a training nor a viewer does, they are harmonics fitted to the head (`harmonics_fit.py`).

@@ -46,8 +46,6 @@ class Evidence(NamedTuple):
     pairs: Pairs
     centers: Tensor
     """where they were taken, [V, 3]"""
-    exif: list[Exif]
-    """[V]"""
     known: Tensor
     """exposures from EXIF in stops, NaN where it says nothing, [V]"""
     seen: Looks
@@ -73,7 +71,7 @@ def evidence(datamanager: Any) -> Evidence:
     known = torch.tensor([exposure(of_one) for of_one in exif])
     pairs = compare_photographs(told.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
     centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
-    return Evidence(pairs, centers, exif, known, estimate(pairs, torch.full_like(known, torch.nan), centers))
+    return Evidence(pairs, centers, known, estimate(pairs, torch.full_like(known, torch.nan), centers))
 
 
 def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
@@ -89,7 +87,7 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
     Raises:
         InputError: it is asked for together with the bilateral grid.
     """
-    if config.photographs == "off" or not config.photograph_parts:
+    if config.photographs == "off":
         return None
     if config.use_bilateral_grid:
         if config.photographs == "on":
@@ -99,42 +97,40 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
         return None
     found = evidence(datamanager)
     wanted, why = verdict(config.photographs, found)
-    what = " and ".join(part.replace("-", " ") for part in config.photograph_parts)
-    CONSOLE.print(f"Photographs: {what} {'learnt' if wanted else 'not learnt'}: {why}.", soft_wrap=True, markup=False)
+    learnt = "learnt" if wanted else "not learnt"
+    CONSOLE.print(f"Photographs: exposure and white balance {learnt}: {why}.", soft_wrap=True, markup=False)
     if not wanted:
         return None
     known = found.known
     looks = estimate(found.pairs, known, found.centers) if torch.isfinite(known).any() else found.seen
     names = [path.name for path in datamanager.train_dataset.image_filenames]
-    camera_of, lenses = physical_cameras(datamanager.train_dataset.cameras, found.exif)
-    return PhotographModel(names, camera_of, lenses, config.photograph_parts, channels(looks.stops), looks.held)
+    return PhotographModel(names, channels(looks.stops), looks.held)
 
 
 def verdict(choice: Choice, found: Evidence) -> tuple[bool, str]:
     """Whether a training learns photographs' exposure, and why, in words."""
     pairs, known = found.pairs, found.known
     exposures, *colors = found.seen.random
-    words = f"each differs from what its place explains by {exposures:.2f} stops, in colour by {max(colors):.2f}"
+    words = f"exposure varies by {exposures:.2f} stops, colour by {max(colors):.2f}"
     if not any(found.seen.random):
-        words = "too few points in common to compare them"
-    words += f" ({len(pairs.first)} pairs)"
+        words = "photographs have too few points in common to compare them"
+    needed = found.learnt_by_itself
+    if not needed:
+        words += f" (learnt from {ENOUGH_STOPS[0]:g}, or {ENOUGH_STOPS[1]:g} in colour)"
     if not torch.isfinite(known).any():
-        told = "EXIF says nothing"
+        words += "; EXIF has no exposures"
     elif not varies(known):
-        told = f"EXIF says that exposure is {'the same' if spread(known) < 0.005 else 'almost the same'}"
+        words += f"; EXIF: {'the same' if spread(known) < 0.005 else 'almost the same'} exposure"
     else:
-        told = f"EXIF says that exposure varies by {spread(known):.2f} stops"
+        words += f"; EXIF: exposure varies by {spread(known):.2f} stops"
         _, explained = slope(pairs, known)
         if explained is not None:
-            told += f", which explains {explained:.0%} of their difference"
-    needed = found.learnt_by_itself
-    enough = "" if needed else f"; {ENOUGH_STOPS[0]:g}, and {ENOUGH_STOPS[1]:g} in colour, would be enough"
-    asked = "asked for; " if choice == "on" else ""
-    return needed or choice == "on", f"{asked}{words}; {told}{enough}"
+            words += f", which explains {explained:.0%} of the difference"
+    return needed or choice == "on", "option photographs is on; " * (choice == "on") + words
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
-    """Raise InputError where a training goes on that had learnt other photographs, or other parts of them.
+    """Raise InputError where a training goes on that had learnt other photographs.
 
     Args:
         own: of the training that goes on.
@@ -146,14 +142,7 @@ def check_same_photographs(own: PhotographModel | None, written: Mapping[str, An
             f"The checkpoint was trained with photographs {theirs}, this training has them {ours}. Set "
             f"--pipeline.model.photographs {theirs}, or train anew."
         )
-    if own is None:
-        return
-    if list(own.parts) != written["parts"]:
-        raise InputError(
-            "The checkpoint's training learnt other parts of its photographs. Set "
-            f"--pipeline.model.photograph-parts {' '.join(written['parts'])}, or train anew."
-        )
-    if own.names != written["names"]:
+    if own is not None and own.names != written["names"]:
         raise InputError("The checkpoint was trained on other photographs. Go on with the same ones, or train anew.")
 
 
@@ -196,25 +185,3 @@ def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequenc
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         sightings = list(pool.map(seen, viewmats, matrices, images))
     return compare(sightings, centers)
-
-
-def physical_cameras(cameras: Cameras, exif: Sequence[Exif]) -> tuple[list[int], Tensor]:
-    """Which camera took each photograph: told apart by make, model and focal length of EXIF, by size, and by the focal
-    length in pixels (to 2 %) where EXIF does not name the camera.
-
-    Returns:
-        A number for each photograph, [V]; and of each camera principal point and focal length as shares of width and
-        height, [C, 4].
-    """
-    columns = (cameras.cx, cameras.cy, cameras.fx, cameras.fy, cameras.width, cameras.height)
-    cx, cy, fx, fy, width, height = (value.flatten().double().cpu() for value in columns)
-    shares = torch.stack([cx / width, cy / height, fx / width, fy / height], dim=-1)
-    angles = (shares[:, 2].log() * 50).round().long().tolist()
-    keys = []
-    for size, angle, of_one in zip(zip(width.tolist(), height.tolist(), strict=True), angles, exif, strict=True):
-        named = of_one.get("make"), of_one.get("model"), of_one.get("focal_length")
-        keys.append((size, named if of_one.get("model") else angle))
-    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
-    camera_of = [numbers[key] for key in keys]
-    members = torch.tensor(camera_of)
-    return camera_of, torch.stack([shares[members == number].mean(dim=0) for number in range(len(numbers))]).float()

@@ -171,7 +171,6 @@ class NrfgsPipeline(VanillaPipeline):
             if outputs["rgb"].is_cuda:
                 torch.cuda.synchronize()
             seconds = perf_counter() - start
-            outputs = self.model.as_photographed(outputs, camera)
             metrics, pictures = self.model.get_image_metrics_and_images(outputs, batch)
             per_image.append({"image": name, **metrics, "seconds_per_image": seconds})
             if output_path is not None:

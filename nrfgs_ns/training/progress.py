@@ -172,7 +172,7 @@ def psnr_of(pipeline: Any, index: int) -> float | None:
     pipeline.eval()
     try:
         camera, batch = data.eval_dataset.cameras[index : index + 1].to(model.device), data.cached_eval[index]
-        outputs = model.as_photographed(model.get_outputs_for_camera(camera), camera)
+        outputs = model.get_outputs_for_camera(camera)
         truth = model.truth_of(batch, outputs["background"])
         return psnr(outputs["rgb"], truth, model.mask_of(batch))
     finally:

@@ -75,7 +75,6 @@ class StepGraphs:
         exposed = model.photograph is not None
         obstacles = (
             ("the densification looks at what views show", not model.densification.takes_all_rows),
-            ("lenses are learnt", exposed and model.photograph.has_penalty),
             ("exposures of transparent photographs are learnt", exposed and batch["image"].shape[-1] == 4),
             ("the robust loss chooses pixels", model.trimming is not None),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),

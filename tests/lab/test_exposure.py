@@ -38,9 +38,7 @@ def test_only_training_photographs_are_exposed_anew_and_all_are_smaller(tiny_sce
 
 def test_what_was_learnt_is_compared_with_the_truth(tmp_path):
     truth = {"a": [0.5, 0.6, 0.4], "b": [-0.7, -0.5, -0.6], "c": [0.2, -0.1, 0.2]}
-    model = PhotographModel(
-        ["a.png", "b.png", "c.png"], [0, 0, 0], torch.ones(1, 4), start=torch.tensor([*truth.values()])
-    )
+    model = PhotographModel(["a.png", "b.png", "c.png"], start=torch.tensor([*truth.values()]))
     checkpoint = tmp_path / "step-000000001.ckpt"
     state = {f"_model.photograph.{name}": value for name, value in model.state_dict().items()}
     torch.save({"step": 1, "pipeline": state}, checkpoint)

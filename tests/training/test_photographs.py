@@ -3,7 +3,6 @@
 
 import json
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
-from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, physical_cameras, verdict
+from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, verdict
 from nrfgs_ns.training.run import parse
 
 NAN = math.nan
@@ -37,23 +36,35 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 @pytest.mark.parametrize(
     ("choice", "pairs", "known", "wanted", "words"),
     [
-        ("auto", SAME, [NAN] * 11, False, "in colour by 0.01 (10 pairs); EXIF says nothing; 0.12, and 0.06"),
-        ("auto", DIFFERENT, [NAN] * 11, True, "differs from what its place explains by 0.38 stops"),
-        ("auto", pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them (3 pairs)"),
+        (
+            "auto",
+            SAME,
+            [NAN] * 11,
+            False,
+            "varies by 0.01 stops, colour by 0.01 (learnt from 0.12, or 0.06 in colour); EXIF has no exposures",
+        ),
+        ("auto", DIFFERENT, [NAN] * 11, True, "exposure varies by 0.38 stops"),
+        ("auto", pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them"),
         ("auto", pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
-        ("auto", pairs_with([]), [NAN] * 11, False, "in common to compare them (0 pairs); EXIF says nothing"),
-        ("auto", SAME, [0.3] * 11, False, "EXIF says that exposure is the same"),
-        ("auto", SAME, [0.3] + [NAN] * 10, False, "EXIF says that exposure is the same"),
-        ("auto", SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF says that exposure is almost the same"),
+        (
+            "auto",
+            pairs_with([]),
+            [NAN] * 11,
+            False,
+            "in common to compare them (learnt from 0.12, or 0.06 in colour); EXIF has no exposures",
+        ),
+        ("auto", SAME, [0.3] * 11, False, "EXIF: the same exposure"),
+        ("auto", SAME, [0.3] + [NAN] * 10, False, "EXIF: the same exposure"),
+        ("auto", SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: almost the same exposure"),
         # The light changed, and the camera followed it.
-        ("auto", SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of their difference"),
-        ("auto", pairs_with([0.0] * 10), [0.0, 0.9] * 5 + [0.0], False, "which explains 0% of their difference"),
+        ("auto", SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of the difference"),
+        ("auto", pairs_with([0.0] * 10), [0.0, 0.9] * 5 + [0.0], False, "which explains 0% of the difference"),
         (
             "auto",
             DIFFERENT,
             [0.0, 0.5] * 5 + [0.0],
             True,
-            "in colour by 0.01 (10 pairs); EXIF says that exposure is almost",
+            "colour by 0.01; EXIF: almost the same",
         ),
         (
             "auto",
@@ -62,12 +73,12 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
             True,
             "exposure varies by 0.35 stops, which explains",
         ),
-        ("on", SAME, [NAN] * 11, True, "asked for; each differs"),
+        ("on", SAME, [NAN] * 11, True, "option photographs is on; exposure varies"),
     ],
 )
 def test_the_evidence_decides_and_is_told(choice, pairs, known, wanted, words):
     seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
-    found, why = verdict(choice, Evidence(pairs, CENTERS, [{}] * 11, torch.tensor(known), seen))
+    found, why = verdict(choice, Evidence(pairs, CENTERS, torch.tensor(known), seen))
     assert found == wanted
     assert words in why
 
@@ -90,20 +101,6 @@ def test_exif_comes_from_the_data_set_or_else_from_the_file(tmp_path):
     Image.new("RGB", (8, 8)).save(photo, exif=exif)
     other = tmp_path / "b.jpg"
     assert exif_of([photo, other], [{}, {"iso": 50}]) == [{"exposure_time": 0.25}, {"iso": 50}]
-
-
-def cameras_of(focals, width: int = 100):
-    column = torch.tensor(focals)[:, None]
-    ones = torch.ones_like(column)
-    return SimpleNamespace(cx=50 * ones, cy=40 * ones, fx=column, fy=column, width=width * ones, height=80 * ones)
-
-
-def test_cameras_are_told_apart_by_exif_or_by_their_angle():
-    camera_of, lenses = physical_cameras(cameras_of([100.0, 101.0, 200.0, 100.2]), [{}] * 4)
-    assert camera_of == [0, 0, 1, 0]
-    assert lenses[1].tolist() == pytest.approx([0.5, 0.5, 2.0, 2.5])
-    one, other = {"make": "A", "model": "X"}, {"make": "A", "model": "Y"}
-    assert physical_cameras(cameras_of([100.0, 130.0, 100.0]), [one, one, other])[0] == [0, 0, 1]
 
 
 # Trainings.

@@ -16,7 +16,7 @@ ROWS = (
 SHARE = "--pipeline.model.robust-loss "
 
 
-def of(scene: str, case: str, options: str = "", timed: bool = False, part: str = "") -> list[dict[str, Any]]:
+def of(scene: str, case: str, options: str = "", part: str = "") -> list[dict[str, Any]]:
     """The records of all seeds."""
     return [
         record
@@ -24,7 +24,7 @@ def of(scene: str, case: str, options: str = "", timed: bool = False, part: str 
         if name.rpartition("/")[0] == part
         and "settings" not in record
         and (record["study"]["scene"], record["case"], record["study"]["options"]) == (scene, case, options)
-        and (record["measured"] is None) == timed
+        and record["measured"] is not None
     ]
 
 
@@ -76,13 +76,3 @@ def trimming(part: str) -> str:
         off, on = (mean(of("fox", f"{study}-off", SHARE + share, part=part), "psnr") for share in ("0", "0.1"))
         said.append(f"{off} to {on}")
     return f"{said[0]} dB; without them {said[1]}"
-
-
-def times() -> str:
-    """Milliseconds of castle's steps on each of two machines; their first trainings, which compile, are left out."""
-    pairs = []
-    for part in ("", "later"):
-        found = [of("castle", case, timed=True, part=part) for case in ("as-is-on", "as-is-off")]
-        kept = [[one["train"] for one in both if one["study"]["seed"] > 1] for both in found]
-        pairs.append([fmean(1e3 * one["seconds"] / one["steps"] for one in both) for both in kept])
-    return "; ".join(f"{on:.2f} ms with it, {off:.2f} without ({on / off - 1:+.1%})" for on, off in pairs)
