@@ -20,6 +20,16 @@ INSTEAD = (
     ("`mcmc`", "mcmc: logit", "field"),
 )
 """Rows of the second table: label, trial, and the trial of the default that it is compared with."""
+BY_ERROR = {
+    "`original`": "3DGS",
+    "by error": "error",
+    "wide splats stay": "error: any width",
+    "the same, prune below 0.05": "error: any width, prune 0.05",
+    "residual on the logit": "error: logit",
+    "faster growth": "error: fast all",
+    "the same, resets": "error: fast all, reset",
+}
+"""Rows of the third table, by their trials in results/error-guided.json."""
 BUDGET = "nrfgs, 150,000 splats", "harmonics, 150,000 splats"
 
 
@@ -67,6 +77,25 @@ def instead() -> str:
         splats = [{one["scene"]: one["splats"] for one in runs if one["name"] == name} for name in (trial, default)]
         share = median(splats[0][scene] / splats[1][scene] for scene in splats[0].keys() & splats[1].keys())
         body.append([label, *cells, f"{share:.1f}"])
+    return grid(["", *scenes, "splats"], body)
+
+
+def by_error() -> str:
+    """What growth by error gains over the default on held-out views, in the mean over seeds, and its splats."""
+    scenes, runs = list(TRAINING_VIEWS)[1:], records("error-guided").values()
+
+    def means(trial: str, scene: str) -> tuple[dict[str, tuple[float, float]], float]:
+        seeds = [run for run in runs if run["name"] == trial and run["scene"].endswith(f"/{scene}")]
+        views = zip(*(run["per_image"] for run in seeds), strict=True)
+        values = {view[0][0]: (fmean(one[1] for one in view), fmean(one[2] for one in view)) for view in views}
+        return values, fmean(run["splats"] for run in seeds) if seeds else 0.0
+
+    body = []
+    for label, trial in BY_ERROR.items():
+        pairs = [(means(trial, scene), means("default", scene)) for scene in scenes]
+        shares = [ours[1] / theirs[1] for ours, theirs in pairs if ours[1]]
+        cells = [_gain(ours[0], theirs[0], sorted(ours[0])) for ours, theirs in pairs]
+        body.append([label, *cells, f"{median(shares):.1f}"])
     return grid(["", *scenes, "splats"], body)
 
 
