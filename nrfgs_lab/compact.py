@@ -6,7 +6,7 @@
     python -m nrfgs_lab.compact trade HELD_OUT/fox/dev0.json OUT --others ply --rates --settings MOVED=0  # and of a PLY
     python -m nrfgs_lab.compact speed FILE.nrf OUT/speed.json   # encoding, and decoding in Python and in Chromium
     python -m nrfgs_lab.results pack OUT results/compact.json
-    python -m nrfgs_lab.pages.tables.compact_format             # the figure
+    python -m nrfgs_lab.pages.tables.files             # the figure
 
 `trade` trains the capture, and writes it as compact files trained at each of --rates, and as --others: a PLY file, one
 without a fine-tune, and what splat-transform makes of the PLY, where it is installed. Records of OUT that are there

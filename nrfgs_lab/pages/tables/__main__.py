@@ -15,5 +15,5 @@ for page in pages():
             page.write_text(new, encoding="utf-8")
             print(f"{stale[-1]} written")
         else:
-            print(f"{stale[-1]} is not what the records say: python -m nrfgs_lab.pages.tables --write")
+            print(f"{stale[-1]} differs from the records: python -m nrfgs_lab.pages.tables --write")
 sys.exit(1 if stale and "--write" not in sys.argv[1:] else 0)

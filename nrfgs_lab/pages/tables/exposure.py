@@ -4,7 +4,7 @@
 from statistics import fmean
 from typing import Any
 
-from nrfgs_lab.pages.tables import grid, records
+from nrfgs_lab.pages.tables.runs import grid, records
 
 CAPTURES = "lund", "fern", "fox", "castle", "caliterra", "goldcape", "kitchen"
 ROWS = (
@@ -76,3 +76,6 @@ def trimming(part: str) -> str:
         off, on = (mean(of("fox", f"{study}-off", SHARE + share, part=part), "psnr") for share in ("0", "0.1"))
         said.append(f"{off} to {on}")
     return f"{said[0]} dB; without them {said[1]}"
+
+
+BLOCKS = {f"exposure.{block.__name__}": block for block in (worth, gap, recovered, rule, trimming)}

@@ -1,169 +1,181 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of docs/speed.md."""
+"""Blocks of docs/speed.md, docs/trade-off.md, docs/nerfstudio/nrfgs.md and README.md: what trainings cost."""
 
 from datetime import datetime, timedelta
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-from nrfgs_lab.bench.table import Row
-from nrfgs_lab.pages.tables import BY_NAME, bench_rows, grid, records
+from nrfgs_lab.bench.table import BY_NAME, Row
+from nrfgs_lab.pages.tables.runs import VIEWS, bench_rows, grid, mean_of, signed, span, table
+
+SITTING = timedelta(minutes=10)
+"""Trainings that began within it were made on one machine, one after the other."""
+
+
+def row_of(run: str, scene: str = "bonsai") -> Row:
+    """Whole trainings, by their names in docs/bench/speed.yaml."""
+    return bench_rows("speed")[scene, "own", run]
+
+
+def values(column: str, run: str, scene: str = "bonsai") -> list[float]:
+    """A quantity of whole trainings, by seed."""
+    return list(row_of(run, scene).values[column].values())
+
+
+def _ratios(column: str, run: str, base: str) -> list[float]:
+    """A quantity of trainings of bonsai over another's, of those made in one sitting."""
+
+    def began(record: dict[str, Any]) -> datetime:
+        return datetime.strptime(Path(record["train"]["config_path"]).parent.name, "%Y-%m-%d_%H%M%S")
+
+    ours, theirs = row_of(run), row_of(base)
+    return [
+        ours.values[column][seed] / theirs.values[column][other]
+        for seed, one in ours.records.items()
+        for other, two in theirs.records.items()
+        if abs(began(one) - began(two)) < SITTING
+    ]
+
 
 TRAININGS = "splatfacto", "splatfacto-10k", "splatfacto-big-10k", "nrfgs-sh", "nrfgs", "nrfgs-fast", "nrfgs-best"
-SITTING = timedelta(minutes=10)
-"""Trainings that began within it were made on one machine, one behind the other."""
-VARIANTS = {
-    "fused bf16": "field",
-    "torch": "in PyTorch",
-    "sh head": "harmonics",
-    "sg head": "SG",
-    "vdgs head": "VDGS",
-    "gsnb head": "GSNB",
-}
 
 
-def _trainings() -> dict[str, Row]:
-    """Whole trainings of bonsai, by their names in docs/bench/speed.yaml."""
-    return {run: row for (scene, _, run), row in bench_rows("speed").items() if scene == "bonsai"}
+def _share(run: str) -> str:
+    shares = _ratios("time s", run, "splatfacto")
+    if shares:
+        return f"{median(shares):.2f}"
+    return f"{fmean(values('time s', run)) / fmean(values('time s', 'splatfacto')):.2f}*"
 
 
 def trainings() -> str:
     """What whole trainings of bonsai cost: each run's seconds, means of the rest."""
-    body = []
-    for run in TRAININGS:
-        row = _trainings()[run]
-        shares = _ratios("time s", run, "splatfacto")
-        share = f"{median(shares):.2f}" if shares else f"{fmean(_times_of(run)) / fmean(_times_of('splatfacto')):.2f}*"
-        seconds = ", ".join(f"{value:.1f}" for value in _times_of(run))
-        psnr = f"{row.mean(BY_NAME['PSNR']):.2f}"
-        means = [f"{row.mean(BY_NAME['splats']) / 1000:.0f}k", f"{row.mean(BY_NAME['peak MB']):.0f}"]
-        frames = "/".join(f"{row.mean(BY_NAME[name]):.0f}" for name in ("FPS", "FPS 1080p"))
-        body.append([f"`{run}`", seconds, share, psnr, *means, frames])
-    head = ["bonsai", "seconds", "of splatfacto's", "PSNR", "splats", "peak MB", "frames/s, own size/1080p"]
-    return grid(head, body)
-
-
-def _times_of(run: str) -> list[float]:
-    return list(_trainings()[run].values["time s"].values())
-
-
-def _ratios(what: str, run: str, base: str) -> list[float]:
-    """A quantity of trainings of bonsai over another's, of those made one behind the other on one machine."""
-    rows = _trainings()
-    return [
-        rows[run].values[what][seed] / rows[base].values[what][other]
-        for seed, one in rows[run].records.items()
-        for other, two in rows[base].records.items()
-        if abs(_began(one) - _began(two)) < SITTING
-    ]
-
-
-def _began(record: dict[str, Any]) -> datetime:
-    """When a training began, as its folder is called."""
-    return datetime.strptime(Path(record["train"]["config_path"]).parent.name, "%Y-%m-%d_%H%M%S")
-
-
-def ratio(what: str, run: str, base: str) -> str:
-    """A quantity of trainings of bonsai over others' of the same call, the median."""
-    return f"{median(_ratios(what, run, base)):.2f}"
+    return table(
+        "bonsai | seconds | of splatfacto's | PSNR | splats | peak MB | frames/s, own size/1080p",
+        {f"`{run}`": run for run in TRAININGS},
+        lambda run: ", ".join(f"{value:.1f}" for value in values("time s", run)),
+        _share,
+        lambda run: f"{mean_of(row_of(run), 'PSNR'):.2f}",
+        lambda run: f"{mean_of(row_of(run), 'splats') / 1000:.0f}k",
+        lambda run: f"{mean_of(row_of(run), 'peak MB'):.0f}",
+        lambda run: "/".join(f"{mean_of(row_of(run), name):.0f}" for name in ("FPS", "FPS 1080p")),
+    )
 
 
 def spread(*runs: str) -> str:
     """By how much the slowest training of a run is above its fastest, at most."""
-    return f"{100 * max(max(_times_of(run)) / min(_times_of(run)) - 1 for run in runs):.0f} %"
+    return f"{100 * max(max(times) / min(times) - 1 for times in (values('time s', run) for run in runs)):.0f} %"
 
 
-def of_training(what: str, run: str) -> str:
+def of_training(column: str, run: str) -> str:
     """A quantity of trainings of bonsai, the median."""
-    return BY_NAME[what].form.format(median(_trainings()[run].values[what].values()))
-
-
-PHASES = {"to step 5,000": (0, 5_000), "to 15,000": (5_000, 15_000), "to 30,000": (15_000, 30_000)}
-"""Of a training of bonsai: what the columns are called -> first and last step."""
+    return BY_NAME[column].form.format(median(values(column, run)))
 
 
 def _steps(run: str, begin: int, end: int) -> float:
-    """Milliseconds of a step of whole trainings of bonsai, between two checkpoints; the median over seeds."""
-    found = []
-    for record in _trainings()[run].records.values():
+    """Milliseconds of a step of whole trainings of bonsai between two checkpoints, the median over seeds."""
+    times = []
+    for record in row_of(run).records.values():
         train = record["train"]
         seconds = {0: 0.0, **dict(train["saved"]), train["steps"]: train["seconds"]}
-        found.append(1e3 * (seconds[end] - seconds[begin]) / (end - begin))
-    return median(found)
+        times.append(1e3 * (seconds[end] - seconds[begin]) / (end - begin))
+    return median(times)
+
+
+PHASES = {"to step 5,000": (0, 5_000), "to 15,000": (5_000, 15_000), "to 30,000": (15_000, 30_000)}
 
 
 def steps() -> str:
-    """Milliseconds of a step of whole trainings, while splats come and go and later."""
-    found = {run: [f"{_steps(run, *phase):.2f}" for phase in PHASES.values()] for run in ("nrfgs", "nrfgs-sh")}
-    return ", ".join(f"{phase} {one}/{other}" for phase, one, other in zip(PHASES, *found.values(), strict=True))
-
-
-def step_ratio(run: str, base: str) -> str:
-    """A step of whole trainings over another's, when growth has ended."""
-    return f"{_steps(run, *PHASES['to 30,000']) / _steps(base, *PHASES['to 30,000']):.2f}"
-
-
-def heads() -> str:
-    """Milliseconds of the GPU for each head at a million visible splats, forward and backward."""
-    return ", ".join(f"{label} {_head(variant):.2f}" for variant, label in VARIANTS.items())
-
-
-def _head(variant: str) -> float:
-    times = records("head_gpu")["head_gpu_all"]["times"]
-    found = {one["variant"]: one for one in times if one["share"] == "all" and one["visible"] == 1_000_000}
-    return found[variant]["gpu_ms"]
-
-
-def head_share() -> str:
-    """The field's time at a million visible splats, of the harmonics'."""
-    return f"{_head('fused bf16') / _head('sh head'):.2f}"
-
-
-def errors() -> str:
-    """Relative errors of the field against float64, in bf16."""
-    (found,) = (one for one in records("head_gpu")["head_gpu_all"]["errors"] if one["variant"] == "fused bf16")
-    return f"{found['colors']:.0e} in colours and {found['d weights']:.0e} in gradients of the weights"
-
-
-def cpu_rasterizer(case: str) -> str:
-    """The CPU's rasterizer on a case, forward and backward, and how many times a loop over tiles takes."""
-    one = records("rasterizer_cpu")["rasterizer_cpu_two_threads"]["results"][case]
-    ours = one["ours"]["forward_ms"] + one["ours"]["backward_ms"]
-    return f"{ours:.0f} ms, {one['times_faster']:.0f} times faster"
-
-
-def first_sight() -> str:
-    """Seconds from the command to a picture that is worth looking at."""
-    record = records("first_sight")["nrfgs-fast"]
-    stages = {"imported": "imports", "images read": "images read", "step 0": "first step"}
-    told = [f"{label} {record['stages'][name]:.1f}" for name, label in stages.items()]
-    told += [f"{target} dB {reached['seconds']:.1f}" for target, reached in record["reached"].items()]
-    return ", ".join(told)
-
-
-def imports(which: str = "seconds") -> str:
-    """Processor seconds that a nerfstudio command's imports take: as it is, or without what nrfgs_ns/start.py does."""
-    return f"{records('start_up')[which]:.1f}"
-
-
-def step_shares() -> str:
-    """A step's time over the harmonics' with as many splats, and over its own with the graph."""
-    rows = {(row["method"], row["variant"]): row["step_ms"] for row in records("step_parts")["graph"]["steps"]}
-    grown, rest = (rows["nrfgs", name] / rows["nrfgs-sh", name] for name in ("whole", "at rest: whole"))
-    slower = rows["nrfgs", "without graph"] / rows["nrfgs", "whole"]
-    return f"{grown:.2f} while splats come and go, {rest:.2f} later; without the graph {slower:.2f} times as long"
+    """Milliseconds of a step of whole trainings, while splats are added and removed and later."""
+    pairs = {name: [f"{_steps(run, *phase):.2f}" for run in ("nrfgs", "nrfgs-sh")] for name, phase in PHASES.items()}
+    return ", ".join(f"{name} {'/'.join(pair)}" for name, pair in pairs.items())
 
 
 def frames() -> str:
     """Frames per second of bonsai at 1080p, least and most."""
-    runs, told = {"nrfgs": "", "nrfgs-sh": "`nrfgs-sh` ", "splatfacto": "splatfacto "}, []
-    for run, label in runs.items():
-        found = _trainings()[run].values["FPS 1080p"].values()
-        told.append(f"{label}{min(found):.0f} to {max(found):.0f}")
-    return ", ".join(told)
+    runs = {"nrfgs": "", "nrfgs-sh": "`nrfgs-sh` ", "splatfacto": "splatfacto "}
+    return ", ".join(label + span(values("FPS 1080p", run), "{:.0f}".format) for run, label in runs.items())
 
 
-def frames_of_as_many() -> str:
-    """The field's frames per second over the harmonics' with about as many splats, 1080p."""
-    fps = {row["method"]: row["fps"]["1080p"] for row in records("step_parts")["graph"]["frames"]}
-    return f"{fps['nrfgs'] / fps['nrfgs-sh']:.2f}"
+def cost() -> str:
+    """Seconds of whole trainings of bonsai, least and most, and their mean PSNR."""
+    runs = {"nrfgs": "", "nrfgs-best": "`nrfgs-best` ", "nrfgs-sh": "`nrfgs-sh` ", "splatfacto": "splatfacto "}
+    return "; ".join(
+        f"{label}{span(values('time s', run), '{:.0f}'.format)} s, {mean_of(row_of(run), 'PSNR'):.2f} dB"
+        for run, label in runs.items()
+    )
+
+
+# The choice between methods and presets.
+
+CAPTURES = "bonsai", "fox"
+PRESETS = {
+    "splatfacto": "splatfacto",
+    "splatfacto-10k": "the same, 10,000 steps",
+    "splatfacto-big": "splatfacto-big",
+    "splatfacto-big-10k": "the same, 10,000 steps",
+    **{run: f"`{run}`" for run in ("nrfgs-sh", "nrfgs-fast", "nrfgs", "nrfgs-best")},
+}
+
+
+def _preset(scene: str, run: str) -> tuple[Row | None, str]:
+    """A run, and a mark if it was made on another day than most."""
+    row = bench_rows("speed").get((scene, "own", run))
+    if row is None and run.startswith("splatfacto"):
+        return bench_rows("presets").get((scene, "own", f"nerfstudio_{run}")), "*"
+    if row is None and run == "nrfgs":  # it chooses 10,000 steps, and is the preset
+        return bench_rows("speed").get((scene, "own", "nrfgs-fast")), ""
+    return row, ""
+
+
+def _preset_cell(scene: str, run: str) -> str:
+    row, mark = _preset(scene, run)
+    if row is None:
+        return "-"
+    seconds = list(row.values["time s"].values())
+    time = f", {span(seconds, '{:.0f}'.format)} s" if seconds else ""
+    splats = f"{mean_of(row, 'splats') / 1000:.0f}k"
+    return f"{mean_of(row, 'PSNR'):.2f}/{mean_of(row, 'SSIM'):.3f}, {splats}{time}{mark}"
+
+
+def presets() -> str:
+    """PSNR, SSIM, splats and seconds of a user's choices."""
+    body = [[label, *(_preset_cell(scene, run) for scene in CAPTURES)] for run, label in PRESETS.items()]
+    return grid(["PSNR/SSIM, splats, time", *(f"{scene}, {VIEWS[scene]} views" for scene in CAPTURES)], body)
+
+
+def gain(run: str, base: str) -> str:
+    """The least and the largest difference in dB over captures."""
+    pairs = [[_preset(scene, name)[0] for name in (run, base)] for scene in CAPTURES]
+    return span([mean_of(one, "PSNR") - mean_of(other, "PSNR") for one, other in pairs if one and other], signed)
+
+
+def time(scene: str, run: str, base: str) -> str:
+    """A run's share of another's time on a capture."""
+    ours, theirs = (median(_preset(scene, name)[0].values["time s"].values()) for name in (run, base))
+    return f"{ours / theirs:.2f}"
+
+
+BLOCKS = {
+    **{f"speed.{block.__name__}": block for block in (trainings, spread, steps, frames)},
+    "speed.ratio": lambda column, run, base: f"{median(_ratios(column, run, base)):.2f}",
+    "speed.step_ratio": lambda run, base: f"{_steps(run, 15_000, 30_000) / _steps(base, 15_000, 30_000):.2f}",
+    "readme.cost": cost,
+    "readme.memory": lambda: "{:.1f} GB, splatfacto {:.1f}".format(
+        *(mean_of(row_of(run), "peak MB") / 1000 for run in ("nrfgs", "splatfacto"))
+    ),
+    "trade_off.presets": presets,
+    "trade_off.gain": gain,
+    "trade_off.time": time,
+    "nerfstudio.methods": lambda: table(
+        "method | description | memory (bonsai, 799 x 532) | time for 30,000 steps (H200)",
+        {"`nrfgs`": "nrfgs", "`nrfgs-sh`": "nrfgs-sh", "`splatfacto`": "splatfacto"},
+        {
+            "nrfgs": "the method",
+            "nrfgs-sh": "the same model with spherical harmonics (3DGS)",
+            "splatfacto": "nerfstudio's own, for comparison",
+        }.get,
+        lambda run: f"{float(of_training('peak MB', run)) / 1000:.1f} GB",
+        lambda run: f"{of_training('time s', run)} s",
+    ),
+}

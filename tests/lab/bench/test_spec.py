@@ -27,7 +27,7 @@ from nrfgs_lab.bench.spec import (
     steps_of,
 )
 from nrfgs_lab.pages.options import methods
-from nrfgs_lab.pages.tables.comparison import HEADS, best_trial
+from nrfgs_lab.pages.tables.methods import HEADS, best_trial
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.run import parse
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from nrfgs_lab.pages import tables
-from nrfgs_lab.pages.tables import BLOCK, ROOT, loose_decibels, pages, written
-from nrfgs_lab.pages.tables.comparison import gain, half
-from nrfgs_lab.pages.tables.readme import TRAINING_VIEWS, runs_of
+from nrfgs_lab.pages.tables import BLOCK, ROOT, blocks, files, loose_decibels, pages, sheet, written
+from nrfgs_lab.pages.tables.few_views import runs_of
+from nrfgs_lab.pages.tables.methods import gain, half
+from nrfgs_lab.pages.tables.runs import VIEWS
 
 PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
 LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -28,14 +29,14 @@ def test_decibels_in_prose_stand_in_a_block_of_the_page(name):
 def test_verdicts_in_words_are_those_of_the_records():
     """How many captures docs/comparison.md and README.md say that methods are ahead on."""
 
-    def ahead(runs, ours: str, theirs: str, metric: str = "psnr", scenes=tuple(TRAINING_VIEWS)) -> int:
+    def ahead(runs, ours: str, theirs: str, metric: str = "psnr", scenes=tuple(VIEWS)) -> int:
         return sum(round(gain(runs(scene, ours), runs(scene, theirs), metric), 3) > 0 for scene in scenes)
 
     def equal(budget: int):
         return lambda scene, run: half(scene, run, f"mcmc@{budget}")
 
-    few = [scene for scene in TRAINING_VIEWS if scene != "bonsai"]
-    every = len(TRAINING_VIEWS)
+    few = [scene for scene in VIEWS if scene != "bonsai"]
+    every = len(VIEWS)
     larger, smaller = equal(150_000), equal(75_000)
     assert ahead(half, "NRF-GS", "3DGS", scenes=few) == ahead(half, "VDGS", "NRF-GS", scenes=few) == 5
     assert ahead(larger, "NRF-GS", "3DGS", scenes=few) == 3 and ahead(smaller, "NRF-GS", "3DGS", scenes=few) == 2
@@ -43,7 +44,7 @@ def test_verdicts_in_words_are_those_of_the_records():
     assert ahead(larger, "ours", "3DGS") == 5 and ahead(larger, "ours", "3DGS", scenes=few) == 4
     assert ahead(smaller, "ours", "3DGS") == ahead(smaller, "ours", "3DGS", scenes=["bonsai", "goldcape"]) == 2
     assert ahead(smaller, "ours", "3DGS", scenes=few) == 1
-    assert sum(gain(larger(scene, "3DGS"), half(scene, "ours"), "psnr") > 0 for scene in TRAINING_VIEWS) == 3
+    assert sum(gain(larger(scene, "3DGS"), half(scene, "ours"), "psnr") > 0 for scene in VIEWS) == 3
     assert ahead(runs_of, "nrfgs", "splatfacto") == ahead(runs_of, "nrfgs", "splatfacto", "ssim") == every
     field, harmonics = "nrfgs, 150,000 splats", "harmonics, 150,000 splats"
     assert ahead(runs_of, field, harmonics) == 4
@@ -75,12 +76,13 @@ def test_links_lead_to_files_and_headings_that_are_there(name):
 def test_a_number_that_is_not_the_record_s_is_noticed():
     text = next(text for text in PAGES.values() if BLOCK.search(text))
     first = BLOCK.search(text)
-    changed = text[: first.start(4)] + re.sub(r"\d", "7", first[4]) + text[first.end(4) :]
+    changed = text[: first.start(3)] + re.sub(r"\d", "7", first[3]) + text[first.end(3) :]
     assert changed != text and written(changed) == text
 
 
 def test_a_block_is_a_table_on_its_lines_or_a_number_in_a_sentence(monkeypatch):
-    monkeypatch.setattr(tables.importlib, "import_module", lambda name: Blocks)
+    monkeypatch.setattr(tables, "declared", lambda: {"x.rows": {"head": "a", "rows": {"3.4": []}}})
+    monkeypatch.setattr(tables, "blocks", lambda: {"x.number": lambda whole, part: whole + part})
     page = "Gains <!-- table x.number(1, .2) --><!-- end --> dB.\n\n<!-- table x.rows -->\n<!-- end -->\n"
     result = written(page)
     assert result == (
@@ -93,16 +95,50 @@ def test_a_block_is_a_table_on_its_lines_or_a_number_in_a_sentence(monkeypatch):
         written("<!-- table x.number -->1.2")
 
 
-class Blocks:
-    """A module of blocks."""
+def test_every_block_is_on_a_page():
+    used = {match[1] + (match[2] or "") for text in PAGES.values() for match in BLOCK.finditer(text)}
+    assert set(sheet.declared()) <= used
+    assert set(blocks()) <= {name.partition("(")[0] for name in used}
 
-    @staticmethod
-    def number(whole, part):
-        return whole + part
 
-    @staticmethod
-    def rows():
-        return tables.grid(["a"], [["3.4"]])
+def test_a_declared_block_is_worked_out_from_records(monkeypatch):
+    runs = [{"name": "a", "psnr": 30.0, "views": [1.0, 3.0], "bytes": 2_500_000}, {"name": "b", "psnr": 31.5}]
+    monkeypatch.setattr(
+        sheet, "records", lambda study: {"s": {"runs": runs, "mean": {"1": {"x": 2.0}, "2": {"x": 4.0}}}}[study]
+    )
+    assert (
+        sheet.rendered("{s|runs|name=b|psnr - s|runs|name=a|psnr / 3:.2f} of {s|runs|0|bytes:.1fM} MB")
+        == "0.50 of 2.5 MB"
+    )
+    assert (
+        sheet.rendered("{s|runs|name=a|views|max:.0f} {s|mean|mean x:.1f} {0 - s|runs|1|psnr:signed}") == "3 3.0 -31.50"
+    )
+    table = {
+        "head": " | PSNR | MB",
+        "rows": {"A": "a", "B": "b"},
+        "cells": ["{s|runs|name=$row|psnr:.1f}", "{s|runs|name=$row|bytes:MB}"],
+    }
+    assert sheet.rendered(table).splitlines()[2:] == ["| A | 30.0 | 2.50 |", "| B | 31.5 | - |"]
+    table = {
+        "head": " | 1 | 2",
+        "rows": {"A": "x", "B": "-$column"},
+        "columns": ["1", "2"],
+        "cell": "{s|mean|$column|$row:.0f}",
+    }
+    assert sheet.rendered(table).splitlines()[2] == "| A | 2 | 4 |"
+    with pytest.raises(LookupError):
+        sheet.rendered("{s|runs|name=c|psnr:.1f}")
+
+
+def test_between_two_files_the_trade_is_a_straight_line(monkeypatch):
+    found = {
+        "bonsai-model": {"train": {}},
+        "bonsai-version-2": {"bytes": 9_000_000, "loss_db": 0.0},
+        "bonsai-rate-0.0001": {"bytes": 5_000_000, "loss_db": 0.1},
+        "bonsai-rate-0.001": {"bytes": 2_000_000, "loss_db": 0.7},
+    }
+    monkeypatch.setattr(files, "records", lambda study: found)
+    assert files.at("bonsai", "loss", "4") == "0.30" and files.at("bonsai", "MB", "0.4") == "3.5"
 
 
 def test_every_record_is_named_in_the_index():
@@ -112,12 +148,12 @@ def test_every_record_is_named_in_the_index():
 
 
 def test_every_record_is_shown_or_used():
-    """By a function of the tables, by a page that names the file, or by a test."""
-    sources = [*Path(tables.__file__).parent.glob("*.py"), *(ROOT / "tests").rglob("*.py")]
+    """By a block, by a page that names the file, or by a test."""
+    sources = [sheet.SHEET, *Path(tables.__file__).parent.glob("*.py"), *(ROOT / "tests").rglob("*.py")]
     text = "\n".join([*PAGES.values(), *(path.read_text(encoding="utf-8") for path in sources)])
     stems = {path.stem for path in (ROOT / "results").glob("*.json")}
-    used = set(re.findall(r"""["']([\w-]+)["']|results/([\w-]+)\.json""", text))
-    assert stems <= {stem for pair in used for stem in pair}
+    used = set(re.findall(r"""["']([\w-]+)["']|results/([\w-]+)\.json|[{ ]([\w-]+)\|""", text))
+    assert stems <= {stem for names in used for stem in names}
 
 
 @pytest.mark.parametrize("name", PAGES)

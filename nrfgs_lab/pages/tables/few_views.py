@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blocks of README.md, docs/captures.md and docs/opacity.md: captures' test views, and trials on held-out views."""
+
+from collections.abc import Iterable, Mapping
+from statistics import fmean, median
+
+from nrfgs_lab.pages.tables.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
+
+FIELD, HOST = "nrfgs", "splatfacto"
+SHRUNK = "harmonics, same steps and shrinkage"
+BUDGET = "nrfgs, 150,000 splats", "harmonics, 150,000 splats"
+FEW = list(VIEWS)[1:]
+INSTEAD = (
+    ("`original`", "10,000 steps: 3DGS", "10,000 steps: field"),
+    ("`peak`", "field: peak", "field"),
+    ("`mcmc`", "mcmc: logit", "field"),
+)
+"""Label, trial, and the trial of the default that it is compared with."""
+BY_ERROR = {
+    "`original`": "3DGS",
+    "by error": "error",
+    "wide splats stay": "error: any width",
+    "the same, prune below 0.05": "error: any width, prune 0.05",
+    "residual on the logit": "error: logit",
+    "faster growth": "error: fast all",
+    "the same, resets": "error: fast all, reset",
+}
+"""Label -> trial in results/error-guided.json."""
+COPIES = {"added": "added", "on the logit": "logit", "the same, stored": "logit, base"}
+COPIES |= {"none": "no opacity residual"}
+"""Where the opacity residual is added -> the trial under MCMC."""
+
+
+def runs_of(scene: str, name: str) -> Trainings:
+    """The trainings of a capture in results/captures.json, by seed; nerfstudio's may be in presets.json."""
+    runs = [one for one in records("captures").values() if (one.get("scene"), one.get("name")) == (scene, name)]
+    if name == HOST and not runs:
+        runs = trainings("presets", scene, "nerfstudio_splatfacto", "own")
+    return sorted(runs, key=lambda one: one["seed"])
+
+
+def _ahead(gains: list[float], digits: int = 1, sign: str = "") -> str:
+    """Gain in the median view in dB, and the number of views with a gain."""
+    if not gains:
+        return "-"
+    gain = f"{median(gains):+.{digits}f}" if sign else signed(median(gains), digits)
+    return f"{gain} ({sum(one > 0 for one in gains)}/{len(gains)})"
+
+
+def captures() -> str:
+    """`nrfgs` and splatfacto with default settings, and harmonics with the same steps, on test views."""
+    body = []
+    for scene, views in VIEWS.items():
+        field, harmonics, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, HOST))
+        cells = [f"{mean(runs, 'psnr'):.2f}/{mean(runs, 'ssim'):.3f}" for runs in (field, host, harmonics)]
+        share = f"{mean(field, 'splats') / mean(harmonics, 'splats'):.2f}"
+        body.append([f"{scene}, {views}", *cells, _ahead(view_gains(field, harmonics)), share])
+    head = ["capture, training views", "`nrfgs`", "splatfacto", "harmonics"]
+    return grid([*head, "gain (ahead)", "splats"], body)
+
+
+def gain(scene: str) -> str:
+    """Gain of the field over harmonics with the same steps in a capture's median view."""
+    gains = view_gains(runs_of(scene, FIELD), runs_of(scene, SHRUNK))
+    return f"{signed(median(gains))} dB (ahead in {sum(one > 0 for one in gains)} of {len(gains)})"
+
+
+def over_host(scene: str) -> str:
+    """Gain of the field over splatfacto in a capture's median view, both with default settings."""
+    return f"{signed(median(view_gains(runs_of(scene, FIELD), runs_of(scene, HOST), all_seeds=True)))} dB"
+
+
+def over_host_where_seen() -> str:
+    """The same on captures with 7 test views or more, least and most: in the mean, and in the median view."""
+    pairs = [(runs_of(scene, FIELD), runs_of(scene, HOST)) for scene in VIEWS]
+    pairs = [pair for pair in pairs if len(pair[0][0]["per_image"]) >= 7]
+    means = [mean(field, "psnr") - mean(host, "psnr") for field, host in pairs]
+    medians = [median(view_gains(*pair, all_seeds=True)) for pair in pairs]
+    bounds = [f"{min(gains):.1f} to {max(gains):.1f}" for gains in (means, medians)]
+    return "{} dB ({} in the median view) on the {} captures with 7 test views or more".format(*bounds, len(means))
+
+
+def demo(what: str) -> str:
+    """Gain of the field in the demo, of each seed: over whole pictures, or where it shines."""
+    part = {"whole": "eval", "shine": "shine"}[what]
+    seeds = [record["methods"] for _, record in sorted(records("demo").items())]
+    return ", ".join(signed(one["nrfgs"][part]["psnr"] - one["nrfgs-sh"][part]["psnr"], 2) for one in seeds)
+
+
+def _value(runs: Trainings, metric: str) -> float | None:
+    values = [one[metric] for one in runs if one.get(metric)]
+    return fmean(values) if values else None
+
+
+def _cell(runs: Trainings) -> str:
+    values = [(_value(runs, metric), form) for metric, form in (("psnr", ".2f"), ("ssim", ".3f"))]
+    return "/".join(format(value, form) for value, form in values if value is not None) or "-"
+
+
+def _gap(runs: Trainings) -> str:
+    train = _value(runs, "train_psnr")
+    return "-" if train is None else f"{train - _value(runs, 'psnr'):.1f}"
+
+
+def test_views() -> str:
+    """Test views of all captures, and by how much training views are above them."""
+    body = []
+    for scene, views in VIEWS.items():
+        field, shrunk, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, HOST))
+        budget = [runs_of(scene, name) for name in BUDGET]
+        cells = [_cell(field), _cell(host), _cell(shrunk), _ahead(view_gains(field, shrunk), 2, "+")]
+        cells += [f"{_gap(field)}, {_gap(shrunk)}", ", ".join(map(_cell, budget))]
+        body.append([f"{scene}, {views}", *cells, _ahead(view_gains(*budget), 2, "+")])
+    head = "`nrfgs`", "splatfacto", "harmonics", "gain", "gaps", "150k: field, harmonics", "gain there"
+    return grid(["capture, training views", *head], body)
+
+
+# Held-out views: (capture, which were held out, image) -> PSNR and SSIM.
+
+Views = dict[tuple[str, str, str], tuple[float, float]]
+
+
+def _views(*trials: str) -> Views:
+    return {
+        (one["scene"].partition("/")[2], one["scene"].partition("/")[0], view[0]): (view[1], view[2])
+        for trial in trials
+        for one in records("held-out").values()
+        if one["name"] == trial
+        for view in one["per_image"]
+    }
+
+
+def _held_out_gain(ours: Mapping, theirs: Mapping, views: list) -> str:
+    """Median dB, mean SSIM x 1000."""
+    if not views:
+        return ""
+    psnr, ssim = ([ours[view][number] - theirs[view][number] for view in views] for number in (0, 1))
+    return f"{signed(median(psnr), 2)}/{signed(1000 * fmean(ssim), 0)}"
+
+
+def gains_over(harmonics: str, rows: Mapping[str, Iterable[str]]) -> str:
+    """Gains of trials over another on the held-out views that all have.
+
+    Args:
+        harmonics: the other's name.
+        rows: names of trials, by the row's label.
+    """
+    base = _views(harmonics)
+    tried = {label: _views(*names) for label, names in rows.items()}
+    common = [view for view in base if all(view in views for views in tried.values())]
+    places = {scene: [view for view in common if view[0] == scene] for scene in FEW}
+    body = [[label, *(_held_out_gain(views, base, places[scene]) for scene in FEW)] for label, views in tried.items()]
+    return grid(["views", *(f"{scene}, {len(views)}" for scene, views in places.items())], body)
+
+
+def instead() -> str:
+    """Gains of other strategies over the default's on held-out views, and their splats."""
+    runs, body = list(records("held-out").values()), []
+    for label, trial, default in INSTEAD:
+        ours, theirs = _views(trial), _views(default)
+        cells = [_held_out_gain(ours, theirs, [v for v in theirs if v in ours and v[0] == one]) for one in FEW]
+        splats = [{one["scene"]: one["splats"] for one in runs if one["name"] == name} for name in (trial, default)]
+        share = median(splats[0][scene] / splats[1][scene] for scene in splats[0].keys() & splats[1].keys())
+        body.append([label, *cells, f"{share:.1f}"])
+    return grid(["", *FEW, "splats"], body)
+
+
+def by_error() -> str:
+    """Gain of growth by error over the default on held-out views, in the mean over seeds, and its splats."""
+    runs = records("error-guided").values()
+
+    def means(trial: str, scene: str) -> tuple[dict[str, tuple[float, float]], float]:
+        seeds = [run for run in runs if run["name"] == trial and run["scene"].endswith(f"/{scene}")]
+        views = zip(*(run["per_image"] for run in seeds), strict=True)
+        values = {view[0][0]: (fmean(one[1] for one in view), fmean(one[2] for one in view)) for view in views}
+        return values, fmean(run["splats"] for run in seeds) if seeds else 0.0
+
+    body = []
+    for label, trial in BY_ERROR.items():
+        pairs = [(means(trial, scene), means("default", scene)) for scene in FEW]
+        shares = [ours[1] / theirs[1] for ours, theirs in pairs if ours[1]]
+        cells = [_held_out_gain(ours[0], theirs[0], sorted(ours[0])) for ours, theirs in pairs]
+        body.append([label, *cells, f"{median(shares):.1f}"])
+    return grid(["", *FEW, "splats"], body)
+
+
+def without(trial: str) -> str:
+    """Gain of a trial over the default on `bonsai` with all its views except those held out, in both ways."""
+    runs = records("held-out")
+    gains, better, count, splats = [], 0, 0, []
+    for place in ("4/bonsai", "0/bonsai"):
+        base = runs[f"field/{place}-42"]
+        if (one := runs.get(f"field: {trial}/{place}-42")) is None:
+            continue
+        pairs = list(zip(one["per_image"], base["per_image"], strict=True))
+        gains.append(f"{fmean(ours[1] - theirs[1] for ours, theirs in pairs):+.2f}")
+        better += sum(ours[2] > theirs[2] for ours, theirs in pairs)
+        count += len(pairs)
+        splats.append(one["splats"] / base["splats"])
+    more = f"{100 * fmean(splats) - 100:+.0f} % splats"
+    return f"{' and '.join(gains)} dB, SSIM better in {better} of {count} views, {more}"
+
+
+def moved() -> str:
+    """On how many captures MCMC is better on test views with the residual on the logit, and where not."""
+    names = "nrfgs, 150,000 splats, opacity added", "nrfgs, 150,000 splats"
+    added, logit = (
+        {one["scene"]: one for one in records("captures").values() if one["name"] == name} for name in names
+    )
+    worse = [scene for scene in added if logit[scene]["psnr"] < added[scene]["psnr"]]
+    cells = [f"`{scene}`, {added[scene]['psnr']:.2f} to {logit[scene]['psnr']:.2f} dB" for scene in worse]
+    return f"better on {len(added) - len(worse)} captures of {len(added)} (not on {', '.join(cells)})"
+
+
+BLOCKS = {
+    "readme.captures": captures,
+    "readme.gain": gain,
+    "readme.over_host": over_host,
+    "readme.over_host_where_seen": over_host_where_seen,
+    "readme.demo": demo,
+    "captures.trials": lambda: str(len(records("held-out"))),
+    "captures.tried": lambda: gains_over(
+        "harmonics: shrinkage",
+        {"**u = V / (V + 20)**": ("field", "field: trust"), "u = 1": ("field: u = 1", "field: whole")},
+    ),
+    "captures.instead": instead,
+    "captures.by_error": by_error,
+    "captures.without": without,
+    "captures.test_views": test_views,
+    "opacity.copies": lambda: gains_over("mcmc: harmonics", {name: [f"mcmc: {one}"] for name, one in COPIES.items()}),
+    "opacity.moved": moved,
+}

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blocks of docs/compact-format.md, docs/export.md and docs/web.md: what files of a model cost and lose.
+
+python -m nrfgs_lab.pages.tables.files        # writes docs/images/compact-trade.png
+"""
+
+import re
+from statistics import fmean
+from typing import Any
+
+from nrfgs_lab.pages.tables.few_views import SHRUNK, runs_of
+from nrfgs_lab.pages.tables.runs import ROOT, records, signed, table
+from nrfgs_ns.files import whole
+
+CAPTURES = "bonsai", "goldcape", "fox"
+Report = dict[str, Any]
+
+
+def reports(scene: str) -> dict[str, Report]:
+    """The records of a scene's files, the largest file first."""
+    every = {name.removeprefix(f"{scene}-"): one for name, one in records("compact").items() if name.startswith(scene)}
+    return dict(sorted(((n, one) for n, one in every.items() if "bytes" in one), key=lambda pair: -pair[1]["bytes"]))
+
+
+def tuned(scene: str) -> dict[str, Report]:
+    """The fine-tuned files of a scene, by rate."""
+    return {name: one for name, one in reports(scene).items() if name.startswith("rate")}
+
+
+def at(scene: str, what: str, value: str) -> str:
+    """Decibels lost at a size in MB, or MB at a loss in dB, on straight lines between fine-tunes."""
+    import numpy as np
+
+    files = tuned(scene).values()
+    size, loss = [one["bytes"] / 1e6 for one in files], [one["loss_db"] for one in files]
+    if what == "loss":
+        return f"{np.interp(-float(value), [-x for x in size], loss):.2f}"
+    return f"{np.interp(float(value), loss, size):.1f}"
+
+
+def added(scene: str) -> str:
+    """Per cent of a training's seconds that the longest of its fine-tunes takes."""
+    longest = max(one["seconds"]["finetune"] for one in reports(scene).values() if one.get("finetune"))
+    return f"{100 * longest / records('compact')[f'{scene}-model']['train']['seconds']:.0f} %"
+
+
+def draw() -> None:
+    """The figure: a line of fine-tunes for each scene, and the file without one."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    with pyplot.rc_context({"font.size": 8}):
+        figure, panel = pyplot.subplots(figsize=(5.6, 3.4), dpi=110)
+        for number, scene in enumerate(CAPTURES):
+            color, points = f"C{number}", {n: (r["bytes"] / 1e6, -r["loss_db"]) for n, r in reports(scene).items()}
+            lines = {name: points[name] for name in tuned(scene)}
+            panel.plot(*zip(*lines.values(), strict=True), "o-", color=color, markersize=4, label=scene)
+            for name, place in lines.items():
+                words = name.removeprefix("rate-")
+                panel.annotate(words, place, (4, -8), textcoords="offset points", fontsize=6, color=color)
+            panel.plot(*points["version-2"], "s", color=color, markersize=4)
+        panel.axhline(0.0, color="grey", linewidth=0.6)
+        panel.set(xlabel="MB (squares: not trained for the file)", ylabel="dB against the model", xscale="log")
+        panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        panel.xaxis.set_major_formatter("{x:g}")
+        panel.xaxis.set_minor_formatter(NullFormatter())
+        panel.grid(alpha=0.3, which="both", linewidth=0.4)
+        panel.legend(loc="lower right")
+        figure.tight_layout()
+        with whole(ROOT / "docs" / "images" / "compact-trade.png") as aside:
+            figure.savefig(aside, format="png", metadata={"Software": None})
+        pyplot.close(figure)
+
+
+# PLY files.
+
+
+def plies() -> dict[str, Report]:
+    """Capture -> the report of its PLY file."""
+    return {scene: one for scene in ("bonsai", "caliterra", "fox", "goldcape") if (one := reports(scene).get("ply"))}
+
+
+def losses() -> str:
+    """Loss of a PLY file against each model; beside it, harmonics that were trained themselves."""
+    return table(
+        " | splats | MB | seconds | model | file | in Spark | harmonics, trained",
+        {scene: (scene, one) for scene, one in plies().items()},
+        lambda pair: f"{pair[1]['splats']:,}",
+        lambda pair: f"{pair[1]['bytes'] / 1e6:.1f}",
+        lambda pair: f"{pair[1]['seconds']['fit']:.0f}",
+        *(lambda pair, part=part: f"{pair[1][f'psnr_{part}']:.2f}" for part in ("model", "file", "on_screen")),
+        lambda pair: f"{fmean(run['psnr'] for run in runs_of(pair[0], SHRUNK)):.2f}",
+    )
+
+
+def settings() -> str:
+    """DB by which files differ from models on held-out views, after 0, the fewest and the most steps tried."""
+    scenes: dict[str, dict[int, str]] = {}
+    for name, one in records("compact").items():
+        if match := re.fullmatch(r"held-out-(\w+)-ply-STEPS=(\d+)", name):
+            scenes.setdefault(match[1], {})[int(match[2])] = signed(-one["loss_db"], 2)
+    return "; ".join(
+        f"{scene} " + ", ".join(f"{one[steps]} ({steps:,})" for steps in [*sorted(one)[:2], max(one)])
+        for scene, one in scenes.items()
+    )
+
+
+BLOCKS = {
+    **{f"compact_format.{block.__name__}": block for block in (at, added)},
+    **{f"export.{block.__name__}": block for block in (losses, settings)},
+    "export.worst": lambda: f"{max(one['loss_db'] for one in plies().values()):.1f}",
+}
+
+if __name__ == "__main__":
+    draw()

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blocks of docs/comparison.md and docs/deviations.md: methods, their parts, and single differences from the papers."""
+
+from statistics import fmean, median
+
+from nrfgs_lab.pages.tables.runs import (
+    ORIGINAL,
+    VIEWS,
+    Trainings,
+    bench_rows,
+    grid,
+    mean,
+    mean_of,
+    records,
+    signed,
+    trainings,
+    view_gains,
+)
+
+# Every capture at half its size, in 10,000 steps.
+
+BASE = "3DGS"
+METHODS = "VDGS", "GSNB", "SG", "NRF-GS", "ours"
+OF_THE_PAPER = {"VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
+"""The paper's gains on bonsai, in dB, and splats in multiples of 3DGS's."""
+BUDGETS = "mcmc@150000", "mcmc@75000"
+
+
+def half(scene: str, run: str, rule: str = ORIGINAL) -> Trainings:
+    """A run of docs/bench/methods.yaml, or of budgets.yaml."""
+    return trainings("methods" if rule == ORIGINAL else "budgets", scene, run, rule)
+
+
+def gain(ours: Trainings, theirs: Trainings, metric: str) -> float:
+    """Gain in a metric's mean over views and seeds."""
+    return mean(ours, metric) - mean(theirs, metric)
+
+
+def every() -> str:
+    """3DGS's PSNR and SSIM, and the others' gains, dB and SSIM x 1000; the median share of its splats."""
+    psnr = f"{mean_of(bench_rows('paper')['bonsai', ORIGINAL, BASE], 'PSNR'):.2f}"
+    body = [[BASE, "", psnr, *_levels(), "", ""]]
+    for run in METHODS:
+        paper = "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
+        share = median(mean(half(one, run), "splats") / mean(half(one, BASE), "splats") for one in VIEWS)
+        body.append([run, paper, _protocol(run), *_gains(run), f"{share:.2f}", _ahead(run)])
+    return grid(["", "paper", "protocol", *VIEWS, "splats", "ahead"], body)
+
+
+def equal() -> str:
+    """3DGS's PSNR with 150,000 and 75,000 splats, and the others' gains."""
+    levels = zip(*([level.partition("/")[0] for level in _levels(rule)] for rule in BUDGETS), strict=True)
+    body = [[BASE, *map(", ".join, levels), ""]]
+    for run in METHODS:
+        gains = zip(*(_gains(run, rule, ssim=False) for rule in BUDGETS), strict=True)
+        body.append([run, *map(", ".join, gains), ", ".join(_ahead(run, rule) for rule in BUDGETS)])
+    return grid(["150,000, 75,000 splats", *VIEWS, "ahead"], body)
+
+
+def seeds(run: str, scene: str) -> str:
+    """Decibels between a run's best and worst seed under 3DGS's rules."""
+    values = [one["psnr"] for one in half(scene, run)]
+    return f"{max(values) - min(values):.1f}"
+
+
+def _levels(rule: str = ORIGINAL) -> list[str]:
+    every = [half(scene, BASE, rule) for scene in VIEWS]
+    return [f"{mean(runs, 'psnr'):.2f}/{mean(runs, 'ssim'):.3f}" for runs in every]
+
+
+def _gains(run: str, rule: str = ORIGINAL, ssim: bool = True) -> list[str]:
+    """A cell for each capture, bold if it is the capture's largest gain in dB."""
+    cells = []
+    for scene in VIEWS:
+        base = half(scene, BASE, rule)
+        gains = {one: gain(half(scene, one, rule), base, "psnr") for one in METHODS}
+        cell = signed(gains[run], 2)
+        if ssim:
+            cell += f"/{signed(1000 * gain(half(scene, run, rule), base, 'ssim'), 0)}"
+        cells.append(f"**{cell}**" if gains[run] == max(gains.values()) > 0 else cell)
+    return cells
+
+
+def _protocol(run: str) -> str:
+    """A method's gain in the paper's protocol, and its share of 3DGS's splats; VDGS as its authors have it."""
+    rows = bench_rows("paper")
+    name = "VDGS_no_resets" if run == "VDGS" else run
+    ours, base = (rows.get(("bonsai", ORIGINAL, name)) for name in (name, BASE))
+    if not ours:
+        return ""
+    share = mean_of(ours, "splats") / mean_of(base, "splats")
+    return f"{signed(mean_of(ours, 'PSNR') - mean_of(base, 'PSNR'), 2)} ({share:.2f})"
+
+
+def _ahead(run: str, rule: str = ORIGINAL) -> str:
+    """On how many captures a run is above 3DGS: in PSNR, in SSIM, in PSNR in the median test view."""
+    pairs = [(half(scene, run, rule), half(scene, BASE, rule)) for scene in VIEWS]
+    measured = [(gain(*pair, "psnr"), gain(*pair, "ssim"), median(view_gains(*pair))) for pair in pairs]
+    counts = [sum(round(gain, 3) > 0 for gain in gains) for gains in zip(*measured, strict=True)]
+    return "/".join(map(str, counts))
+
+
+# Full size, 30,000 steps, two seeds.
+
+
+def gains(rule: str) -> str:
+    """Gains of the methods over 3DGS on each capture."""
+    rows, parts = bench_rows("comparison"), []
+    for scene in "bonsai", "goldcape":
+        base = mean_of(rows[scene, rule, BASE], "PSNR")
+        cells = [f"{run} {signed(mean_of(rows[scene, rule, run], 'PSNR') - base, 2)}" for run in METHODS[:-1]]
+        parts.append(f"`{scene}` {', '.join(cells)}")
+    return "; ".join(parts)
+
+
+def stored_opacity() -> str:
+    """PSNR of the field and GSNB on bonsai with 150,000 splats, where MCMC goes by the stored opacity."""
+    field = records("comparison")["stored-opacity/NRF-GS-mcmc@150000-bonsai-42"]["measured"]["test"]["psnr"]
+    other = mean_of(bench_rows("comparison")["bonsai", "mcmc@150000", "GSNB"], "PSNR")
+    return f"NRF-GS {field:.1f} dB, GSNB {other:.1f}"
+
+
+PARTS = {
+    "opacity residual": ("no_opacity", 0.35),
+    "distance": ("no_distance", 0.21),
+    "split": ("no_split", 0.48),
+}
+"""Part of the field -> the run without, and the part's gain in the paper, in dB."""
+
+
+def parts() -> str:
+    """Gain of the field by each of its parts, on bonsai and goldcape under 3DGS's rules."""
+    rows, sentences = bench_rows("comparison"), []
+    for part, (without, paper) in PARTS.items():
+        pairs = [[rows[scene, ORIGINAL, run] for run in ("NRF-GS", without)] for scene in ("bonsai", "goldcape")]
+        gained = ", ".join(signed(mean_of(one, "PSNR") - mean_of(other, "PSNR"), 2) for one, other in pairs)
+        sentences.append(f"{part} {gained} ({paper:+.2f})")
+    return "; ".join(sentences)
+
+
+def over_gsnb() -> str:
+    """Gain over GSNB in the median held-out view of bonsai: at the host's rates, and at GSNB's own."""
+    field, *others = (trainings("deviations", "bonsai", run) for run in ("NRF", "GSNB", "GSNB_rates"))
+    return "{:.2f} to {:.2f} dB".format(*(median(view_gains(field, other)) for other in others))
+
+
+# The choice of the heads' settings.
+
+TRIALS = {"third": "a third of its rate", "triple": "three times its rate", "shrinkage": "shrinkage"}
+HEADS = {"SH": "3DGS", "VDGS": "VDGS", "GSNB": "GSNB", "SG": "SG", "NRF": "NRF-GS"}
+"""Head, as heads.yaml calls it -> its run."""
+
+
+def chosen() -> str:
+    """Heads whose settings are not their own, and the gain in the median held-out view, mean over captures."""
+    best = {head: best_trial(head) for head in HEADS}
+    return ", ".join(
+        f"{HEADS[head]} {TRIALS[trial]} ({signed(fmean(trial_gains(head, trial)), 2)} dB)"
+        for head, trial in best.items()
+        if trial
+    )
+
+
+def best_trial(head: str) -> str:
+    """The trial with the largest gain in the mean over captures; empty: the head's own setting."""
+    gains = {trial: fmean(trial_gains(head, trial) or [0.0]) for trial in TRIALS}
+    best = max(gains, key=gains.get)
+    return best if gains[best] > 0 else ""
+
+
+def trial_gains(head: str, trial: str) -> list[float]:
+    """Gain over the head's own setting in the median held-out view, for each capture."""
+    pairs = [[trainings("heads", scene, name) for name in (f"{head}_{trial}", head)] for scene in VIEWS]
+    return [median(view_gains(*pair)) for pair in pairs if all(pair)]
+
+
+# Single differences from the papers, on held-out views.
+
+SCENES = "bonsai", "goldcape", "fox"
+SAME = {"3DGS": "SH", "VDGS": "VDGS", "GSNB": "GSNB", "NRF": "NRF"}
+"""A run of docs/bench/deviations.yaml that changes nothing -> the same one of heads.yaml."""
+
+
+def worth(change: str) -> str:
+    """Effect of a single change on held-out views, capture by capture: dB in the median view, times the splats."""
+    cells = []
+    for scene in SCENES:
+        changed, plain = (trainings("deviations", scene, run) for run in (change, change.partition("_")[0]))
+        gain = signed(median(view_gains(changed, plain)), 2)
+        cells.append(f"`{scene}` {gain} (x{mean(changed, 'splats') / mean(plain, 'splats'):.2f})")
+    return ", ".join(cells)
+
+
+def noise() -> str:
+    """Decibels between two equal trainings in the median held-out view: the most of any method, for each capture."""
+    cells = []
+    for scene in SCENES:
+        pairs = [(trainings("deviations", scene, run), trainings("heads", scene, same)) for run, same in SAME.items()]
+        cells.append(f"{max(abs(median(view_gains(*pair))) for pair in pairs if all(pair)):.2f} dB on `{scene}`")
+    return ", ".join(cells)
+
+
+def _level(study: str, run: str, scene: str = "bonsai", rule: str = ORIGINAL) -> str:
+    row = bench_rows(study)[scene, rule, run]
+    return f"{mean_of(row, 'PSNR'):.2f} dB with {mean_of(row, 'splats') / 1000:.0f}k"
+
+
+def start() -> str:
+    """PSNR of the small fox with the paper's start, and with ours."""
+    runs = "paper_s_start", "no_warm-up", "zero_start"
+    paper, cold, ours = (mean_of(bench_rows("warm-up")["fox", ORIGINAL, run], "PSNR") for run in runs)
+    return f"with {paper:.2f} dB, without {cold:.2f}; here {ours:.2f}"
+
+
+def rules() -> str:
+    """Field and splats under splatfacto's rules and 3DGS's, on bonsai."""
+    levels = (_level("speed", run, rule="own") for run in ("nrfgs", "nrfgs-best"))
+    return "{} (splatfacto's), {} (3DGS's)".format(*levels)
+
+
+def resets() -> str:
+    """VDGS's PSNR on bonsai in the paper's protocol, with and without resets of opacity, and its splats."""
+    levels = (_level("paper", run).replace("with ", "(") + ")" for run in ("VDGS", "VDGS_no_resets"))
+    return " to ".join(levels)
+
+
+BLOCKS = {
+    **{
+        f"comparison.{block.__name__}": block
+        for block in (every, equal, seeds, gains, stored_opacity, parts, over_gsnb, chosen)
+    },
+    **{f"deviations.{block.__name__}": block for block in (worth, noise, start, rules, resets)},
+}

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The vocabulary of the blocks: records, the trainings in them, what they gain over each other, and how it is written.
+
+A training is a dictionary with `seed`, `psnr`, `ssim`, `ms_ssim` (means over test views), `splats` and `per_image`: for
+each test view its name, PSNR, SSIM and MS-SSIM.
+"""
+
+import json
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from nrfgs_lab.bench.table import BY_NAME, Row
+
+ROOT = Path(__file__).resolve().parents[3]
+RUN = re.compile(r"runs/(?P<run>.+)-(?P<strategy>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)")
+"""Names of a benchmark's records. An underscore stands for a space."""
+VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "castle": 26, "kitchen": 21, "fern": 17}
+"""Capture -> its training views."""
+ORIGINAL = "original"
+"""3DGS's rules for adding and removing splats."""
+Trainings = list[dict[str, Any]]
+"""Trainings of one setting, by seed."""
+
+
+@cache
+def records(study: str) -> dict[str, Any]:
+    """The records of results/STUDY.json."""
+    content = json.loads((ROOT / "results" / f"{study}.json").read_text(encoding="utf-8"))
+    return content.get("records", content)
+
+
+@cache
+def bench_rows(study: str) -> dict[tuple[str, str, str], Row]:
+    """The rows of a benchmark's records: (scene, strategy, run) -> its values over seeds."""
+    rows: dict[tuple[str, str, str], Row] = {}
+    for name, record in records(study).items():
+        if match := RUN.fullmatch(name):
+            place = match["scene"], match["strategy"], match["run"]
+            row = rows.setdefault(place, Row(match["scene"], match["run"], match["strategy"]))
+            row.records[int(match["seed"])] = {"jobs": 1, **record}
+    return {place: row.fill() for place, row in rows.items()}
+
+
+def mean_of(row: Row, column: str) -> float:
+    """A row's mean over seeds.
+
+    Raises:
+        KeyError: no record of the row has it.
+    """
+    mean = row.mean(BY_NAME[column])
+    if mean is None:
+        raise KeyError(f"{row.run} on {row.scene} has no {column}.")
+    return mean
+
+
+def trainings_of(row: Row | None) -> Trainings:
+    """The trainings of a benchmark's row; none of a missing one."""
+    metrics, trainings = ("psnr", "ssim", "ms_ssim"), []
+    for seed, record in row.records.items() if row else ():
+        test = record["measured"]["test"]
+        views = [[view["image"], *(view[metric] for metric in metrics)] for view in test["per_image"]]
+        values = {metric: test[metric] for metric in metrics}
+        trainings.append({**values, "seed": seed, "per_image": views, "splats": record["measured"]["splats"]})
+    return trainings
+
+
+def trainings(study: str, scene: str, run: str, strategy: str = ORIGINAL) -> Trainings:
+    """The trainings of a run of a benchmark."""
+    return trainings_of(bench_rows(study).get((scene, strategy, run)))
+
+
+def mean(runs: Trainings, metric: str) -> float:
+    """A metric's mean over trainings."""
+    return fmean(one[metric] for one in runs)
+
+
+def view_gains(ours: Trainings, theirs: Trainings, all_seeds: bool = False) -> list[float]:
+    """Gain in dB in each test view, in the mean over the seeds that both have, or over all that each has."""
+    seeds = {one["seed"] for one in ours} & {one["seed"] for one in theirs}
+    views: dict[str, list[list[float]]] = defaultdict(lambda: [[], []])
+    for number, runs in enumerate((ours, theirs)):
+        for one in runs:
+            for name, psnr, *_ in one["per_image"] if all_seeds or one["seed"] in seeds else ():
+                views[name][number].append(psnr)
+    return [fmean(one) - fmean(other) for one, other in views.values() if one and other]
+
+
+def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def table(head: str, rows: dict[str, Any], *cells: Callable[[Any], str]) -> str:
+    """A table: a line for each label and value of `rows`, with a cell by each function of the value.
+
+    Args:
+        head: titles between vertical bars.
+    """
+    body = ([label, *(cell(value) for cell in cells)] for label, value in rows.items())
+    return grid([title.strip() for title in head.split("|")], body)
+
+
+def signed(difference: float, digits: int = 1) -> str:
+    """A difference with its sign; without one if it rounds to 0."""
+    number = f"{difference:+.{digits}f}"
+    return number if float(number) else number[1:]
+
+
+def span(numbers: Sequence[float], form: Callable[[float], str]) -> str:
+    """Least and largest number, once if they are equal as written."""
+    return " to ".join(dict.fromkeys(form(bound(numbers)) for bound in (min, max)))

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The blocks that numbers.yaml declares: texts and tables with numbers of records."""
+
+import operator
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+import yaml
+
+from nrfgs_lab.pages.tables.runs import grid, records, signed
+
+SHEET = Path(__file__).resolve().parents[1] / "numbers.yaml"
+UNITS = {"k": 1e3, "M": 1e6, "G": 1e9}
+AGGREGATES: dict[str, Callable] = {"min": min, "max": max, "mean": fmean, "median": median, "sum": sum}
+OPERATORS = {"+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv}
+FORMS: dict[str, Callable[[Any], str]] = {
+    "signed": lambda number: signed(number, 2),
+    "MB": lambda number: f"{number / 1e6:.{1 if number > 1e7 else 2}f}",
+    "size": lambda number: f"{number / 1000:,.0f} KB" if number < 1e6 else f"{number / 1e6:.1f} MB",
+    "mean": lambda row: f"{row['mean']:.2f}",
+    "±": lambda row: f"{row['mean']:.2f}" + (f"±{row['deviation']:.2f}" if row["deviation"] is not None else ""),
+}
+"""Forms beside Python's. The last two are of a mean with a deviation."""
+
+
+@cache
+def declared() -> dict[str, Any]:
+    """Name of a block, perhaps with arguments in brackets -> its text or table."""
+    return yaml.safe_load(SHEET.read_text(encoding="utf-8"))
+
+
+def rendered(block: Any) -> str:
+    """A block as Markdown."""
+    if isinstance(block, str):
+        return filled(block)
+    columns = block.get("columns", [None])
+    lines = []
+    for label, row in block["rows"].items():
+        cells = block.get("cells", row)
+        if "cell" in block:
+            cells = [row if isinstance(row, str) and "{" in row else block["cell"]] * len(columns)
+        places = columns if len(columns) > 1 else columns * len(cells)
+        cells = [filled(one, row, place, block.get("missing", "-")) for one, place in zip(cells, places, strict=True)]
+        lines.append([label, *cells])
+    return grid([title.strip() for title in filled(block["head"]).split("|")], lines)
+
+
+def filled(template: str, row: Any = None, column: Any = None, missing: str | None = None) -> str:
+    """A template with its numbers.
+
+    Args:
+        row, column: what `$row` and `$column` stand for; of a list, `$row[0]` is the first.
+        missing: the whole text if a record lacks a number; None: that is an error.
+    """
+    for name, value in (("row", row), ("column", column)):
+        for number, part in enumerate(value if isinstance(value, list) else ()):
+            template = template.replace(f"${name}[{number}]", str(part))
+        template = template.replace(f"${name}", str(value))
+    try:
+        return re.sub(r"\{([^{}]*):([^{}:]*)\}", lambda match: formatted(term(match[1]), match[2]), template)
+    except LookupError:
+        if missing is None:
+            raise
+        return missing
+
+
+def term(words: str) -> Any:
+    """The value of terms joined by operators, from left to right."""
+    first, *rest = re.split(r" ([-+*/]) ", words)
+    value = single(first)
+    for sign, other in zip(rest[::2], map(single, rest[1::2]), strict=True):
+        value = OPERATORS[sign](value, other)
+    return value
+
+
+def single(words: str) -> Any:
+    """A number, or the value at a path of a record."""
+    study, *path = words.strip().split("|")
+    if not path:
+        return float(study)
+    value: Any = records(study)
+    for key in path:
+        value = step(value, key)
+    return value
+
+
+def step(value: Any, key: str) -> Any:
+    """The value one key further down."""
+    if isinstance(value, dict) and key in value:
+        return value[key]
+    what, _, inner = key.partition(" ")
+    if what in AGGREGATES:
+        return AGGREGATES[what]([entry(one, inner) for one in (value.values() if isinstance(value, dict) else value)])
+    if isinstance(value, list) and "=" in key:
+        pairs = [pair.split("=") for pair in key.split("&")]
+        chosen = [one for one in value if all(str(one[name]) == wanted for name, wanted in pairs)]
+        return chosen[0]
+    return value[int(key)] if isinstance(value, list) else value[key]
+
+
+def entry(value: Any, key: str) -> Any:
+    """The entry of an element: itself for an empty key, or the difference of two, "A less B"."""
+    if " less " in key:
+        one, other = (entry(value, part) for part in key.split(" less "))
+        return one - other
+    return value if not key else value[int(key)] if isinstance(value, list) else value[key]
+
+
+def formatted(value: Any, form: str) -> str:
+    """A value in a form."""
+    if form in FORMS:
+        return FORMS[form](value)
+    unit = UNITS.get(form[-1:])
+    return format(value / unit, form[:-1]) if unit else format(value, form)
