@@ -30,12 +30,14 @@ from nrfgs_ns.appearance.head import SplatAppearance, base_opacities
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics
 from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
 
+RAMP_STEPS = 5000
+"""Training steps over which the learnt basis is faded in."""
+
 
 @dataclass
 class GsnbConfig(ShConfig):
     """Spherical harmonics and a learnt basis. The defaults are the paper's."""
 
-    STEPS = (*ShConfig.STEPS, "ramp_steps")
     _target: type = field(default_factory=lambda: NeuralBasis)
     """the head class that this configuration builds"""
     num_bands: int = 6
@@ -44,8 +46,6 @@ class GsnbConfig(ShConfig):
     """whether the direction itself stands beside its bands; its reference has the bands alone, 36 inputs"""
     hidden_width: int = 64
     """units of each of the basis network's two hidden layers."""
-    ramp_steps: int = 5000
-    """training steps over which the learnt basis is faded in."""
     distance_eps: float = 0.01
     """smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
 
@@ -53,7 +53,6 @@ class GsnbConfig(ShConfig):
         super().validate()
         self.require(self.num_bands >= 1, "num_bands", "at least 1")
         self.require(self.hidden_width >= 1, "hidden_width", "at least 1")
-        self.require(self.ramp_steps >= 1, "ramp_steps", "at least 1")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
 
 
@@ -79,7 +78,7 @@ class NeuralBasis(SphericalHarmonics):
 
     def set_step(self, step: int) -> None:
         super().set_step(step)
-        self.ramp = min(step / self.config.ramp_steps, 1.0)
+        self.ramp = min(step / RAMP_STEPS, 1.0)
 
     @property
     def phase(self) -> Hashable:

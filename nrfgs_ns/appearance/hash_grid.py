@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from nrfgs_ns.kernels.trial import Gate
 
 PRIMES = (1, 2654435761, 805459861)
-"""The hash's multipliers for x, y, z."""
+"""The hash's multipliers for x, y, z; `hash_grid_triton.py` repeats them."""
 INITIAL_RANGE = 1e-4
 """Features start uniform in +- this, as in the paper: next to nothing, and no two the same."""
 
@@ -42,10 +42,10 @@ class HashGrid(nn.Module):
     """Features of positions, [M, 3] -> [M, levels * features].
 
     Args:
-        levels: number of lattices, >= 1.
-        features: numbers per lattice point and level, >= 1.
-        log2_table_size: log2 T, rows of each level's table.
         base_resolution: N_0, lattice steps per unit of length on level 0.
+        levels: number of lattices, >= 1.
+        features: numbers per lattice point and level, a power of two.
+        log2_table_size: log2 T, rows of each level's table.
         per_level_scale: b, ratio of neighbouring levels' resolutions, >= 1.
     """
 
@@ -55,7 +55,13 @@ class HashGrid(nn.Module):
     offsets: Tensor
 
     def __init__(
-        self, levels: int, features: int, log2_table_size: int, base_resolution: int, per_level_scale: float
+        self,
+        base_resolution: int,
+        *,
+        levels: int = 4,
+        features: int = 4,
+        log2_table_size: int = 15,
+        per_level_scale: float = 1.5,
     ) -> None:
         super().__init__()
         self.table_size = 2**log2_table_size
@@ -88,7 +94,7 @@ class HashGrid(nn.Module):
         return self.in_torch(positions)
 
     def try_kernels(self, device: torch.device) -> None:
-        """Find out whether the kernels run on a CUDA device."""
+        """Try the kernels on a CUDA device, which compiles them."""
         _kernels_run_on(device, self.table.shape[1])
 
     def in_torch(self, positions: Tensor) -> Tensor:

@@ -7,8 +7,7 @@ level's table. Backward, it has all of them: a position's gradient is their sum,
 added up by atomics, in whatever order, so its last bits differ from run to run, as those of PyTorch's index_select do.
 Of the two, only what autograd asks for is computed.
 
-Any number of features and levels is taken. Features are padded to a power of two; what is padded is neither read nor
-written, but where the number is a power of two, up to four are read, and on recent cards added, at once.
+The number of features is a power of two; up to four are read, and on recent cards added, at once.
 
 Lattice coordinates are int32, and the hash is unsigned 32-bit arithmetic, of which T rows see the last bits: the rows
 are those of `hash_grid.py` wherever coordinates are below 2^31. Beyond, coordinates stay at the last float32 below 2^31
@@ -22,29 +21,26 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.appearance import hash_grid
 from nrfgs_ns.kernels.launch import Launcher
 
 POSITIONS = 128
 """Most positions of a program: one for each thread."""
 TILE = 512
-"""Most features, padded, that a program has of each corner: four for each thread."""
+"""Most features that a program has of each corner: four for each thread."""
 # Nothing is fused: far out, position * N_l is rounded by more than a step, and fused with the subtraction of its
 # floor that rounding would come back as the distance into the cell. There is nothing to pipeline either.
 OPTIONS = {"num_warps": 4, "num_stages": 1, "enable_fp_fusion": False}
 
-PRIME_X = tl.constexpr(hash_grid.PRIMES[0])
-PRIME_Y = tl.constexpr(hash_grid.PRIMES[1])
-PRIME_Z = tl.constexpr(hash_grid.PRIMES[2])
+PRIME_X, PRIME_Y, PRIME_Z = tl.constexpr(1), tl.constexpr(2654435761), tl.constexpr(805459861)  # hash_grid.PRIMES
 FARTHEST = tl.constexpr(2.0**31 - 2.0**7)  # the last float32 that an int32 holds
 CORNERS = tl.constexpr(8)
 
 
 @triton.jit
-def _block(positions, count, PADDED: tl.constexpr, B: tl.constexpr):
-    """A program's positions: which they are, int64 [B], which of them are there, x, y and z; lanes [1, PADDED]."""
+def _block(positions, count, F: tl.constexpr, B: tl.constexpr):
+    """A program's positions: which they are, int64 [B], which of them are there, x, y and z; lanes [1, F]."""
     items = tl.program_id(0).to(tl.int64) * B + tl.arange(0, B)
-    lanes = tl.arange(0, PADDED)[None, :]
+    lanes = tl.arange(0, F)[None, :]
     valid = items < count
     x = tl.load(positions + items * 3, mask=valid, other=0.0)
     y = tl.load(positions + items * 3 + 1, mask=valid, other=0.0)
@@ -109,33 +105,33 @@ def _weight(weights, CORNER: tl.constexpr):
 def forward_kernel(
     positions, table, resolutions, features,
     count, levels, numbered_levels, table_size,
-    F: tl.constexpr, PADDED: tl.constexpr, B: tl.constexpr,
+    F: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
     """Features [count, levels * F] of positions [count, 3]; program (i, l) computes block i of level l."""
     level = tl.program_id(1)
-    items, valid, x, y, z, lanes = _block(positions, count, PADDED, B)
+    items, valid, x, y, z, lanes = _block(positions, count, F, B)
     _, numbered, keys, weights = _level(x, y, z, level, resolutions, numbered_levels)
     level_table = table + tl.cast(level, tl.int64) * table_size * F
-    total = tl.zeros((B, PADDED), tl.float32)
+    total = tl.zeros((B, F), tl.float32)
     for corner in tl.static_range(CORNERS):
         offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
-        total += _weight(weights, corner)[:, None] * tl.load(level_table + offsets, mask=lanes < F, other=0.0)
+        total += _weight(weights, corner)[:, None] * tl.load(level_table + offsets)
     begin = items[:, None] * (levels * F) + level * F
-    tl.store(features + begin + lanes, total, mask=valid[:, None] & (lanes < F))
+    tl.store(features + begin + lanes, total, mask=valid[:, None])
 
 
 @triton.jit(do_not_specialize=["count", "levels", "numbered_levels", "table_size"])
 def backward_kernel(
     positions, table, resolutions, d_features, d_positions, d_table,
     count, levels, numbered_levels, table_size,
-    F: tl.constexpr, PADDED: tl.constexpr, B: tl.constexpr, BY_POSITION: tl.constexpr, BY_TABLE: tl.constexpr,
+    F: tl.constexpr, B: tl.constexpr, BY_POSITION: tl.constexpr, BY_TABLE: tl.constexpr,
 ):  # fmt: skip
     """Gradients of the positions, written, and of the table, added, from those of the features.
 
     Without BY_POSITION, or without BY_TABLE, that one is not computed, and any tensor can be passed for it.
     """
-    items, valid, x, y, z, lanes = _block(positions, count, PADDED, B)
-    here = valid[:, None] & (lanes < F)
+    items, valid, x, y, z, lanes = _block(positions, count, F, B)
+    here = valid[:, None]
 
     d_x, d_y, d_z = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
     for level in range(levels):
@@ -149,7 +145,7 @@ def backward_kernel(
             by_x, by_y, by_z = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
             for corner in tl.static_range(CORNERS):
                 offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
-                read = tl.load(table + level_begin + offsets, mask=lanes < F, other=0.0)
+                read = tl.load(table + level_begin + offsets)
                 by_weight = tl.sum(read * upstream, axis=1)
                 w_x, w_y, w_z = weights[0][corner // 4], weights[1][corner // 2 % 2], weights[2][corner % 2]
                 by_x += w_y * w_z * by_weight * (2 * (corner // 4) - 1)
@@ -213,6 +209,5 @@ class Interpolation(torch.autograd.Function):
 
 def _blocks(count: int, features: int) -> tuple[int, dict[str, int]]:
     """Blocks of positions, and the kernels' constants."""
-    padded = triton.next_power_of_2(features)
-    block = max(1, min(POSITIONS, TILE // padded))
-    return triton.cdiv(count, block), {"F": features, "PADDED": padded, "B": block}
+    block = max(1, min(POSITIONS, TILE // features))
+    return triton.cdiv(count, block), {"F": features, "B": block}

@@ -15,7 +15,14 @@ opens only where detail pays. Both are one hidden layer of ReLUs: 46 -> 64 -> 4 
 all at the default sizes. Without the split there is one branch of twice the width that sees everything
 (58 -> 128 -> 4, 8,068 weights) and no gate.
 
-`opacity_bound.py` has the ways in which opacity is kept in [0, 1]. `fused/` computes the same in two GPU kernels.
+Two bounds keep opacity in [0, 1], with t = tanh(d_alpha) and x = alpha + s_alpha t:
+
+    straight-through   min(max(x, 0), 1), with the gradient of x, so that a splat beyond an end can come back
+    logit              sigmoid(logit + 4 s_alpha t); at half opacity, to first order, alpha + s_alpha t
+
+On the logit the residual scales with the opacity: n copies of a splat, each of about alpha / n, together look like one.
+
+`fused/` computes the same in two GPU kernels.
 """
 
 from collections.abc import Mapping
@@ -29,7 +36,13 @@ from nrfgs_ns.appearance.diffuse import DIFFUSE, Others
 from nrfgs_ns.appearance.encoding import LOW_DIM, fourier_bands, high_dim, view_geometry
 from nrfgs_ns.appearance.fused import FusedField
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, Component, SplatAppearance, base_colors
-from nrfgs_ns.appearance.opacity_bound import OPACITY_BOUNDS, OpacityBound, bounded_opacity
+
+OpacityBound = Literal["straight-through", "logit"]
+OPACITY_BOUNDS: tuple[OpacityBound, ...] = ("straight-through", "logit")
+LOGIT_SLOPE = 4.0
+"""One over the sigmoid's slope at half opacity."""
+LATENT_STD = 0.1
+"""Standard deviation of the initial latents."""
 
 
 @dataclass
@@ -56,14 +69,11 @@ class NrfConfig(AppearanceHeadConfig):
     """s_alpha: largest change of opacity"""
     distance_eps: float = 0.01
     """smallest camera distance told apart, in scene units: the near plane"""
-    latent_std: float = 0.1
-    """standard deviation of the initial latents"""
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound | None = None
-    """how base + residual stays in [0, 1] (docs/opacity.md). clamp: no gradient beyond the ends. straight-through: the
-    gradient ignores the clamp. logit: the residual is added to the logit. smooth: a clamp with rounded corners. None:
-    logit for mcmc, otherwise straight-through"""
+    """how base + residual stays in [0, 1] (docs/opacity.md). straight-through: clamped, but the gradient ignores the
+    clamp. logit: the residual is added to the logit. None: logit for mcmc, otherwise straight-through"""
     implementation: Literal["auto", "torch", "fused"] = "auto"
     """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere. fused: an error instead of PyTorch"""
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"
@@ -71,7 +81,7 @@ class NrfConfig(AppearanceHeadConfig):
 
     @property
     def bound(self) -> OpacityBound:
-        """The opacity bound of a head that nobody chose one for, too."""
+        """The chosen opacity bound, or the default one."""
         return self.opacity_bound or "straight-through"
 
     def trusted(self, share: float) -> "NrfConfig":
@@ -90,7 +100,6 @@ class NrfConfig(AppearanceHeadConfig):
         self.require(self.color_scale >= 0, "color_scale", "zero or positive")
         self.require(self.opacity_scale >= 0, "opacity_scale", "zero or positive")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
-        self.require(self.latent_std >= 0, "latent_std", "zero or positive")
         self.require(self.output_init in ("zero", "default"), "output_init", "'zero' or 'default'")
         for name, choices in (
             ("opacity_bound", (None, *OPACITY_BOUNDS)),
@@ -142,8 +151,8 @@ class NeuralResidualField(AppearanceHead):
         self.fused.try_on(device)
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
-        """Base colours and latents: "features_dc" [N, 3], "latents" [N, D] ~ N(0, latent_std^2)."""
-        latents = torch.randn(len(rgb), self.config.latent_dim, device=rgb.device) * self.config.latent_std
+        """Base colours and latents: "features_dc" [N, 3], "latents" [N, D] ~ N(0, 0.1^2)."""
+        latents = torch.randn(len(rgb), self.config.latent_dim, device=rgb.device) * LATENT_STD
         return {**super().splat_params(rgb), "latents": latents}
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
@@ -229,3 +238,20 @@ class NeuralResidualField(AppearanceHead):
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     """One hidden layer of ReLUs, with biases."""
     return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
+
+
+def bounded_opacity(logit: Tensor, residual: Tensor, scale: float, bound: OpacityBound) -> Tensor:
+    """Opacity with its residual, in [0, 1].
+
+    Args:
+        logit: base opacities' logits, [M, 1].
+        residual: t, [M, 1], in [-1, 1].
+        scale: s_alpha >= 0, the largest change of opacity (for "logit": at half opacity and to first order).
+
+    Returns:
+        [M, 1].
+    """
+    if bound == "logit":
+        return torch.sigmoid(logit + LOGIT_SLOPE * scale * residual)
+    x = torch.sigmoid(logit) + scale * residual
+    return x + (x.clamp(0.0, 1.0) - x).detach()

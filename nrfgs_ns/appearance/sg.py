@@ -32,6 +32,9 @@ from nrfgs_ns.appearance.head import (
     base_opacities,
 )
 
+START_STEP = 2000
+"""Training step of the first lobes; before it only the base colour is trained."""
+INITIAL_SHARPNESS = 2.0
 SHORTEST_AXIS = 1e-3
 """Stored axes shorter than this are divided by it instead of their length: they start at 1, and the bound is for the
 gradient of one that training leads through zero."""
@@ -41,23 +44,16 @@ gradient of one that training leads through zero."""
 class SgConfig(AppearanceHeadConfig):
     """Spherical Gaussians with free axes."""
 
-    STEPS = ("start_step",)
     _target: type = field(default_factory=lambda: SphericalGaussians)
     """the head class that this configuration builds"""
     lobes: int = 3
     """L: lobes of each splat, 1 to 6. They start about x, y, z, -x, -y, -z, in this order."""
-    start_step: int = 2000
-    """training step from which there are lobes; before it only the base colour is trained."""
-    initial_sharpness: float = 2.0
-    """s at the start."""
     distance_eps: float = 0.01
     """smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
 
     def validate(self) -> None:
         # Two lobes that started alike would get the same gradients and stay alike.
         self.require(1 <= self.lobes <= 6, "lobes", "1 to 6, so that no two lobes start about the same axis")
-        self.require(self.start_step >= 0, "start_step", "zero or positive")
-        self.require(self.initial_sharpness > 0, "initial_sharpness", "positive")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
 
 
@@ -83,12 +79,12 @@ class SphericalGaussians(AppearanceHead):
         return {
             **super().splat_params(rgb),
             "sg_axes": torch.cat([axes, -axes])[:lobes].repeat(count, 1, 1),
-            "sg_sharpness": torch.full((count, lobes), float(self.config.initial_sharpness), device=rgb.device),
+            "sg_sharpness": torch.full((count, lobes), INITIAL_SHARPNESS, device=rgb.device),
             "sg_colors": torch.zeros(count, lobes, 3, device=rgb.device),
         }
 
     def set_step(self, step: int) -> None:
-        self.active = step >= self.config.start_step
+        self.active = step >= START_STEP
 
     @property
     def phase(self) -> Hashable:

@@ -6,13 +6,13 @@ Seen from the direction d from camera to splat, splat i with mean x, opacity log
     f       = sigmoid(network(d, grid(x))),
     opacity = sigmoid(o) f,       colour = max(0, 1/2 + sum_{l <= L} sum_m k_{l, m} Y_{l, m}(d)),
 
-where grid is a hash grid of the mean as it is (`hash_grid.py`: 4 levels of 4 features) and the network has two hidden
-layers of 32 leaky ReLUs: 19 -> 32 -> 32 -> 1. In the other modes f multiplies the coefficients k, one factor each (48
-outputs), or both (49). Source: the paper "Gaussian Splatting with NeRF-based Color and Opacity", called VDGS.
+where grid is a hash grid of the mean in scene units (`hash_grid.py`: 4 levels of 4 features) and the network has two
+hidden layers of 32 leaky ReLUs: 19 -> 32 -> 32 -> 1. Source: the paper "Gaussian Splatting with NeRF-based Color and
+Opacity", called VDGS, in the mode that multiplies opacity.
 
 Sizes at the defaults: 48 colour numbers per splat, as with harmonics alone; shared, 524,288 in the grid and 1,729 in
-the network (3,280 for the coefficients, 3,313 for both). f starts near 1/2, so a splat starts at half its opacity.
-Pruning sees the base opacity sigmoid(o), but under `mcmc`, which sees the largest that views have shown.
+the network. f starts near 1/2, so a splat starts at half its opacity. Pruning sees the base opacity sigmoid(o), except
+in `mcmc`, which sees the largest that views have shown.
 
 The grid and the network have the reference's optimiser, Adam at 1e-3 without a schedule; all else has the host's. The
 reference trains with opacity resets switched off. That is a matter of densification and not of the colour model;
@@ -21,7 +21,6 @@ here every method is densified in the same way, resets included.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +29,7 @@ from nrfgs_ns.appearance.directions import unit_vectors
 from nrfgs_ns.appearance.hash_grid import HashGrid
 from nrfgs_ns.appearance.head import Component, SplatAppearance, base_opacities
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics
-from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
+from nrfgs_ns.appearance.spherical_harmonics import eval_sh
 
 
 @dataclass
@@ -39,37 +38,22 @@ class VdgsConfig(ShConfig):
 
     _target: type = field(default_factory=lambda: ViewDirectionFactors)
     """the head class that this configuration builds"""
-    mode: Literal["opacity", "sh", "both"] = "opacity"
-    """what the network's factors multiply: opacity, the coefficients of the harmonics, or both."""
     hidden_width: int = 32
     """units of each of the network's two hidden layers."""
-    grid_levels: int = 4
-    """levels of the hash grid."""
-    grid_features: int = 4
-    """features per level of the hash grid."""
-    grid_log2_table_size: int = 15
-    """log2 of the rows in each level's table."""
     grid_base_resolution: int = 16
     """lattice steps per scene unit on the coarsest level."""
-    grid_per_level_scale: float = 1.5
-    """ratio of the resolutions of neighbouring levels."""
     distance_eps: float = 0.01
     """smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
 
     def validate(self) -> None:
         super().validate()
-        self.require(self.mode in ("opacity", "sh", "both"), "mode", "'opacity', 'sh' or 'both'")
         self.require(self.hidden_width >= 1, "hidden_width", "at least 1")
-        self.require(self.grid_levels >= 1, "grid_levels", "at least 1")
-        self.require(self.grid_features >= 1, "grid_features", "at least 1")
-        self.require(1 <= self.grid_log2_table_size <= 24, "grid_log2_table_size", "1 to 24")
         self.require(self.grid_base_resolution >= 1, "grid_base_resolution", "at least 1")
-        self.require(self.grid_per_level_scale >= 1, "grid_per_level_scale", "at least 1")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
 
 
 class ViewDirectionFactors(SphericalHarmonics):
-    """Harmonics and base opacity, multiplied by the network's factors."""
+    """Harmonics, and the base opacity multiplied by the network's factor."""
 
     name = "vdgs"
     is_harmonics = False
@@ -77,21 +61,13 @@ class ViewDirectionFactors(SphericalHarmonics):
     def __init__(self, config: VdgsConfig):
         super().__init__(config)
         self.config: VdgsConfig = config
-        self.grid = HashGrid(
-            config.grid_levels,
-            config.grid_features,
-            config.grid_log2_table_size,
-            config.grid_base_resolution,
-            config.grid_per_level_scale,
-        )
-        self.bases = num_bases(config.degree)
-        outputs = {"opacity": 1, "sh": 3 * self.bases, "both": 1 + 3 * self.bases}[config.mode]
+        self.grid = HashGrid(config.grid_base_resolution)
         self.network = nn.Sequential(
             nn.Linear(3 + self.grid.width, config.hidden_width),
             nn.LeakyReLU(),
             nn.Linear(config.hidden_width, config.hidden_width),
             nn.LeakyReLU(),
-            nn.Linear(config.hidden_width, outputs),
+            nn.Linear(config.hidden_width, 1),
         )
 
     def try_kernels(self, device: torch.device) -> None:
@@ -102,22 +78,16 @@ class ViewDirectionFactors(SphericalHarmonics):
         means = splats["means"].index_select(0, visible)
         directions = unit_vectors(means - camera_centers, self.config.distance_eps * self.scene_unit)
         factors = torch.sigmoid(self.network(torch.cat([directions, self.grid(means / self.scene_unit)], dim=-1)))
-
         coefficients = self.coefficients(splats, visible)
-        if self.config.mode != "opacity":
-            coefficients = coefficients * factors[:, -3 * self.bases :].unflatten(-1, (self.bases, 3))
-        opacities = base_opacities(splats["opacities"].index_select(0, visible))
-        if self.config.mode != "sh":
-            opacities = opacities * factors[:, 0]
         return SplatAppearance(
             colors=(eval_sh(self.active_degree, directions, coefficients) + 0.5).clamp_min(0.0),
-            opacities=opacities,
+            opacities=base_opacities(splats["opacities"].index_select(0, visible)) * factors[:, 0],
         )
 
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
-        """The harmonics' "residual", and "opacity residual", what the factor takes from opacity, if it does."""
+        """The harmonics' "residual", and the factor's "opacity residual"."""
         seen, base = self(splats, visible, camera_centers), self.base_appearance(splats, visible)
-        shown = {"residual": Component(seen.colors - base.colors, "color")}
-        if self.config.mode != "sh":
-            shown["opacity residual"] = Component((seen.opacities - base.opacities)[:, None], "opacity")
-        return shown
+        return {
+            "residual": Component(seen.colors - base.colors, "color"),
+            "opacity residual": Component((seen.opacities - base.opacities)[:, None], "opacity"),
+        }

@@ -23,7 +23,7 @@ def interpolate(grid, x):
     return Interpolation.apply(x, grid.table, grid.resolutions, len(grid.sides), grid.table_size)
 
 
-@pytest.mark.parametrize("features", [1, 2, 3, 4])
+@pytest.mark.parametrize("features", [1, 2, 4])
 def test_values_and_gradients(features):
     assert_near_twin(*grids(features=features), positions(60), interpolate)  # a part of a block
 
@@ -36,7 +36,7 @@ def test_counts_around_a_block(count):
 @pytest.mark.parametrize(
     "options, numbered",
     [
-        ({"levels": 2, "log2_table_size": 1, "features": 9}, 0),
+        ({"levels": 2, "log2_table_size": 1, "features": 8}, 0),
         ({"levels": 4, "log2_table_size": 15, "base_resolution": 16}, 1),  # the paper's: 16, 24, 36, 54
     ],
 )
@@ -115,7 +115,7 @@ def test_the_trial_passes_here_and_its_failure_is_told(monkeypatch, caplog):
         raise RuntimeError("no compiler\nmore of it")
 
     monkeypatch.setattr(hash_grid_triton, "launch_backward", broken)
-    assert not hash_grid._kernels_run_on(device, 3)  # other kernels, which are tried anew
+    assert not hash_grid._kernels_run_on(device, 2)  # other kernels, which are tried anew
     assert [record.getMessage() for record in caplog.records] == [
         "The hash grid runs in plain PyTorch on cpu: Triton's kernels do not run here (RuntimeError: no compiler)."
     ]

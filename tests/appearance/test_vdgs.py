@@ -39,7 +39,6 @@ def grid_by_hand(table, x):
 def by_hand(head, splats, visible, centers):
     """The formulas, one splat at a time, with nothing shared with the implementation but the weights."""
     first, _, second, _, third = head.network
-    mode = head.config.mode
     colors, opacities = [], []
     for row, center in zip(visible.tolist(), centers, strict=True):
         x = splats["means"][row]
@@ -50,28 +49,22 @@ def by_hand(head, splats, visible, centers):
             h = torch.where(h > 0, h, 0.01 * h)
         f = 1 / (1 + torch.exp(-(third.weight @ h + third.bias)))
         k = torch.cat([splats["features_dc"][row][None], splats["features_rest"][row]])
-        alpha = 1 / (1 + torch.exp(-splats["opacities"][row, 0]))
-        if mode in ("opacity", "both"):
-            alpha = alpha * f[0]
-        if mode in ("sh", "both"):
-            k = k * f[1 if mode == "both" else 0 :].reshape(16, 3)
+        alpha = f[0] / (1 + torch.exp(-splats["opacities"][row, 0]))
         colors.append((0.5 + _eval_sh_bases_fast(16, d) @ k).clamp_min(0))
         opacities.append(alpha)
     return torch.stack(colors), torch.stack(opacities)
 
 
-@pytest.mark.parametrize("mode, network", [("opacity", 1729), ("sh", 3280), ("both", 3313)])
-def test_sizes(mode, network):
-    head = VdgsConfig(mode=mode).setup()
-    assert shared_weights(head.network) == network
+def test_sizes():
+    head = VdgsConfig().setup()
+    assert shared_weights(head.network) == 1729
     assert shared_weights(head.grid) == 4 * 2**15 * 4 == 524_288
-    assert shared_weights(head) == 524_288 + network
+    assert shared_weights(head) == 524_288 + 1729
     assert numbers_per_splat(head) == 48
 
 
-@pytest.mark.parametrize("mode", ["opacity", "sh", "both"])
-def test_matches_the_formulas(mode):
-    head = awake(VdgsConfig(mode=mode))
+def test_matches_the_formulas():
+    head = awake(VdgsConfig())
     splats, visible, centers = scene(head, count=18)
     assert (splats["means"][visible].abs() > 1).any() and (splats["means"][visible] < 0).any()
     colors, opacities = head(splats, visible, centers)
@@ -80,7 +73,7 @@ def test_matches_the_formulas(mode):
     assert_close(opacities, expected_opacities, rtol=0, atol=1e-12)
 
 
-def test_opacity_mode_leaves_colours_alone_and_only_turns_opacity_down():
+def test_the_factor_leaves_colours_alone_and_only_turns_opacity_down():
     head, plain = awake(VdgsConfig()), ShConfig().setup()
     splats, visible, centers = scene(head)
     ours, theirs = head(splats, visible, centers), plain(splats, visible, centers)
@@ -90,16 +83,8 @@ def test_opacity_mode_leaves_colours_alone_and_only_turns_opacity_down():
     assert not torch.allclose(ours.opacities, head(splats, visible, -centers).opacities)
 
 
-def test_sh_mode_leaves_opacity_alone():
-    head, plain = awake(VdgsConfig(mode="sh")), ShConfig().setup()
-    ours, theirs = head(*scene(head)), plain(*scene(plain))
-    assert torch.equal(ours.opacities, theirs.opacities)
-    assert not torch.allclose(ours.colors, theirs.colors)
-
-
-@pytest.mark.parametrize("mode", ["opacity", "both"])
-def test_what_the_view_takes_from_opacity_can_be_shown(mode):
-    head = awake(VdgsConfig(mode=mode))
+def test_what_the_view_takes_from_opacity_can_be_shown():
+    head = awake(VdgsConfig())
     splats, visible, centers = scene(head)
     parts = head.components(splats, visible, centers)
     change = parts["opacity residual"]
@@ -117,8 +102,7 @@ def test_the_degree_grows_as_for_harmonics():
 
 def grid(**options):
     torch.manual_seed(0)
-    defaults = {"levels": 4, "features": 4, "log2_table_size": 15, "base_resolution": 16, "per_level_scale": 1.5}
-    made = HashGrid(**{**defaults, **options}).double()
+    made = HashGrid(16, **options).double()
     made.table.data.normal_()
     return made
 
@@ -177,14 +161,8 @@ def test_far_splats_find_rows_too(dtype):
 @pytest.mark.parametrize(
     "field, value",
     [
-        ("mode", "color"),
         ("hidden_width", 0),
-        ("grid_levels", 0),
-        ("grid_features", 0),
-        ("grid_log2_table_size", 0),
-        ("grid_log2_table_size", 25),
         ("grid_base_resolution", 0),
-        ("grid_per_level_scale", 0.5),
         ("distance_eps", 0.0),
         ("degree", 4),
     ],

@@ -6,7 +6,7 @@ import torch
 from densification_cases import Table
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.opacity_bound import bounded_opacity
+from nrfgs_ns.appearance.nrf import bounded_opacity
 from nrfgs_ns.densification.relocation import add_samples, diffuse, relocate, split_evenly
 
 pytestmark = pytest.mark.usefixtures("no_cuda")

@@ -51,7 +51,7 @@ ALL = CompactOptions(threshold=0.0, rank=32)
 MODES = ["full", "base", "residual", "opacity residual"]
 KINDS = {
     "as trained by default": ("classic", {}),
-    "antialiased": ("antialiased", {"latent_dim": 7, "opacity_bound": "smooth", "num_bands": 2, "hidden_width": 30}),
+    "antialiased": ("antialiased", {"latent_dim": 7, "num_bands": 2, "hidden_width": 30}),
     "one branch": ("classic", {"split_bands": False, "opacity_bound": "logit", "use_distance": False}),
     "low band, opacity fixed": ("antialiased", {"num_bands": 1, "opacity_residual": False}),
 }

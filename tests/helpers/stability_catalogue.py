@@ -20,8 +20,7 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.encoding import fourier_bands, view_geometry
 from nrfgs_ns.appearance.head import base_colors
-from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
-from nrfgs_ns.appearance.opacity_bound import OPACITY_BOUNDS, bounded_opacity
+from nrfgs_ns.appearance.nrf import OPACITY_BOUNDS, NeuralResidualField, NrfConfig, bounded_opacity
 from nrfgs_ns.rasterizer import Projection, ProjectionOptions, project
 from nrfgs_ns.rasterizer.torch_cpu.projection import LARGEST_RADIUS, MIN_QUATERNION
 from nrfgs_ns.training.guard import MAX_GRADIENT

@@ -106,10 +106,9 @@ def test_a_head_offers_what_it_has():
     assert offered(NrfConfig(split_bands=False)) == ["residual", "opacity residual"]
     assert offered(NrfConfig(num_bands=1)) == ["residual", "opacity residual"]
     assert offered(NrfConfig(opacity_residual=False)) == FIELD[:-1]
-    for config in (ShConfig(), VdgsConfig(mode="sh"), GsnbConfig(), SgConfig()):
+    for config in (ShConfig(), GsnbConfig(), SgConfig()):
         assert offered(config) == ["residual"]
-    for mode in ("opacity", "both"):
-        assert offered(VdgsConfig(mode=mode)) == ["residual", "opacity residual"]
+    assert offered(VdgsConfig()) == ["residual", "opacity residual"]
 
 
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"])

@@ -46,8 +46,7 @@ OUTPUTS = tl.constexpr(8)  # columns of W2
 PI = tl.constexpr(3.141592653589793)
 HALF_LOG_2 = tl.constexpr(0.34657359027997264)
 FARTHEST = tl.constexpr(1e18)  # encoding.FARTHEST; the slope beyond, 0 there, is below 1e-18 here
-SMOOTH_SHARPNESS = tl.constexpr(50.0)  # opacity_bound.SHARPNESS
-LOGIT_SLOPE = tl.constexpr(4.0)  # opacity_bound.LOGIT_SLOPE
+LOGIT_SLOPE = tl.constexpr(4.0)  # nrf.LOGIT_SLOPE
 
 
 # Tiles [B, 4].
@@ -123,14 +122,8 @@ def _features_backward(d_F, waves, lanes, B: tl.constexpr, R: tl.constexpr, BAND
 
 
 @triton.jit
-def _smooth_tail(x):
-    """log(1 + exp(-B |x|)) / B: how much softplus(B x) / B exceeds max(x, 0)."""
-    return tl.log(1.0 + tl.exp(-tl.abs(x) * SMOOTH_SHARPNESS)) / SMOOTH_SHARPNESS
-
-
-@triton.jit
 def _bounded_opacity(logit, alpha, t, scale, BOUND: tl.constexpr):
-    """Opacity, with its slopes by the logit and by t = tanh(d_alpha). See opacity_bound.py."""
+    """Opacity, with its slopes by the logit and by t = tanh(d_alpha). See nrf.py."""
     alpha_slope = alpha * (1.0 - alpha)
     if BOUND == "none":  # no residual: nothing to bound
         return alpha, alpha_slope, 0.0 * t
@@ -138,17 +131,10 @@ def _bounded_opacity(logit, alpha, t, scale, BOUND: tl.constexpr):
         opacity = sigmoid(logit + t * scale * LOGIT_SLOPE)
         slope = opacity * (1.0 - opacity)
         return opacity, slope, slope * scale * LOGIT_SLOPE
-    else:
+    else:  # straight-through
         x = alpha + scale * t
         clamped = tl.minimum(tl.maximum(x, 0.0, propagate_nan=tl.PropagateNan.ALL), 1.0, tl.PropagateNan.ALL)
-        if BOUND == "smooth":
-            slope = sigmoid(x * SMOOTH_SHARPNESS) - sigmoid((x - 1.0) * SMOOTH_SHARPNESS)
-            return clamped + _smooth_tail(x) - _smooth_tail(x - 1.0), alpha_slope * slope, scale * slope
-        elif BOUND == "clamp":
-            slope = tl.where((x >= 0.0) & (x <= 1.0), 1.0, 0.0)
-            return clamped, alpha_slope * slope, scale * slope
-        else:  # straight-through
-            return clamped, alpha_slope, scale + 0.0 * t
+        return clamped, alpha_slope, scale + 0.0 * t
 
 
 @triton.jit
@@ -231,7 +217,7 @@ def forward_kernel(
         color = tl.maximum(base + color_scale * t, 0.0, propagate_nan=tl.PropagateNan.ALL)
         opacity, _, _ = _bounded_opacity(stored, base, t, opacity_scale, BOUND)
         if DIFFUSE:
-            opacity = tl.where(is_diffuse, base, opacity)  # without residual, too, the smooth bound is another number
+            opacity = tl.where(is_diffuse, base, opacity)  # the logit bound rounds another way
         out = deal(tl.where(lanes < 3, color, opacity), B)
         tl.store(colors_out + items * 3 + lanes, out, mask=valid & (lanes < 3))
         tl.store(opacities_out + items + (lanes - 3), out, mask=valid & (lanes == 3))

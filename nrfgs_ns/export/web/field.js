@@ -159,9 +159,7 @@ ${view.map((input, k) => `      h += w[o + ${k}] * ${input};`).join("\n")}
   }
   const bounds = {
     "logit": "1.0 / (1.0 + exp(-(logit + 4.0 * change)))",
-    "smooth": "soft(x) - soft(x - 1.0)",
-    "clamp": "clamp(x, 0.0, 1.0)",
-    "straight-through": "clamp(x, 0.0, 1.0)",
+    "straight-through": "clamp(base.a + change, 0.0, 1.0)",
   };
   return `${HEAD}
 uniform sampler2D table;
@@ -173,10 +171,6 @@ uniform int mode;        // 0 full, 1 residual, 2 opacity residual
 uniform bool only_seen;  // leave out what the camera does not see
 uniform vec4 planes[5];  // see planesOf
 out uvec4 look;
-
-float soft(float x) {  // softplus(50 x) / 50
-  return max(x, 0.0) + log(1.0 + exp(-50.0 * abs(x))) / 50.0;
-}
 
 void main() {
   int i = int(gl_FragCoord.y) * ${PER_ROW(TABLE_TEXELS)} + int(gl_FragCoord.x);
@@ -204,7 +198,6 @@ ${kept ? `    ivec2 at = ${texel(plan.groups)};` : ""}${branch(low, "low")}${hig
     residual.rgb = ${number(config.color_scale)} * tanh(clamp(turned, -15.0, 15.0));
     seen.rgb = max(color.rgb + residual.rgb, 0.0);
 ${config.opacity_residual ? `    float change = ${number(config.opacity_scale)} * tanh(clamp(low.a, -15.0, 15.0));
-    float x = base.a + change;
     seen.a = ${bounds[config.opacity_bound]};
     residual.a = seen.a - base.a;` : ""}
     if (gain != 1.0) {
