@@ -355,7 +355,7 @@ def test_twice_is_the_same():
 @pytest.mark.parametrize("name", ["means", "latents", "features_dc", "opacities", "centers", "low.0.weight"])
 def test_finite_differences(name):
     """The kernel against itself, along its own gradient."""
-    head, _ = heads(opacity_bound="smooth", num_bands=2)
+    head, _ = heads(opacity_bound="logit", num_bands=2)
     splats, visible, centers = scene(head, 30, 25)
     inputs = {**splats, "centers": centers, **{k: v.data for k, v in head.named_parameters()}}
     gradient = evaluate(head, splats, visible, centers)[f"d {name}"].double()
