@@ -1,39 +1,72 @@
 # SPDX-License-Identifier: Apache-2.0
-"""NRF-GS for nerfstudio: what this project adds beside ns-train, ns-eval, ns-viewer and ns-render."""
+"""`nrfgs COMMAND`: commands beside nerfstudio's ns-train, ns-eval, ns-viewer and ns-render.
 
+A command is an entry point of the group `nrfgs.commands`: its name, and a dataclass of options with a `main`. Only the
+command that runs is imported; the list reads the others' docstrings from their source.
+"""
+
+import ast
+import difflib
 import sys
 import warnings
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 
 import tyro
 
 from nrfgs_ns.errors import InputError
 
 GROUP = "nrfgs.commands"
-"""Of entry points: a command's name, and the dataclass that holds its options and has a `main`."""
 
 
 def commands() -> dict[str, EntryPoint]:
-    """The commands of `nrfgs` by name, whichever installed package they come from.
+    """The commands of all installed packages, by name.
 
     Raises:
         InputError: there are none.
     """
-    found = {one.name: one for one in sorted(entry_points(group=GROUP), key=lambda one: one.name)}
-    if not found:
+    commands = {entry.name: entry for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name)}
+    if not commands:
         raise InputError(f"no package offers commands (entry points {GROUP}). Install this one again: pip install -e .")
-    return found
+    return commands
+
+
+def summary(command: EntryPoint) -> str:
+    """The first sentence of a command's docstring, read without importing its module; "" if there is no source."""
+    spec = find_spec(command.module)
+    if spec is None or spec.origin is None:
+        return ""
+    with open(spec.origin, encoding="utf-8") as file:
+        tree = ast.parse(file.read())
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    text = ast.get_docstring(classes[command.attr]) if command.attr in classes else None
+    return " ".join((text or "").split()).split(". ")[0].removesuffix(".")
+
+
+def listing() -> str:
+    """The help of `nrfgs` itself."""
+    lines = [f"  {name:<10}{summary(entry)}" for name, entry in commands().items()]
+    return "\n".join(
+        ["usage: nrfgs COMMAND [OPTIONS]", "", *lines, "", "`nrfgs COMMAND --help` explains a command's options."]
+    )
 
 
 def chosen(arguments: list[str]):
-    """The command that the arguments ask for, with its options. Of all commands that one alone is imported."""
-    found = commands()
-    if arguments and arguments[0] in found:
-        name, *options = arguments
-        return tyro.cli(found[name].load(), prog=f"nrfgs {name}", args=options)
-    # No command, or none of these: tyro lists them.
-    every = {name: one.load() for name, one in found.items()}
-    return tyro.extras.subcommand_cli_from_dict(every, prog="nrfgs", description=__doc__, args=arguments)
+    """The command that the arguments name, with its options.
+
+    Raises:
+        InputError: no command has that name.
+    """
+    name, *options = arguments or ["--help"]
+    if name in ("--help", "-h"):
+        print(listing())
+        sys.exit()
+    known = commands()
+    if name not in known:
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"Did you mean `nrfgs {close[0]}`?" if close else f"There are {', '.join(known)}."
+        raise InputError(f"no command {name!r}. {hint}")
+    return tyro.cli(known[name].load(), prog=f"nrfgs {name}", args=options)
 
 
 def entrypoint() -> None:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained neural residual field made smaller: a new head with edited weights, and the splats' tables that go with it.
+"""A trained neural residual field with shorter latents or diffuse splats: a new head with edited weights, and the
+splats' tables that go with it. Nothing here trains.
 
-Nothing here trains. What is left out is left out of the configuration where that is possible, so that the smaller field
-also costs less; the rest of the weights are the old ones. Inputs that become constant, and latents that lie in a
-subspace, are folded into the first layer, which is exact: with z = m + B y,
+Latents that lie in a subspace are folded into the first layer, which is exact: with z = m + B y,
 
     W z + b = (W B) y + (W m + b).
 """
@@ -46,55 +45,6 @@ def input_columns(config: NrfConfig, branch: str) -> dict[str, list[int]]:
     return columns
 
 
-def without_high_branch(field: Field) -> Field:
-    """Only the low branch; the same as a gate that is shut.
-
-    Raises:
-        ValueError: there is no high branch.
-    """
-    if field.head.high is None:
-        raise ValueError("this field has no high branch")
-    return Field(_build(field.head, {"num_bands": 1}, layers(field.head.low), None), field.splats)
-
-
-def without_low_branch(field: Field) -> Field:
-    """The low branch answers 0 for colours; opacity's residual, which is its other answer, stays."""
-    w1, b1, w2, b2 = layers(field.head.low)
-    w2, b2 = w2.clone(), b2.clone()
-    w2[:3], b2[:3] = 0.0, 0.0
-    return Field(_build(field.head, {}, (w1, b1, w2, b2), _high(field.head)), field.splats)
-
-
-def without_opacity_residual(field: Field) -> Field:
-    """Opacities are the base's."""
-    w1, b1, w2, b2 = layers(field.head.low)
-    return Field(
-        _build(field.head, {"opacity_residual": False}, (w1, b1, w2[:3], b2[:3]), _high(field.head)), field.splats
-    )
-
-
-def with_constant_distance(field: Field, log_distance: float) -> Field:
-    """The log distance is the same number everywhere, and no input any more."""
-    changed = []
-    for name, branch in _branches(field.head):
-        w1, b1, w2, b2 = layers(branch)
-        (column,) = input_columns(field.head.config, name)["distance"]
-        keep = [i for i in range(w1.shape[1]) if i != column]
-        changed.append((w1[:, keep], b1 + log_distance * w1[:, column], w2, b2))
-    return Field(_build(field.head, {"use_distance": False}, *_pair(changed)), field.splats)
-
-
-def without_input(field: Field, name: str) -> Field:
-    """An input of `input_columns` is 0 everywhere."""
-    changed = []
-    for branch_name, branch in _branches(field.head):
-        w1, b1, w2, b2 = layers(branch)
-        w1 = w1.clone()
-        w1[:, input_columns(field.head.config, branch_name).get(name, [])] = 0.0
-        changed.append((w1, b1, w2, b2))
-    return Field(_build(field.head, {}, *_pair(changed)), field.splats)
-
-
 class LatentBasis(NamedTuple):
     """Principal components: z = mean + axes y, y = inverse (z - mean). float64."""
 
@@ -109,14 +59,14 @@ class LatentBasis(NamedTuple):
 
 
 def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
-    """Principal components of the latents, in the metric of what the first layer makes of them.
+    """Principal components of the latents, in the metric of the first layer's outputs.
 
     A direction of the latents counts by how far it moves the hidden units, |W (z - z')|^2 over both branches: the
     components are those whose first r predict W z with the least squared error, weighted, for each r.
 
     Args:
-        weight: of each splat, >= 0; all are alike if their sum is 0. That of a diffuse splat, whose latent nothing
-            reads, does not count. [N]
+        weight: of each splat, >= 0; equal if their sum is 0. Diffuse splats, whose latents nothing reads, do not
+            count. [N]
     """
     latents = field.splats["latents"].detach().double()
     if DIFFUSE in field.splats:
@@ -126,7 +76,7 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     weight = (weight / weight.sum()).double()[:, None]
     mean = (weight * latents).sum(dim=0)
     seen_by_units = torch.cat(
-        [layers(branch)[0][:, : latents.shape[1]].double() for _, branch in _branches(field.head)]
+        [layers(branch)[0][:, : latents.shape[1]].double() for _, branch in branches_of(field.head)]
     )
     gram = seen_by_units.T @ seen_by_units
     values, vectors = torch.linalg.eigh(gram)
@@ -147,12 +97,12 @@ def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
     latents = field.splats["latents"]
     reduced = (latents.detach().double() - basis.mean) @ basis.inverse[:rank].T
     changed = []
-    for _, branch in _branches(field.head):
+    for _, branch in branches_of(field.head):
         w1, b1, w2, b2 = layers(branch)
         of_latents = w1[:, :size].double()
         folded = torch.cat([of_latents @ basis.axes[:, :rank], w1[:, size:].double()], dim=1)
         changed.append((folded, b1.double() + of_latents @ basis.mean, w2, b2))
-    head = _build(field.head, {"latent_dim": rank}, *_pair(changed))
+    head = rebuilt(field.head, {"latent_dim": rank}, *pair(changed))
     return Field(head, {**field.splats, "latents": reduced.to(latents.dtype)})
 
 
@@ -160,10 +110,10 @@ def with_components(field: Field, columns: Tensor) -> Field:
     """Only these components of the latents [R], of which there is at least one; the others are 0 for every splat."""
     size = field.head.config.latent_dim
     changed = []
-    for _, branch in _branches(field.head):
+    for _, branch in branches_of(field.head):
         w1, b1, w2, b2 = layers(branch)
         changed.append((torch.cat([w1[:, :size][:, columns], w1[:, size:]], dim=1), b1, w2, b2))
-    head = _build(field.head, {"latent_dim": len(columns)}, *_pair(changed))
+    head = rebuilt(field.head, {"latent_dim": len(columns)}, *pair(changed))
     return Field(head, {**field.splats, "latents": field.splats["latents"][:, columns]})
 
 
@@ -172,7 +122,7 @@ def with_diffuse(field: Field, diffuse: Tensor, features_dc: Tensor, opacities: 
 
     Args:
         diffuse: which, bool [N].
-        features_dc, opacities: what they look like instead, [N, 3] and [N, 1]; other rows are ignored.
+        features_dc, opacities: their appearance instead, [N, 3] and [N, 1]; other rows are ignored.
     """
     rows = diffuse[:, None]
     splats = {
@@ -198,7 +148,8 @@ def build(config: NrfConfig, weights: Mapping[str, Tensor], scene_unit: float) -
     return head.to(next(iter(weights.values())).device).requires_grad_(False).eval()
 
 
-def _build(old: NeuralResidualField, changes: dict, low: Layers, high: Layers | None) -> NeuralResidualField:
+def rebuilt(old: NeuralResidualField, changes: dict, low: Layers, high: Layers | None) -> NeuralResidualField:
+    """A head with other options and other weights of its branches."""
     weights = {}
     for name, branch in (("low", low), ("high", high)):
         if branch is not None:
@@ -207,13 +158,11 @@ def _build(old: NeuralResidualField, changes: dict, low: Layers, high: Layers | 
     return build(replace(old.config, **changes), weights, old.scene_unit)
 
 
-def _branches(head: NeuralResidualField) -> list[tuple[str, nn.Sequential]]:
+def branches_of(head: NeuralResidualField) -> list[tuple[str, nn.Sequential]]:
+    """The branches that a head has, by name."""
     return [(name, branch) for name, branch in (("low", head.low), ("high", head.high)) if branch is not None]
 
 
-def _high(head: NeuralResidualField) -> Layers | None:
-    return None if head.high is None else layers(head.high)
-
-
-def _pair(changed: list[Layers]) -> tuple[Layers, Layers | None]:
+def pair(changed: list[Layers]) -> tuple[Layers, Layers | None]:
+    """The low branch (or the only one), and the high one."""
     return changed[0], changed[1] if len(changed) > 1 else None

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """A compact file as the tables of a model. `format.py`, `encode.py` and `entropy.py` describe the file.
-
-In version 1 every stream is xz, of uint8 to uint64. Splats that depend on the view come first, then the diffuse ones,
-as streams view.<table> and diffuse.<table>, [columns, n], each in Morton order; codes are >= 0, with low in every grid.
-means are differences of Morton numbers, [n]. Rotations: quats_largest, [n], which of (w, x, y, z) is the largest, and
-quats, [3, n], the others in quats_bits bits each, from -sqrt(1/2) to sqrt(1/2). There are no turns.
 """
 
 import math
@@ -21,7 +16,7 @@ from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.encode import FORMAT, GROUPS
 from nrfgs_ns.compact.format import LARGEST_RATIO, SMALL, read_container
-from nrfgs_ns.compact.quantise import Grid, from_morton, from_smallest_three
+from nrfgs_ns.compact.quantise import Grid, from_morton
 from nrfgs_ns.compact.tables import COLUMNS, splats_of
 from nrfgs_ns.errors import InputError
 
@@ -33,8 +28,6 @@ WIDTHS = dict(zip(COLUMNS, (1, 3, 3, 3), strict=True))
 """Columns of each table in the stream "splats"."""
 LONGEST = 200
 """Characters of what a message quotes."""
-RETIRED = "geometry_gradient"
-"""An option of the head in files of older versions. It was for training alone."""
 
 
 class Decoded(NamedTuple):
@@ -60,10 +53,8 @@ def decode(path: Path) -> Decoded:
         if header["format"] != FORMAT:
             raise ValueError(f"it holds {header['format']!r}")
         config, weights = _config(header["head"]), _weights(streams)
-        version = 2 if "splats" in streams else 1
-        _check(version, header, config, weights, sum(stream.nbytes for stream in streams.values()))
-        read = _coded_splats if version > 1 else _splats
-        return Decoded(config, weights, read(header, streams, config.latent_dim), header)
+        _check(header, config, weights, sum(stream.nbytes for stream in streams.values()))
+        return Decoded(config, weights, _splats(header, streams, config.latent_dim), header)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RuntimeError) as error:
         # The checksums hold: it was written like this.
         reason = " ".join(str(error).split())[:LONGEST]
@@ -77,10 +68,9 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     if head["name"] != "nrf":
         raise ValueError(f"a head named {head['name']!r}")
     known = {field.name for field in fields(NrfConfig)} - {"_target"}
-    options = {name: value for name, value in head["config"].items() if name != RETIRED}
-    if unknown := options.keys() - known:
+    if unknown := head["config"].keys() - known:
         raise ValueError(f"an unknown option {sorted(unknown)[0]!r} of the head")
-    config = NrfConfig(**options)
+    config = NrfConfig(**head["config"])
     usual = NrfConfig(opacity_bound=NrfConfig().bound)
     for name in known:
         value, default = getattr(config, name), getattr(usual, name)
@@ -95,8 +85,8 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     return config
 
 
-def _check(version: int, header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor], unpacked: int) -> None:
-    """Raise ValueError where the header names sizes that the file does not have, or grids that are none."""
+def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor], unpacked: int) -> None:
+    """Raise ValueError where the header names sizes that the file does not have, or impossible grids."""
     unit = header["head"]["scene_unit"]
     if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < float(unit) < math.inf:
         raise ValueError(f"the head's scene_unit is {ascii(unit)}")
@@ -104,11 +94,7 @@ def _check(version: int, header: dict[str, Any], config: NrfConfig, weights: dic
         raise ValueError(
             f"head.low.0.weight of shape {list(weights['low.0.weight'].shape)} with latents of {config.latent_dim}"
         )
-    columns = {"means": 3, "scales": 3, "opacities": 1, "colors": 3, "latents": config.latent_dim}
-    if version > 1:
-        columns["turns"] = 3
-    elif not isinstance(header["quats_bits"], int) or not 2 <= header["quats_bits"] <= 16:
-        raise ValueError(f"quats_bits is {header['quats_bits']}")
+    columns = {"means": 3, "turns": 3, "scales": 3, "opacities": 1, "colors": 3, "latents": config.latent_dim}
     for name, count in columns.items():
         for part in ("low", "step"):
             numbers = np.asarray(header["grids"][name][part])
@@ -123,9 +109,9 @@ def _check(version: int, header: dict[str, Any], config: NrfConfig, weights: dic
     with torch.random.fork_rng(devices=[]):  # whose numbers are not looked at
         shapes = {name: list(value.shape) for name, value in config.setup().state_dict().items()}
     for name in shapes.keys() | weights.keys():
-        found = list(weights[name].shape) if name in weights else "none"
-        if found != shapes.get(name):
-            raise ValueError(f"head.{name} of shape {found}, for a head that has {shapes.get(name, 'none')}")
+        shape = list(weights[name].shape) if name in weights else "none"
+        if shape != shapes.get(name):
+            raise ValueError(f"head.{name} of shape {shape}, for a head that has {shapes.get(name, 'none')}")
         if not torch.isfinite(weights[name]).all():
             raise ValueError(f"head.{name} is not finite")
     counts = [header["splats"][group] for group in GROUPS]
@@ -143,47 +129,6 @@ def _weights(streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
 
 
 def _splats(header: dict[str, Any], streams: dict[str, np.ndarray], rank: int) -> dict[str, Tensor]:
-    grids = {name: Grid(np.array(grid["low"]), np.array(grid["step"])) for name, grid in header["grids"].items()}
-    parts: dict[str, list[np.ndarray]] = {
-        name: [] for name in ("means", "quats", "scales", "opacities", "colors", "latents", DIFFUSE)
-    }
-    for group in GROUPS:
-        count = header["splats"][group]
-
-        def stream(name: str, columns: int, group: str = group, count: int = count) -> np.ndarray:
-            found = streams[f"{group}.{name}"]
-            if found.shape != (columns, count) or found.dtype.kind != "u":
-                raise ValueError(f"{group}.{name} of shape {list(found.shape)} instead of {[columns, count]}")
-            return found
-
-        def codes(name: str, columns: int, stream=stream) -> np.ndarray:
-            return stream(name, columns).T.astype(np.int64)
-
-        differences, largest = streams[f"{group}.means"], streams[f"{group}.quats_largest"]
-        if differences.shape != (count,) or largest.shape != (count,) or largest.max(initial=0) > 3:
-            raise ValueError(f"{group}.means or {group}.quats_largest are not {count} numbers in range")
-        places = np.cumsum(differences.astype(np.uint64), dtype=np.uint64)
-        parts["means"].append(grids["means"].values(from_morton(places)))
-        parts["quats"].append(from_smallest_three(largest.astype(np.int64), codes("quats", 3), header["quats_bits"]))
-        for name, columns in (("scales", 3), ("opacities", 1), ("colors", 3)):
-            parts[name].append(grids[name].values(codes(name, columns)))
-        latents = np.zeros((count, rank), dtype=np.float32)
-        if group == "view":
-            for column, (low, step) in enumerate(zip(*grids["latents"], strict=True)):
-                latents[:, column] = low + step * stream("latents", rank)[column].astype(np.float64)
-        parts["latents"].append(latents)
-        parts[DIFFUSE].append(np.full(count, group == DIFFUSE))
-    tables = {name: torch.from_numpy(np.concatenate(values)) for name, values in parts.items()}
-    tables["features_dc"] = (tables.pop("colors") - 0.5) / SH_C0
-    tables = {name: value if value.dtype == torch.bool else value.float() for name, value in tables.items()}
-    for name, value in tables.items():
-        if not torch.isfinite(value).all():
-            raise ValueError(f"{name} beyond float32")
-    return tables
-
-
-def _coded_splats(header: dict[str, Any], streams: dict[str, np.ndarray], rank: int) -> dict[str, Tensor]:
-    """The same from version 2 on."""
     count, of_view = sum(header["splats"][group] for group in GROUPS), header["splats"]["view"]
     shapes = {"means": (2, count), "splats": (1 + sum(WIDTHS.values()), count), "latents": (rank, of_view)}
     for name, shape in shapes.items():

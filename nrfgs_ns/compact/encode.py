@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A field as the header and the streams of a compact file of version 2; the container is `format.py`'s.
+"""A field as the header and the streams of a compact file; the container is `format.py`'s.
 
 Keys of the header, beside "streams":
 
@@ -38,9 +38,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.compact.format import Table
-from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.compact.quantise import MOST_BITS, Grid, morton
-from nrfgs_ns.compact.tables import COLUMNS, steps_of, tables_of
+from nrfgs_ns.compact.tables import COLUMNS, Precision, steps_of, tables_of
 from nrfgs_ns.errors import InputError
 
 FORMAT = "nrfgs-compact"
@@ -70,7 +69,6 @@ def encode(
     Raises:
         InputError: no splat is finite.
     """
-    precision.validate()
     rows = [value.detach().reshape(len(value), -1) for value in field.splats.values()]
     finite = torch.stack([row.isfinite().all(dim=1) for row in rows]).all(dim=0)
     finite &= field.splats["quats"].detach().abs().amax(dim=1) > 0

@@ -17,10 +17,9 @@ from torch import Tensor, nn
 from nrfgs_ns.appearance.field import Field, Sight
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
-from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.compact.quantise import MOST_BITS, Grid, morton
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
-from nrfgs_ns.compact.tables import COLUMNS, splats_of, steps_of, tables_of
+from nrfgs_ns.compact.tables import COLUMNS, Precision, splats_of, steps_of, tables_of
 from nrfgs_ns.model.view_noise import ViewNoise
 
 BYTE = 8

@@ -11,7 +11,7 @@
     28 + L         the streams, one after the other, in the order of the list
 
 All numbers are little-endian. An entry of "streams" has "name", "coding", "dtype" (of the numbers), "shape", "bytes"
-(in the file) and "crc32" (of these bytes). Version 1 has no "coding": there every stream is "xz".
+(in the file) and "crc32" (of these bytes).
 
 "xz": the xz format; unpacked, the numbers' bytes by significance: first every number's lowest byte, then every number's
 next, and so on; numbers (uint8, uint16, uint32, uint64, float16 or float32) in row-major order.
@@ -23,7 +23,7 @@ next, and so on; numbers (uint8, uint16, uint32, uint64, float16 or float32) in 
            the model, int32 numbers, packed as in "xz"
            what the coder wrote (`entropy.py`)
 
-`encode.py` says which streams there are. A reader refuses a later version, another length than the file's, and a
+`encode.py` says which streams there are. The version is 2; a reader refuses any other, another length than the file's, and a
 checksum that does not hold.
 
 Nothing in a file is ever run, and nothing is allocated before its size was checked against the lengths in the header,
@@ -52,11 +52,10 @@ CHECKSUM = struct.Struct("<I")
 MODEL = struct.Struct("<II")
 """Numbers of a coded table's model, and its bytes."""
 DTYPES = ("uint8", "uint16", "uint32", "uint64", "float16", "float32")
-ENTRY = {"name": str, "dtype": str, "shape": list, "bytes": int, "crc32": int}
-"""What a stream's entry in the header has; from version 2 on also "coding", one of CODINGS."""
-CODINGS = ("xz", "rans")
-CODED = ("int16", "int32", "uint32")
-"""Types of coded tables."""
+ENTRY = {"name": str, "coding": str, "dtype": str, "shape": list, "bytes": int, "crc32": int}
+"""Keys of a stream's entry in the header, and their types."""
+CODINGS = {"xz": DTYPES, "rans": ("int16", "int32", "uint32")}
+"""Codings, and the types of numbers that each holds."""
 LARGEST_RATIO = 32
 """Times its own size that a file may unpack to. Those of results/compact.json unpack to at most ten times theirs."""
 SMALL = 2**24
@@ -80,35 +79,26 @@ class Table(NamedTuple):
 
 
 def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> int:
-    """Write a file, whole or not at all, of version 2 if it holds a Table, else of version 1; returns its size.
+    """Write a file, whole or not at all; returns its size.
 
     Args:
         header: what JSON can hold; "streams" is added.
         streams: arrays of DTYPES, and tables.
     """
     entries, bodies = [], []
-    version = 2 if any(isinstance(stream, Table) for stream in streams.values()) else 1
     for name, stream in streams.items():
         if isinstance(stream, Table):
             array, body, coding = _coded(stream)
+        elif stream.dtype.name in DTYPES:
+            array, body, coding = stream, _pack(_planes(stream)), "xz"
         else:
-            array, body, coding = stream, None, "xz"
-        if body is None and array.dtype.name not in DTYPES:
-            raise ValueError(f"stream {name} is {array.dtype.name}; use one of {', '.join(DTYPES)}")
-        bodies.append(body := _pack(_planes(array)) if body is None else body)
-        entries.append(
-            {
-                "name": name,
-                "dtype": array.dtype.name,
-                "shape": list(array.shape),
-                "bytes": len(body),
-                "crc32": zlib.crc32(body),
-                **({"coding": coding} if version > 1 else {}),
-            }
-        )
+            raise ValueError(f"stream {name} is {stream.dtype.name}; use one of {', '.join(DTYPES)}")
+        sizes = {"dtype": array.dtype.name, "shape": list(array.shape), "bytes": len(body)}
+        entries.append({"name": name, "coding": coding, **sizes, "crc32": zlib.crc32(body)})
+        bodies.append(body)
     text = json.dumps({**header, "streams": entries}, allow_nan=False).encode("utf-8")
     total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
-    start = PREAMBLE.pack(MAGIC, version, len(text), total) + text
+    start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
     with whole(path) as aside:
         aside.write_bytes(b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies]))
     return total
@@ -121,8 +111,8 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         the header, and the streams by name.
 
     Raises:
-        InputError: there is no such file, it is of another kind or a later version, it is cut short or longer than it
-            says, or a checksum does not hold.
+        InputError: there is no such file, it is of another kind or version, it is cut short or longer than it says, or
+            a checksum does not hold.
     """
     try:
         data = path.read_bytes() if path.is_file() else None
@@ -137,33 +127,36 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         raise InputError(f"{path} is cut short: {len(data)} bytes. {fix}")
     _, version, length, total = PREAMBLE.unpack_from(data)
     first = PREAMBLE.size + length + CHECKSUM.size
-    # A file of a later version may lie otherwise: what it is comes before whether it is whole.
-    if version > VERSION:
+    # Another version may be laid out differently: its number comes before whether the file is whole.
+    if version != VERSION:
         raise InputError(
-            f"{path} says that it is of version {version} of the format, and this program reads up to {VERSION}. "
-            "Install a newer nrfgs-ns, or copy the file again."
+            f"{path} is of version {version} of the format, and this program reads version {VERSION}. "
+            f"{'Install a newer nrfgs-ns, or copy it again.' if version > VERSION else fix}"
         )
     if len(data) != total or len(data) < first:
         raise InputError(f"{path} has {len(data)} bytes, and its header says {total}. {fix}")
     header_end = first - CHECKSUM.size
-    if version < 1 or zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
+    if zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
         raise InputError(f"{path} is damaged: the header's checksum does not hold. {fix}")
-    header = _header(path, data[PREAMBLE.size : header_end], version, max(LARGEST_RATIO * len(data), SMALL))
+    header = _header(path, data[PREAMBLE.size : header_end], max(LARGEST_RATIO * len(data), SMALL))
     streams = {}
     for entry in header["streams"]:
         body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
         if len(body) != entry["bytes"] or zlib.crc32(body) != entry["crc32"]:
             raise InputError(f"{path} is damaged: the checksum of its stream {entry['name']!r} does not hold. {fix}")
-        unpack = _uncoded if entry.get("coding") == "rans" else _unpack
+        unpack = _uncoded if entry["coding"] == "rans" else _unpack
         streams[entry["name"]] = unpack(path, entry, body)
     if first != len(data):
         raise InputError(f"{path} has {len(data) - first} bytes after its last stream. {fix}")
     return header, streams
 
 
-def _header(path: Path, text: bytes, version: int, most: int) -> dict[str, Any]:
-    """The header, whose checksum holds, with a list of streams of which each has what it must, and which together
-    unpack to no more than `most` bytes."""
+def _header(path: Path, text: bytes, most: int) -> dict[str, Any]:
+    """The header, whose checksum holds: its streams' entries are complete, and unpack to at most `most` bytes together.
+
+    Raises:
+        InputError: it is not so.
+    """
     try:
         header = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -175,14 +168,12 @@ def _header(path: Path, text: bytes, version: int, most: int) -> dict[str, Any]:
     for entry in entries:
         if not (isinstance(entry, dict) and all(_is(entry.get(key), kind) for key, kind in ENTRY.items())):
             raise InputError(f"{path}: its header has a stream {ascii(entry)[:200]}, which cannot be.")
-        name, sizes = ascii(entry["name"])[:80], entry["shape"]
-        coding = entry.get("coding") if version > 1 else entry.setdefault("coding", "xz")
+        name, sizes, coding = ascii(entry["name"])[:80], entry["shape"], entry["coding"]
         if coding not in CODINGS:
-            raise InputError(f"{path}: its stream {name} has the coding {ascii(coding)[:80]}, which is none.")
-        dtypes = CODED if coding == "rans" else DTYPES
-        shape_is_one = len(sizes) <= MOST_AXES and all(_is(size, int) and 0 <= size < 2**48 for size in sizes)
-        shape_is_one &= coding == "xz" or len(sizes) == 2
-        if entry["dtype"] not in dtypes or not shape_is_one or entry["bytes"] < 0:
+            raise InputError(f"{path}: its stream {name} has the unknown coding {ascii(coding)[:80]}.")
+        possible = len(sizes) <= MOST_AXES and all(_is(size, int) and 0 <= size < 2**48 for size in sizes)
+        possible &= coding == "xz" or len(sizes) == 2
+        if entry["dtype"] not in CODINGS[coding] or not possible or entry["bytes"] < 0:
             raise InputError(
                 f"{path}: its stream {name} is {ascii(entry['dtype'])[:80]} {ascii(sizes)[:80]}, which cannot be."
             )

@@ -9,7 +9,6 @@ Array = np.ndarray
 
 MOST_BITS = 21
 """For a coordinate: three of them are interleaved in 63 bits."""
-HALF_SQRT2 = 0.5**0.5
 
 
 class Grid(NamedTuple):
@@ -63,15 +62,6 @@ _SPREADS = (
     (2, 0x1249249249249249),
 )
 """Shifts and masks that pull 21 bits apart, two zeros between neighbours."""
-
-
-def from_smallest_three(largest: Array, codes: Array, bits: int) -> Array:
-    """Rotations of unit length [N, 4]. Each of the three is off by at most sqrt(1/2) / (2^bits - 1)."""
-    others = codes / (2**bits - 1) * (2 * HALF_SQRT2) - HALF_SQRT2
-    unit = np.empty((len(codes), 4))
-    unit[np.arange(4) != largest[:, None]] = others.reshape(-1)
-    unit[np.arange(len(codes)), largest] = np.sqrt(np.maximum(1.0 - (others**2).sum(axis=1), 0.0))
-    return unit / np.linalg.norm(unit, axis=1, keepdims=True).clip(min=1e-12)
 
 
 def _octahedral() -> Array:

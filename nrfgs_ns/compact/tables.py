@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of a file, from version 2 on: what the numbers of a splat are before they are rounded.
+"""The tables of a file: the numbers of a splat before they are rounded, and the steps to which they are.
 
 means      [N, 3]
 turns      [N, 3]   x, y, z of the rotation with w > 0 that turns least and draws the same ellipsoid: of the 24 ways to
@@ -11,6 +11,7 @@ latents    [V, R]   of the V splats that are not diffuse
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,13 +19,31 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.head import SH_C0, base_colors
-from nrfgs_ns.compact.precision import Precision
 from nrfgs_ns.compact.quantise import nearest_turn
 
 COLUMNS = ("opacities", "scales", "colors", "turns")
 """Tables of all splats, beside the means, in the order of a file."""
 SMALLEST_W2 = 1e-6
-"""Of a rotation, w squared: x, y and z may be rounded beyond unit length."""
+"""Smallest w^2 of a rotation: x, y and z may be rounded beyond unit length."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Steps of the grids. No number is off by more than half of its step."""
+
+    means: float = 0.03125
+    """largest step of a coordinate, in standard deviations of the median splat; 10 to 21 bits for each axis. Finer than
+    the others, because a splat smaller than the median suffers more, and pixels notice places first"""
+    quats: int = 8
+    """bits of each of a rotation's three smaller components"""
+    scales: float = 0.0625
+    """step of a log scale: a sixteenth is 6 % of a size"""
+    opacities: float = 0.0625
+    """step of an opacity's logit: a sixteenth is at most 1/64 of opacity"""
+    colors: float = 1 / 512
+    """step of a base colour, in units of white"""
+    latents: float = 0.0625
+    """step of a latent's components, in standard deviations of the strongest"""
 
 
 def tables_of(splats: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:

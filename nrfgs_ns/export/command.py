@@ -1,70 +1,112 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs export`: which file is written, and what about it can be chosen."""
+"""`nrfgs export FORMAT`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
 import tyro
 
-from nrfgs_ns.compact.options import CompactOptions
-from nrfgs_ns.export.web.options import WebOptions
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.options import CompactOptions, PlyOptions, WebOptions
 from nrfgs_ns.files import check_writable
+from nrfgs_ns.trained.find import NamesTraining
+
+FLAT = tyro.conf.arg(name="")
+"""A group of options without a prefix."""
 
 
 @dataclass
-class PlyOptions:
-    """How splats lie in a PLY file."""
+class _Format(NamesTraining):
+    """What all formats have in common."""
 
-    world: Literal["viewers", "training", "capture"] = "viewers"
-    """viewers: y points down, as the programs expect that open files of 3DGS. training: as it was trained, z up, and as
-    ns-export writes it. capture: the data set's own axes and unit of length; of coordinates too large for float32 the
-    file's header says what was subtracted"""
-    steps: int | None = None
-    """of the fine-tune that makes the file draw what the model draws, 0 for none. None: 2,500, on a CPU 400"""
-    largest: float | None = None
-    """cut the splats' standard deviations to this length, in the unit of the training's world, in which the cameras lie
-    between -1 and 1: viewers that leave out what is centred off the screen do less harm. None: as trained"""
+    output: Path = field(kw_only=True)
+    """the file to write; an older one is replaced"""
+    measure: bool = True
+    """render the test views from the model and from the written file, and print the difference"""
+    report: Path | None = None
+    """also write the numbers to this file, as JSON"""
+
+    def checked(self) -> Path:
+        """The config.yml, with the paths checked that are written at the end."""
+        config = self.config()
+        for path, option in ((self.report, "--report"), (self.output, "--output")):
+            if path is not None:
+                check_writable(path, option)
+        return config
+
+
+@dataclass
+class Ply(_Format):
+    """The format of 3D Gaussian Splatting, with spherical harmonics fitted to the colours."""
+
+    options: Annotated[PlyOptions, FLAT] = field(default_factory=PlyOptions)
+
+    def main(self) -> None:
+        config = self.checked()
+        if self.options.largest is not None and not 0 < self.options.largest < float("inf"):
+            raise InputError(f"--largest is {self.options.largest}; it must be positive.")
+        if self.options.steps is not None and self.options.steps < 0:
+            raise InputError(f"--steps is {self.options.steps}; it must be at least 0.")
+        from nrfgs_ns.export.ply import export_ply
+
+        export_ply(config, self.output, self.options, self.measure, self.report)
+
+
+@dataclass
+class Compact(_Format):
+    """The field itself in a small file, for nrfgs view, ns-eval, ns-viewer and ns-render (docs/compact-format.md)."""
+
+    options: Annotated[CompactOptions, FLAT] = field(default_factory=CompactOptions)
+
+    def main(self) -> None:
+        config = self.checked()
+        check_compact(self.options)
+        from nrfgs_ns.export.compact import export_compact
+
+        export_compact(config, self.output, self.options, self.measure, self.report)
+
+
+@dataclass
+class Web(_Format):
+    """A page that runs the field in a browser (docs/web.md): a file, or, unless --output ends in .html, a folder."""
+
+    options: Annotated[CompactOptions, FLAT] = field(default_factory=CompactOptions)
+    page: Annotated[WebOptions, FLAT] = field(default_factory=WebOptions)
+
+    def checked(self) -> Path:
+        alone = self.output.suffix.lower() in (".html", ".htm")
+        if self.output.exists() and self.output.is_file() != alone:
+            raise InputError(
+                f"--output {self.output} is a {'file' if self.output.is_file() else 'folder'}. Name a file that ends "
+                "in .html, or a folder that does not."
+            )
+        config = self.config()
+        check_writable(self.output if alone else self.output / "index.html", "--output")
+        if self.report is not None:
+            check_writable(self.report, "--report")
+        return config
+
+    def main(self) -> None:
+        config = self.checked()
+        check_compact(self.options)
+        from nrfgs_ns.export.web.command import export_web
+
+        export_web(config, self.output, self.options, self.page, self.measure, self.report)
+
+
+def check_compact(options: CompactOptions) -> None:
+    """Raise InputError, naming the option, if a value cannot work."""
+    for name in ("finetune", "rate", "budget"):
+        if not getattr(options, name) >= 0:
+            raise InputError(f"--{name} is {getattr(options, name)}; it must be zero or positive.")
 
 
 @dataclass
 class Export:
     """Write a trained model as a file that other programs read."""
 
-    format: tyro.conf.Positional[Literal["ply", "compact", "web"]]
-    """ply: the format of 3D Gaussian Splatting, with spherical harmonics fitted to the colours. compact: the field
-    itself in a small file, which ns-eval, ns-viewer and ns-render read (docs/compact-format.md). web: a page that runs
-    the field in a browser (docs/web.md)"""
-    load_config: Path
-    """config.yml of the training"""
-    output: Path
-    """the file to write; an older one is replaced. web: a name that does not end in .html is a folder's, for a web
-    server"""
-    measure: bool = True
-    """render the test views from the model and from the written file, and tell what the fit loses"""
-    report: Path | None = None
-    """also write the numbers to this file, as JSON"""
-    ply: PlyOptions = field(default_factory=PlyOptions)
-    """how splats lie in a PLY file"""
-    compact: CompactOptions = field(default_factory=CompactOptions)
-    """what a compact file may leave out, and the scene in a page"""
-    web: WebOptions = field(default_factory=WebOptions)
-    """what a page says of itself"""
+    format: tyro.conf.OmitSubcommandPrefixes[Ply | Compact | Web]
 
     def main(self) -> None:
-        if self.report is not None:
-            check_writable(self.report, "--report")
-        if self.format == "web":
-            from nrfgs_ns.export.web.command import export_web
-
-            export_web(self.load_config, self.output, self.compact, self.web, self.measure, self.report)
-            return
-        check_writable(self.output, "--output")
-        if self.format == "compact":
-            from nrfgs_ns.export.compact import export_compact
-
-            export_compact(self.load_config, self.output, self.compact, self.measure, self.report)
-        else:
-            from nrfgs_ns.export.ply import export_ply
-
-            export_ply(self.load_config, self.output, self.ply, self.measure, self.report)
+        self.format.main()

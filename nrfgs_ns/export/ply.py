@@ -10,23 +10,29 @@ and writes the same numbers, in the training's world.
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
+from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.files import whole, write_whole
-
-if TYPE_CHECKING:  # nerfstudio takes seconds to import: `nrfgs --help` answers at once
-    from nrfgs_ns.export.command import PlyOptions
-    from nrfgs_ns.export.frames import Similarity
-    from nrfgs_ns.model.harmonics_fit import PlainSplats
+from nrfgs_ns.model.harmonics_fit import PlainSplats
+from nrfgs_ns.model.pinhole import pinhole
+from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
+from nrfgs_ns.threads import few_threads
+from nrfgs_ns.trained.loading import load_model, lost, measure_loss
 
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz"),
@@ -47,82 +53,70 @@ WORTH_A_WORD = 0.1
 """Loss in dB from which the command speaks of it."""
 
 
-def export_ply(load_config: Path, output: Path, options: "PlyOptions", measure: bool, report_file: Path | None) -> None:
-    """See `nrfgs export --help`."""
-    from nerfstudio.utils.rich_utils import CONSOLE
-
-    from nrfgs_ns.data.world import CaptureFrame
-    from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, to_capture
-    from nrfgs_ns.export.loading import load_model, measure_loss
-
-    if options.largest is not None and not 0 < options.largest < math.inf:
-        raise InputError(f"--ply.largest is {options.largest}; it must be positive.")
-    if options.steps is not None and options.steps < 0:
-        raise InputError(f"--ply.steps is {options.steps}; it must be at least 0.")
-    # Set up exactly as in ns-export, so that both fit over the same cameras.
-    pipeline = load_model(load_config, "inference")
-    pipeline.model.fit_on(pipeline.datamanager.train_dataset.cameras, options.steps)
-    begin = perf_counter()
-    fit = pipeline.model.fit
-    splats, seconds = fit.splats, perf_counter() - begin
-    # Brush's mark, which splat-transform reads, too: the splats are dimmed for the blur that a renderer adds to them.
-    comments = ["SplatRenderMode: mip"] if pipeline.model.config.rasterize_mode == "antialiased" else []
-    origin = None
-    if options.largest is not None:
-        splats = splats._replace(scales=splats.scales.clamp_max(math.log(options.largest)))
-    placed = {"viewers": Y_DOWN, "training": NOWHERE}.get(options.world)
-    if placed is None:
-        frame = CaptureFrame.of(pipeline.datamanager.train_dataparser_outputs)
-        placed = to_capture(frame)
-        origin = frame.origin
-        comments.append(f"origin {' '.join(f'{number:.17g}' for number in origin)}")
-    written = write_splats(placed.moved(splats), output, comments)
-    report = {
-        "splats": len(fit.splats.means),
-        "written": written,
-        "bytes": output.stat().st_size,
-        "world": options.world,
-        "exact": fit.exact,
-        "ridge_views": fit.strength,
-        "training_views": fit.views,
-        "unseen_splats": fit.unseen,
-        "seconds": {"fit": seconds},
-    }
-    how = "its harmonics as they are"
-    if not fit.exact:
-        how = f"harmonics fitted over {fit.views} training views (ridge {fit.strength:g} views)"
-    CONSOLE.print(
-        f"{output}: {written:,} of {report['splats']:,} splats, {how}, {report['bytes'] / 1e6:.1f} MB",
-        markup=False,
-        soft_wrap=True,
-    )
-    if origin is not None and origin.any():
-        report["origin"] = origin.tolist()
-        CONSOLE.print(f"Its coordinates are the capture's less {tuple(report['origin'])}, as its header says.")
-    if not fit.exact and fit.unseen:
-        CONSOLE.print(f"{fit.unseen:,} splats are seen by no training view and have their base colour.")
-    if measure:
-        pipeline = load_model(load_config, "test")
-        report |= measure_loss(pipeline, pictures_of_file(pipeline.model, output, placed))
-        lost = round(report["loss_db"], 2) + 0.0  # without the sign of a -0.0
-        CONSOLE.print(
-            f"PSNR on {len(report['per_image'])} test views: model {report['psnr_model']:.2f} dB, "
-            f"file {report['psnr_file']:.2f} dB: it loses {lost:.2f} dB. Base colours and opacities alone have "
-            f"{report['psnr_base']:.2f} dB.",
-            soft_wrap=True,
-        )
-        if report["psnr_file"] - report["psnr_on_screen"] > WORTH_A_WORD:
-            CONSOLE.print(
-                f"Viewers that leave out splats centred off the screen, as Spark does, show "
-                f"{report['psnr_on_screen']:.2f} dB. In Spark raise clipXY from {SPARKS_EDGE}; for all viewers "
-                "--ply.largest cuts large splats down.",
-                soft_wrap=True,
-            )
+def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bool, report_file: Path | None) -> None:
+    """Write a PLY file, and report what it costs; see `nrfgs export ply --help`."""
+    with few_threads() as threads:
+        # Set up exactly as in ns-export, so that both fit over the same cameras.
+        pipeline = load_model(load_config, "inference")
+        threads.suit_to(pipeline)
+        pipeline.model.fit_on(pipeline.datamanager.train_dataset.cameras, options.steps)
+        begin = perf_counter()
+        fit = pipeline.model.fit
+        splats, seconds = fit.splats, perf_counter() - begin
+        if options.largest is not None:
+            splats = splats._replace(scales=splats.scales.clamp_max(math.log(options.largest)))
+        # Brush's mark, which splat-transform reads, too: the splats are dimmed for the blur that a renderer adds.
+        comments = ["SplatRenderMode: mip"] if pipeline.model.config.rasterize_mode == "antialiased" else []
+        origin = None
+        placed = {"viewers": Y_DOWN, "training": NOWHERE}.get(options.world)
+        if placed is None:
+            frame = CaptureFrame.of(pipeline.datamanager.train_dataparser_outputs)
+            placed, origin = to_capture(frame), frame.origin
+            comments.append(f"origin {' '.join(f'{number:.17g}' for number in origin)}")
+        written = write_splats(placed.moved(splats), output, comments)
+        report = {
+            "splats": len(fit.splats.means),
+            "written": written,
+            "bytes": output.stat().st_size,
+            "world": options.world,
+            "exact": fit.exact,
+            "ridge_views": fit.strength,
+            "training_views": fit.views,
+            "unseen_splats": fit.unseen,
+            "seconds": {"fit": seconds},
+        }
+        if origin is not None and origin.any():
+            report["origin"] = origin.tolist()
+        if measure:
+            pipeline = load_model(load_config, "test")
+            report |= measure_loss(pipeline, pictures_of_file(pipeline.model, output, placed))
+    for line in summary(output, report):
+        CONSOLE.print(line, markup=False, soft_wrap=True)
     if report_file is not None:
         write_whole(report_file, json.dumps(report, indent=1) + "\n")
 
 
-def write_splats(splats: "PlainSplats", path: Path, comments: Sequence[str] = ()) -> int:
+def summary(output: Path, report: dict[str, Any]) -> Iterator[str]:
+    """A report in sentences."""
+    harmonics = "its harmonics as they are"
+    if not report["exact"]:
+        harmonics = f"harmonics fitted over {report['training_views']} training views"
+    yield f"{output}: {report['written']:,} of {report['splats']:,} splats, {harmonics}, {report['bytes'] / 1e6:.1f} MB"
+    if "origin" in report:
+        yield f"Its coordinates are the capture's less {tuple(report['origin'])}, as its header says."
+    if not report["exact"] and report["unseen_splats"]:
+        yield f"{report['unseen_splats']:,} splats are seen by no training view and have their base colour."
+    if "psnr_file" in report:
+        yield f"{lost(report)} Base colours and opacities alone have {report['psnr_base']:.2f} dB."
+        if report["psnr_file"] - report["psnr_on_screen"] > WORTH_A_WORD:
+            yield (
+                f"Viewers that leave out splats centred off the screen, as Spark does, show "
+                f"{report['psnr_on_screen']:.2f} dB. In Spark raise clipXY from {SPARKS_EDGE}; for all viewers "
+                "--largest cuts large splats down."
+            )
+
+
+def write_splats(splats: PlainSplats, path: Path, comments: Sequence[str] = ()) -> int:
     """Write a 3DGS PLY file, whole or not at all.
 
     Splats that are not finite or too faint to be drawn are left out.
@@ -156,14 +150,12 @@ def write_splats(splats: "PlainSplats", path: Path, comments: Sequence[str] = ()
     return len(vertices)
 
 
-def read_splats(path: Path) -> "PlainSplats":
+def read_splats(path: Path) -> PlainSplats:
     """Read a 3DGS PLY file of any degree up to 3; lower ones are filled up with zeros.
 
     Raises:
         InputError: the file is not there, or has not the properties of one.
     """
-    from nrfgs_ns.model.harmonics_fit import PlainSplats
-
     try:
         vertices = PlyData.read(str(path))["vertex"].data
     except (OSError, KeyError, ValueError, PlyParseError) as error:
@@ -197,7 +189,7 @@ def read_splats(path: Path) -> "PlainSplats":
 
 @torch.no_grad()
 def render_splats(
-    splats: "PlainSplats", camera, background: Tensor, rasterize_mode: str = "classic", scene_unit: float = 1.0
+    splats: PlainSplats, camera, background: Tensor, rasterize_mode: str = "classic", scene_unit: float = 1.0
 ) -> Tensor:
     """Render a file's splats as any viewer would, with this project's rasterizer.
 
@@ -209,11 +201,6 @@ def render_splats(
     Returns:
         [H, W, 3] in [0, 1].
     """
-    from nrfgs_ns.appearance.field import Field
-    from nrfgs_ns.appearance.sh import ShConfig
-    from nrfgs_ns.model.pinhole import pinhole
-    from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
-
     device = splats.means.device
     pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
     field = Field(ShConfig(degree=3).setup(), splats._asdict())
@@ -224,8 +211,6 @@ def render_splats(
 
 def on_screen(means: Tensor, camera) -> Tensor:
     """Which splats' centres [N, 3] lie no farther from the picture's middle than SPARKS_EDGE, bool [N]."""
-    from nrfgs_ns.model.pinhole import pinhole
-
     pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
     seen_from = pinhole(camera, pose.to(means.device), 1)
     viewmat, intrinsics = seen_from.viewmat.reshape(4, 4), seen_from.K.reshape(3, 3)
@@ -234,7 +219,7 @@ def on_screen(means: Tensor, camera) -> Tensor:
     return ((pixels[:, :2] - half * pixels[:, 2:]).abs() <= SPARKS_EDGE * half * pixels[:, 2:]).all(dim=1)
 
 
-def pictures_of_file(model, path: Path, placed: "Similarity") -> Callable[[Any], dict[str, Tensor]]:
+def pictures_of_file(model, path: Path, placed: Similarity) -> Callable[[Any], dict[str, Tensor]]:
     """What a file shows beside the model that it was written from.
 
     Args:

@@ -15,16 +15,16 @@ from PIL import Image
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 from nrfgs_ns.appearance.reduce import input_columns
 from nrfgs_ns.compact.format import write_container
-from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.compact import check_options, measure_file, packed, write_config
-from nrfgs_ns.export.loading import load_model
-from nrfgs_ns.export.web.options import WebOptions
+from nrfgs_ns.export.compact import measure_file, packed, write_config
+from nrfgs_ns.export.options import CompactOptions, WebOptions
 from nrfgs_ns.export.web.page import page
-from nrfgs_ns.files import check_writable, whole
+from nrfgs_ns.files import whole
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.pinhole import pinhole
+from nrfgs_ns.threads import few_threads
+from nrfgs_ns.trained.loading import load_model, lost
 
 SCENE = "scene.nrf"
 """Name of the scene's file in a folder."""
@@ -49,58 +49,53 @@ def export_web(
     Args:
         output: an .html file; any other name is that of a folder, in which the page and its scene lie apart.
     """
-    check_options(options)
     alone = output.suffix.lower() in (".html", ".htm")
-    if output.exists() and output.is_file() != alone:
-        raise InputError(
-            f"--output {output} is a {'file' if output.is_file() else 'folder'}. Name a file that ends in .html, or a "
-            "folder that does not."
-        )
-    check_writable(output if alone else output / SCENE, "--output")
-    pipeline = load_model(load_config, "test")
-    model = pipeline.model
-    if not isinstance(model.head, NeuralResidualField):
-        raise InputError(
-            f"--load-config {load_config}: a page runs a neural residual field, and this model has the "
-            f"{model.head.name!r} head. Use nrfgs export ply, and a viewer of such files."
-        )
-    if (vectors := weight_vectors(model.head.config)) > MOST_WEIGHTS:
-        raise InputError(
-            f"--load-config {load_config}: the field's weights fill {vectors} vectors of a shader, and some phones "
-            f"have room for {MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
-        )
-    header, streams, numbers = packed(pipeline, load_config, options)
-    about, poster = surroundings(pipeline)
-    with TemporaryDirectory() as temporary:
-        file = Path(temporary) / SCENE
-        scene_bytes = write_container(file, header, streams)
-        scene = file.read_bytes()
-        losses = measure_file(pipeline, write_config(load_config, file)) if measure else {}
+    with few_threads() as threads:
+        pipeline = load_model(load_config, "test")
+        threads.suit_to(pipeline)
+        check_model(pipeline.model, load_config)
+        header, streams, numbers = packed(pipeline, load_config, options)
+        about, poster = surroundings(pipeline)
+        with TemporaryDirectory() as temporary:
+            file = Path(temporary) / SCENE
+            scene_bytes = write_container(file, header, streams)
+            scene = file.read_bytes()
+            losses = measure_file(pipeline, write_config(load_config, file)) if measure else {}
     title = output.stem if web.title is None else web.title
     text = page(about, poster, scene if alone else SCENE, title, web.author)
-    written = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
-    for path, content in written.items():
+    contents = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
+    for path, content in contents.items():
         write(path, content)
 
-    size = sum(map(len, written.values()))
+    size = sum(map(len, contents.values()))
     name = about["photographs"][about["start"]]["name"]
-    CONSOLE.print(
+    lines = [
         f"{output}: {numbers['written']:,} splats, {numbers['view_dependent']:,} of them view-dependent, "
         f"{size / 1e6:.2f} MB; 3DGS's PLY of as many splats has {numbers['ply_bytes'] / 1e6:.2f} MB. It begins where "
-        f"{name} was taken.",
-        markup=False,
-        soft_wrap=True,
-    )
+        f"{name} was taken."
+    ]
     if measure:
-        CONSOLE.print(
-            f"PSNR on {len(losses['per_image'])} test views: model {losses['psnr_model']:.2f} dB, the page's scene "
-            f"{losses['psnr_file']:.2f} dB."
-        )
-    where = "Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md."
-    CONSOLE.print(where)
+        lines.append(lost(losses))
+    lines.append("Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md.")
+    for line in lines:
+        CONSOLE.print(line, markup=False, soft_wrap=True)
     if report is not None:
         numbers |= {"bytes": size, "scene_bytes": scene_bytes, "start": name, **losses}
         write(report, (json.dumps(numbers, indent=1) + "\n").encode())
+
+
+def check_model(model, load_config: Path) -> None:
+    """Raise InputError where no page can run a model."""
+    if not isinstance(model.head, NeuralResidualField):
+        raise InputError(
+            f"{load_config}: a page runs a neural residual field, and this model has the {model.head.name!r} head. Use "
+            "nrfgs export ply, and a viewer of such files."
+        )
+    if (vectors := weight_vectors(model.head.config)) > MOST_WEIGHTS:
+        raise InputError(
+            f"{load_config}: the field's weights fill {vectors} vectors of a shader, and some phones have room for "
+            f"{MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
+        )
 
 
 def weight_vectors(config: NrfConfig) -> int:

@@ -35,48 +35,7 @@ function readScene(bytes, progress) {
       scene.weights[name.slice("head.".length)] = { shape: stream.shape, values };
     }
   }
-  if (streams.splats) {
-    readTables(streams, scene, rank);
-    return scene;
-  }
-  let first = 0;
-  for (const group of ["view", "diffuse"]) {
-    const n = count[group];
-    const codes = (name, columns) => {
-      const stream = streams[`${group}.${name}`];
-      if (!stream || stream.shape.length !== (columns ? 2 : 1) || stream.shape.at(-1) !== n) {
-        throw new BadFile(`The scene's ${group}.${name} does not fit its number of splats.`);
-      }
-      if (columns && stream.shape[0] !== columns) throw new BadFile(`The scene's ${group}.${name} has other columns.`);
-      return stream;
-    };
-    readMeans(codes("means", 0), header.grids.means, scene.table, first, n);
-    readRotations(codes("quats_largest", 0), codes("quats", 3), header.quats_bits, scene.table, first, n);
-    const put = (name, columns, offset, value) => {
-      const code = numbers(codes(name, columns));
-      const { low, step } = header.grids[name];
-      for (let c = 0; c < columns; c++) {
-        for (let i = 0; i < n; i++) scene.table[16 * (first + i) + offset + c] = value(low[c] + step[c] * code[c * n + i]);
-      }
-    };
-    put("opacities", 1, 3, (x) => x);
-    put("scales", 3, 8, Math.exp);
-    put("colors", 3, 12, (x) => x);
-    first += n;
-  }
-  if (count.view > 0) {
-    const stream = streams["view.latents"];
-    if (!stream || stream.shape[0] !== rank || stream.shape[1] !== count.view) {
-      throw new BadFile("The scene's view.latents do not fit its number of splats.");
-    }
-    const code = numbers(stream), width = 4 * Math.ceil(rank / 4);
-    const { low, step } = header.grids.latents;
-    for (let r = 0; r < rank; r++) {
-      for (let i = 0; i < count.view; i++) {
-        scene.latents[width * i + r] = low[r] + step[r] * code[r * count.view + i];
-      }
-    }
-  }
+  readTables(streams, scene, rank);
   return scene;
 }
 
@@ -86,7 +45,7 @@ function readContainer(bytes, progress) {
     throw new BadFile("The page does not hold a scene of nrfgs, or only a part of one.");
   }
   const version = view.getUint32(8, true);
-  if (version < 1 || version > VERSION) throw new BadFile("The scene is of another version than this page reads.");
+  if (version !== VERSION) throw new BadFile("The scene is of another version than this page reads.");
   const length = view.getUint32(12, true), total = Number(view.getBigUint64(16, true));
   if (total !== bytes.length || 28 + length > total) {
     throw new BadFile(`The scene has ${bytes.length} bytes instead of ${total}: the page is cut short.`);
@@ -113,7 +72,7 @@ function readContainer(bytes, progress) {
   return { header, streams };
 }
 
-// The tables of a file of version 2: all splats in one order; the scene has the view-dependent ones first.
+// The tables: all splats in one order; the scene has the view-dependent ones first.
 function readTables({ means, splats, latents }, scene, rank) {
   const n = scene.count, of = scene.viewDependent, { grids } = scene.header;
   const fits = ({ columns, shape } = {}, c, rows) => columns && shape[0] === c && shape[1] === rows;
@@ -188,19 +147,8 @@ function thirds(x) {
   return (x ^ (x >>> 16)) & 0x3ff;
 }
 
-// Running sums of 64-bit differences, and the coordinates whose bits alternate in them.
-function readMeans({ planes }, { low, step }, table, first, n) {
-  const lower = new Uint32Array(n), upper = new Uint32Array(n), place = new Uint32Array(n);
-  for (let i = 0; i < n; i++) {
-    const word = (k) => planes[k * n + i] | (planes[(k + 1) * n + i] << 8) | (planes[(k + 2) * n + i] << 16) | (planes[(k + 3) * n + i] << 24);
-    lower[i] = word(0);
-    upper[i] = word(4);
-    place[i] = first + i;
-  }
-  readPlaces(lower, upper, { low, step }, table, place);
-}
-
-// The same from the differences' lower and upper 32 bits, for splats whose rows of the table are `place`.
+// Running sums of 64-bit differences, given as lower and upper 32 bits, and the coordinates whose bits alternate in them.
+// Splat i goes to row place[i] of the table.
 function readPlaces(lowers, uppers, { low, step }, table, place) {
   let lower = 0, upper = 0;
   for (let i = 0; i < place.length; i++) {
@@ -213,24 +161,6 @@ function readPlaces(lowers, uppers, { low, step }, table, place) {
       const code = thirds(lower >>> a & 0x3fffffff >>> a) | (thirds(middle >>> a) << 10) | (((upper >>> (28 + a)) & 1) << 20);
       table[16 * place[i] + a] = low[a] + step[a] * code;
     }
-  }
-}
-
-// The smallest three components of unit quaternions, and the largest from their length.
-function readRotations(largest, codes, bits, table, first, n) {
-  const which = numbers(largest), code = numbers(codes), top = 2 ** bits - 1;
-  for (let i = 0; i < n; i++) {
-    const at = 16 * (first + i) + 4;
-    let squares = 0;
-    for (let k = 0, c = 0; k < 4; k++) {
-      if (k === which[i]) continue;
-      const value = (code[n * c++ + i] / top - 0.5) * Math.SQRT2;
-      table[at + k] = value;
-      squares += value * value;
-    }
-    const rest = Math.sqrt(Math.max(1 - squares, 0)), norm = Math.sqrt(squares + rest * rest);
-    table[at + which[i]] = rest;
-    for (let k = 0; k < 4; k++) table[at + k] /= norm;
   }
 }
 

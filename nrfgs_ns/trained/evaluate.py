@@ -1,36 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs eval`: what `ns-eval` does and writes, for a training that another person has handed on, too."""
+"""`nrfgs eval`: the numbers and file of `ns-eval`, also for a training from somebody else."""
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
 from nrfgs_ns.files import check_writable, write_whole
+from nrfgs_ns.trained.find import NamesTraining
 
 
 @dataclass
-class Eval:
-    """Evaluate a trained model on its test views. Its config.yml is read as options alone and runs no code."""
+class Eval(NamesTraining):
+    """Evaluate a trained model on its test views. Its config.yml is read as options only and runs no code."""
 
-    config: tyro.conf.Positional[Path]
-    """config.yml of the training"""
     output_path: Path = Path("output.json")
     """the file for the numbers, as ns-eval writes it"""
     render_output_path: Path | None = None
     """folder for the pictures, truth and rendering side by side"""
 
     def main(self) -> None:
+        path = self.config()
         check_writable(self.output_path, "--output-path")
         if self.render_output_path is not None:
             check_writable(self.render_output_path / "eval.png", "--render-output-path")
         from nerfstudio.utils.rich_utils import CONSOLE
 
-        from nrfgs_ns.export.loading import load_training
+        from nrfgs_ns.threads import few_threads
+        from nrfgs_ns.trained.loading import load_training
 
-        trained = load_training(self.config, "test")
-        results = trained.pipeline.get_average_eval_image_metrics(output_path=self.render_output_path, get_std=True)
+        with few_threads() as threads:
+            trained = load_training(path, "test")
+            threads.suit_to(trained.pipeline)
+            results = trained.pipeline.get_average_eval_image_metrics(output_path=self.render_output_path, get_std=True)
         numbers = {
             "experiment_name": trained.config.experiment_name,
             "method_name": trained.config.method_name,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trained models, for what looks at them or writes them."""
+"""Trained models, loaded for evaluation, viewing and export, and the loss of a file made from one."""
 
 import os
 from collections.abc import Callable
@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
-from rich.progress import track
 from torch import Tensor
 
 from nrfgs_ns.errors import InputError
@@ -140,28 +139,36 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
         pictures: renders a camera, a batch of one: name -> image [H, W, 3]. One of them is "file".
 
     Returns:
-        Means over the images, dB, inside their masks: psnr_model, and psnr_NAME of each picture. loss_db: what the file
-        lacks of the model. per_image: each image's values.
+        Means over the images, dB, inside their masks: psnr_model, and psnr_NAME of each picture. loss_db: model minus
+        file. per_image: each image's values.
 
     Raises:
         InputError: no test image has pixels inside its mask.
     """
-    from nerfstudio.utils.rich_utils import CONSOLE
-
     from nrfgs_ns.image.metrics import psnr
+    from nrfgs_ns.progress import progress
 
     model = pipeline.model
     names = [Path(name).name for name in pipeline.datamanager.eval_dataset.image_filenames]
-    images = list(zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True))
     per_image, scores = [], {}
-    for image, (camera, batch) in track(images, "Measuring the loss", console=CONSOLE, transient=True):
-        outputs = model.get_outputs_for_camera(camera)
-        truth, mask = model.truth_of(batch, outputs["background"]), model.mask_of(batch)
-        every = {"model": outputs["rgb"], **pictures(camera)}
-        scores = {f"psnr_{name}": psnr(picture, truth, mask) for name, picture in every.items()}
-        if None not in scores.values():  # nothing inside the mask
-            per_image.append({"image": image, **scores})
+    with progress("Measuring the loss", len(names)) as advance:
+        for image, (camera, batch) in zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True):
+            outputs = model.get_outputs_for_camera(camera)
+            truth, mask = model.truth_of(batch, outputs["background"]), model.mask_of(batch)
+            rendered = {"model": outputs["rgb"], **pictures(camera)}
+            scores = {f"psnr_{name}": psnr(picture, truth, mask) for name, picture in rendered.items()}
+            if None not in scores.values():  # None: no pixel inside the mask
+                per_image.append({"image": image, **scores})
+            advance()
     if not per_image:
         raise InputError("No test image has pixels inside its mask: there is nothing to measure on. Use --no-measure.")
-    means = {key: sum(one[key] for one in per_image) / len(per_image) for key in scores}
+    means = {key: sum(image[key] for image in per_image) / len(per_image) for key in scores}
     return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}
+
+
+def lost(numbers: dict[str, Any]) -> str:
+    """`measure_loss` in a sentence."""
+    count, loss = len(numbers["per_image"]), numbers["loss_db"]
+    views = "one test view" if count == 1 else f"{count} test views"
+    change = f"{abs(loss):.2f} dB {'lost' if loss > 0 else 'gained'}" if abs(loss) >= 0.005 else "nothing lost"
+    return f"PSNR on {views}: model {numbers['psnr_model']:.2f} dB, file {numbers['psnr_file']:.2f} dB ({change})."

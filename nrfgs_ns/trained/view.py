@@ -1,23 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs view`: nerfstudio's viewer, as `ns-viewer` opens it, for what another person has handed on, too."""
+"""`nrfgs view`: nerfstudio's viewer, as `ns-viewer` opens it, also for a training or file from somebody else."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from time import sleep
 from types import SimpleNamespace
 
-import tyro
-
 from nrfgs_ns.compact.format import MAGIC
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.trained.find import NamesTraining, config_of
 
 
 @dataclass
-class View:
-    """Look at a trained model in a browser. Its config.yml is read as options alone and runs no code."""
+class View(NamesTraining):
+    """Look at a trained model in a browser: a training, or a file of `nrfgs export compact`. No code in it is run."""
 
-    model: tyro.conf.Positional[Path]
-    """config.yml of the training, or a file of `nrfgs export compact`, which needs nothing else"""
     host: str = "127.0.0.1"
     """address to listen on. 127.0.0.1: this machine only; from another use ssh -L 7007:localhost:7007 HOST. 0.0.0.0:
     everybody who reaches this machine can look"""
@@ -25,27 +21,29 @@ class View:
     """port to listen on. None: 7007, or the next that is free"""
 
     def main(self) -> None:
-        if not self.model.is_file():
-            raise InputError(f"{self.model}: no such file. Name a config.yml, or a file of nrfgs export compact.")
-        with self.model.open("rb") as file:
+        path = config_of(self.named())
+        with path.open("rb") as file:
             compact = file.read(len(MAGIC)) == MAGIC
 
+        from nrfgs_ns.threads import few_threads
         from nrfgs_ns.viewer.server import LocalViewerConfig
 
         config = LocalViewerConfig(websocket_host=self.host, websocket_port=self.port)
-        if compact:
-            view_file(self.model, config)
-            while True:
-                sleep(1)
-        from nerfstudio.scripts.viewer.run_viewer import _start_viewer
+        with few_threads() as threads:
+            if compact:
+                threads.suit(view_file(path, config).pipeline.model.num_points)
+                while True:
+                    sleep(1)
+            from nerfstudio.scripts.viewer.run_viewer import _start_viewer
 
-        from nrfgs_ns.export.loading import load_training
+            from nrfgs_ns.trained.loading import load_training
 
-        trained = load_training(self.model, "test")
-        # Where nerfstudio looks for the config.yml that it names in its command for ns-render; it writes nothing there.
-        config.relative_log_filename = str(self.model.absolute().parent / "viewer.log")
-        trained.config.vis, trained.config.viewer = "viewer", config
-        _start_viewer(trained.config, trained.pipeline, trained.step)
+            trained = load_training(path, "test")
+            threads.suit_to(trained.pipeline)
+            # Where nerfstudio looks for the config.yml that its command for ns-render names; it writes nothing there.
+            config.relative_log_filename = str(path.absolute().parent / "viewer.log")
+            trained.config.vis, trained.config.viewer = "viewer", config
+            _start_viewer(trained.config, trained.pipeline, trained.step)
 
 
 def view_file(path: Path, config):
@@ -53,7 +51,7 @@ def view_file(path: Path, config):
     from nerfstudio.utils.rich_utils import CONSOLE
     from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 
-    from nrfgs_ns.export.loading import load_file
+    from nrfgs_ns.trained.loading import load_file
     from nrfgs_ns.viewer.panel import ViewerPanel
 
     model = load_file(path)

@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs inspect`: parts of a trained field left out, and what that costs and saves on held-out views.
+
+Nothing is trained again: a number here is the trained model's loss without a part, which is at least the loss of a
+model trained without it.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.table import Table
+from torch import Tensor
+
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.nrf import NeuralResidualField
+from nrfgs_ns.appearance.reduce import (
+    LatentBasis,
+    Layers,
+    branches_of,
+    input_columns,
+    latent_basis,
+    layers,
+    pair,
+    rebuilt,
+    with_rank,
+)
+from nrfgs_ns.compact.slim import THRESHOLDS, FieldViews, Residuals, dropped, look_over, slim
+from nrfgs_ns.data.views import evenly_spaced
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import check_writable, write_whole
+from nrfgs_ns.model.harmonics_fit import look_through
+from nrfgs_ns.progress import progress
+from nrfgs_ns.trained.find import NamesTraining
+from nrfgs_ns.trained.loading import load_model
+from nrfgs_ns.training.run import machine
+
+TIMED = 5
+"""Evaluations of a view's head; the fastest counts, because other work on the machine only ever adds."""
+
+
+@dataclass
+class Inspect(NamesTraining):
+    """Measure what each part of a trained field is worth, and what it costs."""
+
+    output: Path | None = None
+    """file for the numbers; None: inspect.json beside the config"""
+    views: int = 12
+    """test views to measure on, evenly spaced"""
+    budget: float = 0.05
+    """dB that the parts may cost together that are left out at once"""
+
+    def main(self) -> None:
+        if self.views < 1:
+            raise InputError(f"--views is {self.views}; it must be at least 1.")
+        if not self.budget >= 0:
+            raise InputError(f"--budget is {self.budget}; it must be zero or positive.")
+        config = self.config()
+        output = self.output or config.parent / "inspect.json"
+        check_writable(output, "--output")
+        pipeline = load_model(config, "test")
+        model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
+        if not isinstance(model.head, NeuralResidualField):
+            raise InputError(f"{config}: the {model.head.name!r} head has no parts. Name a training of nrfgs.")
+        images = pipeline.datamanager.fixed_indices_eval_dataloader
+        images = [images[i] for i in evenly_spaced(len(images), self.views)]
+        if not images:
+            raise InputError(f"{config}: its data set has no test views to measure on.")
+        with progress(f"Looking at the splats from {len(cameras)} training views"):
+            seen, distance = look_over(model, cameras), mean_log_distance(model, cameras)
+        field, views = model.field.detached(), FieldViews(model, images)
+        basis = latent_basis(field, seen.weight)
+        candidates = list(changes(field, seen, basis, distance))
+        rows = [row("nothing", "full", field, views, None)]
+        with progress("Leaving out", len(candidates)) as advance:
+            for name, group, extra, change in candidates:
+                rows.append(row(name, group, change(field), views, rows[0].psnr, **extra))
+                advance(name)
+        all_together, left_out = together(field, rows, candidates, seen, views, self.budget)
+        for entry in rows:
+            entry.threshold = None if entry.threshold == float("inf") else entry.threshold  # JSON has no infinity
+        result = {
+            "machine": machine(),
+            "splats": model.num_points,
+            "views": len(images),
+            "budget_db": self.budget,
+            "image_seconds": sum(fastest(lambda c=c: model.get_outputs_for_camera(c)) for c, _ in images) / len(images),
+            "latent_variances": basis.variances.tolist(),
+            "rows": [asdict(entry) for entry in rows],
+            "together": {**asdict(all_together), "left_out": left_out},
+        }
+        write_whole(output, json.dumps(result, indent=1) + "\n")
+        CONSOLE.print(table([*rows, all_together]))
+        parts = ", ".join(left_out) or "nothing"
+        CONSOLE.print(f"Within {self.budget:g} dB can be left out together: {parts}. Numbers: {output}", soft_wrap=True)
+
+
+@dataclass
+class Row:
+    """One field, measured."""
+
+    part: str
+    """what was left out"""
+    group: str
+    """full, part, input, rank, residual, together"""
+    psnr: float
+    """mean over the views, dB"""
+    loss_db: float
+    """the full field's PSNR minus this one's"""
+    bytes: int
+    """of the splats and the head, float32"""
+    head_seconds: float
+    """for one view, mean over the views"""
+    diffuse: float = 0.0
+    """share of the splats without residual"""
+    rank: int | None = None
+    """numbers in a latent, where that is what was changed"""
+    threshold: float | None = None
+    """8-bit steps, where residuals below it were dropped"""
+
+
+Candidate = tuple[str, str, dict[str, Any], Callable[[Field], Field]]
+"""Name, group, the row's extra columns, and the change."""
+
+
+def changes(field: Field, seen: Residuals, basis: LatentBasis, distance: float) -> Iterator[Candidate]:
+    """Everything that can be left out of a field."""
+    config = field.head.config
+    if field.head.high is not None:
+        yield "high branch", "part", {}, without_high_branch
+    yield "low branch", "part", {}, without_low_branch
+    if config.opacity_residual:
+        yield "opacity residual", "part", {}, without_opacity_residual
+    if config.use_distance:
+        yield "distance", "part", {}, lambda field: with_constant_distance(field, distance)
+    inputs = {name for branch, _ in branches_of(field.head) for name in input_columns(config, branch)}
+    for name in sorted(inputs):
+        if name == "direction" or name.startswith("band"):
+            yield name, "input", {}, lambda field, name=name: without_input(field, name)
+    for rank in range(1, config.latent_dim + 1):
+        yield f"latent rank {rank}", "rank", {"rank": rank}, lambda field, rank=rank: with_rank(field, basis, rank)
+    for threshold in THRESHOLDS:
+        name = "all residuals" if threshold == float("inf") else f"residuals below {threshold:g} steps"
+        change = lambda field, threshold=threshold: dropped(field, seen, threshold)  # noqa: E731
+        yield name, "residual", {"threshold": threshold}, change
+
+
+def row(part: str, group: str, field: Field, views: FieldViews, full: float | None, **extra: Any) -> Row:
+    """Measure one field; `full` is the full field's PSNR, None for itself."""
+    score = views.psnr(field)
+    loss = 0.0 if full is None else full - score
+    share = diffuse_splats(field) / max(len(field.splats["means"]), 1)
+    return Row(part, group, score, loss, field.bytes, head_seconds(views, field), share, **extra)
+
+
+def diffuse_splats(field: Field) -> int:
+    """Number of splats without residual."""
+    return int(field.splats[DIFFUSE].sum()) if DIFFUSE in field.splats else 0
+
+
+def together(
+    field: Field, rows: list[Row], candidates: list[Candidate], seen: Residuals, views: FieldViews, budget: float
+) -> tuple[Row, list[str]]:
+    """All that can be left out at once within `budget` dB, found by trying the cheapest first.
+
+    Parts may take half of the budget between them; residuals and the latents' rank the rest (`slim`). The low branch
+    stays, for opacity's sake: without its colours nothing is saved.
+
+    Returns:
+        the row of the smallest field, and the names of what it lacks.
+    """
+    full, whole = rows[0].psnr, field
+    change_of = {name: change for name, _, _, change in candidates}
+    left_out: list[str] = []
+    for part in sorted((r for r in rows if r.group == "part"), key=lambda r: r.loss_db):
+        if part.part != "low branch" and part.loss_db <= budget:
+            smaller = change_of[part.part](field)
+            if full - views.psnr(smaller) <= 0.5 * budget:
+                field = smaller
+                left_out.append(part.part)
+    slimmed = slim(field, seen, views, full - budget, lambda _: None)
+    every = slimmed.threshold == float("inf")
+    if diffuse_splats(slimmed.field) > diffuse_splats(field):
+        left_out.append("all residuals" if every else f"residuals below {slimmed.threshold:g} steps")
+    if slimmed.rank < whole.head.config.latent_dim and not every:
+        left_out.append(f"latents beyond rank {slimmed.rank}")
+    return row("together", "together", slimmed.field, views, full, rank=slimmed.rank), left_out
+
+
+@torch.no_grad()
+def head_seconds(views: FieldViews, field: Field) -> float:
+    """Mean over the views of the head's time for one; diffuse splats last, as in a training and in a file."""
+    seconds = []
+    for view, _, _ in views.views:
+        rows = diffuse_last(field.splats, view.visible)
+        seconds.append(fastest(lambda rows=rows, center=view.center: field.head(field.splats, rows, center)))
+    return sum(seconds) / len(seconds)
+
+
+def diffuse_last(splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:
+    """The visible rows, those of diffuse splats behind the others."""
+    return visible[splats[DIFFUSE][visible].to(torch.uint8).argsort(stable=True)] if DIFFUSE in splats else visible
+
+
+def fastest(work: Callable[[], object]) -> float:
+    """Seconds of the fastest of some runs: wall-clock on a GPU, processor time on a CPU."""
+    gpu = torch.cuda.is_available()
+    clock, wait = (perf_counter, torch.cuda.synchronize) if gpu else (process_time, lambda: None)
+    times = []
+    for _ in range(TIMED):
+        wait()
+        start = clock()
+        work()
+        wait()
+        times.append(clock() - start)
+    return min(times)
+
+
+@torch.no_grad()
+def mean_log_distance(model, cameras) -> float:
+    """Mean of log r over the training views, weighted by contribution; r in scene units, as the field sees it."""
+    total, weight = 0.0, 0.0
+    for index in range(len(cameras)):
+        view, _, share = look_through(model, model.field, cameras[index : index + 1])
+        towards = view.center - model.field.splats["means"].index_select(0, view.visible)
+        distance = (towards.norm(dim=-1) / model.head.scene_unit).clamp_min(1e-10)
+        share = share.clamp_min(0.0).double()
+        total, weight = total + float((share * distance.log()).sum()), weight + float(share.sum())
+    return total / max(weight, 1e-30)
+
+
+def table(rows: list[Row]) -> Table:
+    """The rows, with ranks beyond eight at every eighth only."""
+    full, printed = rows[0], Table()
+    for column in ("left out", "PSNR (dB)", "loss (dB)", "MB", "head (ms)", "diffuse"):
+        printed.add_column(column, justify="left" if column == "left out" else "right")
+    for previous, entry in zip([full, *rows], rows, strict=False):
+        if entry.group == "rank" and entry.rank > 8 and entry.rank % 8:
+            continue
+        if entry.group != previous.group:
+            printed.add_section()
+        milliseconds = "" if entry.group == "input" else f"{1e3 * entry.head_seconds:.1f}"  # 0 costs as much as before
+        diffuse = f"{100 * entry.diffuse:.0f} %" if entry.diffuse else ""
+        numbers = f"{entry.psnr:.2f}", f"{entry.loss_db:.3f}", f"{entry.bytes / 1e6:.2f}", milliseconds, diffuse
+        printed.add_row(entry.part, *numbers)
+    return printed
+
+
+def without_high_branch(field: Field) -> Field:
+    """Only the low branch; the same as a gate that is shut.
+
+    Raises:
+        ValueError: there is no high branch.
+    """
+    if field.head.high is None:
+        raise ValueError("this field has no high branch")
+    return Field(rebuilt(field.head, {"num_bands": 1}, layers(field.head.low), None), field.splats)
+
+
+def without_low_branch(field: Field) -> Field:
+    """The low branch answers 0 for colours; opacity's residual, which is its other answer, stays."""
+    w1, b1, w2, b2 = layers(field.head.low)
+    w2, b2 = w2.clone(), b2.clone()
+    w2[:3], b2[:3] = 0.0, 0.0
+    return Field(rebuilt(field.head, {}, (w1, b1, w2, b2), _high(field.head)), field.splats)
+
+
+def without_opacity_residual(field: Field) -> Field:
+    """Opacities are the base's."""
+    w1, b1, w2, b2 = layers(field.head.low)
+    return Field(
+        rebuilt(field.head, {"opacity_residual": False}, (w1, b1, w2[:3], b2[:3]), _high(field.head)), field.splats
+    )
+
+
+def with_constant_distance(field: Field, log_distance: float) -> Field:
+    """The log distance is the same number everywhere, and no input any more."""
+    changed = []
+    for name, branch in branches_of(field.head):
+        w1, b1, w2, b2 = layers(branch)
+        (column,) = input_columns(field.head.config, name)["distance"]
+        keep = [i for i in range(w1.shape[1]) if i != column]
+        changed.append((w1[:, keep], b1 + log_distance * w1[:, column], w2, b2))
+    return Field(rebuilt(field.head, {"use_distance": False}, *pair(changed)), field.splats)
+
+
+def without_input(field: Field, name: str) -> Field:
+    """An input of `input_columns` is 0 everywhere."""
+    changed = []
+    for branch_name, branch in branches_of(field.head):
+        w1, b1, w2, b2 = layers(branch)
+        w1 = w1.clone()
+        w1[:, input_columns(field.head.config, branch_name).get(name, [])] = 0.0
+        changed.append((w1, b1, w2, b2))
+    return Field(rebuilt(field.head, {}, *pair(changed)), field.splats)
+
+
+def _high(head: NeuralResidualField) -> Layers | None:
+    return None if head.high is None else layers(head.high)

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Progress of long work: a bar on a terminal, lines in a log."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from time import monotonic
+
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+SECONDS_BETWEEN_LINES = 30.0
+"""In a log."""
+
+
+@contextlib.contextmanager
+def progress(
+    description: str, total: int | None = None, console: Console = CONSOLE, clock: Callable[[], float] = monotonic
+) -> Iterator[Callable[..., None]]:
+    """Show how far the block is.
+
+    Args:
+        description: what is done.
+        total: number of pieces of work; None: unknown.
+        clock: seconds.
+
+    Yields:
+        advance(description=None), to be called after each piece.
+    """
+    if console.is_terminal:
+        columns = TextColumn("{task.description:<40}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=console, transient=True) as bar:
+            task = bar.add_task(description, total=total)
+            yield lambda description=None: bar.update(task, advance=1, description=description)
+        return
+    done, printed = 0, clock()
+    console.print(f"{description} ...", markup=False, highlight=False, soft_wrap=True)
+
+    def advance(detail: str | None = None) -> None:
+        nonlocal done, printed
+        done += 1
+        if clock() - printed >= SECONDS_BETWEEN_LINES:
+            printed = clock()
+            count = f"{done:,}" if total is None else f"{done:,} of {total:,}"
+            console.print(f"{detail or description}: {count}", markup=False, highlight=False, soft_wrap=True)
+
+    yield advance

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training that a command line names, found before torch is imported."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from nrfgs_ns.errors import InputError
+
+OUTPUTS = Path("outputs")
+"""Where ns-train writes unless it is told otherwise."""
+
+
+@dataclass
+class NamesTraining:
+    """Options that name a trained model."""
+
+    model: tyro.conf.Positional[Path | None] = None
+    """config.yml of a training, or a folder with trainings, of which the newest counts. None: the newest in outputs"""
+    load_config: Path | None = None
+    """the same, as ns-eval and ns-viewer call it"""
+
+    def config(self) -> Path:
+        """The config.yml that is meant.
+
+        Raises:
+            InputError: there is none.
+        """
+        return config_of(self.named())
+
+    def named(self) -> Path | None:
+        """What the command line names.
+
+        Raises:
+            InputError: it names two.
+        """
+        if self.model is not None and self.load_config is not None:
+            raise InputError(f"{self.model} and --load-config {self.load_config} both name a training. Give one.")
+        return self.model if self.load_config is None else self.load_config
+
+
+def config_of(path: Path | None) -> Path:
+    """The config.yml at a path, or the newest one in a folder and the three folders below it.
+
+    Args:
+        path: a config.yml, or a folder: a run's, outputs/EXPERIMENT/METHOD, ...; None: outputs. Where a folder decides,
+            the choice is printed.
+
+    Raises:
+        InputError: there is none.
+    """
+    if path is not None and path.is_file():
+        return path
+    folder = OUTPUTS if path is None else path
+    if not folder.is_dir():
+        missing = "there is no folder outputs here" if path is None else f"{path}: no such file or folder"
+        raise InputError(f"{missing}. Name the config.yml of a training, or its folder.")
+    configs = [config for depth in range(4) for config in folder.glob("*/" * depth + "config.yml")]
+    if not configs:
+        raise InputError(f"{folder}: no config.yml in this folder or below. Name the folder of a training.")
+    newest = max(configs, key=lambda config: config.stat().st_mtime)
+    print(f"Training: {newest}", flush=True)
+    return newest
