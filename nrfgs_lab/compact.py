@@ -34,8 +34,8 @@ from nrfgs_ns.compact import finetune
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
-from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.options import CompactOptions, PlyOptions
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import harmonics_tune
 from nrfgs_ns.training.run import machine, train
@@ -65,7 +65,6 @@ class Trade:
     nrfgs_ns/model/harmonics_tune.py"""
 
     def main(self) -> None:
-        from nrfgs_ns.export.command import PlyOptions
         from nrfgs_ns.export.compact import export_compact
         from nrfgs_ns.export.ply import export_ply
 
@@ -142,8 +141,8 @@ def converted(ply: Path, suffix: str) -> dict[str, Any]:
 def measured(config: Path, ply: Path, made: dict[str, Any]) -> dict[str, Any]:
     """The record of what splat-transform made of a PLY file; its pictures are those of the PLY that it made back."""
     from nrfgs_ns.export.frames import Y_DOWN
-    from nrfgs_ns.export.loading import load_model, measure_loss
     from nrfgs_ns.export.ply import read_splats, render_splats
+    from nrfgs_ns.trained.loading import load_model, measure_loss
 
     pipeline = load_model(config, "test")
     model, splats = pipeline.model, Y_DOWN.inverse.moved(read_splats(ply.with_name(made["file"] + ".ply")))
@@ -167,7 +166,7 @@ class Speed:
     def main(self) -> None:
         from nrfgs_ns.appearance.field import Field
         from nrfgs_ns.appearance.reduce import build
-        from nrfgs_ns.compact.precision import Precision
+        from nrfgs_ns.compact.tables import Precision
 
         found, again = decode(self.file), self.file.with_suffix(".again")
         field = Field(build(found.config, found.weights, found.header["head"]["scene_unit"]), found.splats)

@@ -192,7 +192,7 @@ class SeenView:
 
 def seen_views(config: Path, scene: SceneConfig) -> list[SeenView]:
     """All test views of a training on a procedural scene."""
-    from nrfgs_ns.export.loading import load_model
+    from nrfgs_ns.trained.loading import load_model
 
     pipeline = load_model(config, "test")
     model, dull = pipeline.model, build_scene(replace(scene, gloss=0.0))

@@ -17,9 +17,10 @@ import nrfgs_ns
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.densification import build_densification
-from nrfgs_ns.export.command import Export, PlyOptions
-from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.export.command import Compact, Ply
+from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
+from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.run import evaluate
 from nrfgs_ns.training.trainer import NrfgsTrainer
 
@@ -61,11 +62,11 @@ def test_they_evaluate_as_they_did(saved, tmp_path):
 
 def test_they_export(saved, tmp_path):
     name, config = saved
-    Export("ply", config, tmp_path / "splats.ply", report=tmp_path / "ply.json", ply=PlyOptions(steps=0)).main()
+    Ply(config, output=tmp_path / "splats.ply", report=tmp_path / "ply.json", options=PlyOptions(steps=0)).main()
     assert len(read_splats(tmp_path / "splats.ply").means) == 60
     report = yaml.safe_load((tmp_path / "ply.json").read_text())
     assert report["psnr_file"] == pytest.approx(PSNR_OF_PLY[name], abs=0.02)
-    Export("compact", config, tmp_path / "splats.nrf", report=tmp_path / "compact.json").main()
+    Compact(config, output=tmp_path / "splats.nrf", report=tmp_path / "compact.json").main()
     report = yaml.safe_load((tmp_path / "compact.json").read_text())
     assert report["written"] == 60 and report["loss_db"] < 0.2
 

@@ -132,8 +132,8 @@ def alike(page: Path, config: Path, browser: list[str], patience: float) -> list
     import torch
     from PIL import Image
 
-    from nrfgs_ns.export.loading import load_model
     from nrfgs_ns.image.metrics import psnr
+    from nrfgs_ns.trained.loading import load_model
 
     pipeline = load_model(config, "test")
     cameras = pipeline.datamanager.train_dataset.cameras

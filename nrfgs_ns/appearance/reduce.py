@@ -92,8 +92,6 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
 def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
     """Latents of `rank` numbers, 1..D: their first principal components, with the basis folded into the first layer."""
     size = field.head.config.latent_dim
-    if not 1 <= rank <= size:
-        raise ValueError(f"rank is {rank}; latents of {size} numbers have ranks 1 to {size}")
     latents = field.splats["latents"]
     reduced = (latents.detach().double() - basis.mean) @ basis.inverse[:rank].T
     changed = []

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A compact file as the tables of a model. `format.py`, `encode.py` and `entropy.py` describe the file.
-"""
+"""A compact file as the tables of a model. `format.py`, `encode.py` and `entropy.py` describe the file."""
 
 import math
 from dataclasses import fields
@@ -12,7 +11,6 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.encode import FORMAT, GROUPS
 from nrfgs_ns.compact.format import LARGEST_RATIO, SMALL, read_container

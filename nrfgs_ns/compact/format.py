@@ -23,8 +23,8 @@ next, and so on; numbers (uint8, uint16, uint32, uint64, float16 or float32) in 
            the model, int32 numbers, packed as in "xz"
            what the coder wrote (`entropy.py`)
 
-`encode.py` says which streams there are. The version is 2; a reader refuses any other, another length than the file's, and a
-checksum that does not hold.
+`encode.py` says which streams there are. The version is 2; a reader refuses any other, another length than the file's,
+and a checksum that does not hold.
 
 Nothing in a file is ever run, and nothing is allocated before its size was checked against the lengths in the header,
 and these against the size of the file: it cannot unpack to more than 32 times that, or 16 MB.

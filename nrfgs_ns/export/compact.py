@@ -148,7 +148,7 @@ def choose(pipeline, load_config: Path, options: CompactOptions) -> Chosen:
         cameras = data.train_dataset.cameras
         with progress(f"Looking at the splats from {len(cameras)} training views"):
             seen = look_over(model, cameras)
-        if options.finetune > 0:
+        if options.finetune > 0 or options.budget == 0:
             return Chosen(field, 0.0, seen.weight)
         chosen = evenly_spaced(len(images), VIEWS)
         pairs = [(cameras[i : i + 1].to(model.device), images[i]) for i in chosen]

@@ -30,7 +30,8 @@ class CompactOptions:
     rate: float = 1e-4
     """with finetune: how much of the training's loss a byte for each splat is worth. More: a smaller file"""
     budget: float = 0.03
-    """without finetune: dB on some training views that splats made diffuse and shorter latents may cost"""
+    """without finetune: dB on some training views that splats made diffuse and shorter latents may cost. 0: nothing is
+    left out"""
 
 
 @dataclass

@@ -31,14 +31,13 @@ from typing import NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.appearance.spherical_harmonics import num_bases, sh_bases
 from nrfgs_ns.model.renderer import View
+from nrfgs_ns.progress import progress
 from nrfgs_ns.rasterizer import contributions
 
 DEGREE = 3
@@ -206,9 +205,7 @@ def fit_harmonics(model, cameras: Cameras) -> Fit:
     hold_out_every = min(HOLD_OUT_EVERY, len(cameras))
     groups = range(0, count, SPLATS_AT_ONCE)
     unseen, strength = 0, LONE_STRENGTH
-    columns = TextColumn("Fitting harmonics"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=CONSOLE, transient=True) as progress:
-        task = progress.add_task("", total=len(groups) * len(cameras))
+    with progress("Fitting harmonics", len(groups) * len(cameras)) as advance:
         for first in groups:
             last = min(first + SPLATS_AT_ONCE, count)
             moments = Moments(last - first, model.device)
@@ -218,7 +215,7 @@ def fit_harmonics(model, cameras: Cameras) -> Fit:
                 if first == 0:
                     tuning = held_out if index % hold_out_every == hold_out_every - 1 else kept
                     tuning.add(seen.where(seen.rows % stride == 0, seen.rows // stride))
-                progress.advance(task)
+                advance()
             if first == 0:
                 strength = choose_strength(kept, held_out)
             delta = moments.solve(strength).to(plain.means.dtype)

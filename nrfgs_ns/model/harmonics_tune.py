@@ -12,18 +12,17 @@ import math
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import track
 from torch.nn.functional import pad
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, PlainSplats, no_larger
-from nrfgs_ns.model.renderer import composite_view
+from nrfgs_ns.model.renderer import View, composite_view
 from nrfgs_ns.model.view_noise import camera_spacing
+from nrfgs_ns.progress import progress
 
-STEPS, STEPS_ON_A_CPU = 2500, 400
-"""Of one view each. A GPU takes seconds; a CPU would take many minutes."""
+STEPS, STEPS_ON_A_CPU, STEPS_OF_A_VIEW = 2500, 400, 10
+"""Steps, of one view each. A GPU takes seconds; a CPU makes STEPS_OF_A_VIEW for each view, at most STEPS_ON_A_CPU."""
 RATES = {"opacities": 3.0, "features_dc": 0.15, "features_rest": 0.15}
 """Learning rates to begin with, where pictures are off by 1 (root of the mean square), and in proportion where they are
 off by less: Adam's steps are no shorter there. They fall to 0 by half a cosine."""
@@ -38,10 +37,10 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
         model: an NrfgsModel in evaluation mode.
         splats: one for each of the model's, with its means, rotations and scales. On its device.
         cameras: the training cameras, [V].
-        steps: how many; None: STEPS, on a CPU STEPS_ON_A_CPU. 0 leaves the splats as they are.
+        steps: number of steps; None: as the device allows. 0 leaves the splats as they are.
     """
     if steps is None:
-        steps = STEPS_ON_A_CPU if model.device.type == "cpu" else STEPS
+        steps = min(STEPS_ON_A_CPU, STEPS_OF_A_VIEW * len(cameras)) if model.device.type == "cpu" else STEPS
     if steps == 0:
         return splats
     tables = {name: getattr(splats, name).clone().requires_grad_() for name in RATES}
@@ -49,8 +48,7 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
     background = model.background_color.to(model.device)
     generator = torch.Generator().manual_seed(0)
 
-    def picture(of: Field, camera: Cameras) -> torch.Tensor:
-        view = model.project(camera, of.splats)
+    def picture(of: Field, view: View) -> torch.Tensor:
         return composite_view(view, of.seen_from(view), background, with_depth=False)[0]["rgb"]
 
     def off_by(index: int, sigma: float) -> torch.Tensor:
@@ -59,8 +57,9 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
         moved = sigma * torch.randn(3, 1, generator=generator)
         camera.camera_to_worlds = camera.camera_to_worlds + pad(moved, (3, 0)).to(model.device)
         with torch.no_grad():
-            wanted = picture(field, camera)
-        return (picture(file, camera) - wanted).square().mean()
+            view = model.project(camera, file.splats)  # of both: nothing of the geometry is trained
+            target = picture(field, view)
+        return (picture(file, view) - target).square().mean()
 
     with torch.no_grad():
         off = torch.stack([off_by(index, 0.0) for index in range(len(cameras))]).mean().sqrt().item()
@@ -69,12 +68,14 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.5 * (1 + math.cos(math.pi * step / steps)))
     sigma = MOVED * camera_spacing(cameras.camera_to_worlds[:, :3, 3]) / math.sqrt(3.0)
     order: list[int] = []
-    for _ in track(range(steps), "Drawing what the model draws", console=CONSOLE, transient=True):
-        order = order or torch.randperm(len(cameras), generator=generator).tolist()
-        with torch.enable_grad():
-            loss = off_by(order.pop(), sigma)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        schedule.step()
+    with progress("Fine-tuning the harmonics", steps) as advance:
+        for _ in range(steps):
+            order = order or torch.randperm(len(cameras), generator=generator).tolist()
+            with torch.enable_grad():
+                loss = off_by(order.pop(), sigma)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+            advance()
     return splats._replace(**{name: table.detach() for name, table in tables.items()})

@@ -7,20 +7,9 @@ from head_cases import awake, scene
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.encoding import view_geometry
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.appearance.reduce import (
-    input_columns,
-    latent_basis,
-    with_constant_distance,
-    with_diffuse,
-    with_rank,
-    without_high_branch,
-    without_input,
-    without_low_branch,
-    without_opacity_residual,
-)
+from nrfgs_ns.appearance.reduce import input_columns, latent_basis, with_diffuse, with_rank
 
 CONFIGS = {
     "default": NrfConfig(latent_dim=8, hidden_width=16),
@@ -96,71 +85,6 @@ def test_latents_in_a_subspace_need_no_more(case):
     assert small.splats["latents"].shape == (40, 3) and small.head.config.latent_dim == 3
     assert_same(small, field, visible, centers, rtol=0, atol=1e-4)  # numbers up to 5 here, 2^-24 of them 60 times
     assert small.bytes < field.bytes
-
-
-def test_a_rank_out_of_range_is_refused(case):
-    field, _, _ = case
-    for rank in (0, 9):
-        with pytest.raises(ValueError, match="ranks 1 to 8"):
-            with_rank(field, latent_basis(field, torch.ones(40)), rank)
-
-
-def test_without_the_high_branch_its_gate_is_shut():
-    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
-    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
-    small = without_high_branch(Field(head, splats))
-    shut = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
-    shut.load_state_dict(head.state_dict())
-    shut.high[2].weight[3], shut.high[2].bias[3] = 0.0, -1e4
-    assert small.head.high is None and small.bytes < Field(head, splats).bytes
-    assert_same(small, Field(shut, splats), visible, centers, **FLOAT32)
-    with pytest.raises(ValueError, match="no high branch"):
-        without_high_branch(small)
-
-
-def test_without_the_low_branch_colours_are_the_high_ones():
-    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
-    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
-    small = without_low_branch(Field(head, splats))
-    parts = small.head.components(splats, visible, centers)
-    assert (parts["low branch"].values == 0).all() and parts["high branch"].values.abs().max() > 1e-3
-    assert (small.head(splats, visible, centers).opacities == head(splats, visible, centers).opacities).all()
-
-
-def test_without_opacitys_residual_only_colours_change():
-    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
-    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
-    small = without_opacity_residual(Field(head, splats))
-    found = small.head(splats, visible, centers)
-    assert (found.opacities == head.base_appearance(splats, visible).opacities).all()
-    assert_close(found.colors, head(splats, visible, centers).colors, **FLOAT32)
-
-
-def test_a_constant_distance_is_what_the_field_sees(case):
-    field, visible, _ = case
-    if not field.head.config.use_distance:
-        pytest.skip("this field sees no distance")
-    # From cameras that are all as far away from their splats.
-    torch.manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(len(visible), 3), dim=-1)
-    centers = field.splats["means"][visible] + 3.0 * directions
-    _, log_distance = view_geometry(field.splats["means"][visible], centers, 0.01)
-    small = with_constant_distance(field, float(log_distance[0]))
-    assert not small.head.config.use_distance
-    assert_same(small, field, visible, centers, **FLOAT32)
-
-
-def test_an_input_that_is_0_no_longer_counts(case):
-    field, visible, _ = case
-    center = torch.tensor([5.0, 4.0, 3.0])
-    small = field
-    for name in input_columns(field.head.config, "low") | input_columns(field.head.config, "high"):
-        if name in ("direction", "distance") or name.startswith("band"):
-            small = without_input(small, name)
-    a, b = (small.head(small.splats, visible, c) for c in (center, -center))
-    assert (a.colors == b.colors).all() and (a.opacities == b.opacities).all()
-    a, b = (field.head(field.splats, visible, c) for c in (center, -center))
-    assert (a.colors != b.colors).any()
 
 
 def test_diffuse_splats_have_what_they_are_given(case):

@@ -15,10 +15,8 @@ AREA = "compact file"
 
 
 @lru_cache
-def written(version: int = 2) -> bytes:
+def written() -> bytes:
     """A field of sixty splats."""
-    if version == 1:
-        return (Path(__file__).parents[1] / "fixtures" / "version-1.nrf").read_bytes()
     import tempfile
 
     import torch
@@ -27,7 +25,7 @@ def written(version: int = 2) -> bytes:
     from nrfgs_ns.appearance.nrf import NrfConfig
     from nrfgs_ns.compact.encode import encode
     from nrfgs_ns.compact.format import write_container
-    from nrfgs_ns.compact.precision import Precision
+    from nrfgs_ns.compact.tables import Precision
 
     torch.manual_seed(3)
     head = NrfConfig(latent_dim=8, hidden_width=16, output_init="default").setup().requires_grad_(False)
@@ -67,22 +65,22 @@ def parts(data: bytes) -> tuple[dict, list[bytes]]:
     return header, bodies
 
 
-def joined(text: bytes, bodies: list[bytes], version: int = 2) -> bytes:
+def joined(text: bytes, bodies: list[bytes]) -> bytes:
     """A file whose checksums and lengths hold."""
-    from nrfgs_ns.compact.format import CHECKSUM, MAGIC, PREAMBLE
+    from nrfgs_ns.compact.format import CHECKSUM, MAGIC, PREAMBLE, VERSION
 
     total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
-    start = PREAMBLE.pack(MAGIC, version, len(text), total) + text
+    start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
     return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
 
 
-def claiming(name: str, change, version: int = 2) -> Case:
+def claiming(name: str, change) -> Case:
     """A header that says something else."""
 
     def build(folder: Path):
-        header, bodies = parts(written(version))
+        header, bodies = parts(written())
         change(header)
-        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies, version))
+        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies))
         return partial(read, folder / "field.nrf")
 
     return Case(name, build)
@@ -96,37 +94,35 @@ def zeros(size: int) -> bytes:
     return b"".join([*(packer.compress(piece) for _ in range(size // 2**20)), packer.flush()])
 
 
-def replaced(name: str, stream: str, version: int, count: int, body, entry: dict, **config) -> Case:
+def replaced(name: str, stream: str, count: int, body, entry: dict) -> Case:
     """A stream with another body, and a header that says so."""
 
     def build(folder: Path):
-        header, bodies = parts(written(version))
-        header["head"]["config"].update(config)
+        header, bodies = parts(written())
         content = body()
         for index, one in enumerate(header["streams"]):
             if one["name"] == stream:
                 shape = [count] if len(one["shape"]) == 1 else [one["shape"][0], count // one["shape"][0]]
                 one.update({"shape": shape, "bytes": len(content), "crc32": zlib.crc32(content), **entry})
                 bodies[index] = content
-        group = stream.partition(".")[0]
-        header["splats"][group if version == 1 else "view"] = count
-        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies, version))
+        header["splats"]["view"] = count
+        (folder / "field.nrf").write_bytes(joined(json.dumps(header).encode(), bodies))
         return partial(read, folder / "field.nrf")
 
     return Case(name, build)
 
 
-def bomb(count: int, dtype: str, stream: str, version: int, **config) -> Case:
-    """A stream of so many zeros."""
+def bomb(count: int, dtype: str, stream: str) -> Case:
+    """A stream of zeros."""
     size = count * int(dtype.removeprefix("uint")) // 8
-    entry = {"dtype": dtype} if version == 1 else {"dtype": dtype, "coding": "xz"}
+    entry = {"dtype": dtype, "coding": "xz"}
     name = f"{stream} of {size:,} bytes when unpacked"
-    return replaced(name, stream, version, count, lambda: zeros(size), entry, **config)
+    return replaced(name, stream, count, lambda: zeros(size), entry)
 
 
 def coded(name: str, stream: str, shape: list[int], body) -> Case:
     """A coded table of another shape and with another body."""
-    return replaced(f"{stream}: {name}", stream, 2, 60, body, {"shape": shape})
+    return replaced(f"{stream}: {name}", stream, 60, body, {"shape": shape})
 
 
 def table_of_zeros(columns: int, rows: int) -> bytes:
@@ -165,12 +161,8 @@ def grid(table: str, part: str, value) -> Case:
 
 
 CASES = [
-    bomb(2**28, "uint8", "view.means", 1),
-    bomb(2**26, "uint64", "view.means", 1),
-    bomb(2**25, "uint64", "view.latents", 1),
-    bomb(2**25, "uint64", "diffuse.means", 1, latent_dim=22),
-    bomb(2**28, "uint8", "means", 2),
-    bomb(2**25, "uint64", "latents", 2),
+    bomb(2**28, "uint8", "means"),
+    bomb(2**25, "uint64", "latents"),
     coded("many rows of zeros", "latents", [8, 10**6], lambda: table_of_zeros(8, 10**6)),
     coded("many columns of zeros", "latents", [1000, 2000], lambda: table_of_zeros(1000, 2000)),
     coded("more columns than rows", "splats", [10**6, 1], lambda: table_of_zeros(11, 60)),
@@ -197,10 +189,6 @@ CASES = [
     claiming("no head", lambda header: header.pop("head")),
     claiming("another head", lambda header: header["head"].update(name="sh")),
     claiming("no grids", lambda header: header.update(grids=None)),
-    *(
-        claiming(f"quats_bits {bits}", lambda header, b=bits: header.update(quats_bits=b), 1)
-        for bits in (0, 1, 17, 10**9, True, "8", None)
-    ),
     *(config("latent_dim", value) for value in (0, -1, 9, 10**9, 2**63, 8.0, "8", None, [8], True)),
     *(config("hidden_width", value) for value in (0, 17, 10**9, 10**30, "16", None)),
     *(config("num_bands", value) for value in (0, 4, 10**9, "3", None)),

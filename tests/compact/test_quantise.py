@@ -10,7 +10,6 @@ from nrfgs_ns.compact.quantise import (
     OCTAHEDRAL,
     Grid,
     from_morton,
-    from_smallest_three,
     matrix,
     morton,
     nearest_turn,
@@ -29,25 +28,6 @@ def test_morton_interleaves_and_back(seed, count):
 
 def test_morton_takes_the_largest_codes():
     assert morton(np.full((1, 3), 2**21 - 1)).tolist() == [2**63 - 1]
-
-
-@given(seed=st.integers(0, 99), bits=st.integers(2, 16))
-def test_rotations_of_version_1_are_three_numbers_and_the_one_that_is_missing(seed, bits):
-    random = np.random.default_rng(seed)
-    unit = random.normal(size=(50, 4))
-    unit[:4] = np.eye(4)
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    largest = np.abs(unit).argmax(axis=1)
-    unit *= np.where(unit[np.arange(50), largest] < 0, -1.0, 1.0)[:, None]
-    others, step = np.arange(4) != largest[:, None], np.sqrt(2) / (2**bits - 1)
-    back = from_smallest_three(largest, np.rint((unit[others].reshape(50, 3) + np.sqrt(0.5)) / step), bits)
-    assert np.allclose(np.linalg.norm(back, axis=1), 1.0)
-    # Three components are off by half a step e at most. The fourth, sqrt(1 - sum of squares), has slope at most 1 by
-    # each of them where it is the largest; rounding may leave it up to 2 e sqrt(3) below the others, and the slope a
-    # little higher, and where the squares sum to more than 1, all are scaled back by as much. 8 e covers it.
-    assert np.abs(back - unit).max() < 8 * step / 2
-    exact = np.abs(unit).max(axis=1) > 0.9  # far from where two components compete
-    assert np.abs(back - unit)[exact][others[exact]].max(initial=0) < step / 2 * (1 + 1e-9) + 1e-12
 
 
 @given(seed=st.integers(0, 99))

@@ -20,18 +20,17 @@ from nrfgs_ns.appearance.head import SH_C0, SplatAppearance, base_colors
 from nrfgs_ns.appearance.sh import SphericalHarmonics
 from nrfgs_ns.appearance.spherical_harmonics import sh_bases
 from nrfgs_ns.compact.decode import decode
-from nrfgs_ns.compact.options import CompactOptions
 from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export import ply
-from nrfgs_ns.export.command import Export
-from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.export.command import Compact, Export, Ply, Web
+from nrfgs_ns.export.options import CompactOptions, WebOptions
 from nrfgs_ns.export.ply import read_splats, render_splats, write_splats
-from nrfgs_ns.export.web.options import WebOptions
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model import harmonics_fit, harmonics_tune
 from nrfgs_ns.model.harmonics_fit import STRENGTHS, Moments, Observations, PlainSplats, fit_harmonics, observe
 from nrfgs_ns.model.harmonics_tune import fine_tune
+from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -336,7 +335,7 @@ def test_every_world_holds_the_same_scene(trained, tmp_path, capsys):
     for world in ("training", "viewers", "capture"):
         out, report = tmp_path / f"{world}.ply", tmp_path / f"{world}.json"
         words = ["ply", "--load-config", str(trained("nrfgs")), "--output", str(out), "--report", str(report)]
-        tyro.cli(Export, args=[*words, "--ply.world", world]).main()
+        tyro.cli(Export, args=[*words, "--world", world]).main()
         reports[world], means[world] = json.loads(report.read_text()), read_splats(out).means
         # The same pictures but for float32's rounding, at 16 dB.
         assert reports[world]["psnr_file"] == pytest.approx(reports["training"]["psnr_file"], abs=1e-3)
@@ -364,7 +363,7 @@ def test_an_antialiased_model_is_marked_as_such(trained, tmp_path):
 def test_large_splats_are_cut_down_and_spoken_of(trained, tmp_path, capsys, monkeypatch):
     config, report = trained("nrfgs"), tmp_path / "report.json"
     words = ["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--report", str(report)]
-    tyro.cli(Export, args=[*words, "--ply.largest", "0.02"]).main()
+    tyro.cli(Export, args=[*words, "--largest", "0.02"]).main()
     largest = read_splats(tmp_path / "s.ply").scales.exp().max()
     assert largest == pytest.approx(0.02, rel=1e-5)
     assert "leave out splats" not in capsys.readouterr().out
@@ -376,14 +375,14 @@ def test_large_splats_are_cut_down_and_spoken_of(trained, tmp_path, capsys, monk
     assert numbers["psnr_on_screen"] != pytest.approx(numbers["psnr_file"], abs=0.01)
     assert f"show {numbers['psnr_on_screen']:.2f} dB" in " ".join(capsys.readouterr().out.split())
     for option, value in (("largest", "0"), ("largest", "-1"), ("largest", "nan"), ("largest", "inf"), ("steps", "-1")):
-        with pytest.raises(InputError, match=f"--ply.{option}"):
-            tyro.cli(Export, args=[*words, f"--ply.{option}", value]).main()
+        with pytest.raises(InputError, match=f"--{option}"):
+            tyro.cli(Export, args=[*words, f"--{option}", value]).main()
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_ns_export_writes_the_same_splats(method, trained, tmp_path, export_gaussian_splat):
     config, ours = trained(method), tmp_path / "ours.ply"
-    words = ["ply", "--load-config", str(config), "--output", str(ours), "--no-measure", "--ply.world", "training"]
+    words = ["ply", "--load-config", str(config), "--output", str(ours), "--no-measure", "--world", "training"]
     tyro.cli(Export, args=words).main()
     export_gaussian_splat(load_config=config, output_dir=tmp_path, output_filename="theirs.ply").main()
     a, b = (PlyData.read(tmp_path / f"{name}.ply")["vertex"].data for name in ("ours", "theirs"))
@@ -414,7 +413,7 @@ def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
 
     config = trained("nrfgs-sh")
     words = ["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--no-measure"]
-    tyro.cli(Export, args=[*words, "--ply.world", "training"]).main()
+    tyro.cli(Export, args=[*words, "--world", "training"]).main()
     vertices = PlyData.read(tmp_path / "s.ply")["vertex"]
 
     def table(*names: str) -> torch.Tensor:
@@ -453,20 +452,20 @@ def test_trainings_and_viewers_see_the_stored_tables(mode, tiny_scene, tmp_path,
 
 
 def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        Export("ply", tmp_path / "config.yml", tmp_path / "s.ply").main()
+    with pytest.raises(InputError, match="no such file or folder"):
+        Ply(tmp_path / "config.yml", output=tmp_path / "s.ply").main()
     with pytest.raises(InputError, match="is a folder"):
-        Export("ply", trained("nrfgs"), tmp_path).main()
+        Ply(trained("nrfgs"), output=tmp_path).main()
     (tmp_path / "file").touch()
-    for kind in ("ply", "compact", "web"):  # before anything is loaded
+    for kind in (Ply, Compact, Web):  # before anything is loaded
         for name, report in (("file/s.html", None), ("s.html", tmp_path / "file" / "report.json")):
             with pytest.raises(InputError, match="cannot be written"):
-                Export(kind, tmp_path / "config.yml", tmp_path / name, report=report).main()
+                kind(trained("nrfgs"), output=tmp_path / name, report=report).main()
     lost = tmp_path / "config.yml"
     text = trained("nrfgs").read_text()
     lost.write_text(text.replace("timestamp: ", "timestamp: no-"))
     with pytest.raises(InputError, match="no checkpoints beside it"):
-        Export("ply", lost, tmp_path / "s.ply").main()
+        Ply(lost, output=tmp_path / "s.ply").main()
 
 
 # The page.
@@ -474,9 +473,9 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
 
 def test_a_page_holds_the_scene_and_the_photographs(trained, tmp_path):
     report = tmp_path / "report.json"
-    every = CompactOptions(threshold=0.0, rank=32)
+    every = CompactOptions(budget=0.0)
     web = WebOptions(author="me")
-    Export("web", trained("nrfgs"), tmp_path / "a/tea.html", report=report, compact=every, web=web).main()
+    Web(trained("nrfgs"), output=tmp_path / "a/tea.html", report=report, options=every, page=web).main()
     numbers, text = json.loads(report.read_text()), (tmp_path / "a/tea.html").read_text(encoding="utf-8")
     assert "<h1>tea</h1><p>me</p>" in text
     (tmp_path / "held.nrf").write_bytes(base64.b64decode(re.search('id="packed"[^>]*>([^<]*)<', text).group(1)))
@@ -503,17 +502,17 @@ def test_a_page_holds_the_scene_and_the_photographs(trained, tmp_path):
 
 
 def test_a_page_apart_from_its_scene(trained, tmp_path):
-    Export("web", trained("nrfgs"), tmp_path / "served", measure=False).main()
+    Web(trained("nrfgs"), output=tmp_path / "served", measure=False).main()
     assert {path.name for path in (tmp_path / "served").iterdir()} == {"index.html", "scene.nrf"}
     decode(tmp_path / "served/scene.nrf")
     (tmp_path / "taken").write_text("")
     (tmp_path / "taken.html").mkdir()
     for name, kind in (("taken", "file"), ("taken.html", "folder")):
         with pytest.raises(InputError, match=f"is a {kind}. Name a file that ends in .html"):
-            Export("web", trained("nrfgs"), tmp_path / name).main()
+            Web(trained("nrfgs"), output=tmp_path / name).main()
 
 
 def test_a_page_of_another_head_is_refused(trained, tmp_path):
     with pytest.raises(InputError, match="the 'sh' head.*nrfgs export ply"):
-        Export("web", trained("nrfgs-sh"), tmp_path / "page.html").main()
+        Web(trained("nrfgs-sh"), output=tmp_path / "page.html").main()
     assert not (tmp_path / "page.html").exists()

@@ -17,12 +17,12 @@ from torch.testing import assert_close
 
 from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.command import Export
+from nrfgs_ns.export.command import Compact
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
-from nrfgs_ns.export.loading import load_model, load_training, measure_loss
 from nrfgs_ns.export.ply import on_screen, read_splats, render_splats, write_splats
-from nrfgs_ns.inspect.view import View
 from nrfgs_ns.model.harmonics_fit import PlainSplats
+from nrfgs_ns.trained.loading import load_model, load_training, measure_loss
+from nrfgs_ns.trained.view import View
 from nrfgs_ns.training.checkpoint_files import find
 from nrfgs_ns.training.trainer import end_earlier_logs
 
@@ -53,7 +53,7 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_pat
     monkeypatch.setattr(run_viewer, "_start_viewer", lambda config, *_: viewed.append(config))
     View(config).main()
     assert (viewed[0].get_base_dir() / viewed[0].viewer.relative_log_filename).parent == config.parent
-    Export("compact", config, tmp_path / "sent" / "small.nrf").main()
+    Compact(config, output=tmp_path / "sent" / "small.nrf").main()
     beside = tmp_path / "sent" / "small.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
     assert load_training(beside, "test").pipeline.datamanager.get_datapath() == tmp_path / "moved" / "data"
 
@@ -76,7 +76,7 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_pat
 
 def test_a_model_without_splats_is_told(monkeypatch):
     empty = SimpleNamespace(pipeline=SimpleNamespace(model=SimpleNamespace(num_points=0)))
-    monkeypatch.setattr("nrfgs_ns.export.loading.load_training", lambda path, mode: empty)
+    monkeypatch.setattr("nrfgs_ns.trained.loading.load_training", lambda path, mode: empty)
     with pytest.raises(InputError, match="config.yml: this training has lost all splats"):
         load_model(Path("config.yml"), "test")
 

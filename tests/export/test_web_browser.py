@@ -29,14 +29,14 @@ from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
-from nrfgs_ns.compact.options import CompactOptions
-from nrfgs_ns.compact.precision import Precision
-from nrfgs_ns.export.command import Export
-from nrfgs_ns.export.loading import load_model
+from nrfgs_ns.compact.tables import Precision
+from nrfgs_ns.export.command import Web
+from nrfgs_ns.export.options import CompactOptions
 from nrfgs_ns.export.web.page import page as page_of
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
 from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
+from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.viewer.pictures import AMPLIFICATION, GREY, OPACITY_AXIS, with_gain
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
@@ -46,7 +46,7 @@ pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e
 ALIKE = 40.0
 """dB between the page's picture and the renderer's."""
 SIZE = (320, 240)
-ALL = CompactOptions(threshold=0.0, rank=32)
+ALL = CompactOptions(budget=0.0)
 """Nothing left out but digits: what a budget in dB allows is much, where a training has just begun."""
 MODES = ["full", "base", "residual", "opacity residual"]
 KINDS = {
@@ -234,7 +234,7 @@ def demo(tiny_scene, tmp_path_factory):
         "--optimizers.field.optimizer.lr": 0.05,  # something to show after a few steps
     }
     config = trained(command_line("nrfgs", tiny_scene, folder, 80, options))
-    Export("web", config, folder / "page.html", compact=ALL).main()
+    Web(config, output=folder / "page.html", options=ALL).main()
     return config, folder / "page.html"
 
 
@@ -305,7 +305,7 @@ def test_a_capture_is_drawn_as_by_the_renderer(captures, browser, tmp_path):
     reduced(captures / "bonsai", data, views=24, share=4, points=12_000)
     options = {"--pipeline.model.num-downscales": 0, "--optimizers.field.optimizer.lr": 0.02}
     config = trained(command_line("nrfgs", data, tmp_path, 150, options))
-    Export("web", config, tmp_path / "page.html", compact=ALL).main()
+    Web(config, output=tmp_path / "page.html", options=ALL).main()
     assert_like_the_renderer(browser, config, tmp_path / "page.html", tmp_path)
 
 

@@ -11,10 +11,7 @@ from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
-from nrfgs_ns.compact.precision import Precision
-
-VERSION_1 = Path(__file__).parents[1] / "fixtures" / "version-1.nrf"
-"""A file of the first version of the format, which nothing writes any more: `field()` at the steps of `Precision()`."""
+from nrfgs_ns.compact.tables import Precision
 
 
 def field(count: int = 60) -> Field:

@@ -13,8 +13,8 @@ import torch
 from short_trainings import command_line, trained
 from torch.testing import assert_close
 
-from nrfgs_ns.compact.options import CompactOptions
-from nrfgs_ns.export.command import Export, PlyOptions
+from nrfgs_ns.export.command import Compact, Ply
+from nrfgs_ns.export.options import CompactOptions, PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.rasterizer import composite
 from nrfgs_ns.training.run import evaluate, parse
@@ -102,9 +102,10 @@ def exported_files(device: str, scene: Path, out: Path) -> dict[str, dict]:
     config = trained(command_line("nrfgs", scene, out, STEPS, options))
     scores = evaluate(config, out / "eval.json")
     reports = {}
-    kept = CompactOptions(threshold=0.0)  # so short a training could do without any view-dependent splat
-    for kind, name in (("ply", "splats.ply"), ("compact", "field.nrf")):
-        Export(kind, config, out / name, report=out / f"{kind}.json", ply=PlyOptions(steps=8), compact=kept).main()
+    Ply(config, output=out / "splats.ply", report=out / "ply.json", options=PlyOptions(steps=8)).main()
+    kept = CompactOptions(budget=0.0)  # so short a training could do without any view-dependent splat
+    Compact(config, output=out / "field.nrf", report=out / "compact.json", options=kept).main()
+    for kind in ("ply", "compact"):
         reports[kind] = json.loads((out / f"{kind}.json").read_text())
         # The report's mean over the images is ns-eval's, which sums in another order.
         assert reports[kind]["psnr_model"] == pytest.approx(scores["psnr"], abs=1e-3)

@@ -12,9 +12,9 @@ from PIL import ExifTags, Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.loading import load_model
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
+from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, verdict
 from nrfgs_ns.training.run import parse
 
@@ -219,8 +219,8 @@ def test_a_compact_file_is_chosen_by_photographs_with_their_look(finished):
     """Else the error is that of exposure, and what is left out of the field hardly adds to it."""
     from nerfstudio.utils.eval_utils import eval_setup
 
+    from nrfgs_ns.compact.slim import FieldViews
     from nrfgs_ns.export.compact import photographs_of
-    from nrfgs_ns.simplify.field_views import FieldViews
 
     _, pipeline, _, _ = eval_setup(finished)
     model, data = pipeline.model, pipeline.datamanager

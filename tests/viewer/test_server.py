@@ -19,9 +19,9 @@ from websockets.asyncio.client import connect
 
 from nrfgs_ns.compact.format import MAGIC
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.command import Export
-from nrfgs_ns.export.loading import load_model
-from nrfgs_ns.inspect.view import View, view_file
+from nrfgs_ns.export.command import Compact
+from nrfgs_ns.trained.loading import load_model
+from nrfgs_ns.trained.view import View, view_file
 from nrfgs_ns.training.run import parse
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
@@ -339,7 +339,7 @@ def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):
 def test_nrfgs_view_opens_a_compact_file_alone(tiny_scene, tmp_path, monkeypatch):
     """No config.yml, no data set; and what it draws is what the file's config.yml leads to."""
     config = trained(command_line("nrfgs", tiny_scene, tmp_path / "out", 2))
-    Export("compact", config, tmp_path / "with" / "it.nrf", measure=False).main()
+    Compact(config, output=tmp_path / "with" / "it.nrf", measure=False).main()
     original = load_model(next((tmp_path / "with").rglob("config.yml")), "test")
     (tmp_path / "alone").mkdir()
     (tmp_path / "with" / "it.nrf").rename(tmp_path / "alone" / "it.nrf")

@@ -38,7 +38,8 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.export.command import Export, PlyOptions
+from nrfgs_ns.export.command import Ply
+from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
@@ -330,7 +331,7 @@ def test_ns_viewer_and_export_take_a_reduced_checkpoint(reduced, tmp_path, monke
     model = opened[0].pipeline.model
     assert model.head.high is None and 0 < int(model.densification.state[DIFFUSE].sum()) < model.num_points
 
-    Export("ply", reduced, tmp_path / "splats.ply", measure=False, ply=PlyOptions(steps=4)).main()
+    Ply(reduced, output=tmp_path / "splats.ply", measure=False, options=PlyOptions(steps=4)).main()
     exported = read_splats(tmp_path / "splats.ply")
     assert 0 < len(exported.means) <= model.num_points and torch.isfinite(exported.features_dc).all()
 

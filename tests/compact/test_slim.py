@@ -1,25 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs inspect`: what is measured is what it says, and the residuals' sizes are bounds."""
-
-import json
-from pathlib import Path
+"""What a field can do without: the residuals' sizes are bounds, and the smallest field within a loss is found."""
 
 import pytest
 import torch
-import tyro
-from short_trainings import command_line, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.reduce import latent_basis, with_diffuse, with_rank
-from nrfgs_ns.errors import InputError
-from nrfgs_ns.inspect.ablate import changes, row, together
-from nrfgs_ns.inspect.command import Inspect
-from nrfgs_ns.inspect.report import advice
-from nrfgs_ns.simplify.field_views import FieldViews, dropped, slim
-from nrfgs_ns.simplify.residuals import EIGHT_BIT_STEP, look_over
-from nrfgs_ns.training.run import parse, train
+from nrfgs_ns.compact import slim as slimming
+from nrfgs_ns.compact.slim import EIGHT_BIT_STEP, FieldViews, dropped, look_over, slim
+from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 LOUD = {
@@ -101,7 +92,7 @@ def test_the_largest_change_bounds_what_a_pixel_can_change(loud, field, seen):
         assert tightest > 0.1, "a bound that is far from reached would tell nothing"
 
 
-def test_loss_falls_with_the_rank(loud, field, seen):
+def test_loss_falls_with_the_rank(loud, field, seen, monkeypatch):
     images = loud.datamanager.fixed_indices_eval_dataloader
     views = FieldViews(loud.model, images)
     model = loud.model
@@ -112,12 +103,13 @@ def test_loss_falls_with_the_rank(loud, field, seen):
     basis = latent_basis(field, seen.weight)
     scores = [views.psnr(with_rank(field, basis, rank)) for rank in range(1, 7)]
     assert scores == sorted(scores) and scores[-1] > 80 > scores[0]
+    assert slim(field, seen, views, -1e3, lambda _: None).threshold == float("inf")
     # The smallest that reaches a score is found, and no smaller one would do.
+    monkeypatch.setattr(slimming, "THRESHOLDS", ())
     for wanted in (scores[0] - 1, 0.5 * (scores[1] + scores[2]), scores[4]):
-        slimmed = slim(field, seen, views, wanted, threshold=0.0)
+        slimmed = slim(field, seen, views, wanted, lambda _: None)
         assert views.psnr(slimmed.field) >= wanted
         assert slimmed.rank == 1 or scores[slimmed.rank - 2] < wanted
-    assert slim(field, seen, views, -1e3).threshold == float("inf")
 
 
 def test_views_score_as_the_pipeline_does(loud, field):
@@ -125,30 +117,6 @@ def test_views_score_as_the_pipeline_does(loud, field):
     expected = loud.get_average_eval_image_metrics()["psnr"]
     loud.eval()
     assert views.psnr(field) == pytest.approx(expected, abs=1e-4)
-
-
-def test_the_command(tiny_scene, tmp_path, capsys):
-    config = trained(command_line("nrfgs", tiny_scene, tmp_path, 4, LOUD))
-    tyro.cli(Inspect, args=["--load-config", str(config), "--views", "2"]).main()
-    result = json.loads((config.parent / "inspect" / "inspect.json").read_text())
-    assert (config.parent / "inspect" / "inspect.png").stat().st_size > 10_000
-    rows = {row["part"]: row for row in result["rows"]}
-    assert {"high branch", "low branch", "opacity residual", "distance", "band 0", "band 2", "direction"} < set(rows)
-    assert [row["rank"] for row in result["rows"] if row["group"] == "rank"] == [1, 2, 3, 4, 5, 6]
-    assert rows["latent rank 6"]["loss_db"] == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
-    assert rows["all residuals"]["diffuse"] == 1.0 and rows["all residuals"]["threshold"] is None
-    assert rows["latent rank 1"]["bytes"] < rows["latent rank 2"]["bytes"] < rows["nothing"]["bytes"]
-    assert result["together"]["loss_db"] <= 0.05 + 1e-6 and result["together"]["bytes"] <= rows["nothing"]["bytes"]
-    assert result["advice"] in " ".join(capsys.readouterr().out.split())
-
-    for words, says in (
-        (["--load-config", str(tmp_path / "no.yml")], "no such file"),
-        (["--load-config", str(config), "--views", "0"], "at least 1"),
-        (["--load-config", str(config), "--budget", "-1"], "zero or positive"),
-        (["--load-config", str(config), "--budget", "nan"], "zero or positive"),
-    ):
-        with pytest.raises(InputError, match=says):
-            tyro.cli(Inspect, args=words).main()
 
 
 def test_latents_of_diffuse_splats_do_not_count(loud, field, seen):
@@ -160,48 +128,6 @@ def test_latents_of_diffuse_splats_do_not_count(loud, field, seen):
     some = with_diffuse(Field(field.head, splats), diffuse, seen.features_dc, seen.opacities)
     views = FieldViews(loud.model, loud.datamanager.fixed_indices_eval_dataloader)
     basis = latent_basis(some, seen.weight)
-    (rank_1,) = [change for name, _, _, change in changes(some, seen, basis) if name == "latent rank 1"]
-    assert views.psnr(some) - views.psnr(rank_1(some)) == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
-
-
-def test_the_head_is_timed_with_diffuse_splats_last(loud, field, seen, monkeypatch):
-    """The fused kernels save the network of whole blocks: in the order of an untrained mask they would have none."""
-    camera, batch = next(iter(loud.datamanager.fixed_indices_eval_dataloader))
-    views = FieldViews(loud.model, [(camera, batch)])
-    diffuse = torch.rand(len(field.splats["means"]), generator=torch.Generator().manual_seed(0)) < 0.5
-    some = with_diffuse(field, diffuse, seen.features_dc, seen.opacities)
-    given = []
-    monkeypatch.setattr(type(some.head), "forward", lambda self, splats, visible, center: given.append(visible))
-    assert views.head_seconds(some) >= 0
-    visible = views.views[0][0].visible
-    assert torch.equal(given[0].sort().values, visible) and (diffuse[given[0]].int().diff() >= 0).all()
-    views.head_seconds(field)
-    assert torch.equal(given[-1], visible)
-
-
-def test_splats_that_are_diffuse_already_are_not_left_out_again(loud, field, seen):
-    every = dropped(field, seen, float("inf"))
-    views = FieldViews(loud.model, loud.datamanager.fixed_indices_eval_dataloader)
-    rows = [row("nothing", "full", every, views, None)]
-    _, left_out = together(every, rows, seen, views, 0.05, lambda _: None)
-    assert left_out == []
-
-
-def test_other_heads_are_refused(tiny_scene, tmp_path):
-    words = ["nrfgs-sh", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "1"]
-    config = Path(train([*words, "--vis", "tensorboard"]).config_path)
-    with pytest.raises(InputError, match="'sh' head has no parts"):
-        Inspect(config).main()
-
-
-def test_advice_names_what_to_leave_out():
-    def row(**changes):
-        return {"bytes": 100, "head_seconds": 1.0, "loss_db": 0.0, "threshold": None, "diffuse": 0.0} | changes
-
-    rows = [row(), row(threshold=float("inf"), loss_db=0.7)]
-    assert "is worth 0.70 dB" in advice(rows, row(), [], 0.05) and "Every part pays" in advice(rows, row(), [], 0.05)
-    assert "No splat of this model has a residual" in advice([row(diffuse=1.0), *rows[1:]], row(), [], 0.05)
-    said = advice(rows, row(bytes=40, head_seconds=0.7, loss_db=0.02), ["distance", "latents beyond rank 4"], 0.05)
-    assert (
-        "distance, latents beyond rank 4 cost 0.020 dB and save 60 % of the bytes and 30 % of the head's time" in said
-    )
+    assert views.psnr(some) - views.psnr(with_rank(some, basis, 1)) == pytest.approx(
+        0.0, abs=1e-3
+    )  # exact, but for float32

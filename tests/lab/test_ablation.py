@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs inspect`: parts left out are what their own definition says, and the command measures each."""
+
+import json
+
+import pytest
+import torch
+import tyro
+from compact_fields import field
+from head_cases import awake, scene
+from short_trainings import command_line, trained
+from torch.testing import assert_close
+
+from nrfgs_lab.ablation import (
+    Inspect,
+    diffuse_last,
+    with_constant_distance,
+    without_high_branch,
+    without_input,
+    without_low_branch,
+    without_opacity_residual,
+)
+from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.encoding import view_geometry
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.reduce import input_columns
+from nrfgs_ns.errors import InputError
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+CONFIGS = {
+    "default": NrfConfig(latent_dim=8, hidden_width=16),
+    "one branch": NrfConfig(latent_dim=8, hidden_width=16, split_bands=False),
+    "low only": NrfConfig(latent_dim=8, hidden_width=16, num_bands=1, use_distance=False, opacity_residual=False),
+}
+FLOAT32 = {"rtol": 0, "atol": 2e-5}
+"""Sums of up to 60 products of numbers of order 1 to 10, rounded at 2^-24 each, behind slopes of at most 0.2."""
+LOUD = {
+    "--pipeline.model.appearance.output-init": "default",
+    "--pipeline.model.appearance.latent-dim": 6,
+    "--pipeline.model.warmup-steps": 0,
+    "--pipeline.model.few-views": "off",
+}
+
+
+def test_the_command(tiny_scene, tmp_path, capsys):
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path, 4, LOUD))
+    tyro.cli(Inspect, args=["--load-config", str(config), "--views", "2"]).main()
+    result = json.loads((config.parent / "inspect.json").read_text())
+    rows = {row["part"]: row for row in result["rows"]}
+    assert {"high branch", "low branch", "opacity residual", "distance", "band 0", "band 2", "direction"} < set(rows)
+    assert [row["rank"] for row in result["rows"] if row["group"] == "rank"] == [1, 2, 3, 4, 5, 6]
+    assert rows["latent rank 6"]["loss_db"] == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
+    assert rows["all residuals"]["diffuse"] == 1.0 and rows["all residuals"]["threshold"] is None
+    assert rows["latent rank 1"]["bytes"] < rows["latent rank 2"]["bytes"] < rows["nothing"]["bytes"]
+    assert result["together"]["loss_db"] <= 0.05 + 1e-6 and result["together"]["bytes"] <= rows["nothing"]["bytes"]
+    assert "can be left out together" in capsys.readouterr().out
+    for words, says in (
+        (["--views", "0"], "at least 1"),
+        (["--budget", "-1"], "zero or positive"),
+        (["--budget", "nan"], "zero or positive"),
+    ):
+        with pytest.raises(InputError, match=says):
+            tyro.cli(Inspect, args=["--load-config", str(config), *words]).main()
+
+
+def test_the_head_is_timed_with_diffuse_splats_last():
+    """The fused kernels save the network of whole blocks: in the order of an untrained mask they would have none."""
+    splats = field().splats
+    visible = torch.arange(0, 60, 2)
+    rows = diffuse_last(splats, visible)
+    assert torch.equal(rows.sort().values, visible) and (splats[DIFFUSE][rows].int().diff() >= 0).all()
+    assert diffuse_last({}, visible) is visible
+
+
+@pytest.fixture(params=CONFIGS)
+def case(request):
+    head = awake(CONFIGS[request.param], torch.float32).requires_grad_(False)
+    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
+    return Field(head, splats), visible, centers
+
+
+def assert_same(field: Field, other: Field, visible, centers, **tolerance) -> None:
+    for a, b in zip(
+        field.head(field.splats, visible, centers), other.head(other.splats, visible, centers), strict=True
+    ):
+        assert_close(a, b, **tolerance)
+
+
+def test_without_the_high_branch_its_gate_is_shut():
+    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
+    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
+    small = without_high_branch(Field(head, splats))
+    shut = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
+    shut.load_state_dict(head.state_dict())
+    shut.high[2].weight[3], shut.high[2].bias[3] = 0.0, -1e4
+    assert small.head.high is None and small.bytes < Field(head, splats).bytes
+    assert_same(small, Field(shut, splats), visible, centers, **FLOAT32)
+
+
+def test_without_the_low_branch_colours_are_the_high_ones():
+    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
+    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
+    small = without_low_branch(Field(head, splats))
+    parts = small.head.components(splats, visible, centers)
+    assert (parts["low branch"].values == 0).all() and parts["high branch"].values.abs().max() > 1e-3
+    assert (small.head(splats, visible, centers).opacities == head(splats, visible, centers).opacities).all()
+
+
+def test_without_opacitys_residual_only_colours_change():
+    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
+    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
+    small = without_opacity_residual(Field(head, splats))
+    found = small.head(splats, visible, centers)
+    assert (found.opacities == head.base_appearance(splats, visible).opacities).all()
+    assert_close(found.colors, head(splats, visible, centers).colors, **FLOAT32)
+
+
+def test_a_constant_distance_is_what_the_field_sees(case):
+    field, visible, _ = case
+    if not field.head.config.use_distance:
+        pytest.skip("this field sees no distance")
+    # From cameras that are all as far away from their splats.
+    torch.manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(len(visible), 3), dim=-1)
+    centers = field.splats["means"][visible] + 3.0 * directions
+    _, log_distance = view_geometry(field.splats["means"][visible], centers, 0.01)
+    small = with_constant_distance(field, float(log_distance[0]))
+    assert not small.head.config.use_distance
+    assert_same(small, field, visible, centers, **FLOAT32)
+
+
+def test_an_input_that_is_0_no_longer_counts(case):
+    field, visible, _ = case
+    center = torch.tensor([5.0, 4.0, 3.0])
+    small = field
+    for name in input_columns(field.head.config, "low") | input_columns(field.head.config, "high"):
+        if name in ("direction", "distance") or name.startswith("band"):
+            small = without_input(small, name)
+    a, b = (small.head(small.splats, visible, c) for c in (center, -center))
+    assert (a.colors == b.colors).all() and (a.opacities == b.opacities).all()
+    a, b = (field.head(field.splats, visible, c) for c in (center, -center))
+    assert (a.colors != b.colors).any()

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs`: listed and refused without importing torch; small work takes one thread; a log shows progress."""
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from rich.console import Console
+
+from nrfgs_ns import threads
+from nrfgs_ns.cli import commands, summary
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.progress import SECONDS_BETWEEN_LINES, progress
+from nrfgs_ns.threads import few_threads
+from nrfgs_ns.trained.find import NamesTraining, config_of
+
+RUN = """
+import sys
+from nrfgs_ns.cli import entrypoint
+sys.argv = ["nrfgs", *sys.argv[1:]]
+try:
+    entrypoint()
+finally:
+    heavy = {"torch", "nerfstudio", "gsplat"} & set(sys.modules)
+    assert not heavy, heavy
+"""
+
+
+def nrfgs(*words: str, folder: Path) -> subprocess.CompletedProcess:
+    """Run a command in a folder; it fails where the command imports torch."""
+    run = subprocess.run([sys.executable, "-c", RUN, *words], cwd=folder, capture_output=True, text=True)
+    assert "AssertionError" not in run.stderr, run.stderr
+    return run
+
+
+def test_the_list_has_every_command_and_its_first_sentence(tmp_path):
+    run = nrfgs("--help", folder=tmp_path)
+    assert run.returncode == 0
+    for name, entry in commands().items():
+        assert name in run.stdout and summary(entry) and summary(entry) in run.stdout
+
+
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (["exprot"], "no command 'exprot'. Did you mean `nrfgs export`?"),
+        (["xyz"], "There are bench, demo, eval"),
+        (["eval", "nowhere/config.yml"], "nowhere/config.yml: no such file or folder"),
+        (["eval"], "no folder outputs here"),
+        (["view", "nowhere"], "nowhere: no such file or folder"),
+        (["view", "."], "no config.yml in this folder or below"),
+        (["export", "ply", "--load-config", "nowhere", "--output", "x.ply"], "nowhere: no such file or folder"),
+        (["export", "compact", "nowhere", "--output", "x.nrf"], "nowhere: no such file or folder"),
+        (["export", "web", "nowhere", "--output", "x.html"], "nowhere: no such file or folder"),
+    ],
+)
+def test_mistakes_are_told_before_torch_is_imported(words, says, tmp_path):
+    run = nrfgs(*words, folder=tmp_path)
+    assert run.returncode != 0 and says in " ".join(run.stderr.split()) and not list(tmp_path.iterdir())
+
+
+def test_the_help_of_a_format_has_its_own_options(tmp_path):
+    said = {kind: nrfgs("export", kind, "--help", folder=tmp_path).stdout for kind in ("ply", "compact", "web")}
+    for option, kinds in {"--world": ["ply"], "--rate": ["compact", "web"], "--author": ["web"]}.items():
+        assert [kind for kind, text in said.items() if option in text] == kinds
+
+
+def test_a_training_is_named_in_any_form(tmp_path, monkeypatch, capsys):
+    runs = [tmp_path / "outputs" / "scene" / method / "then" for method in ("nrfgs", "nrfgs-sh")]
+    for age, run in enumerate(runs):
+        run.mkdir(parents=True)
+        (run / "config.yml").write_text("")
+        os.utime(run / "config.yml", (1e9 - age, 1e9 - age))
+    newest, older = (run / "config.yml" for run in runs)
+    monkeypatch.chdir(tmp_path)
+    assert config_of(newest) == newest and capsys.readouterr().out == ""
+    for path, config in ((runs[1], older), (older.parents[1], older), (tmp_path / "outputs", newest)):
+        assert config_of(path) == config
+    assert config_of(None).resolve() == newest
+    assert f"Training: {newest.relative_to(tmp_path)}" in capsys.readouterr().out
+    assert NamesTraining(load_config=older).config() == NamesTraining(older).config() == older
+    with pytest.raises(InputError, match="Give one"):
+        NamesTraining(older, load_config=older).config()
+
+
+def test_small_work_takes_one_thread(monkeypatch):
+    used = []
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
+    monkeypatch.setattr(torch, "set_num_threads", used.append)
+    for side, splats in ((100, 2000), (1000, 2000), (100, 10**6)):
+        sides = torch.full((3, 1), side)
+        data = SimpleNamespace(train_dataset=SimpleNamespace(cameras=Sized(sides, sides)))
+        with few_threads() as chosen:
+            chosen.suit_to(SimpleNamespace(model=SimpleNamespace(num_points=splats), datamanager=data))
+    assert used == [1, 8, 1, 8, 8, 1, 8, 8]
+    assert threads.SMALL > 160 * 120 + 6000, "the demo's scene is small"
+
+
+class Sized(SimpleNamespace):
+    """Cameras that are nothing but their sizes."""
+
+    def __init__(self, width, height):
+        super().__init__(width=width, height=height)
+
+    def __len__(self):
+        return len(self.width)
+
+
+def test_progress_is_told_in_a_log():
+    log, now = io.StringIO(), [0.0]
+    with progress("Counting", 100, Console(file=log), lambda: now[0]) as advance:
+        for _ in range(100):
+            now[0] += SECONDS_BETWEEN_LINES / 40
+            advance()
+    assert log.getvalue().splitlines() == ["Counting ...", "Counting: 40 of 100", "Counting: 80 of 100"]
