@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from nerfstudio.plugins.types import MethodSpecification
 
 from nrfgs_ns import method_config
-from nrfgs_ns.cli import commands
+from nrfgs_ns.cli import commands, summary
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "options.md"
@@ -150,8 +150,7 @@ def page() -> str:
         "## Commands\n\n| | |\n|---|---|",
     ]
     for name, entry_point in commands().items():
-        summary, *_ = inspect.getdoc(entry_point.load()).splitlines()
-        parts.append(f"| `nrfgs {name}` | {summary.split('. ')[0].removesuffix('.')} |")
+        parts.append(f"| `nrfgs {name}` | {summary(entry_point)} |")
     return "\n".join(parts) + "\n"
 
 
