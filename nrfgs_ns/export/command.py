@@ -107,6 +107,7 @@ class Export:
     """Write a trained model as a file that other programs read."""
 
     format: tyro.conf.OmitSubcommandPrefixes[Ply | Compact | Web]
+    """the file's format"""
 
     def main(self) -> None:
         self.format.main()
