@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """nerfstudio's `colmap` parser, with the checks of `nrfgs-data`; and which parsers stand in for nerfstudio's."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from nrfgs_ns.data.checks import check_frames, exists, shown
+from nrfgs_ns.data.checks import check_frames, shown
 from nrfgs_ns.data.colmap import read_model
 from nrfgs_ns.data.dataparser import NrfgsDataParser, Scene
 from nrfgs_ns.data.layout import ColmapLayout, Layout
@@ -37,7 +38,7 @@ class NrfgsColmapDataParser(NrfgsDataParser):
 
     def _read(self) -> tuple[dict[str, Any], Path, Layout]:
         config = self.config
-        if not exists(config.data):
+        if not os.path.exists(config.data):
             raise InputError(f"{shown(str(config.data))}: no such folder. Check the path that --data names.")
         layout = ColmapLayout(config)
         cameras, views, source = read_model(layout.colmap)
@@ -61,8 +62,8 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         check_frames(frames, source)
         return meta, source, layout
 
-    def _order(self, frames: list[dict[str, Any]], layout: Layout) -> list[dict[str, Any]]:
-        return frames  # by COLMAP's numbers
+    def _order(self, frames: list[dict[str, Any]], layout: Layout) -> list[int]:
+        return list(range(len(frames)))  # by COLMAP's numbers
 
     def _to_frames(self, meta: dict[str, Any], layout: Layout) -> torch.Tensor | None:
         return torch.tensor(meta["applied_transform"]) if "applied_transform" in meta else None

@@ -24,15 +24,8 @@ from torch import Tensor
 from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.colmap_parser import checked
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.data.pictures import read_picture
-from nrfgs_ns.data.pixels import (
-    free_memory,
-    from_files,
-    in_parallel,
-    look_through,
-    pixels_folder,
-    undistorted,
-)
+from nrfgs_ns.data.pictures import cache_folder, free_memory, in_parallel, read_mask, read_picture
+from nrfgs_ns.data.pixels import from_files, look_through, undistorted
 from nrfgs_ns.data.views import different_views, scene_unit
 from nrfgs_ns.errors import InputError
 
@@ -82,21 +75,23 @@ class NrfgsInputDataset(InputDataset):
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image with its mask and index; InputError if either file cannot be used."""
-        if self.mask_color and image_type == "uint8":
-            # nerfstudio paints a colour in [0, 1] into whatever it has; among bytes that would be black.
-            data = self.get_data(image_idx, "float32")
-            return {**data, "image": (data["image"] * 255).round().to(torch.uint8)}
-        try:
-            return super().get_data(image_idx, image_type)
-        except InputError:
-            raise
-        except Exception as error:  # nerfstudio reads the mask with PIL, which lets out whatever it meets
-            if self._dataparser_outputs.mask_filenames is None:
-                raise
-            raise InputError(
-                f"{self._dataparser_outputs.mask_filenames[image_idx]} cannot be used as the mask of "
-                f"{self.image_filenames[image_idx]} ({error}). Give an 8-bit grey image of the same size."
-            ) from error
+        image = self.get_image_float32(image_idx) if image_type == "float32" else self.get_image_uint8(image_idx)
+        data = {"image_idx": image_idx, "image": image}
+        if (masks := self._dataparser_outputs.mask_filenames) is not None:
+            mask = read_mask(masks[image_idx])
+            if self.scale_factor != 1.0:
+                mask = mask.resize([int(side * self.scale_factor) for side in mask.size], Image.Resampling.NEAREST)
+            if mask.size != (image.shape[1], image.shape[0]):
+                raise InputError(
+                    f"{masks[image_idx]} is {mask.width} x {mask.height}, but its image {image.shape[1]} x "
+                    f"{image.shape[0]}. Make the mask as large as the image."
+                )
+            data["mask"] = torch.from_numpy(np.array(mask)).unsqueeze(-1).bool()
+            if self.mask_color:
+                color = torch.tensor(self.mask_color)
+                outside = color if image_type == "float32" else (255 * color).round().to(torch.uint8)
+                image[~data["mask"][..., 0], :3] = outside
+        return data
 
 
 @dataclass
@@ -143,19 +138,18 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             The numbers of training and evaluation images.
 
         Raises:
-            InputError: an image or a mask cannot be used, or all masks of the training images are empty.
+            InputError: an image or a mask cannot be used, or nothing is visible in any training image.
         """
         count = len(self.cached_train)
         names = [path.name for path in self.train_dataset.image_filenames]
-        empty = [
-            name
-            for name, data in zip(names, self.cached_train, strict=True)
-            if "mask" in data and not data["mask"].any()
-        ]
+        empty = [name for name, data in zip(names, self.cached_train, strict=True) if not _shows_anything(data)]
         if empty:
-            finding = f"{self.get_datapath()}: the masks of {some(empty)} leave nothing of the image"
+            finding = f"{self.get_datapath()}: masks or transparency leave nothing of {some(empty)}"
             if len(empty) == count:
-                raise InputError(f"{finding}, so there is nothing to learn. Masks are 0 outside, anything else inside.")
+                raise InputError(
+                    f"{finding}, so there is nothing to learn. Masks are 0 outside and 255 inside; opaque pixels have "
+                    "alpha 255."
+                )
             warn(f"{finding}.")
         return count, len(self.cached_eval)
 
@@ -231,7 +225,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             return "memory"
         CONSOLE.print(
             f"Decoded images take {size / 1e9:.1f} GB, and may take {budget / 1e9:.1f} (--pipeline.datamanager."
-            f"image-memory): they are read from files in {pixels_folder()}.",
+            f"image-memory): they are read from files in {cache_folder('pixels')}.",
             markup=False,
             soft_wrap=True,
         )
@@ -257,9 +251,10 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             move = Tensor.pin_memory if place == "memory" else lambda values: values.to(self.device)
             return data | {name: move(data[name]) for name in ("image", "mask") if name in data}
 
-        indices, workers = range(len(dataset)), self.config.max_thread_workers
-        found = in_parallel(lambda index: read(dataset, index, kind), indices, f"Reading {split} images", workers)
-        images = [placed(data) for data in found]
+        sizes = list(zip(dataset.cameras.width[:, 0].tolist(), dataset.cameras.height[:, 0].tolist(), strict=True))
+        workers = self.config.max_thread_workers
+        pictures = in_parallel(lambda index: read(dataset, index, kind), sizes, f"Reading {split} images", workers)
+        images = [placed(data) for data in pictures]
         # What is in memory is a pinhole's, whatever the lens; the camera's type is still the photograph's.
         dataset.cameras.camera_type[:] = CameraType.PERSPECTIVE.value
         self.train_cameras = self.train_dataset.cameras.to(self.device if place == "device" else "cpu")
@@ -309,3 +304,9 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         else:
             np.random.set_state(tuple(state["generator"]))
             self.train_unsampled_epoch_count = np.array(state["epochs_unsampled"])
+
+
+def _shows_anything(data: dict[str, Any]) -> bool:
+    """Whether some pixel of a photograph is inside its mask and not transparent."""
+    image = data["image"]
+    return ("mask" not in data or bool(data["mask"].any())) and (image.shape[-1] < 4 or bool(image[..., 3].any()))

@@ -20,15 +20,13 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from nrfgs_ns.data.checks import (
-    SMALLEST,
+    check_applied,
     check_exist,
     check_frames,
     check_headers,
-    check_intrinsics,
     check_options,
     check_poses,
     check_unique,
-    could_exist,
     number,
     read_transforms,
     shown,
@@ -36,7 +34,7 @@ from nrfgs_ns.data.checks import (
     warn,
 )
 from nrfgs_ns.data.layout import FOLDERS, Layout
-from nrfgs_ns.data.lenses import cameras_of, size_of
+from nrfgs_ns.data.lenses import SMALLEST, cameras_of, read_lenses
 from nrfgs_ns.data.pictures import smaller_copies, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
@@ -48,21 +46,11 @@ from nrfgs_ns.start import with_data_parsers
 
 with_data_parsers()
 
-MASK_MODES = ("1", "L", "I", "I;16")
-"""PIL modes with one value per pixel that means something by itself (a palette index does not)."""
 MIN_POINTS = 4
 """Fewer points cannot start a training: a splat's first size is its distance to its three nearest neighbours."""
 ORIENTATIONS = ("pca", "up", "vertical", "none")
 COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """The applied_transform of data sets from before nerfstudio wrote it down."""
-
-
-def __getattr__(name: str):
-    if name == "NrfgsColmapDataParser":  # where a config.yml may say that it is
-        from nrfgs_ns.data import colmap_parser
-
-        return colmap_parser.NrfgsColmapDataParser
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 @dataclass
@@ -92,6 +80,8 @@ class Scene(NamedTuple):
     """rows of each split"""
     factor: int
     """by which images are smaller than the intrinsics say"""
+    lenses: np.ndarray
+    """`lenses.read_lenses`, float64 [V, 12]"""
     cameras: Cameras
     """all of them, placed and of the size of the images"""
     transform: torch.Tensor
@@ -132,7 +122,7 @@ class NrfgsDataParser(DataParser):
         cameras = scene.cameras[torch.from_numpy(rows)]
         if self._images_needed:
             sizes = list(zip(cameras.width.flatten().tolist(), cameras.height.flatten().tolist(), strict=True))
-            files |= _checked_files(scene, frames, files, sizes)
+            files |= _checked_files(scene, rows, files, sizes)
         box = self.config.scene_scale * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         outputs = PlacedOutputs(
             image_filenames=files["file_path"],
@@ -160,30 +150,53 @@ class NrfgsDataParser(DataParser):
     @cached_property
     def _scene(self) -> Scene:
         """The whole data set, checked as far as can be done without opening all images."""
-        check_options(self.config)
+        config = self.config
+        check_options(config)
         meta, source, layout = self._read()
-        frames, config = meta["frames"], self.config
-        check_intrinsics(meta, source)
-        check_poses(frames, source, need_spread=config.auto_scale_poses and len(frames) > 1)
+        frames = meta["frames"]
+        lenses = read_lenses(meta, source)
+        check_applied(meta, source)
+        poses = check_poses(frames, source, need_spread=config.auto_scale_poses and len(frames) > 1)
         if getattr(config, "mask_color", None) is not None and "mask_path" not in frames[0]:
             raise InputError(
                 f"{source}: --mask-color is set, but no frame has a mask_path. Add masks or drop the option."
             )
-        if self._images_needed:
-            factor = config.downscale_factor
-            if factor is None:  # the first image in its full size decides
-                check_exist([layout.file(frame["file_path"]) for frame in frames], source, "images")
-                factor = layout.factor_of(frames[0]["file_path"])
-            for key in FOLDERS:
-                what = "images" if key == "file_path" else f"files of {key}"
-                check_exist(layout.files(frames, key, factor), source, what)
-        else:
-            factor = self.downscale_factor
-        frames = meta["frames"] = self._order(frames, layout)
-        paths = [layout.file(frame["file_path"]) for frame in frames]
-        check_unique(paths, f"{source}: frames")
+        factor = self._factor(frames, layout, source) if self._images_needed else self.downscale_factor
+        order = self._order(frames, layout)
+        frames = meta["frames"] = [frames[row] for row in order]
+        lenses, poses = lenses[order], poses[order]
+        splits = self._splits(meta, layout, source)
+        placed, transform, scale = self._placed(poses, meta, source)
+        cameras = cameras_of(meta, lenses, placed, source)
+        rounding = getattr(config, "downscale_rounding_mode", "floor")
+        cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
+        if min(cameras.width.min(), cameras.height.min()) < SMALLEST:
+            raise InputError(
+                f"{source}: --downscale-factor {factor} leaves images of {cameras.width.min()} x "
+                f"{cameras.height.min()} pixels. Give a smaller one."
+            )
+        self._warn_of_repeated(cameras.camera_to_worlds, splits, frames, source)
+        to_frames = self._to_frames(meta, layout)
+        return Scene(meta, source, layout, splits, factor, lenses, cameras, transform, to_frames, scale)
+
+    def _factor(self, frames: list[dict[str, Any]], layout: Layout, source: Path) -> int:
+        """The downscale factor, for which all files are there."""
+        factor = self.config.downscale_factor
+        if factor is None:  # the first image in its full size decides
+            check_exist([layout.file(frame["file_path"]) for frame in frames], source, "images")
+            factor = layout.factor_of(frames[0]["file_path"])
+        for key in FOLDERS:
+            what = "images" if key == "file_path" else f"files of {key}"
+            check_exist(layout.files(frames, key, factor), source, what)
+        return factor
+
+    def _splits(self, meta: dict[str, Any], layout: Layout, source: Path) -> Rows:
+        """Rows of the training and the evaluation images, as the data set names them or by rule."""
+        paths = [layout.file(frame["file_path"]) for frame in meta["frames"]]
         named = self._named_splits(meta, layout)
-        splits = split_by_names(named, paths, layout.file, source) if named else split_by_rule(config, paths, source)
+        splits = (
+            split_by_names(named, paths, layout.file, source) if named else split_by_rule(self.config, paths, source)
+        )
         if named and "train" not in named:
             there = next(iter(named.values()))[0]  # test_filenames, test_list.txt
             raise InputError(
@@ -194,42 +207,34 @@ class NrfgsDataParser(DataParser):
                 f"{source}: no image is left for training. Correct train_filenames if it is there, else --eval-mode, "
                 "--eval-interval or --train-split-fraction."
             )
-        poses, transform, scale = self._placed(meta, source)
-        cameras = cameras_of(meta, poses, source)
-        rounding = getattr(config, "downscale_rounding_mode", "floor")
-        cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
-        if min(cameras.width.min(), cameras.height.min()) < SMALLEST:
-            raise InputError(
-                f"{source}: --downscale-factor {factor} leaves images of {cameras.width.min()} x "
-                f"{cameras.height.min()} pixels. Give a smaller one."
-            )
-        self._tell_repeated(cameras.camera_to_worlds, splits, paths, source)
-        return Scene(meta, source, layout, splits, factor, cameras, transform, self._to_frames(meta, layout), scale)
+        return splits
 
-    def _tell_repeated(self, poses: torch.Tensor, splits: Rows, paths: list[Path], source: Path) -> None:
+    def _warn_of_repeated(self, poses: torch.Tensor, splits: Rows, frames: list[dict[str, Any]], source: Path) -> None:
         """Warn of images for evaluation alone that were taken from where a training image was."""
         train = splits["train"]
         evaluated = np.setdiff1d(np.union1d(splits["val"], splits["test"]), train)
         repeated = repeated_views(poses, evaluated, train)
         if repeated:
             warn(
-                f"{source}: {some([paths[row].name for row in repeated])}, for evaluation, show what training images "
-                "show from the same place, which flatters the results. Remove copies, and frames of a camera that "
-                "stands still."
+                f"{source}: {some([Path(frames[row]['file_path']).name for row in repeated])}, for evaluation, show "
+                "what training images show from the same place, which flatters the results. Remove copies, and frames "
+                "of a camera that stands still."
             )
 
-    def _placed(self, meta: dict[str, Any], source: Path) -> tuple[torch.Tensor, torch.Tensor, float]:
+    def _placed(
+        self, poses: np.ndarray, meta: dict[str, Any], source: Path
+    ) -> tuple[torch.Tensor, torch.Tensor, float]:
         """Poses in the world that is trained in, and the way there (`world.place`)."""
-        frames, config = meta["frames"], self.config
+        config = self.config
         orientation = meta.get("orientation_override", config.orientation_method)
         if orientation not in ORIENTATIONS:
             raise InputError(
                 f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, "
                 "or remove it."
             )
-        single = len(frames) == 1
+        single = len(poses) == 1
         placed = place(
-            np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64),
+            poses,
             "up" if single and orientation == "vertical" else orientation,  # which needs two cameras
             config.center_method,
             config.auto_scale_poses and not single,
@@ -242,7 +247,7 @@ class NrfgsDataParser(DataParser):
             )
         return placed
 
-    # What is another thing in COLMAP's layout.
+    # Different in COLMAP's layout.
 
     def _read(self) -> tuple[dict[str, Any], Path, Layout]:
         """What the data set says, the file that it says so in, and where its files are."""
@@ -250,9 +255,10 @@ class NrfgsDataParser(DataParser):
         check_frames(meta["frames"], source)
         return meta, source, Layout(source.parent)
 
-    def _order(self, frames: list[dict[str, Any]], layout: Layout) -> list[dict[str, Any]]:
-        """The frames in the order that they are split in: by name, as in nerfstudio."""
-        return sorted(frames, key=lambda frame: layout.file(frame["file_path"]))
+    def _order(self, frames: list[dict[str, Any]], layout: Layout) -> list[int]:
+        """The order in which frames are split: by name, as in nerfstudio."""
+        parts = [layout.file(frame["file_path"]).parts for frame in frames]
+        return sorted(range(len(frames)), key=parts.__getitem__)
 
     def _to_frames(self, meta: dict[str, Any], layout: Layout) -> torch.Tensor | None:
         """The transform [3, 4] that has already been applied to the frames' poses, if one has."""
@@ -270,7 +276,7 @@ class NrfgsDataParser(DataParser):
         before scaling; None without."""
         if "ply_file_path" in scene.meta:
             name = scene.meta["ply_file_path"]
-            if not (isinstance(name, str) and could_exist(name)):
+            if not isinstance(name, str):
                 raise InputError(f"{scene.source}: ply_file_path is {shown(repr(name))}. Name a file, or remove it.")
             return *read_ply(scene.layout.file(name)), scene.transform
         if scene.layout.colmap.is_dir():
@@ -303,7 +309,7 @@ class NrfgsDataParser(DataParser):
 
 
 def _checked_files(
-    scene: Scene, frames: list[dict[str, Any]], files: dict[str, list[Path]], sizes: Sequence[tuple[int, int]]
+    scene: Scene, rows: np.ndarray, files: dict[str, list[Path]], sizes: Sequence[tuple[int, int]]
 ) -> dict[str, list[Path]]:
     """Images and masks, found to have the sizes that their cameras have; those that are larger, resized."""
     checked = {}
@@ -318,20 +324,14 @@ def _checked_files(
         shrink = scene.factor > 1 and not scene.layout.has_copies(key, scene.factor)
         if not shrink:
             check_unique(paths, f"{scene.source}: frames")
-        expected = [size_of(scene.meta, frame) for frame in frames] if shrink else sizes
+        full = [(int(width), int(height)) for width, height in scene.lenses[rows, 4:6]]
         fix = fixes[what]
         if scene.factor > 1 and not shrink:
             fix = (
                 f"Remove {paths[0].parent}, so that copies are made, or with `colmap` give "
                 "--downscale-rounding-mode round or ceil."
             )
-        modes = check_headers(paths, expected, what, fix)
-        bad = [path for path, mode in zip(paths, modes, strict=True) if mode not in MASK_MODES]
-        if key == "mask_path" and bad:
-            raise InputError(
-                f"{some(bad)}: a mask must have one grey channel (0 outside, anything else inside), not colours or a "
-                "palette. Save it as 8-bit grey."
-            )
+        check_headers(paths, full if shrink else sizes, what, fix)
         checked[key] = smaller_copies(paths, sizes, what) if shrink else paths
     return checked
 

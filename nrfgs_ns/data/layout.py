@@ -7,7 +7,7 @@ from typing import Any
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION
 
-from nrfgs_ns.data.pictures import read_header
+from nrfgs_ns.data.pictures import read_size
 
 FOLDERS = {"file_path": "images", "mask_path": "masks", "depth_file_path": "depths"}
 """What a frame calls its image, mask and depths -> the folder of smaller copies, followed by _ and the factor."""
@@ -49,7 +49,7 @@ class Layout:
     def factor_of(self, image: str) -> int:
         """The smallest power of two that leaves an image no side longer than 1600 pixels, among those that may be taken
         without having been asked for."""
-        size, factor = max(read_header(self.file(image))[0]), 1
+        size, factor = max(read_size(self.file(image))), 1
         while size / factor > MAX_AUTO_RESOLUTION and self._may_be_taken(image, 2 * factor):
             factor *= 2
         return factor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the intrinsics of a data set to nerfstudio's cameras, whose distortion can be undone."""
+"""Intrinsics of a data set, checked, and nerfstudio's cameras with them, whose distortion can be undone."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,55 +10,169 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
 
-from nrfgs_ns.data.checks import number, shown
+from nrfgs_ns.data.checks import number, shown, some
 from nrfgs_ns.data.sight import MARGIN
 from nrfgs_ns.errors import InputError
 
+PIXELS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """nerfstudio's order of the parameters."""
+UNKNOWN = ("k5", "k6", "s1", "s2", "s3", "s4")
+"""Parameters of OpenCV's larger models, which neither nerfstudio nor we undistort."""
+DRAWN = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
+"""Cameras that are drawn: pinholes, and those whose photographs are undistorted to a pinhole's."""
+SMALLEST, LARGEST = 4, 2**16
+"""Pixels that an image has along each side."""
+WIDEST, NARROWEST = 0.1, 1e3
+"""Focal lengths of lenses, in image sizes: fields of view of 157 degrees and of 3.4 minutes."""
+FARTHEST_CENTER = 10.0
+"""Largest distance of the principal point from the image's middle, in image sizes."""
 FISHEYE_AT_LEAST = 1e-12
 """A distortion without effect, so that nerfstudio undistorts: it does only where some parameter is not 0."""
 LEFT_OF_IMAGE = 0.25
 """Share of an image's pixels that undistortion must leave."""
 LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
-"""By what undistortion may change the focal length: a fisheye of 170 degrees becomes a pinhole of a fifth."""
+"""Change of the focal length by undistortion: a fisheye of 170 degrees becomes a pinhole of a fifth."""
 
 
-def _column(meta: dict[str, Any], key: str) -> list[float]:
-    """An intrinsic parameter of every frame, by nerfstudio's rule: the top level's if it has it."""
-    return [number((meta if key in meta else frame)[key]) for frame in meta["frames"]]
+def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
+    """Intrinsics of every frame, by nerfstudio's rule: the top level's where it has them.
 
+    Returns:
+        float64 [V, 12]: `PIXELS` in the order above, then `DISTORTION`.
 
-def size_of(meta: dict[str, Any], frame: dict[str, Any]) -> tuple[int, int]:
-    """Width and height of a frame's image in full size."""
-    return tuple(int(number((meta if key in meta else frame)[key])) for key in ("w", "h"))
-
-
-def _distortion(holder: dict[str, Any]) -> list[float]:
-    """In nerfstudio's order, of the top level or of a frame."""
-    given = holder.get("distortion_params", [holder.get(key, 0.0) for key in DISTORTION])
-    return [number(value) for value in given]
-
-
-def cameras_of(meta: dict[str, Any], poses: torch.Tensor, source: Path) -> Cameras:
-    """The cameras in full size."""
+    Raises:
+        InputError: a number is missing, makes no sense, or is given twice with two values.
+    """
     frames = meta["frames"]
-    fx, fy, cx, cy = (torch.tensor(_column(meta, key)) for key in ("fl_x", "fl_y", "cx", "cy"))
-    width, height = (torch.tensor(_column(meta, key)).int() for key in ("w", "h"))
+    _check_model(meta, source)
+    for key in ("distortion_params", *PIXELS, *DISTORTION):
+        other = [frame["file_path"] for frame in frames if key in meta and key in frame and frame[key] != meta[key]]
+        if other:
+            raise InputError(
+                f"{source}: {key} of {some(other)} is not the one at the top level, which would be used for all "
+                "frames. Remove it at the top level, or in these frames."
+            )
+    table = np.empty((len(frames), len(PIXELS) + len(DISTORTION)))
+    for index, key in enumerate(PIXELS):
+        table[:, index] = _column(meta, key, source, positive=key not in ("cx", "cy"))
     shared = any(key in meta for key in (*DISTORTION, "distortion_params"))
-    distortion = torch.tensor([_distortion(meta if shared else frame) for frame in frames])
+    table[:, len(PIXELS) :] = [_distortion(holder, name, source) for holder, name in _holders(meta, shared)]
+    focal, center, sides = table[:, 0:2], table[:, 2:4], table[:, 4:6]
+    size = sides.max(axis=1, keepdims=True)
+    small = ~((SMALLEST <= sides) & (sides <= LARGEST)).all(axis=1)
+    focal_is_odd = ~((WIDEST * size <= focal) & (focal <= NARROWEST * size)).all(axis=1)
+    center_is_odd = ~(np.abs(center - sides / 2) <= FARTHEST_CENTER * sides).all(axis=1)
+    for index in np.flatnonzero(small | focal_is_odd | center_is_odd)[:1]:
+        fl_x, fl_y, cx, cy, w, h = table[index, :6]
+        where = f"{source}: {shown(frames[index]['file_path'])}"
+        if small[index]:
+            raise InputError(f"{where} is {w:g} x {h:g} pixels. Use images of {SMALLEST} to {LARGEST} a side.")
+        raise InputError(
+            f"{where} has fl_x {fl_x:g}, fl_y {fl_y:g}, cx {cx:g}, cy {cy:g} for an image of {w:g} x {h:g}: no lens "
+            "does that. Give them in pixels of this image."
+        )
+    return table
+
+
+def _check_model(meta: dict[str, Any], source: Path) -> None:
+    """The camera model is one that is drawn, and has no parameters beyond its own."""
+    model = meta.get("camera_model", "OPENCV")
+    drawn = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in DRAWN]
+    if not isinstance(model, str) or model not in drawn:
+        known = isinstance(model, str) and model in CAMERA_MODEL_TO_TYPE
+        raise InputError(
+            f"{source}: camera_model {shown(repr(model))} is {'not drawn here' if known else 'unknown'}. Use one of "
+            f"{', '.join(drawn)}{'; undistort the photographs to one of them' if known else ''}."
+        )
+    other = [
+        frame["file_path"]
+        for frame in meta["frames"]
+        if CAMERA_MODEL_TO_TYPE.get(str(frame.get("camera_model", model))) != CAMERA_MODEL_TO_TYPE[model]
+    ]
+    if other:
+        raise InputError(
+            f"{source}: camera_model of {some(other)} is not {model}, the top level's, which is used for all frames. "
+            "Undistort the photographs, or correct it."
+        )
+    holders = [(meta, "the top level"), *((frame, frame["file_path"]) for frame in meta["frames"])]
+    for holder, name in holders:
+        if holder.get("is_fisheye") and CAMERA_MODEL_TO_TYPE[model] != CameraType.FISHEYE:
+            raise InputError(
+                f"{source}: is_fisheye of {shown(name)} is not read by nerfstudio. Set camera_model to OPENCV_FISHEYE."
+            )
+        for key in UNKNOWN:
+            if holder.get(key, 0.0) != 0.0:
+                raise InputError(
+                    f"{source}: {key} of {shown(name)} is {shown(repr(holder[key]))}, a distortion that cannot be "
+                    f"undone here. Undistort the photographs, or fit a model of {', '.join(DISTORTION)}."
+                )
+
+
+def _holders(meta: dict[str, Any], shared: bool) -> list[tuple[dict[str, Any], str]]:
+    """The top level alone, or every frame; each with its name for messages."""
+    return [(meta, "the top level")] if shared else [(frame, frame["file_path"]) for frame in meta["frames"]]
+
+
+def _column(meta: dict[str, Any], key: str, source: Path, positive: bool) -> list[float]:
+    """One parameter of the top level, or of every frame."""
+    values = []
+    for holder, name in _holders(meta, key in meta):
+        if key not in holder:
+            hint = " (from a field of view: w / (2 tan(camera_angle_x / 2)))" if key in ("fl_x", "fl_y") else ""
+            raise InputError(f"{source}: {key} is missing, at the top and in {shown(name)}. Add it, in pixels{hint}.")
+        value = number(holder[key])
+        if not np.isfinite(value) or positive and value <= 0 or key in ("w", "h") and value < 1:
+            raise InputError(
+                f"{source}: {key} of {shown(name)} is {shown(repr(holder[key]))}. Give a number of pixels, above 0."
+            )
+        values.append(value)
+    return values
+
+
+def _distortion(holder: dict[str, Any], name: str, source: Path) -> list[float]:
+    """Six parameters in nerfstudio's order, of the top level or of a frame."""
+    if "distortion_params" in holder:
+        values = holder["distortion_params"]
+        numbers = [number(value) for value in values] if isinstance(values, list) else []
+        if len(numbers) != len(DISTORTION) or not np.isfinite(numbers).all():
+            raise InputError(
+                f"{source}: distortion_params of {shown(name)} is {shown(repr(values))}. Give six numbers: "
+                f"{', '.join(DISTORTION)}."
+            )
+        return numbers
+    numbers = [number(holder.get(key, 0.0)) for key in DISTORTION]
+    for key, value in zip(DISTORTION, numbers, strict=True):
+        if not np.isfinite(value):
+            raise InputError(
+                f"{source}: {key} of {shown(name)} is {shown(repr(holder[key]))}. Give a number, 0 for none."
+            )
+    return numbers
+
+
+def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: torch.Tensor, source: Path) -> Cameras:
+    """The cameras in full size.
+
+    Args:
+        lenses: of `read_lenses`.
+        poses: [V, 3, 4].
+    """
     kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
+    table = torch.from_numpy(lenses)
+    fx, fy, cx, cy = table[:, :4].float().unbind(1)
+    width, height = table[:, 4:6].int().unbind(1)
+    distortion = table[:, len(PIXELS) :].float()
     if kind == CameraType.FISHEYE:
         distortion[(distortion == 0).all(dim=1), 0] = FISHEYE_AT_LEAST
-    _check_distortion(fx, fy, cx, cy, width, height, distortion, kind, frames, source)
+    full = np.column_stack([lenses[:, :4], width, height, distortion])
+    _check_distortion(full, kind, meta["frames"], source)
     return Cameras(poses, fx, fy, cx, cy, width, height, distortion, kind, metadata={})
 
 
-def _check_distortion(fx, fy, cx, cy, width, height, distortion, kind: CameraType, frames, source: Path) -> None:
+def _check_distortion(lenses: np.ndarray, kind: CameraType, frames: list[dict[str, Any]], source: Path) -> None:
     """Undistorting leaves enough of every image."""
-    numbers = torch.stack([fx, fy, cx, cy, width, height], dim=1)
-    lenses, first = np.unique(torch.cat([numbers, distortion], dim=1).double().numpy(), axis=0, return_index=True)
-    for lens, index in zip(lenses, first, strict=True):
+    different, first = np.unique(lenses, axis=0, return_index=True)
+    for lens, index in zip(different, first, strict=True):
         if not lens[6:].any():
             continue
         where = f"{source}: the distortion of {shown(frames[index]['file_path'])}"

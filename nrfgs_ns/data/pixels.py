@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs as training reads them, decoded and undistorted: where they are kept, and the files of those for which
-there is no memory.
+"""Photographs as training reads them, decoded and undistorted; files of those for which there is no memory.
 
 A file holds a photograph's bytes unchanged and is mapped into memory: only what is read takes memory, and the system
 may drop it again. Files are made once, and anew where the photograph, its mask or its camera has changed.
@@ -8,50 +7,24 @@ may drop it again. Files are made once, and anew where the photograph, its mask 
 
 import hashlib
 import json
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from nrfgs_ns.data.pictures import cache_folder
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole, write_whole
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
 LENS = ("fx", "fy", "cx", "cy", "width", "height")
-"""What undistortion changes of a camera."""
+"""Fields of a camera that undistortion changes."""
 MAPPED = ("image", "mask")
-"""What a photograph's files hold."""
-KEPT = {"image_idx", *MAPPED}
+"""Contents of a photograph's files."""
 PAGE = 4096
 """Bytes."""
-
-
-def in_parallel(
-    read: Callable[[Item], Result], items: Sequence[Item], what: str, workers: int | None
-) -> Iterator[Result]:
-    """`map` on so many threads (None: one for each processor), with a bar that says `what` is done; where one fails,
-    those that have not begun are left out.
-    """
-    columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with (
-        ThreadPoolExecutor(workers or os.cpu_count()) as pool,
-        Progress(*columns, console=CONSOLE, transient=True) as bar,
-    ):
-        try:
-            yield from bar.track(pool.map(read, items), total=len(items))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
@@ -77,8 +50,7 @@ def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
     data["image"] = torch.from_numpy(image)
     if mask is not None:
         data["mask"] = mask
-    lens = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], image.shape[1], image.shape[0])
-    _set_lens(dataset.cameras, index, lens)
+    _set_lens(dataset.cameras, index, (K[0, 0], K[1, 1], K[0, 2], K[1, 2], image.shape[1], image.shape[0]))
     return data
 
 
@@ -89,11 +61,9 @@ def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
         InputError: there is no room for them.
     """
     folder = _folder(dataset, index, image_type)
-    found = _about(folder)
-    if found is None:
+    about = _about(folder)
+    if about is None:
         data = undistorted(dataset, index, image_type)
-        if not data.keys() <= KEPT:
-            raise InputError(f"{data.keys() - KEPT} of a photograph cannot be kept in a file. Give more image-memory.")
         try:
             _write(folder, data, [getattr(dataset.cameras, name)[index].item() for name in LENS])
         except OSError as error:
@@ -101,28 +71,14 @@ def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
                 f"{folder} cannot be written ({error.strerror}). Make room there, set XDG_CACHE_HOME to another "
                 "folder, or give more --pipeline.datamanager.image-memory."
             ) from error
-        found = _about(folder)
-    _set_lens(dataset.cameras, index, found["lens"])
-    return {"image_idx": index} | {name: _mapped(folder, name, found[name]) for name in MAPPED if name in found}
+        about = _about(folder)
+    _set_lens(dataset.cameras, index, about["lens"])
+    return {"image_idx": index} | {name: _mapped(folder, name, about[name]) for name in MAPPED if name in about}
 
 
 def look_through(image: torch.Tensor) -> None:
     """Have a mapped image's bytes in memory when they are needed: read one of each page."""
     image.view(torch.uint8).flatten()[::PAGE].sum()
-
-
-def free_memory() -> int | None:
-    """Bytes that programs can still have without anything being swapped out; None where the system does not tell."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration, ValueError):
-        return None
-
-
-def pixels_folder() -> Path:
-    """Where the files are: nrfgs-ns/pixels in XDG_CACHE_HOME, or else in .cache of the home folder."""
-    return cache_folder().with_name("pixels")
 
 
 def _write(folder: Path, data: dict[str, Any], lens: list[float]) -> None:
@@ -137,15 +93,14 @@ def _write(folder: Path, data: dict[str, Any], lens: list[float]) -> None:
 
 
 def _about(folder: Path) -> dict[str, Any] | None:
-    """What a folder's files hold; None where they are not there or not whole, as those who clean a cache leave them."""
+    """Contents of a folder's files; None where they are not there or not whole, as those who clean a cache leave
+    them."""
     try:
-        found = json.loads((folder / "about.json").read_text(encoding="utf-8"))
-        whole_ones = [
-            (folder / f"{name}.bin").stat().st_size == _bytes(*found[name]) for name in MAPPED if name in found
-        ]
+        about = json.loads((folder / "about.json").read_text(encoding="utf-8"))
+        sizes = {name: (folder / f"{name}.bin").stat().st_size for name in MAPPED if name in about}
+        return about if all(size == _bytes(*about[name]) for name, size in sizes.items()) else None
     except (OSError, ValueError):
         return None
-    return found if all(whole_ones) else None
 
 
 def _bytes(kind: str, *shape: int) -> int:
@@ -155,13 +110,14 @@ def _bytes(kind: str, *shape: int) -> int:
 def _mapped(folder: Path, name: str, form: list) -> torch.Tensor:
     """A tensor that is a file; what is written into it stays in memory."""
     kind, *shape = form
-    dtype = getattr(torch, kind)
     count = torch.Size(shape).numel()
-    return torch.from_file(str(folder / f"{name}.bin"), shared=False, size=count, dtype=dtype).view(shape)
+    return torch.from_file(str(folder / f"{name}.bin"), shared=False, size=count, dtype=getattr(torch, kind)).view(
+        shape
+    )
 
 
 def _folder(dataset: Any, index: int, image_type: str) -> Path:
-    """Where the photograph's files belong: a folder named after all that decides its pixels."""
+    """Folder of a photograph's files, named after all that decides its pixels."""
     outputs = dataset._dataparser_outputs
     paths = [outputs.image_filenames[index]]
     if outputs.mask_filenames is not None:
@@ -172,7 +128,7 @@ def _folder(dataset: Any, index: int, image_type: str) -> Path:
     camera = [distortion, *(getattr(cameras, name)[index].item() for name in (*LENS, "camera_type"))]
     kept = [files, camera, image_type, dataset.scale_factor, str(dataset.mask_color), str(outputs.alpha_color)]
     name = hashlib.sha256(json.dumps(kept).encode("utf-8", "surrogateescape")).hexdigest()[:24]
-    return pixels_folder() / name
+    return cache_folder("pixels") / name
 
 
 def _set_lens(cameras: Cameras, index: int, lens: Sequence[float]) -> None:

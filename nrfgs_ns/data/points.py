@@ -8,12 +8,13 @@ points that are there but damaged must not turn into a random start unnoticed.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from nrfgs_ns.data.checks import exists, shown, warn
+from nrfgs_ns.data.checks import shown, warn
 from nrfgs_ns.data.colmap import read_points
 from nrfgs_ns.errors import InputError
 
@@ -21,36 +22,49 @@ GREY = 127
 """Colour of points that have none."""
 LONGEST_HEADER = 2**16
 """Bytes in which the header of a .ply must end."""
+COARSE = 1e-4
+"""Rounding of coordinates that deserves a warning, in extents of the middle four fifths of the points."""
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads vertices (x, y, z) and their colours (red, green, blue: integers in [0, 255], or floats in
-    [0, 1]) of a .ply file."""
+    """Read vertices (x, y, z) and their colours (red, green, blue: integers in [0, 255], or floats in [0, 1])."""
     fix = "Repair or replace it, or remove ply_file_path from transforms.json to start from random points."
-    if not (exists(path) and path.is_file()):
-        raise InputError(f"{path}, named by ply_file_path, is missing. {fix}")
+    if not os.path.isfile(path):  # False, too, for a name that cannot be
+        raise InputError(f"{shown(str(path))}, named by ply_file_path, is missing. {fix}")
     try:
         _check_counts(path)
         vertices = PlyData.read(path)["vertex"].data
-        xyz = np.stack([vertices[axis] for axis in "xyz"], axis=-1)
-        if xyz.dtype.kind not in "iuf":  # lists: NumPy before 2.2 takes lists of one for numbers
+        stored = np.stack([vertices[axis] for axis in "xyz"], axis=-1)
+        if stored.dtype.kind not in "iuf":  # lists: NumPy before 2.2 takes lists of one for numbers
             raise ValueError("x, y and z are not numbers")
-        xyz = xyz.astype(np.float64)
     except KeyError as error:
         raise InputError(f"{path} has no vertex element. {fix}") from error
     except Exception as error:  # plyfile lets out whatever it meets in a broken file
         raise InputError(f"{path} cannot be read as vertices with x, y, z ({shown(str(error))}). {fix}") from error
-    if not {"red", "green", "blue"} <= set(vertices.dtype.names):
+    if {"red", "green", "blue"} <= set(vertices.dtype.names):
+        rgb = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)
+        if rgb.dtype.kind not in "iuf":
+            raise InputError(f"{path}: its colours are not numbers. {fix}")
+        rgb = rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0)
+    else:
         warn(f"{path} has no colours; its points start in mid grey.")
-        return _finite(xyz, np.full(xyz.shape, float(GREY)), path)
-    rgb = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)
-    if rgb.dtype.kind not in "iuf":
-        raise InputError(f"{path}: its colours are not numbers. {fix}")
-    return _finite(xyz, rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0), path)
+        rgb = np.full(stored.shape, float(GREY))
+    xyz, rgb = _finite(stored.astype(np.float64), rgb, path)
+    if stored.dtype.kind == "f" and len(xyz):
+        size = np.median(np.abs(xyz), axis=0).max()
+        step = np.spacing(size.astype(stored.dtype))
+        extent = np.ptp(np.quantile(xyz, (0.1, 0.9), axis=0), axis=0).max()
+        if step > COARSE * extent > 0:
+            warn(
+                f"{path}: coordinates of {size:,.0f} in {8 * stored.itemsize} bits are rounded to {step:g}"
+                f", where the points extend over {extent:.3g}. Store them as double, or nearer to the origin (with the "
+                "poses)."
+            )
+    return xyz, rgb
 
 
 def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
-    """Writes a .ply of points [N, 3], stored as float32, with colours uint8 [N, 3]."""
+    """Write a .ply of points [N, 3], stored as float32, with colours uint8 [N, 3]."""
     names = ("x", "y", "z", "red", "green", "blue")
     vertices = np.empty(len(xyz), dtype=list(zip(names, ["<f4"] * 3 + ["u1"] * 3, strict=True)))
     for name, values in zip(names, (*xyz.T, *rgb.T), strict=True):
@@ -71,20 +85,18 @@ def _check_counts(path: Path) -> None:
 
 
 def read_colmap(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads points3D.bin or points3D.txt of a COLMAP model."""
+    """Read points3D.bin or points3D.txt of a COLMAP model."""
     return _finite(*read_points(folder))
 
 
 def _finite(xyz: np.ndarray, rgb: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Drops what is not finite, with a warning, and rounds colours in [0, 255] to uint8."""
+    """Points without those that are not finite, which a warning counts, with colours as uint8."""
     good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
+    finding = f"{path}: {np.count_nonzero(~good)} of {len(good)} points have a NaN or infinite value"
     if np.count_nonzero(good) < len(good) / 2:
-        raise InputError(
-            f"{path}: {np.count_nonzero(~good)} of {len(good)} points have a NaN or infinite value. Repair or replace "
-            "the file."
-        )
+        raise InputError(f"{finding}. Repair or replace the file.")
     if not good.all():
-        warn(f"{path}: {np.count_nonzero(~good)} of {len(good)} points have a NaN or infinite value and are left out.")
+        warn(f"{finding} and are left out.")
     xyz, rgb = xyz[good], rgb[good]
     if rgb.size and (rgb.min() < 0 or rgb.max() > 255):
         raise InputError(f"{path}: its colours are out of range. Store them as uchar, or as floats in [0, 1].")

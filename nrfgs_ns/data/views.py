@@ -7,6 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:  # `nrfgs prepare` does without torch
     from torch import Tensor
 
@@ -56,7 +58,7 @@ way."""
 
 
 def different_views(poses: Tensor) -> int:
-    """V, the number of training views that a head is trusted by and steps are chosen by: those that tell anything new.
+    """V, the number of training views that a head is trusted by and steps are chosen by; duplicates count once.
 
     A copy of a photograph, or a frame of a video whose camera stands still, is where an earlier view is and looks where
     that one looks. From one place in another direction it is another view.
@@ -68,19 +70,19 @@ def different_views(poses: Tensor) -> int:
 
 
 def repeated_views(poses: Tensor, rows: Sequence[int], of: Sequence[int]) -> list[int]:
-    """Which of some cameras stand where one of others does, and look where that one looks.
+    """Those of some cameras that stand where one of others does, and look where that one looks.
 
     Args:
         poses: of the whole capture, camera-to-world, [V, 3 or 4, 4].
         rows, of: of `poses`.
     """
-    import torch
+    from scipy.spatial import cKDTree
 
     if not (len(rows) and len(of)):
         return []
     places = _places_and_directions(poses)
-    nearest = torch.cdist(places[list(rows)], places[list(of)]).amin(dim=1)
-    return [int(row) for row, distance in zip(rows, nearest.tolist(), strict=True) if distance <= SAME_PLACE]
+    distances, _ = cKDTree(np.unique(places[list(of)], axis=0)).query(places[list(rows)])
+    return [int(row) for row, distance in zip(rows, distances, strict=True) if distance <= SAME_PLACE]
 
 
 def distinct_places(centers: Tensor) -> Tensor:
@@ -88,26 +90,29 @@ def distinct_places(centers: Tensor) -> Tensor:
     return centers[_first_of_each(_in_reaches(centers))]
 
 
-def _places_and_directions(poses: Tensor) -> Tensor:
-    """Where cameras are and which way they look, [V, 6], so that `SAME_PLACE` holds for both."""
-    import torch
-
-    poses = poses.double()
-    return torch.cat([_in_reaches(poses[:, :3, 3]), poses[:, :3, 2]], dim=1)
+def _places_and_directions(poses: Tensor) -> np.ndarray:
+    """Positions and viewing directions of cameras, float64 [V, 6], so that `SAME_PLACE` holds for both."""
+    return np.concatenate([_in_reaches(poses[:, :3, 3]), poses[:, :3, 2].double().cpu().numpy()], axis=1)
 
 
-def _in_reaches(centers: Tensor) -> Tensor:
+def _in_reaches(centers: Tensor) -> np.ndarray:
     """Cameras [V, 3] about their mean, in distances from there to the farthest."""
-    away = centers.double() - centers.double().mean(dim=0)
-    return away / max([1e-300, *away.norm(dim=1).tolist()])
+    away = centers.double().cpu().numpy()
+    away = away - away.mean(axis=0) if len(away) else away
+    return away / np.linalg.norm(away, axis=1).max(initial=1e-300)
 
 
-def _first_of_each(rows: Tensor) -> list[int]:
-    """Which rows [V, K] are not near an earlier one of these."""
-    kept, columns = [], rows.T.contiguous()
-    near = rows.new_zeros(len(rows)).bool()
+def _first_of_each(rows: np.ndarray) -> list[int]:
+    """Rows [V, K] that are not near an earlier one of these.
+
+    Near linear: rows that are kept lie apart, so that only a few of them find the same row in the tree.
+    """
+    from scipy.spatial import cKDTree
+
+    kept, near = [], np.zeros(len(rows), dtype=bool)
+    tree = cKDTree(rows) if len(rows) else None
     for i in range(len(rows)):
         if not near[i]:
             kept.append(i)
-            near |= (columns - columns[:, i, None]).square().sum(dim=0) <= SAME_PLACE**2
+            near[tree.query_ball_point(rows[i], SAME_PLACE)] = True
     return kept

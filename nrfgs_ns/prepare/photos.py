@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, ImageOps
 
-from nrfgs_ns.data.pictures import exif_of, exif_of_copy, known, open_picture, read_header
+from nrfgs_ns.data.pictures import exif_of, exif_of_copy, known, open_picture, read_size
 from nrfgs_ns.errors import InputError
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -153,7 +153,7 @@ def same_camera(folder: Path, names: list[str]) -> bool:
 
 def sizes(folder: Path, names: list[str]) -> list[tuple[int, int]]:
     """Width and height of stored photographs, pixels."""
-    return [read_header(folder / name)[0] for name in names]
+    return [read_size(folder / name) for name in names]
 
 
 def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:

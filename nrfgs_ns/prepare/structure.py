@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nrfgs_ns.data.pictures import open_picture, read_header, share_of_size
+from nrfgs_ns.data.pictures import open_picture, read_size, share_of_size
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.prepare.forecast import looked_at
 from nrfgs_ns.prepare.pairs import Pairs
@@ -78,7 +78,7 @@ def extract_features(
     batch = max(os.cpu_count() or 1, 4)
     for first in range(0, len(names), batch):
         part = names[first : first + batch]
-        large = min(looked_at([read_header(photos / name)[0]], longest_side) for name in part) >= LARGE
+        large = min(looked_at([read_size(photos / name)], longest_side) for name in part) >= LARGE
         options.sift.first_octave = 0 if large else -1  # -1: the photograph is doubled first
         if one_camera and first > 0:
             reader.existing_camera_id = 1  # each call would make a camera of its own

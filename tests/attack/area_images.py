@@ -8,6 +8,7 @@ import zlib
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from area_transforms import broken, capture_in, load
 from attempt import Case
@@ -32,13 +33,13 @@ def encoded(form: str, size: tuple[int, int] = (12, 9), mode: str = "RGB") -> by
     return file.getvalue()
 
 
-def png_claiming(width: int, height: int) -> bytes:
+def png_claiming(width: int, height: int, kind: int = 2) -> bytes:
     """A PNG that says it is of this size, and holds a few bytes."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0))
     return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
 
 
@@ -58,6 +59,49 @@ def sized(width: int, height: int) -> Case:
             Image.new("L", (width, height), 255).save(capture.folder / one["mask_path"])
 
     return broken(f"all images {width} x {height}", change)
+
+
+def deep(name: str) -> Case:
+    """12 bits in 16, in three channels."""
+
+    def change(capture: Capture) -> None:
+        capture.meta["frames"][6]["file_path"] = name
+        assert cv2.imwrite(str(capture.folder / name), capture.rng.integers(0, 2**12, (9, 12, 3), dtype=np.uint16))
+
+    return broken(f"{name} of 16 bits in colour", change)
+
+
+def transparent(capture: Capture) -> None:
+    for one in capture.meta["frames"]:
+        Image.new("RGBA", (12, 9)).save(capture.folder / one["file_path"])
+
+
+def ringing(capture: Capture) -> None:
+    """JPEG masks that are dark, not black: nothing is inside."""
+    for one in capture.meta["frames"]:
+        one["mask_path"] = one["mask_path"].replace("png", "jpg")
+        Image.new("L", (12, 9), 9).save(capture.folder / one["mask_path"], quality=50)
+
+
+def no_memory(folder: Path):
+    """Ten images and masks of 12,000 x 12,000 pixels, on a machine with a gigabyte free."""
+    import nrfgs_ns.data.pictures as pictures
+
+    capture, side = capture_in(folder), 12_000
+    capture.meta |= {"w": side, "h": side, "cx": 6e3, "cy": 6e3, "fl_x": 1e4, "fl_y": 1e4}
+    for one in capture.meta["frames"]:
+        for key in ("file_path", "mask_path"):
+            (capture.folder / one[key]).write_bytes(png_claiming(side, side, 2 if key == "file_path" else 0))
+    capture.save()
+
+    def read() -> None:
+        free, pictures.free_memory = pictures.free_memory, lambda: 10**9
+        try:
+            load(capture.folder)
+        finally:
+            pictures.free_memory = free
+
+    return read
 
 
 def odd_file(name: str, make) -> Case:
@@ -86,6 +130,10 @@ CASES = [
     ),
     holding("bomb of 4 gigapixels", png_claiming(65000, 65000), w=65000, h=65000, fl_x=5e4, fl_y=5e4, cx=3e4, cy=3e4),
     holding("bomb of 170 megapixels", png_claiming(13000, 13000), w=13000, h=13000, fl_x=1e4, fl_y=1e4, cx=6e3, cy=6e3),
+    Case("ten masks of 12,000 x 12,000", no_memory),
+    *(deep(f"images/003.{ending}") for ending in ("png", "tif")),
+    broken("all images transparent", transparent),
+    broken("JPEG masks all but black", ringing),
     holding("PNG of 0 x 0", png_claiming(0, 0)),
     holding("text of 100 MB when unpacked", b"\x89PNG\r\n\x1a\n" + bytes(50)),
     sized(1, 1),

@@ -28,6 +28,7 @@ BINARY = b"binary_little_endian"
 ROWS = b"5 6 7\n" * 9
 FINE = np.full((40, 3), 6.0)
 CASES = [
+    stored("float32 in UTM", np.float32(np.random.default_rng(1).normal((5e5, 5.6e6, 100), 0.5, (40, 3)))),
     holding("empty", b""),
     holding("no ply", b"solid\n"),
     holding("header without end", b"ply\nformat ascii 1.0\nelement vertex 9\n"),

@@ -145,6 +145,14 @@ CASES = [
     meta("k1 null", k1=None),
     meta("k1 list", k1=[0.1]),
     meta("k4 of a pinhole", k4=0.1),
+    meta("is_fisheye", is_fisheye=True),
+    meta("k6", k6=0.1),
+    frame("k5", k5=0.1),
+    *(
+        frame(f"{key} other than at the top level", **{key: value})
+        for key, value in {"fl_x": 20.0, "camera_model": "OPENCV_FISHEYE", "w": 13}.items()
+    ),
+    broken("20,000 copies of a frame", lambda c: c.meta.update(frames=c.meta["frames"][:1] * 20_000)),
     meta("fisheye of 1e9", camera_model="OPENCV_FISHEYE", k1=1e9),
     *(
         frame(f"pose {str(value)[:24]}", transform_matrix=value)

@@ -20,8 +20,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-CALLS = 300_000
-"""Calls of functions, Python's and C's, that an input may take: a tenth of a second or two."""
+CALLS = 1_000_000
+"""Calls of functions, Python's and C's, that an input may take: some tenths of a second."""
 PATIENCE = 300.0
 """Seconds without any answer after which an attempt counts as endless."""
 BYTES = 2**30

@@ -8,7 +8,6 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, Colm
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from small_colmap import MODEL, Model
 
-from nrfgs_ns.data import dataparser
 from nrfgs_ns.data.colmap_parser import NrfgsColmapDataParser, checked
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParser, NrfgsDataParserConfig
@@ -81,7 +80,6 @@ def test_lists_of_splits(scene):
 
 def test_it_is_what_the_colmap_command_uses(scene):
     assert checked(ColmapDataParserConfig())._target is NrfgsColmapDataParser
-    assert dataparser.NrfgsColmapDataParser is NrfgsColmapDataParser  # what a config.yml of an older version names
     assert checked(NerfstudioDataParserConfig())._target is NrfgsDataParser
     own = NrfgsDataParserConfig()
     assert checked(own) is own

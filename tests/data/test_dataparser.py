@@ -186,6 +186,20 @@ def test_double_precision_points_far_from_the_origin(capture):
     assert np.abs(error).max() <= 2**-14
 
 
+@pytest.mark.parametrize("dtype, warned", [(np.float32, True), (np.float64, False)])
+def test_rounded_coordinates_are_mentioned(capture, printed, dtype, warned):
+    """UTM: 5,600,000 m north in float32 is rounded to half a metre."""
+    offset = np.array([500_000.0, 5_600_000.0, 100.0])
+    xyz, rgb = cloud()
+    capture.add_ply((xyz + offset).astype(dtype), rgb)
+    for frame in capture.meta["frames"]:
+        for row in range(3):
+            frame["transform_matrix"][row][3] += offset[row]
+    capture.parse()
+    assert ("points.ply: coordinates of 5,600,0" in (text := printed())) == warned
+    assert ("in 32 bits are rounded to 0.5" in text) == warned
+
+
 def test_points_that_are_not_finite_are_dropped_and_counted(capture, printed):
     xyz, rgb = cloud()
     colours = (rgb / 255).astype(np.float32)

@@ -154,10 +154,10 @@ def test_empty_masks_are_named(tmp_path, printed):
 
     Image.new("L", (12, 9)).save(capture.folder / "masks/003.png")
     load()
-    assert "the masks of 003.png leave nothing of the image" in printed()
+    assert "masks or transparency leave nothing of 003.png" in printed()
     for path in (capture.folder / "masks").iterdir():
         Image.new("L", (12, 9)).save(path)
-    with pytest.raises(InputError, match="masks of 000.png, 001.png, 002.png and 6 more leave nothing"):
+    with pytest.raises(InputError, match="leave nothing of 000.png, 001.png, 002.png and 6 more"):
         load()
 
 

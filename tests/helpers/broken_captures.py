@@ -62,6 +62,14 @@ META = {  # what is done to the data set -> what the message must say
     "no rows": (lambda c: c.meta.update(h=0), "h of the top level 0 pixels"),
     "distortion": (lambda c: c.meta.update(k1=float("inf")), "k1 inf 0 for none"),
     "camera model": (lambda c: c.meta.update(camera_model="PINE"), "camera_model 'PINE' OPENCV"),
+    "fisheye of instant-ngp": (lambda c: c.meta.update(is_fisheye=True), "is_fisheye top level OPENCV_FISHEYE"),
+    "sixth distortion": (lambda c: c.meta.update(k6=0.1), "k6 top level 0.1 Undistort"),
+    "sixth distortion of a frame": (lambda c: c.meta["frames"][3].update(k5=0.1), "k5 006.png 0.1 Undistort"),
+    "focal length twice": (lambda c: c.meta["frames"][3].update(fl_x=20.0), "fl_x 006.png top level Remove"),
+    "camera model twice": (
+        lambda c: (c.meta.update(camera_model="OPENCV"), c.meta["frames"][3].update(camera_model="OPENCV_FISHEYE")),
+        "camera_model 006.png top level correct",
+    ),
     "applied_transform": (lambda c: c.meta.update(applied_transform=[[1, 0], [0]]), "applied_transform 3 x 4 remove"),
     "applied_scale": (lambda c: c.meta.update(applied_scale=0), "applied_scale positive"),
     "twice": (lambda c: c.meta["frames"].append(c.meta["frames"][0]), "009.png more than once Keep one"),
@@ -94,6 +102,7 @@ META = {  # what is done to the data set -> what the message must say
     ),
     "one depth only": (lambda c: c.meta["frames"][4].update(depth_file_path="d.png"), "depth_file_path for none"),
 }
+
 FILES = {
     "first image missing": (lambda c: (c.folder / "images/009.png").unlink(), "1 of 10 images missing 009.png"),
     "image missing": (lambda c: (c.folder / LAST).unlink(), "1 of 10 images missing 000.png Restore"),
@@ -105,6 +114,4 @@ FILES = {
     "mask missing": (with_masks(lambda c: (c.folder / "masks/001.png").unlink()), "mask_path missing masks/001.png"),
     "mask unreadable": (with_masks(spoil("masks/001.png")), "masks/001.png not a readable"),
     "mask of another size": (with_masks(repaint("masks/001.png", (6, 5), "L")), "masks masks/001.png 6 x 5 12 x 9"),
-    "mask in colours": (with_masks(repaint("masks/001.png", (12, 9), "RGB")), "masks/001.png grey palette 8-bit"),
-    "mask in a palette": (with_masks(repaint("masks/001.png", (12, 9), "P")), "masks/001.png grey palette 8-bit"),
 }
