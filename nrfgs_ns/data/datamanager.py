@@ -46,6 +46,11 @@ class NrfgsInputDataset(InputDataset):
         for name in ("width", "height"):  # as images and masks are rounded; nerfstudio does it in float32
             full = getattr(dataparser_outputs.cameras, name).flatten().tolist()
             sides = [[int(side * scale_factor)] for side in full]
+            if min(sides, default=[1])[0] < 1:
+                raise InputError(
+                    f"--pipeline.datamanager.camera-res-scale-factor {scale_factor} leaves nothing of the images. Give "
+                    "a larger one."
+                )
             setattr(self.cameras, name, torch.tensor(sides, dtype=getattr(self.cameras, name).dtype))
         lost = ~torch.isfinite(self.cameras.camera_to_worlds).flatten(1).all(dim=1)
         if lost.any():  # nerfstudio's own parsers do not look
