@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What writes pages of the documentation: options, tables of numbers, the newcomer's page, pictures of the viewer."""
+"""Pages of the documentation: options, tables of numbers, pictures."""

@@ -1,20 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What several GPUs are worth on one scene: memory, images per second, and the same quality from as many images.
+"""Memory and images per second of one scene on several GPUs.
 
-    python -m nrfgs_lab.timing.many_gpus load --scene SCENES/bonsai --splats 4000000 \
-        --out load.json
-    python -m nrfgs_lab.timing.many_gpus quality --scene SCENES/bonsai --out quality.json
+    python -m nrfgs_lab.timing.many_gpus --scene SCENES/bonsai --splats 4000000 --out load.json
 
-`load` trains from random splats with densification off, at full resolution, on each number of devices in turn, and
-notes each device's peak memory and the images per second. `quality` runs `ns-train` with
-`--pipeline.sharding.schedules images`, and then `ns-eval`. Both write after each run and do not repeat what is there.
-With `--device-type cpu` the same runs on gloo and the CPU rasterizer, to try it out.
+Trains from random splats with densification off, at full resolution, on each number of devices in turn. The file is
+written after each run; a run in it is not repeated. With `--device-type cpu` the same on gloo and the CPU rasterizer.
 """
 
 import json
 import shlex
-import subprocess
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,8 +22,9 @@ import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from nrfgs_ns.distributed.launch import free_port, join_group
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import initial_splats
-from nrfgs_ns.training.run import evaluate, machine, parse
+from nrfgs_ns.training.run import machine, parse
 
 QUIET = {
     "--vis": "tensorboard",
@@ -41,8 +36,8 @@ QUIET = {
 
 
 @dataclass
-class Common:
-    """What both have."""
+class Load:
+    """Peak memory and images per second at a given number of splats."""
 
     scene: Path
     """folder of a data set in nerfstudio's layout"""
@@ -56,24 +51,6 @@ class Common:
     """more options of ns-train"""
     device_type: Literal["cuda", "cpu"] = "cuda"
     """cpu: to try it out"""
-
-    def read(self) -> list[dict[str, Any]]:
-        """The runs that are there."""
-        return json.loads(self.out.read_text())["runs"] if self.out.exists() else []
-
-    def write(self, runs: list[dict[str, Any]]) -> None:
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        self.out.write_text(json.dumps({"machine": machine(), "scene": self.scene.name, "runs": runs}, indent=1) + "\n")
-
-    def base(self) -> dict[str, Any]:
-        """What tells a run from others."""
-        return {"method": self.method, "options": self.options}
-
-
-@dataclass
-class Load(Common):
-    """Peak memory and images per second at a given number of splats."""
-
     splats: tuple[int, ...] = (4_000_000,)
     """numbers of splats"""
     extent: float = 2.0
@@ -86,11 +63,18 @@ class Load(Common):
     """turns of each number of devices"""
 
     def main(self) -> None:
-        runs = self.read()
+        runs = json.loads(self.out.read_text())["runs"] if self.out.exists() else []
         for turn in range(self.rounds):
             for count in self.splats:
                 for world in self.devices:
-                    key = {**self.base(), "splats": count, "devices": world, "round": turn, "steps": self.steps}
+                    key = {
+                        "method": self.method,
+                        "options": self.options,
+                        "splats": count,
+                        "devices": world,
+                        "round": turn,
+                        "steps": self.steps,
+                    }
                     if any(all(run.get(name) == value for name, value in key.items()) for run in runs):
                         continue
                     with tempfile.TemporaryDirectory() as folder:
@@ -107,13 +91,9 @@ class Load(Common):
                             "peak_memory_setup_bytes": [part["peak_memory_setup_bytes"] for part in parts],
                         }
                     )
-                    self.write(runs)
-        for run in runs:
-            peak = max(run["peak_memory_bytes"]) / 2**30
-            print(
-                f"{run['splats']:,} splats, {run['devices']} devices: {run['images_per_second']:.1f} images/s, "
-                f"peak {peak:.2f} GiB"
-            )
+                    content = {"machine": machine(), "scene": self.scene.name, "runs": runs}
+                    write_whole(self.out, json.dumps(content, indent=1) + "\n")
+                    print(runs[-1], flush=True)
 
 
 def one_device(rank: int, load: Load, count: int, world: int, url: str, folder: str) -> None:
@@ -176,57 +156,5 @@ def peak_memory() -> int:
     return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
 
 
-@dataclass
-class Quality(Common):
-    """PSNR after as many images, on each number of devices."""
-
-    steps: int = 30_000
-    """images in all; on W devices, 1 / W as many steps"""
-    seeds: tuple[int, ...] = (42,)
-    """--machine.seed of each repetition"""
-    work: Path = Path("outputs/many-gpus")
-    """folder for checkpoints"""
-
-    def main(self) -> None:
-        runs = self.read()
-        for seed in self.seeds:
-            for world in self.devices:
-                key = {**self.base(), "images": self.steps, "devices": world, "seed": seed}
-                if any(all(run.get(name) == value for name, value in key.items()) for run in runs):
-                    continue
-                runs.append({**key, **self.run(world, seed)})
-                self.write(runs)
-        for run in runs:
-            print(
-                f"{run['devices']} devices, seed {run['seed']}: PSNR {run['psnr']:.2f}, SSIM {run['ssim']:.4f}, "
-                f"{run['splats']:,} splats, {run['wall_seconds']:.0f} s"
-            )
-
-    def run(self, world: int, seed: int) -> dict[str, Any]:
-        """One `ns-train` and one `ns-eval`."""
-        folder = self.work / f"{self.method}-{world}-{seed}"
-        options = {
-            **QUIET,
-            "--data": self.scene,
-            "--output-dir": folder,
-            "--timestamp": "run",
-            "--machine.seed": seed,
-            "--machine.device-type": self.device_type,
-            "--machine.num-devices": world,
-            "--max-num-iterations": self.steps,
-            "--pipeline.sharding.schedules": "images",
-        }
-        several_cpus = self.device_type == "cpu" and world > 1
-        program = "nrfgs_ns.distributed.launch" if several_cpus else "nerfstudio.scripts.train"
-        words = [str(word) for option in options.items() for word in option]
-        start = perf_counter()
-        subprocess.run([sys.executable, "-m", program, self.method, *words, *shlex.split(self.options)], check=True)
-        seconds = perf_counter() - start
-        (config,) = folder.rglob("run/config.yml")
-        results = evaluate(config, folder / "eval.json")
-        names = ("psnr", "ssim", "l1", "splats", "parameter_bytes")
-        return {"wall_seconds": seconds, **{name: results[name] for name in names}}
-
-
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"load": Load, "quality": Quality}, description=__doc__).main()
+    tyro.cli(Load).main()

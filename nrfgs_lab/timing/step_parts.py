@@ -26,8 +26,6 @@ import torch
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
-from rich.console import Console
-from rich.table import Table
 from torch.profiler import ProfilerActivity, profile
 
 from nrfgs_lab.bench.measure import FULL_HD, at_size, frames_per_second
@@ -94,7 +92,7 @@ class StepParts:
             for method, (model, cameras) in models.items()
         ]
         self._keep(rows, frames)
-        report(rows, frames)
+        print(self.out.read_text())
 
     def _keep(self, rows: list[dict[str, Any]], frames: list[dict[str, Any]]) -> None:
         self.out.parent.mkdir(parents=True, exist_ok=True)
@@ -224,27 +222,6 @@ def fps(model: Any, cameras: Mapping[str, list]) -> dict[str, float]:
     found = {size: frames_per_second(model, some) for size, some in cameras.items()}
     with shut(("lists",)):
         return found | {f"{size}, gsplat's lists": frames_per_second(model, some) for size, some in cameras.items()}
-
-
-def report(rows: list[dict[str, Any]], frames: list[dict[str, Any]]) -> None:
-    """Print medians and ranges over rounds."""
-    table = Table("method", "variant", "splats", "step ms", "host ms", "GPU ms", "launches")
-    for method, variant in dict.fromkeys((row["method"], row["variant"]) for row in rows):
-        mine = [row for row in rows if (row["method"], row["variant"]) == (method, variant)]
-        cells = [spread([row[key] for row in mine], 2) for key in ("step_ms", "host_ms", "gpu_ms")]
-        table.add_row(method, variant, f"{mine[0]['splats']:,}", *cells, f"{mine[0]['launches']:.0f}")
-    Console(width=140).print(table)
-    table = Table("method", "splats", *frames[0]["fps"])
-    for method in dict.fromkeys(row["method"] for row in frames):
-        mine = [row for row in frames if row["method"] == method]
-        cells = [spread([row["fps"][size] for row in mine], 0) for size in mine[0]["fps"]]
-        table.add_row(method, f"{mine[0]['splats']:,}", *cells)
-    Console(width=140).print(table)
-
-
-def spread(numbers: list[float], digits: int) -> str:
-    """Median, least and largest."""
-    return f"{statistics.median(numbers):.{digits}f} ({min(numbers):.{digits}f} to {max(numbers):.{digits}f})"
 
 
 if __name__ == "__main__":

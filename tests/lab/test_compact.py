@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scene costs in a file: the laboratory's command and table."""
+"""The command of the trade of bytes for dB."""
 
 import pytest
 
