@@ -56,11 +56,11 @@ class Prepare:
     camera: Literal["auto", "single", "per-image"] = "auto"
     """single: one set of intrinsics for all photographs. auto: single if sizes, models and focal lengths agree"""
     feature_size: int = 1600
-    """longest side of the images in which features are found, pixels"""
+    """longest side of the images in which features are found, pixels; 10 or more"""
     features: int = 4096
-    """largest number of features in a photograph; more give more points and take longer"""
+    """largest number of features in a photograph, 10 or more; more give more points and take longer"""
     frames: int = 150
-    """frames to take from a video"""
+    """frames to take from a video, 10 or more; at most all that it has"""
 
     def main(self) -> None:
         try:
@@ -92,10 +92,13 @@ class Run:
         self.options, self.screen = options, screen or Console()
         self.inputs = files.find_inputs(options.photos)
         self.is_video = options.photos.is_file()
-        structure.colmap()  # a missing package is told before any work
+        if self.is_video:
+            files.open_video(options.photos)[0].release()
+        structure.colmap()  # reports a missing package before any work
         self.out, self.work = options.out, options.out / "work"
         self.stored, self.database, self.model = self.work / "photos", self.work / "database.db", self.work / "model"
         self.undistorted, self.pairs_file = self.work / "undistorted", self.work / "likely_pairs.json"
+        self.repeated = 0  # stages that were done already
         self.speed: float | None = None  # seconds for the features of a million pixels
         self.state_file = self.work / "state.json"
         if self.out.exists() and not self.state_file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
@@ -114,8 +117,15 @@ class Run:
     # The stages.
 
     def import_input(self) -> None:
-        if not self.is_video and (others := files.left_out(self.options.photos)):
-            self.screen.print(f"Left out, since they are not read here: {others}.", markup=False, soft_wrap=True)
+        if not self.is_video and (others := files.left_out(self.options.photos, self.inputs)):
+            self.screen.print(others, markup=False, soft_wrap=True)
+        if not self.is_video and len(self.inputs) < files.FEW:
+            self.screen.print(
+                f"Warning: {len(self.inputs)} photographs are few. 30 or more, each showing most of what the one "
+                "before it shows, make a better scene.",
+                style="bold yellow",
+                soft_wrap=True,
+            )
         total = self.options.frames if self.is_video else len(self.inputs)
         frames = {"frames": self.options.frames} if self.is_video else {}
         with self.stage("import", "read the photographs", [self.stored], total, **frames) as advance:
@@ -223,7 +233,7 @@ class Run:
         self.key = hashlib.sha256(json.dumps([self.key, slot, depends_on], sort_keys=True).encode()).hexdigest()
         before = self.state.get(slot, {})
         if before == {"key": self.key, "done": True} and all(path.exists() for path in made[:1]):
-            self.screen.print(f"{name}: done before", style="dim")
+            self.repeated += 1
             yield None
             return
         if before and before["key"] != self.key:
@@ -253,6 +263,8 @@ class Run:
 
     def verdict(self) -> None:
         """Print what was achieved and what to do next; the numbers go to OUT/prepare.json."""
+        if self.repeated == len(STAGES):
+            self.screen.print(f"{self.out} is prepared already, from these photographs and options.", soft_wrap=True)
         model = structure.colmap().Reconstruction(self.model)
         total, registered = len(self.names), model.num_reg_images()
         numbers = {

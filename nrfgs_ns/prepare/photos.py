@@ -4,24 +4,31 @@
 import hashlib
 import os
 import re
+import shlex
 import shutil
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from PIL import ExifTags, Image, ImageOps
 
-from nrfgs_ns.data.pictures import exif_of, exif_of_copy, known, open_picture, read_size
+from nrfgs_ns.data.pictures import FORMATS, check_depth, exif_of, exif_of_copy, known, open_picture, read_size
 from nrfgs_ns.errors import InputError
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Suffixes of photographs, in any case."""
+HEIF = (".heic", ".heif")
+"""Suffixes of what phones write, which are read where pillow-heif is installed."""
+CONVERT = "To read HEIC, run `pip install pillow-heif`, or convert it to JPEG (`heif-convert`, or the phone's export)."
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """Suffixes of videos, in any case."""
 KEPT = (".jpg", ".jpeg", ".png")
 """Formats that are used as they are; the others become PNG."""
 FEWEST = 3
 """Photographs from which a scene can be reconstructed at all."""
+FEW = 15
+"""Fewer photographs get a warning."""
 SHARPNESS_WIDTH = 320
 """Frames are shrunk to this width before their sharpness is compared, pixels: motion blur counts, not noise."""
 SMALLEST = 16
@@ -30,6 +37,16 @@ LONGEST_STEM = 120
 """Letters of a stored name: file systems allow 255 bytes, some of which others need."""
 
 Advance = Callable[[], None]
+
+
+def reads_heif() -> bool:
+    """Whether PIL reads HEIC: with pillow-heif, which is told to PIL here."""
+    try:
+        import pillow_heif
+    except ImportError:
+        return False
+    pillow_heif.register_heif_opener()
+    return True
 
 
 def find_inputs(source: Path) -> list[Path]:
@@ -44,32 +61,40 @@ def find_inputs(source: Path) -> list[Path]:
         raise InputError(f"{source} is neither a folder of photographs nor a video ({', '.join(VIDEOS)}).")
     if not source.is_dir():
         raise InputError(f"{source}: no such folder or video. Check the path.")
+    if (source / "transforms.json").is_file():
+        raise InputError(
+            f"{source} is a scene already: its transforms.json has the poses. Train with `ns-train nrfgs --data "
+            f"{shlex.quote(str(source))}`, or name its folder of photographs."
+        )
+    suffixes = (*PHOTOS, *HEIF) if reads_heif() else PHOTOS
     files = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
-    photos = [path for path in files if path.suffix.lower() in PHOTOS]
+    photos = [path for path in files if path.suffix.lower() in suffixes]
     if not photos:
         raise InputError(f"{source} holds no photographs ({', '.join(PHOTOS)}). {_nearby(source, files)}")
     if len(photos) < FEWEST:
+        hint = f" {CONVERT}" if any(path.suffix.lower() in HEIF for path in files) else ""
         raise InputError(
-            f"{source} holds {len(photos)} photographs; at least {FEWEST} are needed, better 30 or more. Take "
-            "them from different places, each seeing most of what the one before it sees."
+            f"{source} holds {len(photos)} photograph{'s' if len(photos) > 1 else ''}; at least {FEWEST} are needed, "
+            "better 30 or more. Take them from different places, each seeing most of what the one before it sees."
+            + hint
         )
     return photos
 
 
-def left_out(source: Path) -> str:
-    """What of a folder `find_inputs` leaves out: how many files of each suffix, and folders; "" for nothing."""
-    kinds = Counter(
-        "folders" if path.is_dir() else path.suffix.lower() or "no suffix"
-        for path in source.iterdir()
-        if not path.name.startswith(".") and not (path.is_file() and path.suffix.lower() in PHOTOS)
-    )
-    return ", ".join(f"{kind} ({number})" for kind, number in sorted(kinds.items()))
+def left_out(source: Path, photos: list[Path]) -> str:
+    """Contents of a folder beside its photographs, as a sentence: files by suffix, and folders; "" for nothing."""
+    others = [path for path in source.iterdir() if not path.name.startswith(".") and path not in set(photos)]
+    kinds = Counter("folders" if path.is_dir() else path.suffix.lower() or "no suffix" for path in others)
+    if not kinds:
+        return ""
+    listed = ", ".join(f"{kind} ({number})" for kind, number in sorted(kinds.items()))
+    return f"Left out, since they are not read here: {listed}.{f' {CONVERT}' if kinds.keys() & set(HEIF) else ''}"
 
 
 def _nearby(source: Path, files: list[Path]) -> str:
-    """What to do about a folder without photographs."""
-    if any(path.suffix.lower() in (".heic", ".heif") for path in files):
-        return "Convert the HEIC files to JPEG first (phones can export JPEG)."
+    """Next step for a folder without photographs."""
+    if any(path.suffix.lower() in HEIF for path in files):
+        return CONVERT
     if any(path.suffix.lower() in VIDEOS for path in files):
         return "It holds a video: name that file itself."
     if any(path.is_dir() for path in source.iterdir()):
@@ -91,14 +116,14 @@ def digest(paths: list[Path]) -> str:
 def stored_names(photos: list[Path]) -> list[str]:
     """File names in the scene, in order: all different, short, and of ASCII letters without blanks, which end names in
     COLMAP's lists."""
-    names: list[str] = []
+    names: dict[str, None] = {}  # a set in order
     for index, path in enumerate(photos):
         suffix = path.suffix.lower() if path.suffix.lower() in KEPT else ".png"
         name = re.sub(r"[^\w.-]", "_", path.stem, flags=re.ASCII)[:LONGEST_STEM] + suffix
         while name in names:
             name = f"{index:05d}_{name}"
-        names.append(name)
-    return names
+        names[name] = None
+    return list(names)
 
 
 def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
@@ -112,7 +137,7 @@ def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
         target = folder / name
         if not target.exists():
             aside = folder.with_name("photo" + target.suffix)  # an interrupted copy must not look like a whole one
-            with open_picture(path) as image:
+            with open_picture(path, (*FORMATS, "HEIF") if path.suffix.lower() in HEIF else FORMATS) as image:
                 _store(image, path, aside)
             os.replace(aside, target)
         advance()
@@ -120,8 +145,7 @@ def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
 
 def _store(image: Image.Image, path: Path, target: Path) -> None:
     """Write one photograph: as it is if it can be, else upright in 8-bit RGB, JPEG as JPEG and the rest as PNG."""
-    if image.mode[0] in "IF":
-        raise InputError(f"{path} has more than 8 bits per channel (mode {image.mode}). Convert it to 8 bits.")
+    check_depth(image, path)
     if min(image.size) < SMALLEST:
         raise InputError(f"{path} is {image.width} x {image.height} pixels, too small to show anything. Remove it.")
     try:
@@ -156,10 +180,8 @@ def sizes(folder: Path, names: list[str]) -> list[tuple[int, int]]:
     return [read_size(folder / name) for name in names]
 
 
-def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:
-    """Write the sharpest frame of each of `frames` equal pieces of a video as JPEG, frame_00000.jpg and so on.
-
-    Sharpness is the variance of the Laplacian.
+def open_video(video: Path) -> tuple[Any, int]:
+    """OpenCV's reader of a video, and its number of frames; the first one can be decoded.
 
     Raises:
         InputError: OpenCV is not there, or cannot decode the file, or there are too few frames.
@@ -172,32 +194,47 @@ def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> No
             "opencv-python-headless`, or extract frames with another program and name their folder."
         ) from error
     reader = cv2.VideoCapture(str(video))
+    total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+    if total < FEWEST or not reader.read()[0]:
+        raise InputError(
+            f"{video}: OpenCV finds {max(total, 0)} frames in it, of which it decodes none or too few. Convert it to "
+            "MP4 (H.264), or extract frames with another program and name their folder."
+        )
+    reader.set(cv2.CAP_PROP_POS_FRAMES, 0)
+    return reader, total
+
+
+def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:
+    """Write the sharpest frame of each of `frames` equal pieces of a video as JPEG, frame_00000.jpg and so on.
+
+    Sharpness is the variance of the Laplacian.
+
+    Raises:
+        InputError: the video cannot be used.
+    """
+    reader, total = open_video(video)
+    import cv2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = min(frames, total)
+    sharpest, piece, written = (-1.0, None), 0, 0
     try:
-        total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
-        if total < FEWEST:
-            raise InputError(
-                f"{video}: OpenCV finds {max(total, 0)} frames in it. Convert it to MP4 (H.264), or extract frames "
-                "with another program and name their folder."
-            )
-        folder.mkdir(parents=True, exist_ok=True)
-        frames = min(frames, total)
-        best, piece, written = (-1.0, None), 0, 0
         for index in range(total + 1):
-            found, frame = reader.read() if index < total else (False, None)
-            if not found or index * frames // total != piece:
-                if best[1] is not None:
-                    coded = cv2.imencode(".jpg", best[1], [cv2.IMWRITE_JPEG_QUALITY, 97])[1]
+            decoded, frame = reader.read() if index < total else (False, None)
+            if not decoded or index * frames // total != piece:
+                if sharpest[1] is not None:
+                    coded = cv2.imencode(".jpg", sharpest[1], [cv2.IMWRITE_JPEG_QUALITY, 97])[1]
                     (folder / f"frame_{written:05d}.jpg").write_bytes(coded)  # imwrite is silent where the disk is full
                     written += 1
                     advance()
-                best, piece = (-1.0, None), index * frames // total
-            if not found:
+                sharpest, piece = (-1.0, None), index * frames // total
+            if not decoded:
                 break
             height = max(round(frame.shape[0] * SHARPNESS_WIDTH / frame.shape[1]), 1)
             small = cv2.resize(frame, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA)
             sharpness = cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var()
-            if sharpness > best[0]:
-                best = sharpness, frame
+            if sharpness > sharpest[0]:
+                sharpest = sharpness, frame
     finally:
         reader.release()
     if written < FEWEST:

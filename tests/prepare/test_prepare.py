@@ -7,10 +7,12 @@ import math
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from PIL.PngImagePlugin import PngImageFile
 from PIL.TiffImagePlugin import IFDRational
 from rich.console import Console
 
@@ -171,7 +173,7 @@ def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, 
     for name in ("extract_features", "match_features", "find_cameras", "undistort"):
         monkeypatch.setattr(structure, name, None)
     said = run_quietly(source, out)
-    assert said.count("done before") == 7 and "6 of 6 photographs" in said
+    assert "scene is prepared already" in said and "6 of 6 photographs" in said and "ns-train nrfgs" in said
 
     with pytest.raises(TypeError):  # another option: everything from the features on, whose function is gone
         run_quietly(source, out, features=100)
@@ -288,6 +290,8 @@ def test_a_poor_reconstruction_comes_with_advice(prepared, walls):
         (lambda d: (d.mkdir(), (d / "a.HEIC").touch()), "HEIC"),
         (lambda d: (d.mkdir(), (d / "a.mp4").touch()), "name that file itself"),
         (lambda d: [photo(d / f"{i}.jpg") for i in range(2)], "2 photographs; at least 3"),
+        (lambda d: [photo(d / "a.jpg"), (d / "b.heic").touch()], "1 photograph; .*pip install pillow-heif"),
+        (lambda d: (photo(d / "images" / "a.jpg"), (d / "transforms.json").touch()), "scene already.*ns-train nrfgs"),
         (lambda d: d.write_text("no video"), "neither a folder of photographs nor a video"),
     ],
 )
@@ -483,7 +487,33 @@ def test_what_is_left_out_is_counted(tmp_path):
     photo(tmp_path / "in" / "more" / "c.jpg")
     screen = Console(record=True, width=200, file=io.StringIO())
     Run(Prepare(tmp_path / "in", tmp_path / "out"), screen).import_input()
-    assert "Left out, since they are not read here: .heic (2), folders (1), no suffix (1)." in screen.export_text()
+    said = screen.export_text()
+    assert "Left out, since they are not read here: .heic (2), folders (1), no suffix (1). To read HEIC" in said
+    assert "Warning: 3 photographs are few" in said
+
+
+def test_heic_is_read_where_pillow_heif_is_installed(tmp_path, monkeypatch):
+    def register() -> None:
+        Image.register_open("HEIF", PngImageFile, lambda prefix: prefix.startswith(b"\x89PNG"))
+
+    monkeypatch.setitem(sys.modules, "pillow_heif", SimpleNamespace(register_heif_opener=register))
+    for i in range(3):
+        photo(tmp_path / "in" / f"{i}.png").rename(tmp_path / "in" / f"{i}.HEIC")
+    try:
+        run = Run(Prepare(tmp_path / "in", tmp_path / "out"), Console(quiet=True))
+        run.import_input()
+    finally:
+        Image.OPEN.pop("HEIF", None)
+        Image.ID.remove("HEIF")
+    assert run.names == ["0.png", "1.png", "2.png"]
+
+
+def test_a_bad_video_is_named_before_anything_is_written(tmp_path):
+    pytest.importorskip("cv2")
+    (tmp_path / "v.mp4").write_bytes(b"no video")
+    with pytest.raises(InputError, match=r"v\.mp4: OpenCV finds 0 frames"):
+        Run(Prepare(tmp_path / "v.mp4", tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
 
 
 def test_damaged_exif_is_no_reason_to_refuse_a_photograph(tmp_path):
