@@ -117,8 +117,7 @@ class Demo:
             "--steps-per-eval-image": 10 * steps,
             "--steps-per-eval-all-images": 10 * steps,
             "--logging.profiler": "none",
-            "--pipeline.model.densification": "mcmc",
-            "--pipeline.model.splat-budget": self.scene().points,
+            "--pipeline.model.densification": f"mcmc,budget={self.scene().points}",
             "--pipeline.model.num-downscales": 1,
             "--pipeline.model.resolution-schedule": max(steps // 5, 1),
         }

@@ -68,7 +68,7 @@ class Bench:
     runs: tuple[str, ...] = ()
     """runs or knobs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
     strategies: tuple[str, ...] = ()
-    """densification: splatfacto, original, mcmc, mcmc@BUDGET, own"""
+    """values of --pipeline.model.densification, NAME@BUDGET, own"""
     seeds: tuple[int, ...] = ()
     """seeds (--machine.seed), one training for each"""
     steps: int | None = None

@@ -5,7 +5,7 @@
       SH: nrfgs-sh
       NRF-16: {method: nrfgs, options: --pipeline.model.appearance.latent-dim 16}
       splatfacto: {method: splatfacto, strategies: [own]}
-    strategies: [original, mcmc@200000]      # densification, and the budget of mcmc; `own`: the method's, no option
+    strategies: [original, mcmc@200000]      # densification, options of its own after commas; `own`: the method's
     scenes: [bonsai, {path: garden, downscale: 4}]
     seeds: [42, 43]
     steps: 30000
@@ -37,6 +37,7 @@ from typing import Any
 
 import yaml
 
+from nrfgs_ns.densification import strategy_from
 from nrfgs_ns.errors import InputError
 
 QUIET = (
@@ -115,7 +116,7 @@ class Spec:
     scenes: list[Scene]
     """data sets"""
     strategies: list[str] = field(default_factory=lambda: [OWN])
-    """densification: splatfacto, original, mcmc, mcmc@BUDGET, or own for no option at all"""
+    """values of --pipeline.model.densification; NAME@N for NAME,budget=N; or own for no option at all"""
     seeds: list[int] = field(default_factory=lambda: [42])
     """--machine.seed of each repetition"""
     steps: int = 30_000
@@ -297,18 +298,14 @@ def steps_of(spec: Spec, run: Method, scene: Scene) -> int | None:
 
 
 def strategy_options(strategy: str) -> list[str]:
-    """Options of ns-train for a strategy of densification.
+    """Options of ns-train for a strategy of densification; NAME@N is NAME,budget=N.
 
     Raises:
-        InputError: there is no such strategy.
+        InputError: there is no such strategy, or option of it.
     """
-    name, at, budget = strategy.partition("@")
     if strategy == OWN:
         return []
-    known = ("splatfacto", "original", "mcmc")
-    good = name in known and (not at or (name == "mcmc" and budget.isdecimal() and int(budget) > 0))
-    _require(good, f"strategy {strategy!r} is unknown; use {', '.join(known)}, mcmc@BUDGET or own.")
-    return [DENSIFICATION, name, *(["--pipeline.model.splat-budget", budget] if at else [])]
+    return [DENSIFICATION, str(strategy_from(strategy.replace("@", ",budget=")))]
 
 
 def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:

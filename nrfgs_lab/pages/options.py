@@ -17,11 +17,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from nrfgs_ns import method_config
 from nrfgs_ns.cli import commands, summary
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.densification import STRATEGIES, DensificationConfig
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "options.md"
 PACKAGES = "nrfgs_ns", "nrfgs_lab"
@@ -34,8 +36,8 @@ What this package adds to nerfstudio's options, or sets in its own way; `ns-trai
 `python -m nrfgs_lab.pages.options`. Defaults are `nrfgs`'s. The other heads have no `view-noise`, `few-views` or
 `shrinkage`; they train for 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
 """
-RULES = "original", "mcmc"
-"""Densification strategies with options of their own."""
+SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
+"""Options of splatfacto's model, which is not explained here."""
 LEFT_OUT = (
     *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
     *("pipeline.model.appearance.distance-eps", "load-3D-points"),
@@ -64,6 +66,10 @@ def own_options(config: Any, prefix: str = "") -> Iterator[Option]:
     """
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
+        if isinstance(value, DensificationConfig):
+            value = str(value)
+        elif prefix == MODEL and field.name in SPLATFACTOS:
+            continue
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             yield from own_options(value, f"{prefix}{field.name}.")
         elif not field.name.startswith("_") and "Suppress" not in str(field.type):
@@ -127,8 +133,6 @@ def page() -> str:
     options = [one for one in own_options(first.config) if one.flag not in LEFT_OUT]
     heads = [option for option in options if option.flag.startswith(APPEARANCE)]
     model = [option for option in options if option.flag.startswith(MODEL) and option not in heads]
-    rules = {name: [one for one in model if one.flag.startswith(f"{MODEL}{name}.")] for name in RULES}
-    model = [option for option in model if option not in sum(rules.values(), [])]
     rest = [option._replace(flag=f"--{option.flag}") for option in options if not option.flag.startswith(MODEL)]
     data = [one for one in own_options(NrfgsDataParserConfig()) if one.flag not in LEFT_OUT]
     data = [option._replace(flag=f"nrfgs-data --{option.flag}") for option in data]
@@ -138,7 +142,7 @@ def page() -> str:
         table(heads, APPEARANCE),
         "## The model, with every head\n",
         table(model, MODEL),
-        _of_rules(rules),
+        strategies(),
         "## Training and data\n\n`nrfgs-data` and what follows it come last in a command.\n",
         table([option for option in rest if ".dataparser." not in option.flag] + data),
         HOST,
@@ -154,13 +158,16 @@ def page() -> str:
     return "\n".join(parts) + "\n"
 
 
-def _of_rules(rules: dict[str, list[Option]]) -> str:
-    """The options of densification strategies, in a sentence; `--help` explains each."""
-    parts = []
-    for name, options in rules.items():
-        shown = (f"`{one.flag.removeprefix(f'{MODEL}{name}.')}` {_shown(one.default)}" for one in options)
-        parts.append(f"`--{MODEL}{name}.`: {', '.join(shown)}")
-    return f"[Strategies](bench.md#densification-strategies) have thresholds of their own. {'. '.join(parts)}.\n"
+def strategies() -> str:
+    """The options of each strategy of densification."""
+    parts = [
+        "### Strategies\n\nOptions of a strategy follow its name: `--pipeline.model.densification "
+        "mcmc,budget=150000,refine_every=50`. [What they do](bench.md#densification-strategies).\n"
+    ]
+    for name, config in STRATEGIES.items():
+        options = [one._replace(flag=one.flag.replace("-", "_")) for one in own_options(config())]
+        parts.append(table(options).replace("| | default | |", f"| `{name}` | default | |"))
+    return "\n".join(parts)
 
 
 def rates(method: MethodSpecification) -> str:

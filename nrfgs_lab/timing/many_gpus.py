@@ -110,7 +110,7 @@ def one_device(rank: int, load: Load, count: int, world: int, url: str, folder: 
         "--pipeline.model.random-init": True,
         "--pipeline.model.num-random": count,
         "--pipeline.model.random-scale": load.extent,
-        "--pipeline.model.stop-split-at": 0,
+        "--pipeline.model.densification": "splatfacto,stop_split_at=0",
         "--pipeline.model.num-downscales": 0,
         "--pipeline.model.warmup-steps": 0,
     }

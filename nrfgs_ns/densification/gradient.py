@@ -3,7 +3,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -12,7 +12,8 @@ from torch import Tensor
 
 from nrfgs_ns.densification import thinning
 from nrfgs_ns.densification.statistics import take_statistics
-from nrfgs_ns.densification.strategy import Densification, OpacitySeen, Strategy, TrainingViews
+from nrfgs_ns.densification.strategy import Densification, DensificationConfig, OpacitySeen, TrainingViews
+from nrfgs_ns.errors import InputError
 
 EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
@@ -23,18 +24,113 @@ STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop
 
 
 @dataclass
-class OriginalDensification:
-    """Thresholds of 3DGS. Its schedule is in the model's warmup_length, refine_every, reset_alpha_every and
-    stop_split_at, whose defaults are those of 3DGS."""
+class GradientConfig(DensificationConfig):
+    """Options that splatfacto's and 3DGS's rules share."""
 
-    grow_gradient: float = 2e-4
+    steps: ClassVar[tuple[str, ...]] = (*DensificationConfig.steps, "stop_split_at")
+    stop_split_at: int = 15_000
+    """step at which growth ends"""
+    reset_alpha_every: int = 30
+    """refinements between two resets of opacities"""
+    keep: float = 1.0
+    """share of the splats to keep after growth; those that the training views would miss least are removed
+    (docs/fewer-splats.md)"""
+
+    def check(self) -> None:
+        super().check()
+        self.require(self.reset_alpha_every >= 1, "reset_alpha_every", "at least 1")
+        self.require(0 < self.keep <= 1, "keep", "above 0 and at most 1")
+
+    def check_training(self, devices: int, steps: int) -> None:
+        if self.keep == 1.0:
+            return
+        if devices > 1:
+            raise InputError(
+                f"keep is {self.keep}, which is for one device: it compares whole pictures, and here each device has a "
+                "part of the splats. Use 1, or --machine.num-devices 1."
+            )
+        last = thinning.ROUNDS[-1] * self.stop_split_at
+        if last >= steps:
+            raise InputError(
+                f"keep is {self.keep}, but the last splats go at step {last:.0f} of {steps}: stop_split_at is "
+                f"{self.stop_split_at}. Make that smaller, or stretch the schedule to the training with "
+                "--schedule-steps 30000."
+            )
+
+    def _build(self, scene_unit: float | None, reset_at_start: bool, **thresholds: Any) -> "GradientDensification":
+        """Gsplat's strategy with these thresholds."""
+        rules = PruneBySeenOpacity(
+            refine_start_iter=self.warmup_length,
+            refine_stop_iter=self.stop_split_at,
+            refine_every=self.refine_every,
+            reset_every=self.reset_alpha_every * self.refine_every,
+            **thresholds,
+        )
+        return GradientDensification(self.name, rules, self.opacity_seen, scene_unit, reset_at_start, self.keep)
+
+
+@dataclass
+class Splatfacto(GradientConfig):
+    """nerfstudio's rules, with splatfacto's names and defaults."""
+
+    name: ClassVar[str] = "splatfacto"
+    steps: ClassVar[tuple[str, ...]] = (*GradientConfig.steps, "stop_screen_size_at")
+    densify_grad_thresh: float = 0.0008
     """splats whose mean gradient of the loss by the screen position (normalised to [-1, 1]) is larger grow"""
-    grow_scale: float = 0.01
-    """growing splats up to this size are duplicated, larger ones are split; in extents of the cameras"""
-    prune_opacity: float = 0.005
-    """splats of lower opacity go; a reset brings opacities down to twice this"""
-    prune_scale: float = 0.1
-    """larger splats go, once opacities have been reset; in extents of the cameras"""
+    use_absgrad: bool = True
+    """sum the gradients' absolute values over pixels (AbsGS)"""
+    densify_size_thresh: float = 0.01
+    """growing splats up to this size are duplicated, larger ones are split; in scene units"""
+    split_screen_size: float = 0.05
+    """splats that cover a larger share of the image are split"""
+    cull_alpha_thresh: float = 0.1
+    """splats of lower opacity are pruned; a reset brings opacities down to twice this"""
+    cull_scale_thresh: float = 0.5
+    """larger splats are pruned, once opacities have been reset; in scene units"""
+    cull_screen_size: float = 0.15
+    """splats that cover a larger share of the image are pruned"""
+    stop_screen_size_at: int = 4000
+    """step after which sizes in the image do not count"""
+
+    def check(self) -> None:
+        super().check()
+        opacity = self.cull_alpha_thresh
+        self.require(opacity < 0.5, "cull_alpha_thresh", "below 0.5, since a reset is to twice as much")
+
+    def build(self, num_train_images: int, scene_unit: float) -> "GradientDensification":
+        return self._build(
+            scene_unit,
+            reset_at_start=True,
+            prune_opa=self.cull_alpha_thresh,
+            grow_grad2d=self.densify_grad_thresh,
+            grow_scale3d=self.densify_size_thresh,
+            grow_scale2d=self.split_screen_size,
+            prune_scale3d=self.cull_scale_thresh,
+            prune_scale2d=self.cull_screen_size,
+            refine_scale2d_stop_iter=self.stop_screen_size_at,
+            pause_refine_after_reset=num_train_images + self.refine_every,
+            absgrad=self.use_absgrad,
+        )
+
+
+@dataclass
+class Original(GradientConfig):
+    """3DGS's rules (Kerbl et al. 2023), with its thresholds."""
+
+    name: ClassVar[str] = "original"
+
+    def build(self, num_train_images: int, scene_unit: float) -> "GradientDensification":
+        return self._build(
+            None,
+            reset_at_start=False,
+            prune_opa=0.005,
+            grow_grad2d=2e-4,
+            grow_scale3d=0.01,  # in extents of the cameras, as the next
+            prune_scale3d=0.1,
+            refine_scale2d_stop_iter=0,
+            pause_refine_after_reset=0,
+            absgrad=False,
+        )
 
 
 class PruneBySeenOpacity(DefaultStrategy):
@@ -72,7 +168,7 @@ class GradientDensification(Densification):
 
     def __init__(
         self,
-        name: Strategy,
+        name: str,
         strategy: PruneBySeenOpacity,
         opacity_seen: OpacitySeen,
         scene_unit: float | None,
@@ -101,7 +197,8 @@ class GradientDensification(Densification):
     def rests_at(self, step: int) -> bool:
         return step >= self.strategy.refine_stop_iter
 
-    def see_cameras(self, centers: Tensor) -> None:
+    def begin(self, centers: Tensor, views: TrainingViews, num_splats: int) -> None:
+        self.views = views
         if self.measure_by_cameras:
             spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
@@ -128,15 +225,12 @@ class GradientDensification(Densification):
             self._thin(step, splats, optimizers)
             self.state[THINNED] += 1
 
-    def see_training_views(self, views: TrainingViews) -> None:
-        self.views = views
-
     def _thin(self, step: int, splats, optimizers) -> None:
         """Take out a round's share of the splats (`thinning.py`)."""
         score = thinning.missed(self.views, len(splats["means"]), splats["means"].device)
         gone = thinning.least_missed(score, self.keep)
         remove(splats, optimizers, self.state, gone)
-        if self.strategy.verbose:
+        if self.verbose:
             print(f"Step {step}: {int(gone.sum())} GSs thinned. Now having {len(splats['means'])} GSs.")
 
     def _take_statistics(self, info: Mapping[str, Any], count: int) -> None:
@@ -154,7 +248,7 @@ class GradientDensification(Densification):
         duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
         grown = len(splats["means"])
         pruned = strategy._prune_gs(splats, optimizers, state, step)
-        if strategy.verbose:
+        if self.verbose:
             print(f"Step {step}: {duplicated} GSs duplicated, {split} GSs split. Now having {grown} GSs.")
             print(f"Step {step}: {pruned} GSs pruned. Now having {len(splats['means'])} GSs.")
         for name in ("grad2d", "count", "radii"):

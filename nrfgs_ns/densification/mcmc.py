@@ -2,86 +2,107 @@
 """3DGS-MCMC (Kheradmand et al. 2024): nothing is deleted, dead splats move to live ones, noise explores."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from nrfgs_ns.densification.relocation import add_samples, diffuse, relocate
-from nrfgs_ns.densification.strategy import CHANGE, UNSEEN, Densification, OpacitySeen, seen_with
+from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate
+from nrfgs_ns.densification.strategy import (
+    CHANGE,
+    UNSEEN,
+    Densification,
+    DensificationConfig,
+    OpacitySeen,
+    TrainingViews,
+    seen_with,
+)
 
+LARGEST_BUDGET = 2**24
+"""`torch.multinomial` draws from no more categories than this."""
+MIN_OPACITY = 0.005
+"""Splats of this opacity or less are dead and move."""
+NOISE_LR = 5e5
+"""Size of the noise on positions, times the current learning rate of the means."""
+SCALE_REGULARISATION = 0.01
+"""Weight of the mean standard deviation, in scene units, in the loss."""
 CHANGE_BEFORE = CHANGE + "_before"
-"""As `CHANGE`, in the window before: `every` steps until the last relocation, or what would be one."""
+"""As `CHANGE`, in the window before: `refine_every` steps until the last relocation, or what would be one."""
 
 
 @dataclass
-class McmcDensification:
-    """Constants of 3DGS-MCMC, as in gsplat. Its start and rhythm are the model's warmup_length and refine_every; it
-    starts from the same splats as the other strategies."""
+class Mcmc(DensificationConfig):
+    """3DGS-MCMC (Kheradmand et al. 2024) up to a budget of splats, with gsplat's constants."""
 
-    min_opacity: float = 0.005
-    """splats of this opacity or less are dead and move"""
+    name: ClassVar[str] = "mcmc"
+    steps: ClassVar[tuple[str, ...]] = (*DensificationConfig.steps, "stop_at")
+    copies_splats: ClassVar[bool] = True
+    regularises: ClassVar[bool] = True
+    opacity_seen: OpacitySeen = "peak"
+    """opacity by which splats are moved (docs/opacity.md). base: stored. peak: largest shown since the last
+    refinement"""
+    budget: int = 1_000_000
+    """number of splats to grow to and to keep"""
     stop_at: int = 25_000
     """step after which splats neither move to others nor are added"""
-    noise_lr: float = 5e5
-    """size of the noise on positions, times the current learning rate of the means"""
     opacity_regularisation: float = 0.01
     """weight of the mean opacity in the loss"""
-    scale_regularisation: float = 0.01
-    """weight of the mean standard deviation, in scene units, in the loss"""
+
+    def check(self) -> None:
+        super().check()
+        self.require(1 <= self.budget <= LARGEST_BUDGET, "budget", f"from 1 to {LARGEST_BUDGET}")
+
+    def share_of(self, rank: int, devices: int) -> "Mcmc":
+        return replace(self, budget=len(range(rank, self.budget, devices)))
+
+    def build(self, num_train_images: int, scene_unit: float) -> "McmcDensification":
+        return McmcDensification(self, scene_unit)
 
 
-class Mcmc(Densification):
+class McmcDensification(Densification):
     """Relocation, growth to a budget, and noise (`relocation.py`).
 
-    Args:
-        config: the constants.
-        budget: most splats.
-        start, every: first step of, and steps between, relocations.
-        opacity_seen: which opacity decides that a splat is dead and how far noise may move it. What a relocated splat
-            gets is computed from the stored opacities.
-        scene_unit: world units in a scene unit.
-
-    The mean opacity in the loss is that of what the step's cameras are shown (`mean_opacity`). With the stored ones
-    alone, splats that every view shows would count as dead, too, and the noise would shake them.
+    Which opacity is seen decides that a splat is dead, and how far noise may move it. What a relocated splat gets is
+    computed from the stored opacities. The mean opacity in the loss is that of what the step's cameras are shown
+    (`mean_opacity`). With the stored ones alone, splats that every view shows would count as dead, too, and the noise
+    would shake them.
     """
 
-    name = "mcmc"
+    name = Mcmc.name
 
-    def __init__(
-        self,
-        config: McmcDensification,
-        budget: int,
-        start: int,
-        every: int,
-        opacity_seen: OpacitySeen,
-        scene_unit: float = 1.0,
-    ):
-        super().__init__(opacity_seen)
-        if opacity_seen == "peak":
+    def __init__(self, config: Mcmc, scene_unit: float):
+        super().__init__(config.opacity_seen)
+        if config.opacity_seen == "peak":
             self.state[CHANGE_BEFORE] = None
-        self.scene_unit = scene_unit
-        self.config, self.budget, self.start, self.every = config, budget, start, every
-        self.stop, self.bounds = config.stop_at, (start, config.stop_at)
+        self.config, self.scene_unit = config, scene_unit
+        self.start, self.stop = config.warmup_length, config.stop_at
+
+    def begin(self, centers: Tensor, views: TrainingViews, num_splats: int) -> None:
+        if self.verbose and num_splats > self.config.budget:
+            print(
+                f"Warning: --pipeline.model.densification mcmc: budget is {self.config.budget}, but the training "
+                f"begins with {num_splats} points, and mcmc removes none: all of them stay."
+            )
 
     @torch.no_grad()
     def post_backward(self, step, info, splats, optimizers) -> None:
         self.shown = None
-        if step > self.start and step % self.every == 0:
+        if step > self.start and step % self.config.refine_every == 0:
             if step < self.stop:
                 self._relocate_and_add(splats, optimizers)
             self._begin_another_window()
         lr = float(optimizers["means"].param_groups[0]["lr"])
-        size = self.config.noise_lr * lr / self.scene_unit**2  # times a covariance; lr is a length already
-        diffuse(splats, size, self._lately_seen(splats["opacities"]))
+        size = NOISE_LR * lr / self.scene_unit**2  # times a covariance; lr is a length already
+        add_noise(splats, size, self._lately_seen(splats["opacities"]))
 
     def _relocate_and_add(self, splats, optimizers) -> None:
         """Move the dead and grow by 5 %. A new row has been changed by views as the splat that it was made from: its
         stored opacity is another, but the head would answer for it much as for that one."""
-        smallest = self.config.min_opacity
-        moved = relocate(splats, optimizers, self.seen_opacity(splats["opacities"]) <= smallest, smallest)
+        moved = relocate(splats, optimizers, self.seen_opacity(splats["opacities"]) <= MIN_OPACITY, MIN_OPACITY)
         count = len(splats["means"])
-        added = add_samples(splats, optimizers, max(0, min(self.budget, int(1.05 * count)) - count), smallest)
+        goal = min(self.config.budget, int(1.05 * count))
+        added = add_samples(splats, optimizers, max(0, goal - count), MIN_OPACITY)
         if self.state.get(CHANGE) is not None:
             self.state[CHANGE] = self.state[CHANGE][moved[added]]
 
@@ -99,10 +120,10 @@ class Mcmc(Densification):
         return seen_with(stored, torch.stack(changes).amax(dim=0)) if changes else stored
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
-        self.start, self.stop = (step_at(step) for step in self.bounds)
+        self.start, self.stop = step_at(self.config.warmup_length), step_at(self.config.stop_at)
 
     def regularisation(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {
             "mcmc_opacity_reg": self.config.opacity_regularisation * self.mean_opacity(splats["opacities"]),
-            "mcmc_scale_reg": self.config.scale_regularisation * splats["scales"].exp().mean() / self.scene_unit,
+            "mcmc_scale_reg": SCALE_REGULARISATION * splats["scales"].exp().mean() / self.scene_unit,
         }

@@ -139,7 +139,7 @@ def _shared_places(splats: Splats, rows: Tensor, count: int, min_opacity: float)
 
 
 @torch.no_grad()
-def diffuse(splats: Splats, size: float, opacities: Tensor) -> None:
+def add_noise(splats: Splats, size: float, opacities: Tensor) -> None:
     """Add noise to the means, along each splat's own shape: covariance @ N(0, 1) * size * gate(opacity).
 
     The gate, 1 / (1 + exp(100 (opacity - 0.005))), lets only splats explore that cannot be seen.

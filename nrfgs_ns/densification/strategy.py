@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of all strategies of densification, and which opacity they take a splat to have."""
+"""The interface of all strategies of densification: their options, and what runs in training.
 
+A strategy is a dataclass of its options (`DensificationConfig`), which builds what runs (`Densification`). What it
+wants of the head or of the loss it says itself. A new one is one file, and one line in `choice.py`.
+"""
+
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, MutableMapping
-from typing import Any, Literal, NamedTuple, Protocol
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -11,9 +17,10 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.errors import InputError
 
-Strategy = Literal["splatfacto", "original", "mcmc"]
 OpacitySeen = Literal["base", "peak"]
+"""Opacity of a splat that decides what becomes of it: the stored one, or the largest that a view has shown lately."""
 
 CHANGE = "opacity_change"
 """Name, in a strategy's `state`, of the largest change of each splat's opacity by a view, [N]: see `change_of`."""
@@ -42,6 +49,65 @@ def seen_with(stored: Tensor, change: Tensor) -> Tensor:
     """The opacities that views with these changes show, in [0, 1]; the stored ones where the change is `UNSEEN`."""
     change = torch.where(change > UNSEEN, change, 0.0)
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
+
+
+@dataclass
+class DensificationConfig(ABC):
+    """Options of a strategy. Steps count from 0; `reschedule` stretches them to the training."""
+
+    name: ClassVar[str]
+    """what it is called on the command line and in checkpoints"""
+    copies_splats: ClassVar[bool] = False
+    """replaces splats by copies that share their opacity, which heads adapt to (`AppearanceHeadConfig.for_copies`)"""
+    regularises: ClassVar[bool] = False
+    """adds terms for opacity and size to the loss, in place of the model's `shrinkage`"""
+    steps: ClassVar[tuple[str, ...]] = ("warmup_length", "refine_every")
+    """options that are numbers of steps"""
+    opacity_seen: OpacitySeen = "base"
+    """opacity by which splats are pruned or moved (docs/opacity.md). base: stored. peak: largest shown since the last
+    refinement"""
+    warmup_length: int = 500
+    """step after which refinement begins"""
+    refine_every: int = 100
+    """steps between refinements"""
+
+    @abstractmethod
+    def build(self, num_train_images: int, scene_unit: float) -> "Densification":
+        """The strategy for a training.
+
+        Args:
+            num_train_images: number of training images.
+            scene_unit: world units in a scene unit, in which sizes among the options are.
+        """
+
+    def check(self) -> None:
+        """Raise InputError where an option is out of range."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, (int, float)):
+                self.require(0 <= value < math.inf, field.name, "zero or positive")
+        self.require(self.opacity_seen in ("base", "peak"), "opacity_seen", "base or peak")
+        self.require(self.refine_every >= 1, "refine_every", "at least 1")
+
+    def check_training(self, devices: int, steps: int) -> None:  # noqa: B027  (most work in any training)
+        """Raise InputError where the options cannot work on this number of devices, or in this number of steps."""
+
+    def require(self, holds: bool, name: str, needed: str) -> None:
+        """Raise InputError naming option `name`, its value and what is `needed`, unless the condition holds."""
+        if not holds:
+            raise InputError(
+                f"--pipeline.model.densification {self.name}: {name} is {getattr(self, name)}; it must be {needed}."
+            )
+
+    def share_of(self, rank: int, devices: int) -> "DensificationConfig":
+        """The options for one of several devices, each of which has a part of the splats."""
+        return self
+
+    def __str__(self) -> str:
+        """The option's value on the command line: the name, then options that are not at their defaults."""
+        changed = ((field.name, getattr(self, field.name)) for field in fields(self))
+        default = type(self)()
+        return ",".join([self.name, *(f"{n}={v}" for n, v in changed if v != getattr(default, n))])
 
 
 class Shown(NamedTuple):
@@ -76,9 +142,11 @@ class TrainingViews(Protocol):
 class Densification(ABC):
     """What the model asks of a strategy. `state` is all that a continued training needs, and goes into checkpoints."""
 
-    name: Strategy
+    name: str
     state: dict[str, Any]
     """Numbers, tensors with a row per splat, or None for what the first step has to make."""
+    verbose: bool = True
+    """Whether refinements are printed."""
 
     def __init__(self, opacity_seen: OpacitySeen):
         self.opacity_seen = opacity_seen
@@ -102,11 +170,14 @@ class Densification(ABC):
         """Whether it looks at nothing in this step."""
         return False
 
-    def see_cameras(self, centers: Tensor) -> None:  # noqa: B027  (only some strategies measure by the cameras)
-        """Tell the strategy where the training cameras are, [V, 3], before the first step."""
+    def begin(self, centers: Tensor, views: TrainingViews, num_splats: int) -> None:  # noqa: B027
+        """Take what is known before the first step.
 
-    def see_training_views(self, views: TrainingViews) -> None:  # noqa: B027  (only some strategies look at them)
-        """Give the strategy what it may ask of the training views, before the first step."""
+        Args:
+            centers: of the training cameras, [V, 3].
+            views: what the strategy may ask of the training views.
+            num_splats: splats that the training begins with.
+        """
 
     def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
         """Look at a training view before the loss goes backward.

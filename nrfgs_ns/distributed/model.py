@@ -2,14 +2,14 @@
 """The model on one of several devices: a shard of the splats, seen from the cameras of all."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from nrfgs_ns.densification import Densification, GradientDensification, build_densification
+from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import scale_gradient, send_to_cameras
 from nrfgs_ns.distributed.schedules import fewer
@@ -58,13 +58,10 @@ class ShardedModel(NrfgsModel):
 
     def _strategy(self) -> Densification:
         """Of this device's share of the budget; after a reset it waits for as many images as on one device."""
-        config, rank = self.config, comm.rank()
-        if config.densification == "mcmc":
-            config = replace(config, splat_budget=shard_counts(config.splat_budget, comm.world())[rank])
-        found = build_densification(config, fewer(self.num_train_data, self.images_per_step), self.scene_unit)
-        if isinstance(found, GradientDensification):
-            found.strategy.verbose = rank == 0
-        return found
+        config = self.config.densification.share_of(comm.rank(), comm.world())
+        strategy = config.build(fewer(self.num_train_data, self.images_per_step), self.scene_unit)
+        strategy.verbose = comm.rank() == 0
+        return strategy
 
     def _initial_splats(self) -> dict[str, Tensor]:
         whole = super()._initial_splats()
@@ -168,7 +165,7 @@ class ShardedModel(NrfgsModel):
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
         self.densification.post_backward(step, self._screen_info(), self.gauss_params, self.optimizers)
-        if step % self.config.refine_every == 0:
+        if step % self.config.densification.refine_every == 0:
             self.count()
             if max(self.counts) > self.sharding.rebalance_at * sum(self.counts) / len(self.counts):
                 self.counts = rebalance(self.gauss_params, self.optimizers, self.densification.state, self.counts)

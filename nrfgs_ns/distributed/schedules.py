@@ -18,18 +18,6 @@ from typing import Any
 
 from torch.optim import Optimizer
 
-from nrfgs_ns.densification import UNREAD, McmcDensification
-
-MODEL_STEPS = (
-    "warmup_length",
-    "refine_every",
-    "resolution_schedule",
-    "stop_screen_size_at",
-    "stop_split_at",
-    "sh_degree_interval",
-)
-"""Options of the model that are step numbers. Resets are counted in refinements."""
-
 
 def fewer(steps: int | None, devices: int) -> int | None:
     """A step number, divided; never 0 unless it was. None stays None."""
@@ -42,15 +30,16 @@ def with_fewer_steps(config: Any, devices: int) -> Any:
     Args:
         config: an NrfgsTrainerConfig, for one device; stays what it is.
     """
+
+    def divided(part: Any, names: tuple[str, ...]) -> Any:
+        return replace(part, **{name: fewer(getattr(part, name), devices) for name in names})
+
     model = config.pipeline.model
-    head = model.appearance
-    head = replace(head, **{name: fewer(getattr(head, name), devices) for name in head.STEPS})
-    unread = UNREAD.get(model.densification, ())
-    changed = {name: fewer(getattr(model, name), devices) for name in MODEL_STEPS if name not in unread}
-    if "mcmc" not in unread:
-        mcmc: McmcDensification = model.mcmc
-        changed["mcmc"] = replace(mcmc, stop_at=fewer(mcmc.stop_at, devices))
-    model = replace(model, appearance=head, **changed)
+    model = replace(
+        divided(model, ("resolution_schedule", "sh_degree_interval")),
+        appearance=divided(model.appearance, model.appearance.STEPS),
+        densification=divided(model.densification, model.densification.steps),  # resets are counted in refinements
+    )
     names = (
         "max_num_iterations",
         "average_steps",

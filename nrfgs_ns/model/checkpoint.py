@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a checkpoint must satisfy before it is loaded, and what older versions wrote in it."""
+"""What a checkpoint must satisfy before it is loaded."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.model.retired import RETIRED
 
 
 def reduced_config(config: AppearanceHeadConfig, state: Mapping[str, Any]) -> AppearanceHeadConfig:
@@ -29,15 +28,6 @@ def differences(config: AppearanceHeadConfig, other: AppearanceHeadConfig) -> di
     """The options in which another configuration of the same head differs from one, as `reduced_config` wants them."""
     names = [one.name for one in fields(config)]
     return {name: getattr(other, name) for name in names if getattr(other, name) != getattr(config, name)}
-
-
-def upgraded(state: Mapping[str, Any]) -> dict[str, Any]:
-    """A model's extra state as this version writes it, from one that any version wrote."""
-    strategy = state.get("densification", "splatfacto")
-    now = {**state, "densification": RETIRED.get(strategy, strategy)}
-    if "pace" in state:  # of version 0.1.0
-        now["schedule_step"] = int(state["pace"]["position"])
-    return now
 
 
 def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:

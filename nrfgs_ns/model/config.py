@@ -3,23 +3,24 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import tyro
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.models.base_model import ModelConfig
 
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.densification import McmcDensification, OpacitySeen, OriginalDensification, Strategy
+from nrfgs_ns.densification import DensificationChoice, DensificationConfig, Splatfacto
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.model.retired import RETIRED
 
 PRIOR_VIEWS = 20
 """So many training views are half of what a head needs: `few_views` trusts it by that."""
 HALVING_VIEWS = 12
 """So many more training views halve `shrinkage`."""
 NEGLIGIBLE = 1e-6
-"""A weight of shrinkage below it is none: Adam would still make whole steps of it for splats that no view sees."""
+"""Weights of shrinkage below it are treated as zero: Adam makes whole steps of any for splats that no view sees."""
+EPSILON = math.ulp(1.0)
 
 
 def _model() -> type:
@@ -29,8 +30,8 @@ def _model() -> type:
 
 
 @dataclass
-class NrfgsModelConfig(SplatfactoModelConfig):
-    """Splatfacto's options, and the appearance head's."""
+class NrfgsModelConfig(ModelConfig):
+    """Options of the model: this package's own, then those of splatfacto that are not the densification's."""
 
     _target: type = field(default_factory=_model)
     """target class to instantiate"""
@@ -48,55 +49,74 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     warmup_steps: int | None = None
     """steps before training in which a head that starts with a residual unlearns it. None: one for each training
     view"""
-    densification: Strategy = "splatfacto"
-    """how splats are added and removed. splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to
-    splat_budget"""
-    splat_budget: int = 1_000_000
-    """mcmc: the number of splats to grow to and to keep"""
-    opacity_seen_by_densification: OpacitySeen | None = None
-    """opacity by which splats are pruned or moved (docs/opacity.md). base: stored. peak: largest shown since the last
-    refinement. None: peak for mcmc, otherwise base"""
-    keep: float = 1.0
-    """share of the splats to keep after growth; those that the training views would miss least are removed
-    (docs/fewer-splats.md)"""
-    original: OriginalDensification = field(default_factory=OriginalDensification)
-    """thresholds of the densification 'original'"""
-    mcmc: McmcDensification = field(default_factory=McmcDensification)
-    """constants of the densification 'mcmc'"""
+    densification: DensificationChoice = field(default_factory=Splatfacto)
+    """how splats are added and removed: a strategy, and options of its own, as in mcmc,budget=150000
+    (docs/options.md). splatfacto: nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to a budget"""
     photographs: Literal["auto", "on", "off"] = "auto"
     """learn each photograph's exposure and white balance. auto: if photographs or EXIF show that they vary
     (docs/exposure.md)"""
     robust_loss: float = 0.0
     """largest share of pixels that the loss ignores, those with the largest residuals, such as passers-by
     (docs/exposure.md)"""
-    # The head decides these two; they stay because nerfstudio's exporter and viewer read them from here.
+    resolution_schedule: int = 3000
+    """steps after which the resolution doubles"""
+    num_downscales: int = 2
+    """the training begins at 1 / 2^d of the images' resolution"""
+    background_color: Literal["random", "black", "white"] = "random"
+    """behind the splats in training"""
+    random_init: bool = False
+    """start from random points instead of the capture's"""
+    num_random: int = 50000
+    """number of random points"""
+    random_scale: float = 10.0
+    """side of the cube in which random points lie, in scene units"""
+    ssim_lambda: float = 0.2
+    """weight of SSIM in the loss; that of L1 is 1 - this"""
+    use_scale_regularization: bool = False
+    """penalise splats whose largest and smallest scales differ by more than max_gauss_ratio (PhysGaussian)"""
+    max_gauss_ratio: float = 10.0
+    """ratio of scales from which a splat is penalised"""
+    output_depth_during_training: bool = False
+    """render depth in training, too"""
+    rasterize_mode: Literal["classic", "antialiased"] = "classic"
+    """classic: splats are blurred by 0.3 pixels. antialiased: and dimmed for it (Mip-Splatting)"""
+    camera_optimizer: CameraOptimizerConfig = field(default_factory=lambda: CameraOptimizerConfig(mode="off"))
+    """learn the cameras' poses"""
+    use_bilateral_grid: bool = False
+    """learn a bilateral grid for each photograph"""
+    grid_shape: tuple[int, int, int] = (16, 16, 8)
+    """shape of the bilateral grids (x, y, brightness)"""
+    # The head decides these two; nerfstudio's exporter and viewer read them here.
     sh_degree: tyro.conf.Suppress[int] = 3
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Be what a config.yml says; that of an older version has other options, or values that are no more."""
-        options = vars(type(self)())
-        state = {**options, **{name: value for name, value in state.items() if name in options}}
-        state["few_views"] = "auto" if state["few_views"] == "on" else state["few_views"]
-        self.__dict__.update(state)
-        self.densification = RETIRED.get(self.densification, self.densification)
-
     def check(self) -> None:
-        """Raise InputError where an option is out of range. The densification and the head check their own."""
+        """Raise InputError where an option is out of range. The head checks its own when it is built."""
         if not isinstance(self.appearance, AppearanceHeadConfig):
             raise InputError(
                 f"pipeline.model.appearance is {self.appearance!r}, which is not the configuration of an appearance "
                 "head. Use one from nrfgs_ns.appearance, such as NrfConfig or ShConfig."
             )
-        for name, choices in (("few_views", ("auto", "off")), ("rasterize_mode", ("classic", "antialiased"))):
+        if not isinstance(self.densification, DensificationConfig):
+            raise InputError(
+                f"pipeline.model.densification is {self.densification!r}, which is not a strategy's configuration. Use "
+                "one from nrfgs_ns.densification, such as Splatfacto or Mcmc."
+            )
+        self.densification.check()
+        for name, choices in (
+            ("few_views", ("auto", "off")),
+            ("rasterize_mode", ("classic", "antialiased")),
+            ("background_color", ("random", "black", "white")),
+        ):
             if getattr(self, name) not in choices:
                 fix = " or ".join(map(repr, choices))
                 raise InputError(f"pipeline.model.{name} is {getattr(self, name)!r}; use {fix}.")
         for names, low, high, needed in (
-            (("view_noise", "shrinkage", "warmup_steps"), 0, math.inf, "zero or positive"),
+            (("view_noise", "shrinkage", "warmup_steps", "num_downscales"), 0, math.inf, "zero or positive"),
+            (("ssim_lambda",), 0, 1 + EPSILON, "from 0 to 1"),
             (("robust_loss",), 0, 1, "at least 0 and below 1"),
-            (("cull_alpha_thresh",), 0, 0.5, "at least 0 and below 0.5, since a reset is to twice as much"),
-            (("refine_every", "reset_alpha_every", "resolution_schedule", "num_random"), 1, math.inf, "at least 1"),
+            (("random_scale",), EPSILON, math.inf, "positive"),
+            (("resolution_schedule", "num_random", "max_gauss_ratio"), 1, math.inf, "at least 1"),
         ):
             for name in names:
                 value = getattr(self, name)
@@ -110,9 +130,9 @@ class NrfgsModelConfig(SplatfactoModelConfig):
     def suited_appearance(self, views: int) -> AppearanceHeadConfig:
         """The head's configuration as so many training views, and the densification, want it."""
         head = self.appearance.trusted(self.trust(views))
-        return head.for_copies() if self.densification == "mcmc" else head
+        return head.for_copies() if self.densification.copies_splats else head
 
     def shrinkage_weight(self, views: int) -> float:
         """What `shrinkage` is with so many training views."""
         weight = self.shrinkage / 100 * 0.5 ** (views / HALVING_VIEWS)
-        return weight if weight >= NEGLIGIBLE and self.densification != "mcmc" else 0.0
+        return weight if weight >= NEGLIGIBLE and not self.densification.regularises else 0.0

@@ -10,6 +10,8 @@ from nrfgs_ns.appearance.head import AppearanceHead
 from nrfgs_ns.model.config import NrfgsModelConfig
 
 OPACITY = 0.1
+ALONE = 0.01
+"""Standard deviation of a splat that is the only one, in scene units."""
 NARROWEST = 1e-7
 """Standard deviation of a splat whose neighbours are where it is, in scene units."""
 
@@ -33,7 +35,7 @@ def initial_splats(
         means = (torch.rand(config.num_random, 3) - 0.5) * config.random_scale * scene_unit
         rgb = torch.rand(len(means), 3)
     count = len(means)
-    width = mean_distance(means) if count > 1 else torch.full((count, 1), config.densify_size_thresh * scene_unit)
+    width = mean_distance(means) if count > 1 else torch.full((count, 1), ALONE * scene_unit)
     return {
         "means": means,
         "scales": width.clamp_min(NARROWEST * scene_unit).log().repeat(1, 3),

@@ -23,14 +23,13 @@ from torch.nn import Parameter, ParameterDict
 from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
-from nrfgs_ns.data.checks import warn
-from nrfgs_ns.densification import Densification, build_densification
+from nrfgs_ns.densification import Densification
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
 from nrfgs_ns.image.metrics import image_metrics
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.image.ssim import photometric_loss
-from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config, upgraded
+from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.harmonics_tune import fine_tune
@@ -117,7 +116,7 @@ class NrfgsModel(SplatfactoModel):
 
     def _strategy(self) -> Densification:
         """What makes splats come and go."""
-        return build_densification(self.config, self.num_train_data, self.scene_unit)
+        return self.config.densification.build(self.num_train_data, self.scene_unit)
 
     def learn_photographs(self, photographs: PhotographModel | None) -> None:
         """Let each photograph's look be learnt; None: all have one look."""
@@ -290,13 +289,8 @@ class NrfgsModel(SplatfactoModel):
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
-        self.densification.see_cameras(centers)
-        self.densification.see_training_views(TrainingPictures(self, attributes.pipeline.datamanager))
-        if self.config.densification == "mcmc" and self.num_points > self.config.splat_budget:
-            warn(
-                f"pipeline.model.splat_budget is {self.config.splat_budget}, but the training begins with "
-                f"{self.num_points} points, and mcmc removes none: so many splats stay."
-            )
+        views = TrainingPictures(self, attributes.pipeline.datamanager)
+        self.densification.begin(centers, views, self.num_points)
         self.camera_spacing = camera_spacing(centers)
         self.view_noise = ViewNoise.as_long_as(self.noise_factor * self.camera_spacing, self.view_noise.seed)
 
@@ -522,14 +516,13 @@ class NrfgsModel(SplatfactoModel):
         return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        state = upgraded(state)
         if state["densification"] != self.densification.name:
             raise InputError(
                 f"The checkpoint was trained with --pipeline.model.densification {state['densification']}, this model "
                 f"with {self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
             )
         self.densification.load_state(state["strategy"], self.device)
-        self.num_views = state.get("views", self.num_train_data)  # an older version counted all
+        self.num_views = state.get("views", self.num_train_data)
         if "schedule_step" in state:
             self.schedule_at(state["schedule_step"])
             self.head.set_step(self.schedule_step)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a checkpoint says of its training, so that no other one goes on from it: on which data set, with which options.
 
-Options are of two kinds. Some say what the stored numbers mean (the head's, where the world's centre is, how splats
-come and go): with others the same numbers are another model, and the checkpoint is refused. The rest say how learning
-goes on (learning rates, thresholds, steps): they may change, and are named when they do.
+Options are of two kinds. Some say what the stored numbers mean (the head's, where the world's centre is): with others
+the same numbers are another model, and the checkpoint is refused. The rest say how learning goes on (learning rates,
+thresholds, steps): they may change, and are named when they do.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,11 +15,11 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from nrfgs_ns.data.checks import some
+from nrfgs_ns.densification import DensificationConfig
 from nrfgs_ns.errors import InputError
 
 MEANING = (
     "pipeline.model.appearance",
-    "pipeline.model.densification",
     "pipeline.model.camera_optimizer.mode",
     "pipeline.model.rasterize_mode",
     "pipeline.model.use_bilateral_grid",
@@ -116,6 +116,8 @@ def _is_among(name: str, groups: tuple[str, ...]) -> bool:
 
 def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted names and values of a configuration's options, or of a dictionary of such."""
+    if isinstance(value, DensificationConfig):
+        value = str(value)  # as it is typed
     if is_dataclass(value) and not isinstance(value, type):
         names = [field.name for field in fields(value) if field.name[0] != "_" or field.name == "_target"]
         value = {name: getattr(value, name) for name in names}

@@ -17,7 +17,6 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.densification.thinning import ROUNDS
 from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.cpu_command import ten_minute_command
@@ -87,7 +86,6 @@ class NrfgsTrainerConfig(TrainerConfig):
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise InputError(f"{name} is {value}; it must be zero or positive.")
-        self._check_thinning(devices)
         scale = self.pipeline.datamanager.camera_res_scale_factor
         if not 0 < scale < math.inf:
             raise InputError(f"pipeline.datamanager.camera_res_scale_factor is {scale}; it must be positive.")
@@ -98,6 +96,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"logging.steps_per_log is {self.logging.steps_per_log}; it must be at least 1.")
         self._check_learning_rates()
         self.pipeline.model.check()
+        length = self.schedule_steps or self.max_num_iterations or STEPS
+        self.pipeline.model.densification.check_training(devices, length)
         if self.load_step is not None and self.load_dir is None:
             raise InputError(f"load_step is {self.load_step}, but there is no --load-dir. Give the folder, too.")
         if self.load_dir is not None:
@@ -120,25 +120,6 @@ class NrfgsTrainerConfig(TrainerConfig):
             for option, value in numbers.items():
                 if value is not None and not lowest <= value < math.inf:
                     raise InputError(f"optimizers.{name}.{option} is {value}; it must be {needed}.")
-
-    def _check_thinning(self, devices: int) -> None:
-        """Raise InputError where splats are to go that will not."""
-        model = self.pipeline.model
-        if model.keep == 1.0 or model.densification == "mcmc":  # which refuses it itself
-            return
-        if devices > 1:
-            raise InputError(
-                f"pipeline.model.keep is {model.keep}, which is for one device: it compares whole pictures, and here "
-                "each device has a part of the splats. Use 1, or --machine.num-devices 1."
-            )
-        length = self.schedule_steps or self.max_num_iterations or STEPS
-        last = ROUNDS[-1] * model.stop_split_at
-        if last >= length:
-            raise InputError(
-                f"pipeline.model.keep is {model.keep}, but the last splats go at step {last:.0f} of {length}: "
-                f"pipeline.model.stop_split_at is {model.stop_split_at}. Make that smaller, or stretch the schedule to "
-                f"the training with --schedule-steps {STEPS}."
-            )
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
         """The configuration with what is left open chosen: steps, schedules and mean of a training on one device."""

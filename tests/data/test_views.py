@@ -168,9 +168,7 @@ def first_step(folder, factor, out, *options):
 def test_a_step_without_auto_scaling_is_the_same_in_any_unit(strategy, factor, tmp_path):
     """Powers of two are exact: what differs is the rounding of log-scales and log distances, 2^-20 of what they scale,
     some ten layers deep."""
-    options = ["--pipeline.model.densification", strategy]
-    if strategy == "mcmc":
-        options += ["--pipeline.model.splat-budget", "200"]
+    options = ["--pipeline.model.densification", "mcmc,budget=200" if strategy == "mcmc" else strategy]
     base, base_rgb, base_loss = first_step(tmp_path / "one", 1.0, tmp_path / "out", *options)
     other, rgb, loss = first_step(tmp_path / "other", factor, tmp_path / "out", *options)
     assert base_rgb.std() > 0.01

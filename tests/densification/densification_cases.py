@@ -9,8 +9,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from short_trainings import command_line, set_up
 from torch.nn import Parameter
 
-from nrfgs_ns.densification import build_densification
-from nrfgs_ns.model.config import NrfgsModelConfig
+from nrfgs_ns.densification import STRATEGIES as CONFIGS
 
 STRATEGIES = ("splatfacto", "original", "mcmc")
 REFINES = 1000
@@ -95,21 +94,24 @@ class Table:
 
 
 def strategy(name: str, images: int = 8, **options):
-    return build_densification(NrfgsModelConfig(densification=name, **options), images)
+    return CONFIGS[name](**options).build(images, 1.0)
 
 
-def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **model) -> list[str]:
+def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **rules) -> list[str]:
     """ns-train's command line: refinement every 4th step."""
-    options = {"densification": densification, "warmup-length": 2, "refine-every": 4, "num-downscales": 0}
-    options |= {"few-views": "off", **model}
+    rules = {"warmup_length": 2, "refine_every": 4, **rules}
     if densification == "splatfacto":
-        options |= {"densify-grad-thresh": 1e-6, "reset-alpha-every": 6}
-    options = {f"--pipeline.model.{name}": value for name, value in options.items()}
+        rules = {"densify_grad_thresh": 1e-6, "reset_alpha_every": 6, **rules}
+    options = {
+        "--pipeline.model.densification": str(CONFIGS[densification](**rules)),
+        "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.few-views": "off",
+    }
     return command_line("nrfgs", scene, out, steps, options)
 
 
-def trainer_of(scene: Path, out: Path, densification: str, **model):
-    return set_up(arguments(scene, out, densification, **model))
+def trainer_of(scene: Path, out: Path, densification: str, **rules):
+    return set_up(arguments(scene, out, densification, **rules))
 
 
 def one_step(trainer, step: int) -> dict:

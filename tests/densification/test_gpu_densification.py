@@ -6,7 +6,7 @@ import torch
 from torch.nn import Parameter
 from torch.testing import assert_close
 
-from nrfgs_ns.densification.relocation import diffuse, split_evenly
+from nrfgs_ns.densification.relocation import add_noise, split_evenly
 
 pytestmark = pytest.mark.gpu
 
@@ -41,7 +41,7 @@ def test_diffuse_is_gsplats_noise():
     }
     results = []
     for move in (
-        lambda splats: diffuse(splats, 0.1, torch.sigmoid(splats["opacities"].flatten())),
+        lambda splats: add_noise(splats, 0.1, torch.sigmoid(splats["opacities"].flatten())),
         lambda splats: inject_noise_to_position(splats, {}, {}, scaler=0.1),
     ):
         splats = {name: Parameter(value.cuda()) for name, value in start.items()}

@@ -10,9 +10,8 @@ from nrfgs_ns.appearance.gsnb import GsnbConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
-from nrfgs_ns.densification import CHANGE, UNSEEN, build_densification
+from nrfgs_ns.densification import CHANGE, UNSEEN
 from nrfgs_ns.densification.strategy import change_of, seen_with
-from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -24,7 +23,7 @@ def test_a_splat_visible_through_its_residual_only(name):
     for seen in ("base", "peak"):
         table = Table(50)
         table.set_opacity(7, 0.001)
-        rules = strategy(name, opacity_seen_by_densification=seen)
+        rules = strategy(name, opacity_seen=seen)
         table.step(rules, REFINES - 2, shown=0.3)
         table.step(rules, REFINES - 1, shown=0.001)
         torch.manual_seed(0)
@@ -37,7 +36,7 @@ def test_a_splat_visible_through_its_residual_only(name):
 def test_a_splat_that_its_residual_hides(name):
     """Base above the threshold, invisible in all views: the peak sees it. What no view shows is judged by its base."""
     table = Table(50)
-    rules = strategy(name, opacity_seen_by_densification="peak")
+    rules = strategy(name, opacity_seen="peak")
     torch.manual_seed(0)
     table.step(rules, REFINES, shown=0.001, seen=slice(0, 10))
     left = set(table.splats["latents"][:, 0].long().tolist())
@@ -48,7 +47,7 @@ def test_a_splat_that_its_residual_hides(name):
 def test_the_peak_is_forgotten_at_refinement(name):
     table = Table(50)
     table.set_opacity(7, 0.001)
-    rules = strategy(name, opacity_seen_by_densification="peak")
+    rules = strategy(name, opacity_seen="peak")
     table.step(rules, REFINES, shown=0.3)
     assert 7 in table.splats["latents"][:, 0].long()
     torch.manual_seed(0)
@@ -62,15 +61,7 @@ def test_each_strategy_has_its_own_idea_of_a_dead_splat():
     assert seen == {"splatfacto": "base", "original": "base", "mcmc": "peak"}
     for name in STRATEGIES:
         for asked in ("base", "peak"):
-            assert strategy(name, opacity_seen_by_densification=asked).opacity_seen == asked
-
-
-@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"])
-def test_no_method_needs_an_idea_of_its_own(method):
-    for densification, seen in (("splatfacto", "base"), ("mcmc", "peak")):
-        config = parse([method, "--pipeline.model.densification", densification]).pipeline.model
-        assert config.opacity_seen_by_densification is None
-        assert build_densification(config, 8).opacity_seen == seen
+            assert strategy(name, opacity_seen=asked).opacity_seen == asked
 
 
 # Heads whose opacity is the stored one.
@@ -94,11 +85,11 @@ def test_a_head_of_stored_opacity_cannot_tell_peak_from_base(name):
     """Bit for bit, over three refinements, with opacities that wander across the thresholds in each step: 3DGS-MCMC and
     the others are then what they are."""
     ends = []
-    budget = {"splat_budget": 230} if name == "mcmc" else {}
+    budget = {"budget": 230} if name == "mcmc" else {}
     for seen in ("base", "peak"):
         torch.manual_seed(0)
         table = Table(203)
-        rules = strategy(name, opacity_seen_by_densification=seen, **budget)
+        rules = strategy(name, opacity_seen=seen, **budget)
         table.splats["opacities"].data.uniform_(-7.0, 0.0)
         for step in (998, 999, 1000, 1001, 1050, 1099, 1100, 1101, 1199, 1200, 1201):
             table.step(rules, step, shown=lambda stored: stored, seen=torch.randperm(len(table))[:150])
@@ -147,7 +138,7 @@ def test_noise_spares_what_views_have_lately_shown():
         table = Table(50)
         for row in range(50):
             table.set_opacity(row, 0.006)
-        rules = strategy("mcmc", opacity_seen_by_densification=seen, splat_budget=60)
+        rules = strategy("mcmc", opacity_seen=seen, budget=60)
         torch.manual_seed(0)
         table.step(rules, REFINES, shown=0.4, seen=slice(0, 40))
         assert len(table) > 50
@@ -167,7 +158,7 @@ def test_noise_spares_copies_as_their_source(shown):
     table = Table(50, opacity=0.6)
     for row in range(25, 50):
         table.set_opacity(row, 1e-4)
-    rules = strategy("mcmc", splat_budget=50)
+    rules = strategy("mcmc", budget=50)
     torch.manual_seed(0)
     table.step(rules, REFINES, shown=lambda stored: torch.where(stored > 0.5, shown(stored), 0.0))
     parents = table.splats["latents"][:, 0].long()
@@ -180,7 +171,7 @@ def test_noise_spares_copies_as_their_source(shown):
 def test_what_views_have_shown_is_forgotten_after_the_last_relocation_too():
     """MCMC: noise goes on to the end of the training, and so must the windows of 100 steps that it looks back over."""
     table = Table(50, opacity=0.001)
-    rules = strategy("mcmc", splat_budget=50)
+    rules = strategy("mcmc", budget=50)
     moved = {}
     for step in (25_050, 25_100, 25_101, 25_199, 25_200, 25_201, 25_300, 30_000):
         before = table.splats["means"].detach().clone()
@@ -192,7 +183,7 @@ def test_what_views_have_shown_is_forgotten_after_the_last_relocation_too():
 def test_checkpoints_of_older_versions_start_anew():
     """They hold the largest opacities, not changes, under names of their own."""
     table = Table(50)
-    rules = strategy("mcmc", splat_budget=50)
+    rules = strategy("mcmc", budget=50)
     rules.load_state({"peak": torch.rand(50), "peak_before": torch.rand(50)}, torch.device("cpu"))
     logits = table.splats["opacities"]
     assert torch.equal(rules.seen_opacity(logits), torch.sigmoid(logits.detach().flatten()))
@@ -229,7 +220,7 @@ def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
 def test_the_peak_is_forgotten_at_reset():
     """Splatfacto does not refine at a reset: what was seen before it must not keep a splat alive after it."""
     table = Table(50)
-    rules = strategy("splatfacto", opacity_seen_by_densification="peak")
+    rules = strategy("splatfacto", opacity_seen="peak")
     table.step(rules, 2999, shown=0.9)
     assert_close(rules.state[CHANGE], torch.full((50,), 0.4))
     table.step(rules, 3000, shown=0.9)
@@ -237,7 +228,7 @@ def test_the_peak_is_forgotten_at_reset():
 
 
 def test_the_peak_is_that_of_the_head(tiny_scene, tmp_path):
-    trainer = trainer_of(tiny_scene, tmp_path, "splatfacto", **{"opacity-seen-by-densification": "peak"})
+    trainer = trainer_of(tiny_scene, tmp_path, "splatfacto", opacity_seen="peak")
     model = trainer.pipeline.model
     model.head.low[-1].bias.data[3] = 100.0  # d_alpha = 0.2 tanh(100) = 0.2
     one_step(trainer, 1)  # at step 0 splatfacto resets

@@ -7,7 +7,7 @@ from densification_cases import Table
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.nrf import bounded_opacity
-from nrfgs_ns.densification.relocation import add_samples, diffuse, relocate, split_evenly
+from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate, split_evenly
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -80,7 +80,7 @@ def test_noise_has_the_splats_shape_and_spares_what_is_visible():
         table.set_opacity(row, opacity)
     before = table.splats["means"].detach().clone()
     torch.manual_seed(0)
-    diffuse(table.splats, 0.1, torch.sigmoid(table.splats["opacities"].detach().flatten()))
+    add_noise(table.splats, 0.1, torch.sigmoid(table.splats["opacities"].detach().flatten()))
     moved = table.splats["means"].detach() - before
 
     torch.manual_seed(0)

@@ -2,20 +2,19 @@
 """Densification strategies: what they delete, copy, move and add, and by which thresholds."""
 
 from copy import deepcopy
+from dataclasses import fields
 
 import pytest
 import torch
+import yaml
 from densification_cases import REFINES, STRATEGIES, Table, strategy
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch.testing import assert_close
 
-from nrfgs_ns.densification import (
-    McmcDensification,
-    OriginalDensification,
-    build_densification,
-)
+from nrfgs_ns.densification import Mcmc, Original, Splatfacto, strategy_from
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.host import gsplat_version
-from nrfgs_ns.model.config import NrfgsModelConfig
+from nrfgs_ns.training.run import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -30,7 +29,7 @@ def test_every_tensor_of_the_table_goes_along(name):
     table.splats["scales"].data[10:20] = torch.tensor(0.05).log()
     for row in range(30, 40):
         table.set_opacity(row, 0.001)
-    rules = strategy(name, opacity_seen_by_densification="base")
+    rules = strategy(name, opacity_seen="base")
     torch.manual_seed(0)
     table.step(rules, REFINES, gradient=1.0)
     table.check()
@@ -50,7 +49,7 @@ def test_every_tensor_of_the_table_goes_along(name):
 @pytest.mark.parametrize("budget", [30, 50, 57])
 def test_mcmc_grows_to_its_budget_and_stays_there(budget):
     table = Table(50)
-    rules = strategy("mcmc", splat_budget=budget)
+    rules = strategy("mcmc", budget=budget)
     counts = []
     for step in range(600, 1300, 100):
         table.step(rules, step, gradient=1.0)
@@ -76,14 +75,14 @@ def test_mcmc_rests_before_its_start_and_after_its_end():
 def test_original_measures_by_the_cameras():
     """3DGS: 1.1 times the largest distance of a camera from the mean of all."""
     rules = strategy("original")
-    rules.see_cameras(torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0.0], [2.0, -3.0, 0.0]]))
+    rules.begin(torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0.0], [2.0, -3.0, 0.0]]), None, 4)
     assert rules.state["scene_scale"] == pytest.approx(1.1 * 3.0)
     table = Table(4, scale=0.032)  # 0.01 x 3.3 = 0.033: three are duplicated, the last is split
     table.splats["scales"].data[3] = torch.tensor(0.034).log()
     table.step(rules, REFINES, gradient=1.0)
     kept = torch.bincount(table.splats["scales"].exp().amax(dim=-1).mul(1000).round().long())
     assert kept[32] == 6 and kept[round(34 / 1.6)] == 2
-    rules.see_cameras(torch.ones(1, 3))
+    rules.begin(torch.ones(1, 3), None, 4)
     assert rules.state["scene_scale"] == 1.0
 
 
@@ -116,44 +115,69 @@ def test_original_prunes_large_splats_after_the_first_reset():
         assert len(table) == left
 
 
-def test_constants_are_those_of_the_papers():
-    assert OriginalDensification() == OriginalDensification(2e-4, 0.01, 0.005, 0.1)
-    assert McmcDensification() == McmcDensification(0.005, 25_000, 5e5, 0.01, 0.01)
+def test_splatfactos_options_and_defaults_are_its_own():
+    theirs = SplatfactoModelConfig()
+    for field in fields(Splatfacto):
+        if field.name not in ("opacity_seen", "keep"):
+            assert field.default == getattr(theirs, field.name), field.name
+
+
+# The option on the command line.
 
 
 @pytest.mark.parametrize(
-    "options, says",
+    "text, config",
     [
-        ({"densification": "sparkle"}, "sparkle"),
-        ({"opacity_seen_by_densification": "sparkle"}, "sparkle"),
-        ({"densification": "mcmc", "splat_budget": 0}, "splat_budget"),
-        ({"densification": "mcmc", "splat_budget": 2**24 + 1}, "splat_budget"),
-        ({"densification": "mcmc", "stop_split_at": 100}, "stop_split_at"),
-        ({"densification": "mcmc", "cull_alpha_thresh": 0.005}, "cull_alpha_thresh"),
-        ({"densification": "original", "densify_grad_thresh": 1e-6}, "densify_grad_thresh"),
-        ({"densification": "original", "use_absgrad": False}, "use_absgrad"),
-        ({"densification": "mcmc", "keep": 0.5}, "keep has no effect"),
-        ({"splat_budget": 200_000}, "splat_budget has no effect with the densification 'splatfacto'"),
-        ({"densification": "original", "splat_budget": 200_000}, "splat_budget has no effect"),
-        ({"original": OriginalDensification(prune_opacity=0.01)}, "original has no effect"),
-        ({"densification": "mcmc", "original": OriginalDensification(prune_opacity=0.01)}, "original has no effect"),
-        ({"densification": "original", "mcmc": McmcDensification(stop_at=100)}, "mcmc has no effect"),
+        ("splatfacto", Splatfacto()),
+        ("original", Original()),
+        ("mcmc,budget=77,opacity-seen=base", Mcmc(budget=77, opacity_seen="base")),
+        (
+            "splatfacto,keep=0.5,use_absgrad=False,densify_grad_thresh=4e-4",
+            Splatfacto(keep=0.5, use_absgrad=False, densify_grad_thresh=4e-4),
+        ),
     ],
 )
-def test_options_that_cannot_work_are_refused(options, says):
+def test_a_word_is_a_strategy_with_its_options(text, config, tmp_path):
+    assert strategy_from(text) == config == strategy_from(str(config))
+    chosen = parse(["nrfgs", "--pipeline.model.densification", text, "--output-dir", str(tmp_path)])
+    assert chosen.pipeline.model.densification == config
+    assert yaml.load(yaml.dump(chosen), Loader=yaml.Loader).pipeline.model.densification == config
+
+
+@pytest.mark.parametrize(
+    "text, says",
+    [
+        ("sparkle", "no strategy 'sparkle'; use one of splatfacto, original, mcmc"),
+        ("mcmc,keep=0.5", "mcmc has no option 'keep'; it has opacity_seen, .*budget"),
+        ("mcmc,budget=0", "budget is 0; it must be from 1 to"),
+        (f"mcmc,budget={2**24 + 1}", "budget is"),
+        ("mcmc,budget=many", "budget is 'many'; it must be a whole number"),
+        ("original,opacity_seen=sparkle", "'sparkle'; use one of base, peak"),
+        ("splatfacto,use_absgrad=2", "use_absgrad is '2'; use one of true, false"),
+        ("splatfacto,densify_grad_thresh=nan", "densify_grad_thresh is nan; it must be zero or positive"),
+        ("splatfacto,cull_alpha_thresh=0.5", "cull_alpha_thresh is 0.5; it must be below 0.5"),
+        ("splatfacto,refine_every=0", "refine_every is 0; it must be at least 1"),
+        ("splatfacto,reset_alpha_every=0", "reset_alpha_every is 0"),
+        ("splatfacto,warmup_length=-1", "warmup_length is -1"),
+    ],
+)
+def test_options_that_cannot_work_are_refused(text, says):
     with pytest.raises(InputError, match=says):
-        build_densification(NrfgsModelConfig(**options), 8)
+        strategy_from(text)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"densification": "original", "original": OriginalDensification(prune_opacity=0.01)},
-        {"densification": "mcmc", "mcmc": McmcDensification(stop_at=100), "splat_budget": 7},
-    ],
-)
-def test_options_of_the_strategy_itself_are_not_refused(options):
-    assert build_densification(NrfgsModelConfig(**options), 8).name == options["densification"]
+def test_what_was_set_in_code_is_checked_before_the_training(tmp_path):
+    config = parse(["nrfgs", "--output-dir", str(tmp_path)])
+    config.pipeline.model.densification = Splatfacto(refine_every=0)
+    with pytest.raises(InputError, match="refine_every is 0"):
+        config.setup(local_rank=0, world_size=1)
+
+
+@pytest.mark.parametrize("option", ["refine-every", "cull-alpha-thresh", "splat-budget"])
+def test_options_of_no_strategy_are_unknown_to_the_model(option, capsys):
+    with pytest.raises(SystemExit):
+        parse(["nrfgs", f"--pipeline.model.{option}", "5"])
+    assert option in capsys.readouterr().err
 
 
 @pytest.mark.skipif(gsplat_version() >= (1, 5), reason="gsplat 1.5's strategy reads two radii, and resets no opacity")

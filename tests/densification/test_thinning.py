@@ -6,11 +6,10 @@ import torch
 from densification_cases import Table, arguments, strategy, trainer_of
 from torch.testing import assert_close
 
-from nrfgs_ns.densification import build_densification
+from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.densification.thinning import ROUNDS, least_missed, missed
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.robust import Trimming
-from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.training_views import TrainingPictures
 from nrfgs_ns.training.run import parse
 
@@ -33,7 +32,7 @@ class Missing:
 
 def thinning(table: Table, name: str = "splatfacto", **options):
     chosen = strategy(name, keep=1 / 64, **options)
-    chosen.see_training_views(Missing(table))
+    chosen.begin(torch.zeros(1, 3), Missing(table), len(table))
     return chosen
 
 
@@ -169,7 +168,7 @@ def test_what_the_robust_loss_leaves_out_is_not_missed(training, monkeypatch):
 @pytest.mark.parametrize("keep", [0.0, 1.5, float("nan")])
 def test_shares_that_are_none_are_refused(keep):
     with pytest.raises(InputError, match="keep is"):
-        build_densification(NrfgsModelConfig(keep=keep), 8)
+        Splatfacto(keep=keep).check()
 
 
 def test_a_training_that_ends_before_the_last_round_is_refused(tiny_scene, tmp_path):
@@ -186,7 +185,7 @@ def test_several_devices_are_refused(tiny_scene, tmp_path):
 def test_a_training_keeps_a_half(tiny_scene, tmp_path, monkeypatch):
     """Growth ends before it begins; the rounds are at steps 10 to 15. Which splats go, other tests look at."""
     monkeypatch.setattr("nrfgs_ns.densification.thinning.DRAWS", 8)
-    trainer = trainer_of(tiny_scene, tmp_path, "splatfacto", **{"stop-split-at": 10, "keep": 0.5})
+    trainer = trainer_of(tiny_scene, tmp_path, "splatfacto", stop_split_at=10, keep=0.5)
     model = trainer.pipeline.model
     before = model.num_points
     trainer.train()

@@ -40,12 +40,12 @@ def test_resumed_training_is_the_unbroken_one(densification, seen, tiny_scene, t
 
     The same machine adds the same numbers in the same order, so that only a lost state can differ.
     """
-    model = {"opacity-seen-by-densification": seen}
+    rules = {"opacity_seen": seen}
     if densification == "mcmc":
-        model["splat-budget"] = 330  # from 300: growth of 5 % at steps 4, 8, ... reaches it in the first half
+        rules["budget"] = 330  # from 300: growth of 5 % at steps 4, 8, ... reaches it in the first half
 
     def run(name: str, steps: int, *more: str) -> dict:
-        args = arguments(tiny_scene, tmp_path / name, densification, steps, **model)
+        args = arguments(tiny_scene, tmp_path / name, densification, steps, **rules)
         config = Path(train([*args, *more]).config_path)
         return checkpoint_of(config) | {"folder": models_of(config)}
 

@@ -25,24 +25,18 @@ COMMON = {
     "--pipeline.model.shrinkage": 0,
     "--pipeline.model.view-noise": 0,  # one device draws other numbers than two
 }
-PLAIN = {"--pipeline.model.opacity-seen-by-densification": "peak", "--pipeline.model.shrinkage": 3}
+PEAK = "splatfacto,opacity_seen=peak,warmup_length=2,refine_every=4,reset_alpha_every=6,densify_grad_thresh=1e-6"
+"""Densify every 4th step, reset opacity every 24th."""
+PLAIN = {"--pipeline.model.densification": PEAK, "--pipeline.model.shrinkage": 3}
 RICH = {
-    "--pipeline.model.densification": "mcmc",
+    "--pipeline.model.densification": "mcmc,warmup_length=2,refine_every=4",
     "--pipeline.model.rasterize-mode": "antialiased",
     "--pipeline.model.use-scale-regularization": True,
     "--pipeline.model.max-gauss-ratio": 0.5,  # below every ratio: each splat has a gradient from this term
     "--pipeline.model.use-bilateral-grid": True,
     "--pipeline.model.camera-optimizer.mode": "SO3xR3",
 }
-BUSY = {
-    "--pipeline.model.warmup-length": 2,
-    "--pipeline.model.refine-every": 4,
-    "--pipeline.model.reset-alpha-every": 6,
-    "--pipeline.model.densify-grad-thresh": 1e-6,
-    "--pipeline.model.stop-split-at": 1000,
-    "--pipeline.model.view-noise": 0.5,
-}
-"""Densify every 4th step, reset opacity every 24th."""
+BUSY = {"--pipeline.model.view-noise": 0.5}
 
 
 def trainer_of(scene: Path, out: Path, world: int, **options):
@@ -146,7 +140,7 @@ def step_alone(trainer, cameras) -> dict:
 
 def statistics(model, info) -> dict:
     """Densification's, after it has seen a step."""
-    from nrfgs_ns.densification import GradientDensification
+    from nrfgs_ns.densification.gradient import GradientDensification
 
     rules = model.densification
     if isinstance(rules, GradientDensification):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from device import PLAIN, RICH, one_step, told, train, trainer_of
+from device import PEAK, PLAIN, RICH, one_step, told, train, trainer_of
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -16,7 +16,7 @@ AVERAGED = {
     "--steps-per-save": 7,
     "--save-only-latest-checkpoint": False,
     "--pipeline.model.warmup-steps": 0,
-    "--pipeline.model.stop-split-at": 8,
+    "--pipeline.model.densification": f"{PEAK},stop_split_at=8",
     "--pipeline.sharding.rebalance-at": 100.0,
 }
 """Of 12 steps, the mean begins at step 2. The only refinement is at step 4, and leaves the shards as unequal as it

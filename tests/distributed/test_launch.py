@@ -119,7 +119,7 @@ def endless(scene: Path, out: Path) -> list[str]:
         "--vis": "tensorboard",
         "--steps-per-eval-image": 0,
         "--steps-per-eval-all-images": 0,
-        "--pipeline.model.stop-split-at": 0,
+        "--pipeline.model.densification": "splatfacto,stop_split_at=0",
     }
     words = [str(word) for option in options.items() for word in option]
     return [sys.executable, "-m", "nrfgs_ns.distributed.launch", "nrfgs", *words]

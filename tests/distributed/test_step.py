@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from nrfgs_ns.densification import CHANGE, build_densification
+from nrfgs_ns.densification import CHANGE, STRATEGIES
 from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import rows_of, shard_counts, transfers
 from nrfgs_ns.errors import InputError
@@ -141,10 +141,10 @@ def test_a_step_that_counts_for_other_images_is_not_gone_on_from(written, now):
 
 def test_schedules_counted_in_images():
     config = with_fewer_steps(replace(nrfgs.config, max_num_iterations=30_000, average_steps=200), 2)
-    model, before = config.pipeline.model, nrfgs.config.pipeline.model
-    assert (config.max_num_iterations, model.refine_every, model.stop_split_at) == (15_000, 50, 7_500)
+    rules, before = config.pipeline.model.densification, nrfgs.config.pipeline.model.densification
+    assert (config.max_num_iterations, rules.refine_every, rules.stop_split_at) == (15_000, 50, 7_500)
     assert config.average_steps == 100
-    assert model.reset_alpha_every == before.reset_alpha_every, "resets are counted in refinements"
+    assert rules.reset_alpha_every == before.reset_alpha_every, "resets are counted in refinements"
     assert (before.refine_every, nrfgs.config.average_steps) == (100, None), "the configuration was changed"
     means, field = config.optimizers["means"], config.optimizers["field"]
     assert means["optimizer"].lr == pytest.approx(1.6e-4 * math.sqrt(2))
@@ -157,9 +157,10 @@ def test_schedules_counted_in_images():
     assert adam.param_groups[0]["betas"][0] == 0.0
 
 
-@pytest.mark.parametrize("strategy", ["splatfacto", "original", "mcmc"])
-def test_no_step_number_is_divided_that_the_densification_refuses(strategy):
-    pipeline = replace(nrfgs.config.pipeline, model=replace(nrfgs.config.pipeline.model, densification=strategy))
-    model = with_fewer_steps(replace(nrfgs.config, pipeline=pipeline), 2).pipeline.model
-    assert build_densification(model, num_train_images=10).name == strategy
-    assert (model.refine_every, model.mcmc.stop_at) == (50, 12_500 if strategy == "mcmc" else 25_000)
+@pytest.mark.parametrize("strategy", STRATEGIES.values())
+def test_every_number_of_steps_of_a_strategy_is_divided(strategy):
+    model = replace(nrfgs.config.pipeline.model, densification=strategy())
+    config = replace(nrfgs.config, pipeline=replace(nrfgs.config.pipeline, model=model))
+    rules = vars(with_fewer_steps(config, 2).pipeline.model.densification)
+    changed = {name for name, value in vars(strategy()).items() if rules[name] != value}
+    assert changed == {name for name in rules if name.endswith(("_at", "_length"))} | {"refine_every"}

@@ -31,10 +31,10 @@ from nrfgs_ns.training.run import evaluate, machine, train
 
 SCENE = SceneConfig(views=16, width=48, height=36, points=600, samples=2)
 """Small enough for a run a minute on one core."""
-RESETS = {"--pipeline.model.refine-every": 25, "--pipeline.model.reset-alpha-every": 2}
+RESETS = {"--pipeline.model.densification": "splatfacto,warmup_length=100,refine_every=25,reset_alpha_every=2"}
 """Reset all opacities every 50th step; splatfacto then neither adds nor deletes splats for longer than that."""
 
-NO_SCREEN_SIZE = {"--pipeline.model.stop-screen-size-at": 0}
+NO_SCREEN_SIZE = {"--pipeline.model.densification": "splatfacto,warmup_length=100,stop_screen_size_at=0"}
 """Do not split splats for being wide on the screen: splatfacto's bound, a twentieth of the image, is 2.4 pixels here,
 less than the blur that every splat gets, and 600 points became 150,000 splats for 28,000 pixels within 1,100 steps."""
 
@@ -150,7 +150,7 @@ def run(training: HardTraining, seed: int, steps: int, work: Path) -> dict[str, 
         "--logging.local-writer.enable": False,
         "--logging.profiler": "none",
         "--pipeline.model.num-downscales": 0,
-        "--pipeline.model.warmup-length": 100,
+        "--pipeline.model.densification": "splatfacto,warmup_length=100",
         **training.options,
     }
     args = [training.method, *(str(word) for option in chosen.items() for word in option)]

@@ -11,10 +11,13 @@ from torch.testing import assert_close
 
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.densification import Mcmc
 from nrfgs_ns.model.checkpoint import differences, reduced_config
-from nrfgs_ns.model.config import NrfgsModelConfig
 
-QUICK = {"--pipeline.model.num-downscales": 0, "--pipeline.model.warmup-length": 2, "--pipeline.model.refine-every": 4}
+QUICK = {
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4",
+}
 
 
 def ready(scene, out, steps, *options):
@@ -77,7 +80,7 @@ def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_c
 
 
 def test_mcmc_has_residuals_on_the_logit(tiny_scene, tmp_path, no_cuda, capsys):
-    mcmc = {"--pipeline.model.densification": "mcmc", "--pipeline.model.splat-budget": 300}
+    mcmc = {"--pipeline.model.densification": "mcmc,warmup_length=2,refine_every=4,budget=300"}
     config = trained(command_line("nrfgs", tiny_scene, tmp_path / "mcmc", 3, QUICK, mcmc))
     assert "so that it has opacity_scale 0.057;" in capsys.readouterr().out
     again = ready(tiny_scene, tmp_path / "again", 4, mcmc, {"--load-dir": models_of(config)}).pipeline.model
@@ -90,9 +93,9 @@ def test_mcmc_has_residuals_on_the_logit(tiny_scene, tmp_path, no_cuda, capsys):
 
 
 def test_more_points_than_mcmc_may_have_are_told(tiny_scene, tmp_path, no_cuda, capsys):
-    mcmc = {"--pipeline.model.densification": "mcmc", "--pipeline.model.splat-budget": 299}
+    mcmc = {"--pipeline.model.densification": "mcmc,budget=299"}
     ready(tiny_scene, tmp_path, 1, mcmc)
-    assert "splat_budget is 299, but the training begins with 300 points" in capsys.readouterr().out
+    assert "budget is 299, but the training begins with 300 points" in capsys.readouterr().out
 
 
 def test_a_checkpoint_keeps_its_head_whatever_the_number_of_views(tiny_scene, tmp_path, no_cuda):
@@ -160,15 +163,5 @@ def test_shrinkage_halves_with_every_twelve_views(tiny_scene, tmp_path, no_cuda)
     assert_close(term, weight * (stored.sum() - stored[rows].sum() + 1.7) / len(stored))
     by_logit = torch.autograd.grad(term, table["opacities"])[0].flatten()
     assert by_logit[1] > 0.0 and by_logit[rows].abs().max() < 1e-9, "a head that adds opacity is paid for it"
-    model.config.densification = "mcmc"  # which has terms of its own
+    model.config.densification = Mcmc()  # which has terms of its own
     assert model.shrinking() == {}
-
-
-@pytest.mark.parametrize("written, read", [("on", "auto"), ("auto", "auto"), ("off", "off")])
-def test_options_of_an_older_config_are_todays(written, read):
-    old = vars(NrfgsModelConfig()) | {"head_from": 0.3, "few_views": written, "densification": "consistent"}
-    del old["keep"], old["shrinkage"]
-    config = NrfgsModelConfig.__new__(NrfgsModelConfig)
-    config.__setstate__(old)
-    assert (config.few_views, config.densification) == (read, "splatfacto") and not hasattr(config, "head_from")
-    assert (config.keep, config.shrinkage) == (1.0, 0.0)

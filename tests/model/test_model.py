@@ -73,7 +73,7 @@ def test_background_shows_where_splats_let_it(build, training):
 
 def test_densification_over_asks_for_no_more_gradients(build):
     """Gradients on the screen are kept until the last refinement, and no longer."""
-    pipeline = build("nrfgs", "--pipeline.model.stop-split-at", 5, "--pipeline.model.use-absgrad", True)
+    pipeline = build("nrfgs", "--pipeline.model.densification", "splatfacto,stop_split_at=5")
     model = pipeline.model.train()
     camera, batch = pipeline.datamanager.next_train(0)
     for step in (4, 5):

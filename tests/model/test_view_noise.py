@@ -15,8 +15,7 @@ from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 
 NRFGS = {
     "--pipeline.model.num-downscales": 0,
-    "--pipeline.model.warmup-length": 2,
-    "--pipeline.model.refine-every": 4,
+    "--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4",
 }
 
 

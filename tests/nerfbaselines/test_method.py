@@ -237,7 +237,7 @@ def test_presets_are_those_of_ns_train(method, steps, schedule, densification):
     (one,) = [cls for cls in (Nrfgs, *Nrfgs.__subclasses__()) if cls.method == method]
     config = configure(one.method, {}, {})
     assert (config.max_num_iterations, config.schedule_steps) == (steps, schedule)
-    assert config.pipeline.model.densification == densification and config.method_name == method
+    assert config.pipeline.model.densification.name == densification and config.method_name == method
     assert one.get_method_info()["method_id"] == method
     assert configure(one.method, {"max_num_iterations": 50}, {}).schedule_steps == schedule
 

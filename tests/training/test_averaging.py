@@ -24,11 +24,11 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 CALM = {
     "--pipeline.model.num-downscales": 0,
-    "--pipeline.model.refine-every": 1000,
+    "--pipeline.model.densification": "splatfacto,refine_every=1000",
     "--pipeline.model.warmup-steps": 0,
 }
 """Nothing but the optimisers changes parameters, after the reset of opacity at step 0."""
-RESET = {"--pipeline.model.refine-every": 2, "--pipeline.model.reset-alpha-every": 4}
+RESET = {"--pipeline.model.densification": "splatfacto,refine_every=2,reset_alpha_every=4"}
 """Opacity is reset at steps 0 and 8. Splats neither come nor go: they wait for longer than that after a reset."""
 
 
@@ -96,7 +96,7 @@ def another_field(model, data, optimizers):
 
 
 def noise(model, data, optimizers):
-    relocation.diffuse(model.gauss_params, 1.0, torch.zeros(len(model.means)))
+    relocation.add_noise(model.gauss_params, 1.0, torch.zeros(len(model.means)))
 
 
 def a_step(model, data, optimizers):

@@ -279,7 +279,6 @@ def changed(**options):
     [
         {"pipeline__model__appearance__num_bands": 2},
         {"pipeline__model__appearance__color_scale": 0.3},
-        {"pipeline__model__densification": "mcmc"},
         {"pipeline__model__rasterize_mode": "antialiased"},
         {"pipeline__datamanager__dataparser__orientation_method": "none"},
         {"pipeline__datamanager__dataparser__scale_factor": 2.0},
@@ -298,11 +297,13 @@ def test_another_method_is_refused():
 
 
 def test_options_of_learning_may_change_and_are_named():
-    here = changed(optimizers__means__optimizer__lr=1e-5, max_num_iterations=600, pipeline__model__refine_every=50)
+    here = changed(
+        optimizers__means__optimizer__lr=1e-5, max_num_iterations=600, pipeline__model__densification__refine_every=50
+    )
     assert sorted(check_options(options_of(nrfgs.config), here)) == [
         "--max-num-iterations 0 -> 600",
         "--optimizers.means.optimizer.lr 0.00016 -> 1e-05",
-        "--pipeline.model.refine-every 100 -> 50",
+        "--pipeline.model.densification splatfacto -> splatfacto,refine_every=50",
     ]
 
 

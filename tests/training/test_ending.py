@@ -10,6 +10,7 @@ import pytest
 import torch
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 
+from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.checkpoint_files import DiskFull, find
@@ -21,10 +22,9 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 STEPS = 12
 BUSY = {
-    "--pipeline.model.warmup-length": 2,
-    "--pipeline.model.refine-every": 4,
-    "--pipeline.model.reset-alpha-every": 100,
-    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.densification": Splatfacto(
+        warmup_length=2, refine_every=4, reset_alpha_every=100, densify_grad_thresh=1e-6
+    ),
     "--pipeline.model.num-downscales": 0,
     "--steps-per-eval-image": 5,
     "--steps-per-eval-all-images": 5,
@@ -222,10 +222,8 @@ def test_a_folder_without_checkpoints_is_refused_before_the_data_is_read(tmp_pat
         ("--max-num-iterations", -1),
         ("--pipeline.model.warmup-steps", -1),
         ("--pipeline.model.view-noise", "inf"),
-        ("--pipeline.model.cull-alpha-thresh", 0.5),
+        ("--pipeline.model.ssim-lambda", "nan"),
         ("--pipeline.model.num-random", 0),
-        ("--pipeline.model.refine-every", 0),
-        ("--pipeline.model.reset-alpha-every", 0),
         ("--pipeline.model.resolution-schedule", 0),
         ("--pipeline.datamanager.camera-res-scale-factor", 0),
         ("--pipeline.datamanager.max-thread-workers", -1),

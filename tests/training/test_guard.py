@@ -22,7 +22,6 @@ def device(request):
 
 NAN, INF = math.nan, math.inf
 FULL_SIZE = {"--pipeline.model.num-downscales": 0}
-NOW = {"--pipeline.model.warmup-length": 1, "--pipeline.model.refine-every": 2}
 
 
 @pytest.fixture
@@ -300,7 +299,9 @@ def test_a_training_in_which_nothing_is_visible_stops(start):
 
 
 def test_a_training_without_splats_stops_and_saves_nothing(start):
-    trainer = start({"--pipeline.model.cull-alpha-thresh": 0.49}, NOW, steps=20)
+    trainer = start(
+        {"--pipeline.model.densification": "splatfacto,warmup_length=1,refine_every=2,cull_alpha_thresh=0.49"}, steps=20
+    )
     with pytest.raises(TrainingStopped, match="No splat is left in step 11: all were pruned") as stopped:
         trainer.train()
     assert stopped.value.origin == "nothing visible" and not checkpoints(trainer)

@@ -16,19 +16,18 @@ from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
+from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.run import evaluate, parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
 BUSY = {
-    "--pipeline.model.warmup-length": 2,
-    "--pipeline.model.refine-every": 4,
-    "--pipeline.model.reset-alpha-every": 6,
-    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.densification": Splatfacto(
+        warmup_length=2, refine_every=4, reset_alpha_every=6, densify_grad_thresh=1e-6, stop_split_at=100
+    ),
     "--pipeline.model.resolution-schedule": 10,
     "--pipeline.model.num-downscales": 1,
-    "--pipeline.model.stop-split-at": 100,
 }
 """Densify every 4th step, reset opacity every 24th. 8 training views hold densification back for 12 steps after it."""
 
@@ -198,7 +197,7 @@ def test_saved_config_is_the_run(finished):
     config = yaml.load(finished("nrfgs").read_text(), Loader=yaml.Loader)
     assert config.pipeline.model.appearance.latent_dim == 32
     assert config.machine.device_type == "cpu" or torch.cuda.is_available()
-    assert config.pipeline.model.refine_every == BUSY["--pipeline.model.refine-every"]
+    assert config.pipeline.model.densification == BUSY["--pipeline.model.densification"]
 
 
 def test_a_training_writes_into_no_log_of_an_earlier_one(tiny_scene, tmp_path):

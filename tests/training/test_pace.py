@@ -166,27 +166,17 @@ def test_learning_rates_are_those_of_the_position():
 
 
 SCHEDULES = {
-    "--pipeline.model.warmup-length": 8,
-    "--pipeline.model.refine-every": 2,
-    "--pipeline.model.reset-alpha-every": 100,
-    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.densification": (
+        "splatfacto,warmup_length=8,refine_every=2,reset_alpha_every=100,densify_grad_thresh=1e-6,stop_split_at=30"
+    ),
     "--pipeline.model.resolution-schedule": 10,
     "--pipeline.model.num-downscales": 1,
-    "--pipeline.model.stop-split-at": 30,
 }
 """All that has a schedule, laid out for 40 steps."""
 SH = {"--pipeline.model.appearance.degree-interval": 10}
-CALM = {"--pipeline.model.refine-every": 1000}
+CALM = {"--pipeline.model.densification": "splatfacto,refine_every=1000"}
 """No densification, which every second step would double the splats until a step takes a second."""
-MCMC = {
-    "--pipeline.model.densification": "mcmc",
-    "--pipeline.model.splat-budget": 400,
-    "--pipeline.model.mcmc.stop-at": 20,
-    "--pipeline.model.reset-alpha-every": None,
-    "--pipeline.model.densify-grad-thresh": None,
-    "--pipeline.model.stop-split-at": None,
-}
-"""MCMC, without the options that it refuses."""
+MCMC = {"--pipeline.model.densification": "mcmc,warmup_length=8,refine_every=2,budget=400,stop_at=20"}
 
 
 def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> list[str]:
@@ -288,7 +278,10 @@ def test_without_them_there_is_no_pace(tiny_scene, tmp_path):
     assert trainer.pipeline.model.schedule_step == 0
 
 
-SMALL = {"--pipeline.model.num-downscales": 0, "--pipeline.model.warmup-length": 2, "--pipeline.model.refine-every": 4}
+SMALL = {
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4",
+}
 VIEWS = 8
 """Training views of the tiny scene."""
 

@@ -130,7 +130,7 @@ QUICK = {
     "--pipeline.model.num-downscales": 1,
     "--pipeline.model.background-color": "black",
     "--pipeline.model.warmup-steps": 0,
-    "--pipeline.model.refine-every": 1000,
+    "--pipeline.model.densification": "splatfacto,refine_every=1000",
 }
 
 

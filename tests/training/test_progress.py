@@ -34,7 +34,7 @@ def screen(monkeypatch):
 
 def test_a_training_with_the_line_is_the_one_without(screen, tiny_scene, tmp_path):
     said = screen(terminal=False)
-    options = {"--pipeline.model.refine-every": 4, "--pipeline.model.warmup-length": 2}
+    options = {"--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4"}
     quiet = trained(command_line("nrfgs", tiny_scene, tmp_path / "quiet", 12, options))
     assert not said.getvalue()
     spoken = trained(command_line("nrfgs", tiny_scene, tmp_path / "spoken", 12, options, SPOKEN))

@@ -18,6 +18,7 @@ from smoke_runs import PLAIN, after_one_step, bound, cases, gain_bound
 from smoke_runs import STEPS as SHORT
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
+from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.training.checkpoint_files import find, read_latest
 from nrfgs_ns.training.run import evaluate, train
 
@@ -87,10 +88,9 @@ STEPS = 30
 OPTIONS = {
     "--steps-per-save": 1,
     "--average-steps": 4,
-    "--pipeline.model.warmup-length": 2,
-    "--pipeline.model.refine-every": 4,
-    "--pipeline.model.reset-alpha-every": 6,
-    "--pipeline.model.densify-grad-thresh": 1e-6,
+    "--pipeline.model.densification": Splatfacto(
+        warmup_length=2, refine_every=4, reset_alpha_every=6, densify_grad_thresh=1e-6
+    ),
     "--pipeline.model.num-downscales": 0,
     "--timestamp": "run",
 }

@@ -54,8 +54,7 @@ def training(tiny_scene, tmp_path_factory):
         "--pipeline.model.num-downscales": 0,
         "--pipeline.model.few-views": "off",
         "--pipeline.model.shrinkage": 0,
-        "--pipeline.model.refine-every": 20,
-        "--pipeline.model.warmup-length": 20,
+        "--pipeline.model.densification": "splatfacto,warmup_length=20,refine_every=20",
         "--optimizers.field.optimizer.lr": 0.05,  # something to show after a few steps
     }
     words = [word for option in options.items() for word in option]

@@ -38,6 +38,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
+from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.export.command import Ply
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
@@ -422,10 +423,9 @@ STEPS = 18
 def watched_training(scene, out, each_step, **more) -> dict:
     """Train for STEPS and call each_step(trainer) after each; parameters, optimisers and random state at the end."""
     options = {
-        "--pipeline.model.warmup-length": 2,
-        "--pipeline.model.refine-every": 4,
-        "--pipeline.model.reset-alpha-every": 100,
-        "--pipeline.model.densify-grad-thresh": 1e-6,
+        "--pipeline.model.densification": Splatfacto(
+            warmup_length=2, refine_every=4, reset_alpha_every=100, densify_grad_thresh=1e-6
+        ),
         "--pipeline.model.resolution-schedule": 9,
         "--pipeline.model.num-downscales": 1,
         "--pipeline.model.few-views": "off",

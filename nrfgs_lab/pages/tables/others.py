@@ -9,7 +9,7 @@ from nrfgs_lab.pages.tables.runs import grid, records, signed
 
 FEW = {
     "keep 0.5, three rounds": "`keep 0.5`, three rounds",
-    "4e-4, keep 0.5": "`densify-grad-thresh` halved, `keep 0.5`",
+    "4e-4, keep 0.5": "`densify_grad_thresh` halved, `keep 0.5`",
     "4e-4, keep 0.25": "halved, `keep 0.25`",
 }
 """Trial -> label."""

@@ -23,8 +23,8 @@ class Killed(BaseException):
 
 
 def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monkeypatch):
-    content = {"runs": {"NRF": "nrfgs"}, "scenes": ["tiny"], "strategies": ["mcmc@310"], "steps": 8}
-    options = "--pipeline.model.warmup-length 1 --pipeline.model.few-views off"
+    content = {"runs": {"NRF": "nrfgs"}, "scenes": ["tiny"], "strategies": ["mcmc@310,warmup_length=1"], "steps": 8}
+    options = "--pipeline.model.few-views off"
     content |= {"checkpoint_every": 2, "train_views": 3, "options": options}
     spec = make_spec(content, "test")
     (cell,) = cells_of(spec)

@@ -270,13 +270,13 @@ def test_without_submitit_it_says_what_to_install(tmp_path, monkeypatch):
 
 SPEC = """
 runs: {SH: nrfgs-sh, NRF: nrfgs}
-strategies: [original, mcmc@400]
+strategies: ['original,warmup_length=10,refine_every=10', 'mcmc@400,warmup_length=10,refine_every=10']
 scenes: [tiny]
 seeds: [1]
 steps: 120
 checkpoint_every: 20
 train_views: 3
-options: --pipeline.model.num-downscales 0 --pipeline.model.warmup-length 10 --pipeline.model.refine-every 10
+options: --pipeline.model.num-downscales 0
 """
 
 

@@ -28,6 +28,7 @@ from nrfgs_lab.bench.spec import (
 )
 from nrfgs_lab.pages.options import methods
 from nrfgs_lab.pages.tables.methods import HEADS, best_trial
+from nrfgs_ns.densification import Mcmc, Original, Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.run import parse
 
@@ -114,14 +115,8 @@ def test_a_run_may_have_its_own_scenes_and_a_scene_its_own_steps():
             {"strategies": ["mcmc"], "options": "--pipeline.model.densification original"},
             "densification is given.*mcmc",
         ),
-        ({"strategies": ["mcmc@9"], "options": "--pipeline.model.splat_budget 5"}, "splat-budget is given.*mcmc@9"),
-        (
-            {
-                "strategies": ["mcmc@9"],
-                "runs": {"N": {"method": "nrfgs", "options": "--pipeline.model.splat-budget=5"}},
-            },
-            "N: --pipeline.model.splat-budget is given.*mcmc@9",
-        ),
+        ({"strategies": ["mcmc@0"]}, "budget is 0"),
+        ({"strategies": ["original,budget=9"]}, "original has no option 'budget'"),
     ],
 )
 def test_what_is_wrong_is_named(content, says):
@@ -157,10 +152,10 @@ def test_presets_steps_are_those_of_the_presets():
 
 
 @pytest.mark.parametrize(
-    "strategy, densification, budget",
-    [("own", "splatfacto", 10**6), ("original", "original", 10**6), ("mcmc@77", "mcmc", 77)],
+    "strategy, densification",
+    [("own", Splatfacto()), ("original", Original()), ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9))],
 )
-def test_the_command_means_what_the_file_says(strategy, densification, budget, tiny_scene, tmp_path):
+def test_the_command_means_what_the_file_says(strategy, densification, tiny_scene, tmp_path):
     runs = {"NRF": {"method": "nrfgs", "options": "--pipeline.model.appearance.latent-dim 9"}}
     more = "--pipeline.model.num-downscales 0"
     plan = spec(runs=runs, strategies=[strategy], steps=7, seeds=[5], options=more)
@@ -168,7 +163,7 @@ def test_the_command_means_what_the_file_says(strategy, densification, budget, t
     parser = parser_options(tiny_scene.parent, Scene(tiny_scene.name), tmp_path)
     config = parse(command(plan, cell, parser, tmp_path))
     model = config.pipeline.model
-    assert (model.densification, model.splat_budget) == (densification, budget)
+    assert model.densification == densification
     assert (config.max_num_iterations, config.machine.seed, model.num_downscales) == (7, 5, 0)
     assert model.appearance.latent_dim == 9
     assert config.pipeline.datamanager.dataparser.data == tiny_scene

@@ -66,7 +66,7 @@ def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tm
     monkeypatch.setitem(eval_utils.all_methods, "linear", configs["linear"])
     monkeypatch.setattr(run, "AnnotatedBaseConfigUnion", run.tyro.extras.subcommand_type_from_defaults(configs))
     args = ["linear", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "25"]
-    args += ["--vis", "tensorboard", "--pipeline.model.warmup-length", "5", "--pipeline.model.refine-every", "10"]
+    args += ["--vis", "tensorboard", "--pipeline.model.densification", "splatfacto,warmup_length=5,refine_every=10"]
     args += ["--steps-per-eval-image", "1000", "--steps-per-eval-all-images", "1000"]
     record = train([*args, "--pipeline.model.num-downscales", "0"])
     state = torch.load(next(tmp_path.rglob("*.ckpt")), weights_only=True)["pipeline"]
