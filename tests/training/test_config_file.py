@@ -16,7 +16,6 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.config_file import read_config
 
 METHODS = ["nrfgs", "nrfgs_fast", "nrfgs_best", "nrfgs_sh", "nrfgs_vdgs", "nrfgs_gsnb", "nrfgs_sg"]
-SAVED = Path(__file__).resolve().parents[1] / "fixtures" / "saved_0_1_0"
 
 
 @pytest.fixture
@@ -54,14 +53,6 @@ def test_nerfstudios_colmap_parser_is_read_back(saved):
     read = read_config(saved(yaml.dump(config)))
     assert read == config and read.pipeline.datamanager.dataparser.setup is not None
     assert read.optimizers["field"]["optimizer"]._target is torch.optim.Adam
-
-
-@pytest.mark.parametrize("name", ["whole", "reduced"])
-def test_a_configuration_of_an_older_version_is_read(name):
-    path = SAVED / name / "config.yml"
-    read, plain = read_config(path), yaml.load(path.read_text(), Loader=yaml.Loader)
-    assert type(read) is type(plain) and read.pipeline.model.appearance == plain.pipeline.model.appearance
-    assert vars(read).keys() == vars(plain).keys()
 
 
 WHOLE = yaml.dump(method_config.nrfgs.config)
