@@ -112,11 +112,16 @@ class NrfgsModelConfig(ModelConfig):
                 fix = " or ".join(map(repr, choices))
                 raise InputError(f"pipeline.model.{name} is {getattr(self, name)!r}; use {fix}.")
         for names, low, high, needed in (
-            (("view_noise", "shrinkage", "warmup_steps", "num_downscales"), 0, math.inf, "zero or positive"),
+            (
+                ("view_noise", "shrinkage", "warmup_steps", "num_downscales", "max_gauss_ratio"),
+                0,
+                math.inf,
+                "zero or positive",
+            ),
             (("ssim_lambda",), 0, 1 + EPSILON, "from 0 to 1"),
             (("robust_loss",), 0, 1, "at least 0 and below 1"),
             (("random_scale",), EPSILON, math.inf, "positive"),
-            (("resolution_schedule", "num_random", "max_gauss_ratio"), 1, math.inf, "at least 1"),
+            (("resolution_schedule", "num_random"), 1, math.inf, "at least 1"),
         ):
             for name in names:
                 value = getattr(self, name)

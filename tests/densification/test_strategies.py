@@ -2,13 +2,11 @@
 """Densification strategies: what they delete, copy, move and add, and by which thresholds."""
 
 from copy import deepcopy
-from dataclasses import fields
 
 import pytest
 import torch
 import yaml
 from densification_cases import REFINES, STRATEGIES, Table, strategy
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import Mcmc, Original, Splatfacto, strategy_from
@@ -113,13 +111,6 @@ def test_original_prunes_large_splats_after_the_first_reset():
         table.splats["scales"].data[4] = torch.tensor(0.11).log()
         table.step(strategy("original"), step)
         assert len(table) == left
-
-
-def test_splatfactos_options_and_defaults_are_its_own():
-    theirs = SplatfactoModelConfig()
-    for field in fields(Splatfacto):
-        if field.name not in ("opacity_seen", "keep"):
-            assert field.default == getattr(theirs, field.name), field.name
 
 
 # The option on the command line.
