@@ -74,14 +74,13 @@ def to_all(open_viewer) -> Viewer:
 
 def reachable(address: str, port: int) -> bool:
     with socket.socket() as probe:
-        probe.settimeout(5)
         return probe.connect_ex((address, port)) == 0
 
 
 def answer(address: str, port: int, path: str, *headers: str, host: str | None = None) -> tuple[int, bytes]:
     """Status and body of the answer to a GET whose path is sent as it is."""
     lines = [f"GET {path} HTTP/1.1", f"Host: {host or f'{address}:{port}'}", *headers, "", ""]
-    with socket.create_connection((address, port), timeout=20) as connection:
+    with socket.create_connection((address, port)) as connection:
         connection.sendall("\r\n".join(lines).encode())
         received = b""
         # A WebSocket stays open; all others are closed behind the body.
@@ -217,10 +216,8 @@ def send(port: int, messages: list, until=lambda: True) -> None:
             reading = asyncio.create_task(read())
             for message in messages:
                 await client.send(msgspec.msgpack.encode(message) if isinstance(message, dict) else message)
-            deadline = time.time() + 60
-            while not until():
-                assert time.time() < deadline, "what was waited for has not come"
-                await asyncio.sleep(0.05)
+            while not until():  # as long as the machine needs; pytest ends what never comes
+                await asyncio.sleep(0.01)
             reading.cancel()
 
     asyncio.run(talk())
@@ -284,10 +281,8 @@ def test_messages_that_no_page_sends_do_nothing(to_all):
     send(port, [*garbage, CAMERA, update(slider, 128)], lambda: slider.value == 128)
     assert viewer.viser_server._share_tunnel is None
     assert not viewer.viser_server.gui._current_file_upload_states
-    deadline = time.time() + 120
-    while viewer.render_statemachines and time.time() < deadline:
-        time.sleep(0.1)
-    assert not viewer.render_statemachines, "the client that has gone is still drawn for"
+    while viewer.render_statemachines:  # until the client that has gone is no longer drawn for
+        time.sleep(0.01)
 
 
 def test_a_browser_that_leaves_while_its_camera_moves_stops_nobody(to_all):
@@ -367,11 +362,11 @@ def test_nrfgs_view_opens_a_compact_file_alone(tiny_scene, tmp_path, monkeypatch
             async with connect(f"ws://127.0.0.1:{port}", max_size=None) as client:
                 await client.send(msgspec.msgpack.encode(away))
                 while not {"SetCameraPositionMessage", "SetCameraLookAtMessage"} <= {one["type"] for one in moved}:
-                    moved.extend(msgspec.msgpack.decode(await asyncio.wait_for(client.recv(), 60)))
+                    moved.extend(msgspec.msgpack.decode(await client.recv()))
                 while not drawn:
-                    await asyncio.sleep(0.1)
+                    await asyncio.sleep(0.01)
 
-        asyncio.run(asyncio.wait_for(be_moved(), 100))
+        asyncio.run(be_moved())
     finally:
         viewer.viser_server.stop()
     assert os.listdir(tmp_path / "alone") == ["it.nrf"], "nothing is written beside it"
