@@ -19,6 +19,7 @@ from torch import Tensor
 from viser import _gui_api, _gui_handles, _icons
 
 from nrfgs_ns.data.pictures import open_picture
+from nrfgs_ns.threads import few_threads
 
 SIDE = 100
 """Pixels of the shorter side as shown."""
@@ -80,11 +81,7 @@ def _with_small_photographs(init_scene):
     @functools.wraps(init_scene)
     def init_small_scene(self, train_dataset, *args, **options) -> None:
         read = vars(self.pipeline.datamanager).get("cached_train")  # read by now, or not at all
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # so little work takes several threads, on a busy machine, ten times as long
-        try:
+        with few_threads():
             init_scene(self, SmallPhotographs(train_dataset, read), *args, **options)
-        finally:
-            torch.set_num_threads(threads)
 
     return init_small_scene
