@@ -13,8 +13,8 @@ Conventions, for every function of this module:
   the mask by the truth, so that nothing outside can cost anything; SSIM and MS-SSIM then average over the windows whose
   centre is inside. LPIPS cannot leave pixels out of its average: under a mask it is a lower bound.
 - Colour-corrected metrics (cc_psnr, cc_ssim, ...) are those of the prediction after the affine map of its colours that
-  takes it nearest to the truth (`color_fit.py`), one for each image: what is left of the error when exposure and white
-  balance of a test photograph, which no method can know, are put aside. They never stand alone.
+  is nearest to the truth (`fit_colors`), one for each image: the error that is left without the test photograph's
+  exposure and white balance, which no method can know. Never quote them alone.
 - Arithmetic is float32, or float64 if the images are, or if they are on CUDA: there a float32 convolution may run in
   TF32, whose 10 bits of mantissa SSIM's differences of squares cannot stand. On a CPU float64 convolutions are several
   times slower, and not needed. No gradient is recorded.
@@ -28,10 +28,9 @@ import pickle
 
 import torch
 import torch.nn.functional as F
+from pytorch_msssim import SSIM
 from rich import get_console
 from torch import Tensor
-
-from nrfgs_ns.image.color_fit import fit_colors
 
 AS_THEY_ARE = ("psnr", "ssim", "ms_ssim", "l1", "lpips")
 METRIC_NAMES = (*AS_THEY_ARE, *(f"cc_{name}" for name in AS_THEY_ARE))
@@ -40,6 +39,13 @@ WINDOW_SIZE = 11
 """Side of the SSIM window, pixels (Wang et al. 2004)."""
 WINDOW_SIGMA = 1.5
 """Standard deviation of the Gaussian inside the window, pixels."""
+REACH = WINDOW_SIZE // 2
+"""Pixels from a window's centre to its edge."""
+LIBRARY = SSIM(data_range=1.0, size_average=True, channel=3, win_size=WINDOW_SIZE, win_sigma=WINDOW_SIGMA)
+"""SSIM of pytorch_msssim, of images [1, 3, H, W]."""
+WEIGHTS = tuple(LIBRARY.win[0].flatten().tolist())
+"""The window along one axis, rounded to float32 like the library's: where an image is bright and flat, E[xx] - E[x]^2
+feels that they do not quite add up to 1."""
 SSIM_C1 = 0.01**2
 """Stabiliser of the luminance term, (K1 * data range)^2."""
 SSIM_C2 = 0.03**2
@@ -151,6 +157,30 @@ def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[
     }
 
 
+@torch.no_grad()
+def fit_colors(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Apply the affine map of colours that takes a prediction nearest to the truth.
+
+    Least squares over the pixels inside the mask: 12 numbers for an image, the same for all of its pixels.
+
+    Args:
+        pred, gt: [H, W, 3] in [0, 1].
+        mask: [H, W, 1] bool, True inside; None: everywhere.
+
+    Returns:
+        [H, W, 3] in [0, 1]. A prediction that is not finite, or has nothing inside the mask, comes back as it is.
+    """
+    colors = torch.cat([pred.double(), torch.ones_like(pred[..., :1], dtype=torch.float64)], dim=-1)
+    inside, wanted = (
+        image.reshape(-1, image.shape[-1]) if mask is None else image[mask[..., 0]] for image in (colors, gt.double())
+    )
+    if len(inside) == 0 or not torch.isfinite(inside).all():
+        return pred
+    # The pseudo-inverse: an image of one colour determines fewer than 12 numbers.
+    affine = torch.linalg.pinv(inside.T @ inside, hermitian=True) @ (inside.T @ wanted)
+    return (colors @ affine).clamp(0.0, 1.0).to(pred.dtype)
+
+
 def _lpips(pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
     net = _lpips_net()
     if net is None:
@@ -164,16 +194,6 @@ def _lpips(pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
         return net.to(gt.device)(pred, gt, normalize=True).item()
 
 
-def _check(pred: Tensor, gt: Tensor, mask: Tensor | None) -> None:
-    """Raises ValueError unless the shapes and dtypes are those of the module's conventions."""
-    if pred.shape != gt.shape or gt.ndim != 3 or gt.shape[-1] != 3 or gt.numel() == 0:
-        raise ValueError(f"pred and gt must be [H, W, 3] alike, got {tuple(pred.shape)} and {tuple(gt.shape)}")
-    if not (pred.is_floating_point() and gt.is_floating_point()):
-        raise ValueError(f"pred and gt must be floats in [0, 1], got {pred.dtype} and {gt.dtype}")
-    if mask is not None and (mask.shape != (*gt.shape[:2], 1) or mask.dtype != torch.bool):
-        raise ValueError(f"mask must be {(*gt.shape[:2], 1)} bool, got {tuple(mask.shape)} {mask.dtype}")
-
-
 def _precise(image: Tensor) -> Tensor:
     """The image in the dtype that this module calculates in (see its docstring)."""
     return image.to(torch.promote_types(image.dtype, torch.float64 if image.is_cuda else torch.float32))
@@ -181,7 +201,6 @@ def _precise(image: Tensor) -> Tensor:
 
 def _errors_inside(pred: Tensor, gt: Tensor, mask: Tensor | None) -> Tensor | None:
     """Pred - gt of the pixels inside, [N, 3], without gradient; None if there are none."""
-    _check(pred, gt, mask)
     error = _precise(pred.detach()) - _precise(gt.detach())
     if mask is None:
         return error.reshape(-1, 3)
@@ -191,7 +210,6 @@ def _errors_inside(pred: Tensor, gt: Tensor, mask: Tensor | None) -> Tensor | No
 
 def _planes(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
     """Images channel-first [3, H, W] and the mask [H, W], with the truth in place of the prediction outside."""
-    _check(pred, gt, mask)
     pred, gt = (_precise(image).movedim(-1, 0).contiguous() for image in (pred, gt))
     if mask is None:
         return pred, gt, None
@@ -203,8 +221,7 @@ def _mean_over_centres(maps: Tensor, mask: Tensor | None) -> Tensor | None:
     """Mean per channel [3] of maps [3, H - 10, W - 10] over the windows centred inside mask [H, W]; None if none is."""
     if mask is None:
         return maps.mean((-2, -1))
-    margin = WINDOW_SIZE // 2
-    inside = maps[:, mask[margin:-margin, margin:-margin]]
+    inside = maps[:, mask[REACH:-REACH, REACH:-REACH]]
     return inside.mean(-1) if inside.shape[-1] else None
 
 

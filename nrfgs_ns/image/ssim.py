@@ -18,20 +18,12 @@ Images with a side shorter than the window go to pytorch_msssim, which warns and
 
 import torch
 import torch.nn.functional as F
-from pytorch_msssim import SSIM
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.image.metrics import SSIM_C1, SSIM_C2, WINDOW_SIGMA, WINDOW_SIZE
+from nrfgs_ns.image.metrics import LIBRARY, SSIM_C1, SSIM_C2, WEIGHTS, WINDOW_SIZE
 from nrfgs_ns.kernels.trial import Gate
 
-REACH = WINDOW_SIZE // 2
-"""Pixels from a window's centre to its edge."""
-LIBRARY = SSIM(data_range=1.0, size_average=True, channel=3, win_size=WINDOW_SIZE, win_sigma=WINDOW_SIGMA)
-"""pytorch_msssim's SSIM, of images [1, 3, H, W]."""
-WEIGHTS = tuple(LIBRARY.win[0].flatten().tolist())
-"""The window along one axis, rounded to float32 like the library's: where an image is bright and flat, E[xx] - E[x]^2
-feels that they do not quite add up to 1."""
 MAX_NUMBERS = 2**31
 """The kernels index slopes with 32 bits: three slopes of an image must have fewer numbers."""
 
@@ -42,9 +34,6 @@ def ssim(prediction: Tensor, truth: Tensor) -> Tensor:
     Args:
         prediction: [H, W, 3].
         truth: [H, W, 3], without gradient.
-
-    Raises:
-        ValueError: the shapes differ or are no colour images, or the truth requires a gradient.
     """
     return _weighted_sum(prediction, truth, 0.0, 1.0, 0.0)
 
@@ -56,21 +45,13 @@ def photometric_loss(prediction: Tensor, truth: Tensor, ssim_lambda: float) -> T
         prediction: [H, W, 3].
         truth: [H, W, 3], without gradient.
         ssim_lambda: weight of SSIM, in [0, 1].
-
-    Raises:
-        ValueError: the shapes differ or are no colour images, or the truth requires a gradient.
     """
     return _weighted_sum(prediction, truth, 1.0 - ssim_lambda, -ssim_lambda, ssim_lambda)
 
 
 def _weighted_sum(prediction: Tensor, truth: Tensor, l1_weight: float, ssim_weight: float, constant: float) -> Tensor:
     """l1_weight mean |prediction - truth| + ssim_weight SSIM + constant."""
-    shape = prediction.shape
-    if shape != truth.shape or len(shape) != 3 or shape[2] != 3:
-        raise ValueError(f"prediction {list(shape)} and truth {list(truth.shape)} must both be [H, W, 3].")
-    if truth.requires_grad:
-        raise ValueError("truth requires a gradient, and SSIM has none for it; pass truth.detach().")
-    if min(shape[0], shape[1]) < WINDOW_SIZE:
+    if min(prediction.shape[:2]) < WINDOW_SIZE:
         similarity = LIBRARY(prediction.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None])
     elif _kernels_take(prediction, truth):
         from nrfgs_ns.image.ssim_triton import WeightedSum
@@ -83,7 +64,7 @@ def _weighted_sum(prediction: Tensor, truth: Tensor, l1_weight: float, ssim_weig
 
 
 def try_kernels(device: torch.device) -> None:
-    """Find out whether the kernels run on a CUDA device, which compiles them: the first step would."""
+    """Try the kernels on a CUDA device, which compiles them before the first step."""
     _kernels_run_on(device)
 
 
@@ -130,7 +111,7 @@ def _blur(planes: Tensor) -> Tensor:
 
 
 def _kernels_take(prediction: Tensor, truth: Tensor) -> bool:
-    """Whether the kernels compute this pair."""
+    """Whether the kernels can compute this pair."""
     return (
         prediction.is_cuda
         and truth.is_cuda

@@ -16,7 +16,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.image import ssim
+from nrfgs_ns.image import metrics
 from nrfgs_ns.kernels.launch import Launcher
 
 COLUMNS = 128
@@ -27,17 +27,17 @@ WARPS = 4
 """Warps of a program."""
 
 CHANNELS = tl.constexpr(3)
-SIZE = tl.constexpr(ssim.WINDOW_SIZE)
-REACH = tl.constexpr(ssim.REACH)
-C1 = tl.constexpr(ssim.SSIM_C1)
-C2 = tl.constexpr(ssim.SSIM_C2)
+SIZE = tl.constexpr(metrics.WINDOW_SIZE)
+REACH = tl.constexpr(metrics.REACH)
+C1 = tl.constexpr(metrics.SSIM_C1)
+C2 = tl.constexpr(metrics.SSIM_C2)
 # The window is symmetric: W0 is the weight of its ends, W5 of its centre.
-W0 = tl.constexpr(ssim.WEIGHTS[0])
-W1 = tl.constexpr(ssim.WEIGHTS[1])
-W2 = tl.constexpr(ssim.WEIGHTS[2])
-W3 = tl.constexpr(ssim.WEIGHTS[3])
-W4 = tl.constexpr(ssim.WEIGHTS[4])
-W5 = tl.constexpr(ssim.WEIGHTS[5])
+W0 = tl.constexpr(metrics.WEIGHTS[0])
+W1 = tl.constexpr(metrics.WEIGHTS[1])
+W2 = tl.constexpr(metrics.WEIGHTS[2])
+W3 = tl.constexpr(metrics.WEIGHTS[3])
+W4 = tl.constexpr(metrics.WEIGHTS[4])
+W5 = tl.constexpr(metrics.WEIGHTS[5])
 
 
 @triton.jit
@@ -204,7 +204,7 @@ class WeightedSum(torch.autograd.Function):
     def forward(ctx, prediction: Tensor, truth: Tensor, l1_weight: float, ssim_weight: float, constant: float):
         prediction, truth = prediction.detach().contiguous(), truth.contiguous()
         height, width = prediction.shape[0], 3 * prediction.shape[1]
-        border = ssim.WINDOW_SIZE - 1
+        border = metrics.WINDOW_SIZE - 1
         l1_scale = l1_weight / (height * width)
         ssim_scale = ssim_weight / ((height - border) * (width - 3 * border))
         grid = (-(-width // COLUMNS), -(-height // ROWS), 1)
