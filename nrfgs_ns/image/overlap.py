@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far photographs disagree about how bright, and of what colour, the same points are.
+"""Exposure and white balance of photographs, estimated from the points that they share.
 
-A point of the reconstruction is looked up in the photographs that see it. Photographs taken next to each other have
-most points in common, and see them under almost the same angle. Their light differs by a shift, in stops:
+Photographs taken next to each other share most points of the reconstruction, seen under almost the same angle. Their
+light differs by a shift, in stops:
 
-- If exposure or white balance changed, by the same shift all over the picture.
-- If surfaces shine, points are occluded or the sun has moved, by other shifts in other parts of the picture.
+- If exposure or white balance changed, the shift is the same all over the image.
+- If surfaces shine, points are occluded or the sun has moved, it varies over the image.
 
-So a picture is divided into regions. The shift of a pair of photographs is the median over the regions' medians, and
-its noise is how far the regions disagree. What counts is not that photographs differ, but that they differ by more than
-their places explain (`estimate`).
+So an image is divided into regions. The shift of a pair of photographs is the median over the regions' medians, and its
+noise is the spread of the regions. Differences that the camera positions explain do not count (`estimate`).
 """
 
 import math
@@ -24,45 +23,44 @@ from torch import Tensor
 from nrfgs_ns.image.photograph import GAMMA, TOE
 
 LONGEST_SIDE = 400
-"""Pixels to which a photograph is averaged down where a point lies: its position is not good to the pixel."""
+"""Pixels of the longest side after averaging around each point: its position is not exact to the pixel."""
 MOST_POINTS = 20_000
-"""Of the reconstruction; of more, as many are drawn."""
+"""Of the reconstruction; of more, this number is drawn."""
 CELL, NEARER = 8, 0.02
-"""A point is hidden if, in its square of so many averaged pixels, another is nearer by more than this share."""
+"""Side of a cell in averaged pixels; a point is hidden if another in its cell is nearer by more than this share."""
 DARKEST, BRIGHTEST = 0.06, 0.94
-"""Values between which a pixel tells its light: noise below, clipped above."""
+"""Range of usable pixel values: noise below, clipping above."""
 REGIONS = 4
-"""Along each side of a picture."""
+"""Along each side of an image."""
 FEWEST_POINTS, FEWEST_REGIONS = 12, 4
-"""In a region, and regions of a pair."""
+"""Minimum points in a region, and regions of a pair."""
 NEIGHBOURS, CANDIDATES = 4, 12
 """Other photographs that each is compared with, and how many of the nearest are tried."""
 
 ENOUGH_STOPS = 0.12, 0.06, 0.06
-"""By so much must photographs differ from what their places explain for exposure, log2(R/G) or log2(B/G) to be learnt.
-Captures that do not need it have up to 0.05 stops of exposure and 0.02 of colour; one that does, 0.26."""
+"""Minimum spread of exposure, log2(R/G) or log2(B/G) between photographs, beyond what their positions explain, for them
+to be learnt. Captures that do not need it have up to 0.05 stops of exposure and 0.02 of colour; one that does, 0.26."""
 ENOUGH_KNOWN_STOPS = 0.3
-"""By so much must known exposures vary."""
+"""Minimum spread of EXIF exposures, in stops."""
 FEWEST_PAIRS = 8
-"""Of a capture, to be told by."""
+"""Minimum number of pairs needed to decide."""
 MOST_PHOTOGRAPHS = 1000
-"""Of more, the first so many say how photographs differ, and of all only the mean is taken for the scene's: telling
-patterns apart takes their number cubed."""
+"""Larger captures: the spread is estimated from the first 1,000, and only the mean is held; the cost is cubic."""
 
 SMALLEST_SPREAD = 0.02
-"""Stops; regions that agree by chance do not make a pair certain."""
+"""Smallest noise of a pair, in stops: regions that agree by chance do not make it certain."""
 USUAL_STOPS = 0.3, 0.1, 0.1
-"""How far exposure, log2(R/G) and log2(B/G) of a photograph are from the mean's where too few pairs tell it."""
+"""Spread of exposure, log2(R/G) and log2(B/G) assumed where there are too few pairs."""
 SIZES = tuple(0.01 * 1.5**step for step in range(12))
-"""Stops that are tried for what differs between photographs and between places: 0.01 to 0.86."""
+"""Candidate spreads between photographs and between positions, in stops: 0.01 to 0.86."""
 SCALES = 2.0, 8.0, 32.0
-"""Distances in which brightness changes with the place that are tried, in spacings of the cameras."""
+"""Candidate distances over which brightness changes with the position, in camera spacings."""
 MOST_PATTERNS = 128
-"""Of a column that are held."""
+"""Largest number of held patterns in a column."""
 
 
 class Pairs(NamedTuple):
-    """What E pairs of photographs next to each other say. Columns: mean log2 light, log2(R/G), log2(B/G)."""
+    """Shifts of E pairs of neighbouring photographs. Columns: mean log2 light, log2(R/G), log2(B/G)."""
 
     first: Tensor
     """[E]"""
@@ -71,18 +69,18 @@ class Pairs(NamedTuple):
     shift: Tensor
     """stops by which the second is above the first, [E, 3]"""
     spread: Tensor
-    """by how many stops the picture's regions disagree, [E, 3]"""
+    """disagreement of the image's regions, in stops, [E, 3]"""
 
 
 class Sighting(NamedTuple):
-    """The points that one photograph shows."""
+    """Points seen in one photograph."""
 
     points: Tensor
     """rows of the table of points, ascending, [M]"""
     light: Tensor
     """log2 of the light of red, green and blue, [M, 3]"""
     region: Tensor
-    """of the picture, [M]"""
+    """of the image, [M]"""
 
 
 def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tensor | None = None) -> Sighting:
@@ -93,7 +91,7 @@ def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tenso
         viewmat: world to camera, x right, y down, z forward. [4, 4]
         K: intrinsics in pixels. [3, 3]
         image: uint8, or in [0, 1]. [H, W, 3]
-        mask: bool [H, W], what counts; None: everything.
+        mask: bool [H, W], True inside; None: everywhere.
 
     Returns:
         On the host.
@@ -129,7 +127,7 @@ def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tenso
 
 
 def drawn(points: Tensor) -> Tensor:
-    """At most MOST_POINTS of the points [N, 3], the same ones each time."""
+    """Draw at most MOST_POINTS of the points [N, 3], the same ones each time."""
     if len(points) <= MOST_POINTS:
         return points
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
@@ -150,14 +148,14 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
     def shift_of(pair: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
         return _shift(sightings[pair[0]], sightings[pair[1]])
 
-    # Those that are asked for below unless they tell too little, on all processors.
+    # In parallel: the pairs needed below, except where one of them has too few common points.
     near = sorted(
         {(min(a, b), max(a, b)) for a, row in enumerate(nearest[:, :NEIGHBOURS].tolist()) for b in row if a != b}
     )
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         shifts = dict(zip(near, pool.map(shift_of, near), strict=True))
     done: set[tuple[int, int]] = set()
-    found: list[tuple[int, int, Tensor, Tensor]] = []
+    compared: list[tuple[int, int, Tensor, Tensor]] = []
     for one, candidates in enumerate(nearest.tolist()):
         neighbours = 0
         for other in candidates:
@@ -168,17 +166,16 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
             neighbours += shift is not None or pair in done
             if shift is not None:
                 done.add(pair)
-                found.append((*pair, *shift))
-    if not found:
+                compared.append((*pair, *shift))
+    if not compared:
         none = torch.zeros(0, dtype=torch.int64)
         return Pairs(none, none, torch.zeros(0, 3), torch.zeros(0, 3))
-    first, second, shift, spread = zip(*found, strict=True)
+    first, second, shift, spread = zip(*compared, strict=True)
     return Pairs(torch.tensor(first), torch.tensor(second), torch.stack(shift), torch.stack(spread))
 
 
 def _shift(first: Sighting, second: Sighting) -> tuple[Tensor, Tensor] | None:
-    """By how much the second is above the first, and how far the regions disagree, [3] each; None: too little in
-    common."""
+    """Shift from the first to the second and disagreement of the regions, [3] each; None: too few common points."""
     place = torch.searchsorted(second.points, first.points).clamp_max(max(len(second.points) - 1, 0))
     if len(second.points) == 0 or len(first.points) == 0:
         return None
@@ -212,15 +209,15 @@ def varies(known: Tensor) -> bool:
 
 
 def slope(pairs: Pairs, known: Tensor) -> tuple[float, float | None]:
-    """What known exposures say of the photographs' brightness.
+    """Regression of the photographs' brightness on their known exposures.
 
     Args:
         pairs: of the photographs.
         known: exposure of each in stops, NaN where it is not known. [V]
 
     Returns:
-        Stops of brightness for a stop of known exposure, 0 to 1; and which share of the shifts' squares that explains,
-        0 to 1. (1, None) if there are no pairs to tell it by.
+        Stops of brightness for a stop of known exposure, 0 to 1; and the share of the shifts' squares that this
+        explains, 0 to 1. (1, None) if there are too few pairs.
     """
     expected = known[pairs.second] - known[pairs.first]
     both = torch.isfinite(expected) & (expected.abs() > 0)
@@ -234,26 +231,26 @@ def slope(pairs: Pairs, known: Tensor) -> tuple[float, float | None]:
 
 
 class Looks(NamedTuple):
-    """What photographs say of their exposure before a training. Columns: exposure, log2(R/G), log2(B/G)."""
+    """Exposure before a training. Columns: exposure, log2(R/G), log2(B/G)."""
 
     stops: Tensor
-    """the likeliest of each photograph, mean 0, [V, 3]"""
+    """maximum-likelihood value of each photograph, mean 0, [V, 3]"""
     held: tuple[Tensor, Tensor, Tensor]
-    """for each column, orthonormal patterns over the photographs that are the scene's rather than theirs, the constant
-    among them, [V, K]"""
+    """for each column, orthonormal patterns over the photographs that belong to the scene, the constant among them,
+    [V, K]"""
     random: tuple[float, float, float]
-    """by how many stops a photograph differs from what the place explains, a standard deviation; 0 where too few pairs
-    tell it"""
+    """standard deviation between photographs beyond what their positions explain, in stops; 0 where there are too few
+    pairs"""
 
 
 def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
-    """Tell photographs' exposure from brightness that changes with the place.
+    """Separate photographs' exposures from brightness that changes with the camera's position.
 
-    A photograph's brightness is d = s + g: its exposure s, another for each photograph (variance a), and what changes
-    slowly with the place (a Gaussian process over the cameras, covariance b exp(-distance / scale)): light, gloss, and
-    exposure that follows the scene. a, b and the scale are those under which the pairs' shifts are likeliest, and b is
-    0 if that is hardly less likely (Schwarz's criterion). Patterns in which g is likelier than s belong to the scene:
-    view dependence learns them, and test views have them, too.
+    A photograph's brightness is d = s + g: its exposure s, independent for each photograph (variance a), and a part g
+    that changes slowly with the position (a Gaussian process over the cameras, covariance b exp(-distance / scale)):
+    light, gloss, and exposure that follows the scene. a, b and the scale maximise the likelihood of the pairs' shifts,
+    and b = 0 unless Schwarz's criterion favours b > 0. Patterns with more variance in g than in s belong to the scene:
+    view dependence learns them, and test views show them, too.
 
     Args:
         pairs: of the photographs.
@@ -269,12 +266,12 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
     rows = torch.arange(len(pairs.first))
     difference = torch.zeros(len(rows), count, dtype=torch.float64)
     difference[rows, pairs.second], difference[rows, pairs.first] = 1.0, -1.0
-    usual_stops, places, told = USUAL_STOPS, None, False
+    usual_stops, places, known_spread = USUAL_STOPS, None, False
     if count > MOST_PHOTOGRAPHS:
         first = (pairs.first < MOST_PHOTOGRAPHS) & (pairs.second < MOST_PHOTOGRAPHS)
         part = Pairs(*(value[first] for value in pairs))
         of_part = estimate(part, known[:MOST_PHOTOGRAPHS], centers[:MOST_PHOTOGRAPHS])
-        if told := any(of_part.random):
+        if known_spread := any(of_part.random):
             usual_stops = of_part.random
     elif len(rows) >= FEWEST_PAIRS:
         places = _places(centers)
@@ -286,7 +283,7 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
         seen = difference.T @ (weight * missing)
         if places is None:
             own, patterns = usual**2 * torch.eye(count, dtype=torch.float64), _constant(count)
-            size = usual if told else 0.0
+            size = usual if known_spread else 0.0
             total = own
         else:
             own, total, patterns, size = _split(places, precision, seen)
@@ -305,24 +302,23 @@ def _constant(count: int) -> Tensor:
 
 
 def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """For each of some scales, the covariance of what changes slowly with the place, of variance 1 and with mean 0 over
-    the photographs, as eigenvalues [V], falling, and eigenvectors [V, V]."""
+    """Covariance of g for each scale, of variance 1 and with mean 0 over the photographs: eigenvalues [V], falling, and
+    eigenvectors [V, V]."""
     distance = torch.cdist(centers.double(), centers.double())
     spacing = distance.sort(dim=1).values[:, 1 : 1 + NEIGHBOURS].mean().clamp_min(1e-12)
-    found = []
+    bases = []
     for scale in SCALES:
         covariance = torch.exp(-distance / (scale * spacing))
         covariance = covariance - covariance.mean(dim=0) - covariance.mean(dim=1, keepdim=True) + covariance.mean()
         values, vectors = torch.linalg.eigh(covariance)
-        found.append((values.flip(0).clamp_min(0.0), vectors.flip(1)))
-    return found
+        bases.append((values.flip(0).clamp_min(0.0), vectors.flip(1)))
+    return bases
 
 
 def _split(
     places: list[tuple[Tensor, Tensor]], precision: Tensor, seen: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, float]:
-    """How brightness divides: covariance of the photographs' own part, and of all; patterns that are the place's; and
-    the standard deviation of the own part.
+    """Separation of the brightness: covariance of s and of d, patterns that belong to g, standard deviation of s.
 
     Args:
         places: of `_places`.
@@ -330,9 +326,9 @@ def _split(
     """
     count = len(seen)
     eye = torch.eye(count, dtype=torch.float64)
-    told = precision.diagonal().clamp_min(1e-9)
-    brightness = torch.linalg.solve(precision + 1e-6 * told.mean() * eye, seen)
-    noise = float((1.0 / told).median())
+    own_precision = precision.diagonal().clamp_min(1e-9)
+    brightness = torch.linalg.solve(precision + 1e-6 * own_precision.mean() * eye, seen)
+    noise = float((1.0 / own_precision).median())
     best = None
     for shares, basis in places:
         squares = (basis.T @ brightness).square()
