@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """When the fused field is chosen. Its kernels: fused_interpreted.py."""
 
-import logging
-
 import pytest
 import torch
 from fused_cases import heads, scene
@@ -47,22 +45,6 @@ def test_sizes_beyond_the_kernels_are_named(sizes, monkeypatch):
     head, _ = heads(**sizes)
     with pytest.raises(InputError, match="its sizes are beyond the kernels'"):
         head(*scene(head, 20, 15))
-
-
-def test_falling_back_is_logged_once(caplog):
-    head = NrfConfig(latent_dim=65).setup()
-    device = torch.device("cuda")
-    # As `takes` would on a GPU, which this machine need not have: sizes are refused before anything is moved there.
-    caplog.set_level(logging.WARNING)
-    reasons = [head.fused._ready_on(device) for _ in range(2)]
-    assert reasons[0] == reasons[1]
-    assert len(caplog.records) == 1 and "beyond the kernels'" in caplog.text
-
-
-def test_state_dict_is_the_modules():
-    assert set(NrfConfig().setup().state_dict()) == {
-        f"{branch}.{layer}.{kind}" for branch in ("low", "high") for layer in (0, 2) for kind in ("weight", "bias")
-    }
 
 
 @pytest.mark.parametrize("config", [{}, {"split_bands": False}, {"num_bands": 1}, {"num_bands": 5, "latent_dim": 7}])

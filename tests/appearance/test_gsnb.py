@@ -83,12 +83,3 @@ def test_opposite_directions_along_an_axis_are_told_apart_by_the_direction_itsel
     splats["means"].zero_()
     x = torch.tensor([2.0, 0, 0], dtype=torch.double)
     assert torch.allclose(head(splats, visible, x).colors, head(splats, visible, -x).colors) != raw
-
-
-@pytest.mark.parametrize(
-    "field, value",
-    [("num_bands", 0), ("hidden_width", 0), ("distance_eps", -0.01), ("degree", -1)],
-)
-def test_impossible_settings_are_named(field, value):
-    with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):
-        GsnbConfig(**{field: value}).setup()

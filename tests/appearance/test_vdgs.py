@@ -156,17 +156,3 @@ def test_far_splats_find_rows_too(dtype):
     far = torch.tensor([[1e6, -1e6, 1e6], [-1e9, 1e9, 0.1], [1e30, -1e30, 0.0]], dtype=dtype)
     features = made(far)
     assert torch.isfinite(features).all() and (features != 0).any(dim=1).all()
-
-
-@pytest.mark.parametrize(
-    "field, value",
-    [
-        ("hidden_width", 0),
-        ("grid_base_resolution", 0),
-        ("distance_eps", 0.0),
-        ("degree", 4),
-    ],
-)
-def test_impossible_settings_are_named(field, value):
-    with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):
-        VdgsConfig(**{field: value}).setup()

@@ -8,11 +8,8 @@ from hypothesis import strategies as st
 from pytorch_msssim import SSIM
 from ssim_cases import MOMENT_ROUNDINGS, TOLERANCE, ULP, assert_near, pair, reference
 
-from nrfgs_ns.image import ssim as module
 from nrfgs_ns.image.metrics import SSIM_C2
 from nrfgs_ns.image.ssim import photometric_loss, ssim
-from nrfgs_ns.kernels import trial
-from nrfgs_ns.kernels.trial import Gate
 
 DOUBLE_TOLERANCE = TOLERANCE * 2.0**-29
 """The same bound for float64's 2^-53 instead of 2^-24."""
@@ -105,13 +102,3 @@ def test_not_a_number_is_seen():
     broken = prediction.detach().clone()
     broken[10, 10, 1] = float("nan")
     assert photometric_loss(broken, truth, 0.2).isnan()
-
-
-def test_without_triton_a_warning_and_torch(monkeypatch, caplog):
-    monkeypatch.setattr(module, "_GATE", Gate("SSIM"))
-    monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: None)
-    assert not module._kernels_run_on(torch.device("cpu"))
-    assert not module._kernels_run_on(torch.device("cpu"))
-    assert [record.getMessage() for record in caplog.records] == [
-        "SSIM runs in plain PyTorch on cpu: Triton is not installed."
-    ]
