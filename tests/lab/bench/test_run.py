@@ -71,20 +71,6 @@ def test_the_record_fits_the_checkpoint_that_is_there(tmp_path):
     assert earlier.saved == [[20, 2.0]]
 
 
-def test_a_full_disk_ends_no_training_for_a_note_of_its_progress(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError("no space left")
-
-    def train(args, stepped, saved, earlier):
-        stepped(1)
-        return TrainRecord(args, "")
-
-    monkeypatch.setattr(bench_run, "PROGRESS_SECONDS", 0.0)
-    monkeypatch.setattr(bench_run, "write_whole", full)
-    monkeypatch.setattr(bench_run, "train", train)
-    assert train_or_continue(job_in(tmp_path), tmp_path).config_path == ""
-
-
 def test_killed_in_the_middle_of_ns_eval(tmp_path, monkeypatch, trained):
     """The training is finished and some pictures are written; the next attempt evaluates, and trains no more."""
     job = job_in(tmp_path, steps=41)

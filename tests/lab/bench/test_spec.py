@@ -324,36 +324,6 @@ def test_a_data_set_of_the_same_name_elsewhere_is_read_there(tmp_path):
     ]
 
 
-def test_what_is_no_image_is_not_measured(tmp_path):
-    """A file that a desktop leaves in a folder sorts before the photographs."""
-    scene = colmap_scene(tmp_path / "line", text=False)
-    shutil.copytree(scene / "images", scene / "images_2")
-    for file in (scene / "images_2").iterdir():
-        Image.open(file).resize((48, 36)).save(file)
-    (scene / "images" / ".DS_Store").write_text("no image")
-    parser = parser_options(tmp_path, Scene("line", downscale=2), tmp_path / "mirrors")
-    assert parser[parser.index("--downscale-rounding-mode") + 1] == "floor"
-
-
-def test_dl3dv_is_read_from_the_downscaled_images_alone(tmp_path):
-    """Its transforms.json names images of full size, whose sizes it gives, and which the download lacks."""
-    folder = tmp_path / "hash" / "nerfstudio"
-    (folder / "images_4").mkdir(parents=True)
-    frames = []
-    for view in range(VIEWS):
-        pose = np.eye(4)
-        pose[:3, 3] = 0.1 * view, 0.05 * view, 0.02 * view**2
-        name = f"frame_{view:05d}.png"
-        Image.new("RGB", (24, 18), (20 * view,) * 3).save(folder / "images_4" / name)
-        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
-    sizes = {"w": 96, "h": 72, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 48.0, "cy": 36.0, "camera_model": "OPENCV"}
-    (folder / "transforms.json").write_text(json.dumps({**sizes, "frames": frames}))
-    data = load(parser_options(tmp_path, Scene("hash/nerfstudio", downscale=4), tmp_path / "mirrors"))
-    assert names_of(data.eval_dataset) == ["frame_00000.png", "frame_00008.png"]
-    cameras = data.train_dataset.cameras
-    assert (cameras.width[0].item(), cameras.height[0].item(), cameras.fx[0].item()) == (24, 18, FOCAL / 4)
-
-
 def test_nerfstudios_layout_is_read_by_our_parser(tiny_scene, tmp_path):
     parser = parser_options(tiny_scene.parent, Scene(tiny_scene.name), tmp_path)
     assert parser == ["nrfgs-data", "--data", str(tiny_scene)]
