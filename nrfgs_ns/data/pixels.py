@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
@@ -109,11 +110,8 @@ def _bytes(kind: str, *shape: int) -> int:
 
 def _mapped(folder: Path, name: str, form: list) -> torch.Tensor:
     """A tensor that is a file; what is written into it stays in memory."""
-    kind, *shape = form
-    count = torch.Size(shape).numel()
-    return torch.from_file(str(folder / f"{name}.bin"), shared=False, size=count, dtype=getattr(torch, kind)).view(
-        shape
-    )
+    kind, *shape = form  # not torch.from_file, which takes only names that are UTF-8
+    return torch.from_numpy(np.memmap(folder / f"{name}.bin", dtype=kind, mode="c", shape=tuple(shape)))
 
 
 def _folder(dataset: Any, index: int, image_type: str) -> Path:
