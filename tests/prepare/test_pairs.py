@@ -107,6 +107,3 @@ def test_the_forecast_counts_pairs_and_pixels():
         5 * 16e6 * forecast.MATCH
     )
     assert forecast.still_to_do(sizes, [4000] * 4, []) < few
-    assert [forecast.in_words(s) for s in (10, 61, 600, 9000)] == [
-        "less than a minute", "about 1 minute", "about 10 minutes", "about 2.5 hours",
-    ]  # fmt: skip
