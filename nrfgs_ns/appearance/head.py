@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The appearance head: the one seam between a splat's looks and everything else.
+"""The appearance head: the one seam between a splat's colours and opacity and everything else.
 
-The model asks a head three things. Which numbers does a splat store (`splat_params`)? They join the model's
-`gauss_params`, so that densification, optimisers and checkpoints carry them without knowing what they mean. What do
-the splats that this camera sees look like from it (`forward`)? And what do they look like from nowhere in particular
-(`base_appearance`)? Shared weights are the head's own parameters and never enter `gauss_params`. For people who want
-to see what a head has learnt, it can also be asked what its answer is made of (`components`).
+A head defines three things: the numbers that a splat stores (`splat_params`), which join the model's `gauss_params`, so
+that densification, optimisers and checkpoints carry them without knowing their meaning; the colours and opacities of
+the splats that a camera sees (`forward`); and their part that does not depend on the view (`base_appearance`). Shared
+weights are the head's own parameters and never enter `gauss_params`. `components` splits the result for the viewer.
 
 Nothing here knows nerfstudio or the rasterizer.
 """
@@ -25,7 +24,7 @@ SH_C0 = 0.28209479177387814
 
 
 class SplatAppearance(NamedTuple):
-    """What M splats look like from one camera position each."""
+    """Colours and opacities of M splats, from one camera position each."""
 
     colors: Tensor
     """Linear blend colours, [M, 3], >= 0; 1 is white."""
@@ -34,7 +33,7 @@ class SplatAppearance(NamedTuple):
 
 
 class Component(NamedTuple):
-    """One part of what a head answers, to be looked at."""
+    """One part of a head's result, for the viewer."""
 
     values: Tensor
     """[M, 3] for a change of colour, in units of white; [M, 1] otherwise."""
@@ -44,7 +43,7 @@ class Component(NamedTuple):
 
 @dataclass
 class AppearanceHeadConfig:
-    """What every head's configuration has: the class that it builds."""
+    """Base of all heads' configurations."""
 
     _target: type = field(default_factory=lambda: AppearanceHead)
     """the head class that this configuration builds"""
@@ -98,8 +97,7 @@ class AppearanceHead(nn.Module, ABC):
     sh_degree: int = 0
     """Degree of the spherical harmonics among the splats' parameters; 0 if there are none."""
     scene_unit: float = 1.0
-    """World units in a scene unit: the lengths in a head's configuration, and what it makes of distances, are in scene
-    units, so that a scene looks the same whatever it is measured in."""
+    """World units in a scene unit: a head works in scene units, so that a scene looks the same in any unit."""
     residual_params: tuple[str, ...] = ()
     """Those of `splat_params` that only the residual reads: a diffuse splat need not store them."""
     is_harmonics: bool = False
@@ -135,7 +133,7 @@ class AppearanceHead(nn.Module, ABC):
         )
 
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
-        """What the head's answer is made of, for the viewer and for logs: training never asks.
+        """Parts of the head's result, for the viewer and for logs; never called in training.
 
         A head that has more to show than its residual overrides this; every entry becomes a mode of the viewer under
         its name. Which entries there are must not depend on the arguments, and no visible splats (M = 0) must do.
@@ -158,12 +156,12 @@ class AppearanceHead(nn.Module, ABC):
         return None
 
     def try_kernels(self, device: torch.device) -> None:  # noqa: B027  (most heads have none)
-        """Find out whether the head's own kernels run on a CUDA device, which compiles them: the first step would."""
+        """Try the head's own kernels on a CUDA device, which compiles them before the first step."""
 
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor | None:
-        """How far the head is from adding nothing to the base appearance, as a scalar to minimise in the warm-up.
+        """Distance of the head from adding nothing to the base appearance, a scalar to minimise in the warm-up.
 
-        None if the head has no shared weights that could be taught.
+        None if the head has no shared weights to train.
         """
         return None
 
