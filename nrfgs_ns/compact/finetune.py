@@ -26,20 +26,20 @@ BYTE = 8
 """Bits."""
 EVERY = 4
 """Steps of which one counts bits, for all of them: it takes longer than a picture."""
-TOLD = 20 * EVERY
-"""Steps between two reports: to ask for a number waits for the GPU."""
+REPORT_EVERY = 20 * EVERY
+"""Steps between two reports: reading a number waits for the GPU."""
 NOISY = 0.3
 """Share of the steps in which noise stands for rounding; in the rest, numbers are rounded."""
 RATES = {"means": 1.6e-6, "turns": 5e-4, "scales": 2e-3, "opacities": 1e-2, "colors": 7e-4, "latents": 4e-3}
 """Learning rates of the tables; the means' in scene units, the latents' in standard deviations of the strongest."""
 STEPS_RATE, DENSITY_RATE, FIELD_RATE = 3e-2, 2e-2, 5e-4
 PRUNINGS = (0.08, 0.16, 0.24, 0.32)
-"""When splats go, in shares of the steps. Each time one of so many in the file's order is asked: neighbours, which hide
-behind each other, must not go together."""
+"""When splats are removed, in shares of the steps. Each time every fourth in the file's order is a candidate:
+neighbours, which hide behind each other, must not go together."""
 WORTH = 1.0
-"""What a splat's bytes may cost, over what the loss grows without it."""
+"""Weight of a splat's bytes against the growth of the loss without it."""
 LAST = 0.03
-"""Of the learning rates, at the end; they fall by a cosine."""
+"""Final share of the learning rates, which fall by a cosine."""
 
 
 def prepared(field: Field, weight: Tensor) -> Field:
@@ -75,7 +75,7 @@ class CodedSplats(nn.Module):
         self.density_of_latents = Density(values["latents"].float())
 
     def forward(self, rounded: bool) -> dict[str, Tensor]:
-        """The file's tables as they would come out of it."""
+        """The tables as read back from a file."""
         return {name: table(rounded) for name, table in self.tables.items()}
 
     def splats(self, tables: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -83,7 +83,7 @@ class CodedSplats(nn.Module):
         return splats_of(tables, self.diffuse)
 
     def bits(self, tables: Mapping[str, Tensor]) -> Tensor:
-        """What each splat costs in tables as `forward` gives them, [N]."""
+        """Bits of each splat in tables as `forward` gives them, [N]."""
         steps = {name: table.steps for name, table in self.tables.items()}
         bits = bits_of_places(tables["means"], steps["means"]) + self.density.bits(self._row(tables), self._row(steps))
         latents = self.density_of_latents.bits(tables["latents"], steps["latents"])
@@ -91,7 +91,7 @@ class CodedSplats(nn.Module):
 
     @torch.no_grad()
     def keep(self, kept: Tensor, optimizer: torch.optim.Optimizer) -> None:
-        """Let only the splats `kept`, bool [N], remain, and what the optimizer remembers of them."""
+        """Keep the splats `kept`, bool [N], and their optimizer state."""
         of_latents, self.diffuse = kept[~self.diffuse], self.diffuse[kept]
         for group, (name, table) in zip(optimizer.param_groups, self.tables.items(), strict=False):
             rows, old = of_latents if name == "latents" else kept, table.values
@@ -109,19 +109,19 @@ class CodedSplats(nn.Module):
 
 
 class Gated(NamedTuple):
-    """A field whose splats' opacities, as they are seen, are multiplied."""
+    """A field whose rendered opacities are multiplied."""
 
     field: Field
     gates: Tensor
     """[N]"""
 
     def seen_from(self, view: Sight) -> SplatAppearance:
-        look = self.field.seen_from(view)
-        return look._replace(opacities=look.opacities * self.gates[view.visible])
+        appearance = self.field.seen_from(view)
+        return appearance._replace(opacities=appearance.opacities * self.gates[view.visible])
 
 
 def without_them(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]]) -> tuple[Tensor, float]:
-    """How much larger the squared error of training views is without each splat, the others as they are.
+    """Growth of the training views' squared error without each splat, the others as they are.
 
     A pixel is linear in the opacity of each splat alone: taking splat i away takes d_p = dI_p / dg_i from each pixel p,
     where g_i = 1 multiplies its opacity, and the squared error grows by
@@ -184,11 +184,11 @@ def fine_tune(
         field: the field to begin with (`prepared`), with a neural residual field's head.
         next_view: a training camera and its photograph for each step.
         noise: on where the head is asked from.
-        views: how many training views tell what a splat is worth.
-        steps: how many.
-        rate: of the loss, for a byte of each splat.
+        views: number of training views on which splats are weighed.
+        steps: number of steps.
+        rate: loss for a byte of each splat.
         precision: the steps of the grids to begin with.
-        on_step: told the step and the bits, now and then.
+        on_step: called with the step and the bits, every REPORT_EVERY steps.
     """
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
     coded, count = CodedSplats(field.splats, precision), len(field.splats["means"])
@@ -215,18 +215,18 @@ def fine_tune(
             if step in prunings:
                 with torch.no_grad():
                     tables = coded(rounded=True)
-                    dear = coded.bits(tables) * (WORTH * rate / (BYTE * count))
+                    cost = coded.bits(tables) * (WORTH * rate / (BYTE * count))
                 growth, loss = without_them(model, Field(head, coded.splats(tables)), map(next_view, range(views)))
                 # The training's loss is about the root of the squared error.
-                kept = (turns != prunings.index(step)) | (0.5 * loss * growth > dear)
+                kept = (turns != prunings.index(step)) | (0.5 * loss * growth > cost)
                 coded.keep(kept, optimizer)
                 turns = turns[kept]
             camera, batch = next_view(step)
             tables = coded(rounded=step >= NOISY * steps)
             splats = coded.splats(tables)
             field = Field(head, splats)
-            asked = field._replace(splats=noise.moved(splats, step))
-            outputs, _ = model.render(field, camera, asked)
+            perturbed = field._replace(splats=noise.moved(splats, step))
+            outputs, _ = model.render(field, camera, perturbed)
             loss = model.photometric_loss(outputs, batch)
             if step % EVERY == 0:
                 bits = coded.bits(tables)
@@ -235,7 +235,7 @@ def fine_tune(
             loss.backward()
             optimizer.step()
             schedule.step()
-            if step % TOLD == 0:
+            if step % REPORT_EVERY == 0:
                 on_step(step, float(bits.detach().sum()))
     finally:
         model.train(was_training)

@@ -17,7 +17,7 @@ from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.finetune import TOLD, fine_tune, prepared
+from nrfgs_ns.compact.finetune import REPORT_EVERY, fine_tune, prepared
 from nrfgs_ns.compact.format import read_container, write_container
 from nrfgs_ns.compact.slim import FieldViews, look_over, slim
 from nrfgs_ns.compact.tables import Precision
@@ -118,7 +118,7 @@ def trained_for_the_file(
     centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
     noise = ViewNoise.as_long_as(model.noise_factor * camera_spacing(centers), torch.initial_seed())
     field, steps = prepared(chosen.field, chosen.weight), options.finetune
-    with progress("Training for the file", -(-steps // TOLD)) as advance:
+    with progress("Training for the file", -(-steps // REPORT_EVERY)) as advance:
         tuned = fine_tune(
             model,
             field,
