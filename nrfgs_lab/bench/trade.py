@@ -286,9 +286,8 @@ def draw(rows: list[Row], knobs: dict[str, str], path: Path) -> None:
                             linestyle="none",
                         )
                 front = front_of(of_scene, cost)
-                panel.step(
-                    *zip(*(points[run] for run in front), strict=True), where="post", color="grey", linewidth=0.8
-                )
+                xs, ys = ([points[run][axis] for run in front] for axis in (0, 1))
+                panel.step(xs, ys, where="post", color="grey", linewidth=0.8)
                 for number, run in enumerate(front):
                     offset = 3, (4, -9)[number % 2]
                     panel.annotate(plain_label(run), points[run], offset, textcoords="offset points", fontsize=6)

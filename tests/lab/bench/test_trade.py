@@ -178,5 +178,7 @@ def test_table_and_figure(tmp_path):
     text = table(rows, rows[0], result)
     assert r"| D_4\| | 2 | -1.00 |" in text and "| D 8 | 2 | (+0.01) |" in text and "| none | 0 | - |" in text
     assert change_text({"value": 1.0, "noise": None, "is_noise": True}, "FPS") == "[x 1.00]"
+    shared = [row("default", record(30.0, jobs=2)), row("D 8", record(31.0, jobs=2))]  # without times
+    draw(shared, knobs, tmp_path / "figure.png")
     draw(rows, knobs, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 5000
