@@ -34,7 +34,7 @@ import websockets.server
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer_legacy.server.viewer_state import ViewerLegacyState
-from viser import _messages, infra
+from viser import _client_autobuild, _messages, infra
 from viser.infra import _infra
 
 from nrfgs_ns.errors import InputError
@@ -85,6 +85,8 @@ def protect() -> None:
             f"pins. Run: pip install viser=={VISER_READ}."
         )
     infra.WebsockServer = GuardedServer
+    # The page is built. To ask, viser looks through all processes of the machine, and fails if one of them ends then.
+    _client_autobuild.ensure_client_is_built = lambda: None
     _infra.websockets = _Websockets()
     Viewer.__init__ = _guarded(Viewer.__init__)
     ViewerLegacyState.__init__ = _refused

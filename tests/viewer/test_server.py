@@ -10,6 +10,7 @@ import time
 from types import SimpleNamespace
 
 import msgspec
+import psutil
 import pytest
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.scripts.viewer import run_viewer
@@ -107,6 +108,14 @@ def test_the_network_is_refused_unless_it_is_asked_for(open_viewer, interface, c
     assert reachable("127.0.0.1", port)
     assert not reachable(interface, port)
     assert "127.0.0.1" in viewer.viewer_info[0] and f"ssh -L {port}:localhost:{port}" in viewer.viewer_info[-1]
+
+
+def test_processes_that_end_meanwhile_stop_no_viewer(open_viewer, monkeypatch):
+    def ended(self):
+        raise psutil.NoSuchProcess(self.pid)
+
+    monkeypatch.setattr(psutil.Process, "cwd", ended)
+    assert open_viewer(LocalViewerConfig()).viser_server.get_port()
 
 
 def test_a_busy_port_is_named_with_the_one_instead(open_viewer):
