@@ -11,9 +11,7 @@ written as a nerfstudio data set, or asked for its colour along any ray:
     scene = build_scene(SceneConfig(gloss=0.5))
     colours = scene.radiance(origins, directions)  # [N, 3] linear RGB
 
-Read `shading.py` for the equations, `scene.py` for how they are put together and for the layout, `geometry.py` for the
-ray tracing, `textures.py` for the patterns, `cameras.py` for the views and `dataset.py` for the files. Only numpy is
-needed, and Pillow and plyfile for writing.
+`shading.py` has the equations, `scene.py` the layout. Only numpy is needed, and Pillow and plyfile for writing.
 """
 
 from .cameras import camera_rays, dome_cameras, project, render

@@ -24,7 +24,7 @@ def dome_cameras(config: SceneConfig) -> Array:
     """Camera-to-world matrices [views, 4, 4], float64, OpenGL axes: x right, y up, looking along -z; world z is up.
 
     View i climbs from the lowest to the highest elevation, evenly in the sine (equal areas), while the azimuth turns by
-    the silver ratio, sqrt(2) - 1 of a full turn. The more usual golden angle would not do here: 8 is a Fibonacci
+    the silver ratio, sqrt(2) - 1 of the arc. The more usual golden angle would not do here: 8 is a Fibonacci
     number, so every 8th view - the test views - would crowd on one side.
     """
     # The scene's noise is drawn from the same seed: a second stream keeps cameras and textures independent.
@@ -33,7 +33,7 @@ def dome_cameras(config: SceneConfig) -> Array:
     start = rng.uniform()
     matrices = np.empty((config.views, 4, 4))
     for i in range(config.views):
-        azimuth = 2.0 * math.pi * (start + i * (math.sqrt(2.0) - 1.0))
+        azimuth = 2.0 * math.pi * start + math.radians(config.arc) * (i * (math.sqrt(2.0) - 1.0) % 1.0)
         height = low + (high - low) * (i + 0.5) / config.views
         across = math.sqrt(1.0 - height * height)
         outward = np.array([across * math.cos(azimuth), across * math.sin(azimuth), height])

@@ -3,7 +3,7 @@
 
 import math
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Real
 
 
 @dataclass(frozen=True)
@@ -16,9 +16,10 @@ class SceneConfig:
 
     gloss: float = 1.0
     """Weight g of everything specular, in [0, 1]. At 0 each surface point has one colour, whatever the view."""
-    mirror: float = 1.0
-    """Weight of the mirror's share in what is specular, in [0, 1]. At 0 it is all satin: broad highlights of the lamps,
-    and nothing reflected."""
+    studio: bool = False
+    """A dozen lamps, one satin finish on all objects and no mirrors: small highlights, and nothing else reflected."""
+    arc: float = 360.0
+    """Range of the cameras' azimuths, degrees, in (0, 360]."""
     views: int = 48
     """Number of images, at least 2."""
     width: int = 200
@@ -37,27 +38,19 @@ class SceneConfig:
     """Decides the noise in the textures, the jitter of the cameras and the choice of sparse points."""
 
     def __post_init__(self) -> None:
-        for name, lowest in (("views", 2), ("width", 1), ("height", 1), ("samples", 1), ("points", 1)):
-            self._require_integer(name, lowest)
-        self._require_integer("test_every", 2)
-        self._require_integer("seed", 0)
-        for name in ("gloss", "mirror"):
+        lowest = {"views": 2, "width": 1, "height": 1, "samples": 1, "points": 1, "test_every": 2, "seed": 0}
+        for name, low in lowest.items():
             value = getattr(self, name)
-            if not _is_finite(value) or not 0.0 <= value <= 1.0:
-                raise ValueError(f"SceneConfig.{name} must lie in [0, 1], got {value!r}")
-        if not _is_finite(self.field_of_view) or not 0.0 < self.field_of_view <= 120.0:
-            raise ValueError(f"SceneConfig.field_of_view must lie in (0, 120] degrees, got {self.field_of_view!r}")
-
-    def _require_integer(self, name: str, lowest: int) -> None:
-        value = getattr(self, name)
-        if not isinstance(value, Integral) or isinstance(value, bool) or value < lowest:
-            raise ValueError(f"SceneConfig.{name} must be an integer of at least {lowest}, got {value!r}")
+            if not isinstance(value, int) or isinstance(value, bool) or value < low:
+                raise ValueError(f"SceneConfig.{name} must be an integer of at least {low}, got {value!r}")
+        if not isinstance(self.gloss, Real) or not 0.0 <= self.gloss <= 1.0:
+            raise ValueError(f"SceneConfig.gloss must lie in [0, 1], got {self.gloss!r}")
+        for name, high in (("field_of_view", 120), ("arc", 360)):
+            value = getattr(self, name)
+            if not isinstance(value, Real) or not 0.0 < value <= high:
+                raise ValueError(f"SceneConfig.{name} must lie in (0, {high}] degrees, got {value!r}")
 
     @property
     def focal_length(self) -> float:
         """Focal length in pixels, the same along x and y; the principal point is the image centre."""
         return 0.5 * self.width / math.tan(0.5 * math.radians(self.field_of_view))
-
-
-def _is_finite(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -4,10 +4,9 @@
 <out>/transforms.json       cameras (OpenGL camera-to-world), split, name of the point cloud
 <out>/images/view_000.png   display values (see `shading.tone_curve`) x 255, rounded
 <out>/sparse.ply            points on visible surfaces, with their mean display colour over the training views
-<out>/scene.json            version, config, description, and the SHA-256 of every other file
+<out>/scene.json            version and config
 """
 
-import hashlib
 import json
 import tempfile
 from collections.abc import Callable
@@ -23,8 +22,8 @@ from .geometry import Array
 from .scene import Scene, build_scene
 from .shading import tone_curve
 
-SCENE_VERSION = 1
-"""Raise it when the same config and description begin to give different pictures."""
+SCENE_VERSION = 2
+"""Raise it when the same config begins to give different pictures."""
 SEEN_TOLERANCE = 1e-3
 """A view sees a surface point when its ray ends within this distance of it, world units."""
 
@@ -45,11 +44,10 @@ def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None
     The data set is written beside `out` and moved there when it is complete: an interrupted run leaves no half of one.
 
     Raises:
-        FileExistsError: when `out` holds anything else: another scene, a damaged copy of this one, other files.
+        FileExistsError: when `out` holds anything else: another scene, other files.
     """
     out = Path(out)
-    scene = build_scene(config)
-    record = {"version": SCENE_VERSION, "config": asdict(config), "description": scene.describe()}
+    record = {"version": SCENE_VERSION, "config": asdict(config)}
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         _require_same_scene(out, record)
         return out
@@ -57,9 +55,8 @@ def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as workshop:
         staged = Path(workshop) / "scene"
-        _write_files(scene, staged, progress)
-        files = sorted(path.relative_to(staged).as_posix() for path in staged.rglob("*") if path.is_file())
-        _write_json(staged / "scene.json", {**record, "files": {name: _digest(staged / name) for name in files}})
+        _write_files(build_scene(config), staged, progress)
+        (staged / "scene.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         if out.is_dir():
             out.rmdir()  # it is empty; a folder cannot be moved onto another on every system
         staged.rename(out)
@@ -140,30 +137,17 @@ def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
             for name, camera in zip(names, cameras, strict=True)
         ],
     }
-    _write_json(folder / "transforms.json", transforms)
-
-
-def _write_json(path: Path, content: dict) -> None:
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def _digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal; empty when there is no such file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+    (folder / "transforms.json").write_text(json.dumps(transforms, indent=1) + "\n", encoding="utf-8")
 
 
 def _require_same_scene(out: Path, record: dict) -> None:
-    """Pass when `out` is a complete data set of the scene that `record` describes; raise FileExistsError otherwise."""
+    """Pass when `out` is a data set of the scene that `record` describes; raise FileExistsError otherwise."""
     fix = "Choose another folder, or delete this one to have it written again."
     try:
-        found = json.loads((out / "scene.json").read_text(encoding="utf-8"))
-        files, config = found.pop("files"), dict(found["config"])
+        there = json.loads((out / "scene.json").read_text(encoding="utf-8"))
+        differing = [key for key, value in record["config"].items() if there["config"].get(key) != value]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise FileExistsError(f"{out} exists and is not a procedural scene (no readable scene.json). {fix}") from error
-    if found != json.loads(json.dumps(record)):  # through JSON, which turns tuples into lists
-        differing = [key for key, value in record["config"].items() if config.get(key) != value]
+    if there != record:
         what = f"another {', '.join(differing)}" if differing else "another version of the scene"
         raise FileExistsError(f"{out} holds a procedural scene with {what}. {fix}")
-    damaged = sorted(name for name, digest in files.items() if _digest(out / name) != digest)
-    if damaged:
-        raise FileExistsError(f"{out} holds this scene, but {damaged[0]} is missing or was changed. {fix}")

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene that can be asked for the colour along any ray, and the one layout that this package ships."""
 
-from dataclasses import asdict, dataclass, replace
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,10 +27,10 @@ class Object:
 
 @dataclass(frozen=True)
 class Scene:
-    """Objects on a diffuse floor under lamps and a luminous sky dome; `shading.py` states the reflectance model.
+    """Objects on a floor under lamps and a luminous sky dome; `shading.py` states the reflectance model.
 
-    The sky emits, and the floor is perfectly diffuse: both look the same from everywhere at every gloss. Scene is
-    immutable and holds no image; queries are pure functions of their arguments, in the precision of the rays.
+    The sky emits, and looks the same from everywhere at every gloss; so does a diffuse floor. Scene is immutable and
+    holds no image; queries are pure functions of their arguments, in the precision of the rays.
     """
 
     config: SceneConfig
@@ -41,6 +42,8 @@ class Scene:
     sky: Sky
     noises: tuple[Waves, ...]
     """One noise for each surface: sky, ground, objects in order."""
+    floor_finish: Finish | None = None
+    """None: perfectly diffuse."""
     shadow_softness: float = 0.35
 
     def first_hit(self, origins: Array, directions: Array) -> tuple[Array, Array]:
@@ -71,20 +74,6 @@ class Scene:
         """
         return self._outgoing(points.T, surfaces, normalize(directions.T), BOUNCES).T
 
-    def describe(self) -> dict:
-        """Everything that defines the scene but the noise (which the seed decides), as plain JSON types."""
-        return {
-            "units": "world units; z up; radiance in linear RGB",
-            "sky_radius": self.world.sky_radius,
-            "shadow_softness": self.shadow_softness,
-            "bounces": BOUNCES,
-            "objects": [{"shape": type(item.solid).__name__.lower(), **asdict(item)} for item in self.objects],
-            "lamps": [asdict(lamp) for lamp in self.lamps],
-            "ambient": asdict(self.ambient),
-            "floor": asdict(self.floor),
-            "sky": asdict(self.sky),
-        }
-
     def _trace(self, origins: Array, directions: Array, leaving: Array, bounces: int) -> Array:
         distance, surface = self.world.first_hit(origins, directions, leaving)
         return self._outgoing(origins + distance * directions, surface, -directions, bounces)
@@ -112,18 +101,19 @@ class Scene:
         for number in np.unique(surfaces):
             here = np.flatnonzero(surfaces == number)
             if number == GROUND:
-                result[:, here] = self.floor(points[:, here], self.noises[GROUND]) * irradiance[:, here] / np.pi
-                continue
-            item = self.objects[number - FIRST_SOLID]
-            diffuse = item.paint(item.solid.local(points[:, here]), self.noises[number]) * irradiance[:, here] / np.pi
-            if self.config.gloss == 0.0:  # trace nothing that would be multiplied by zero
+                finish, paint = self.floor_finish, self.floor(points[:, here], self.noises[GROUND])
+            else:
+                item = self.objects[number - FIRST_SOLID]
+                finish, paint = item.finish, item.paint(item.solid.local(points[:, here]), self.noises[number])
+            diffuse = paint * irradiance[:, here] / np.pi
+            if finish is None or self.config.gloss == 0.0:  # trace nothing that would be multiplied by zero
                 result[:, here] = diffuse
                 continue
             lights = [(to_lamp[:, here], facing[:, here]) for to_lamp, facing in arriving]
             specular = self._specular(
-                item.finish, number, points[:, here], normals[:, here], towards_viewer[:, here], lights, bounces
+                finish, number, points[:, here], normals[:, here], towards_viewer[:, here], lights, bounces
             )
-            taken = self.config.gloss * mean_fresnel(max(item.finish.f0))
+            taken = self.config.gloss * mean_fresnel(max(finish.f0))
             result[:, here] = (1.0 - taken) * diffuse + self.config.gloss * specular
         return result
 
@@ -158,11 +148,26 @@ class Scene:
         rough = reflectance * blurred
         for to_lamp, facing in lights:
             rough += highlight(finish, normals, to_lamp, towards_viewer) * facing
-        if bounces == 0:
-            sharp = blurred
-        else:
-            sharp = self._trace(points, bounced, np.full(points.shape[1], surface), bounces - 1)
+        if finish.mirror == 0.0:  # trace nothing that would be multiplied by zero
+            return rough
+        sharp = self._trace(points, bounced, np.full(points.shape[1], surface), bounces - 1) if bounces else blurred
         return (1.0 - finish.mirror) * rough + finish.mirror * reflectance * sharp
+
+
+SATIN = Finish((0.3, 0.3, 0.3), roughness=0.12, mirror=0.0)
+"""The finish of all objects in the studio, and of its floor."""
+
+
+def studio_lamps() -> tuple[Lamp, ...]:
+    """Twelve lamps of all hues, spread over the dome by the golden angle, 6 world units from the middle."""
+    lamps = []
+    for i in range(12):
+        angle, height = 2.0 * math.pi * (i * 0.5 * (math.sqrt(5.0) - 1.0) % 1.0), 0.25 + 0.7 * (i + 0.5) / 12
+        across = math.sqrt(1.0 - height**2)
+        red, green, blue = (6.5 + 3.25 * math.cos(angle - channel * 2.0 * math.pi / 3.0) for channel in range(3))
+        position = 6.0 * across * math.cos(angle), 6.0 * across * math.sin(angle), 6.0 * height
+        lamps.append(Lamp(position, (red, green, blue)))
+    return tuple(lamps)
 
 
 def build_scene(config: SceneConfig) -> Scene:
@@ -216,12 +221,11 @@ def build_scene(config: SceneConfig) -> Scene:
     return Scene(
         config=config,
         world=World(sky_radius=10.0, solids=tuple(item.solid for item in objects)),
-        objects=tuple(
-            replace(item, finish=replace(item.finish, mirror=config.mirror * item.finish.mirror)) for item in objects
-        ),
-        lamps=lamps,
+        objects=tuple(replace(item, finish=SATIN) for item in objects) if config.studio else objects,
+        lamps=studio_lamps() if config.studio else lamps,
         ambient=Ambient(below=(0.08, 0.07, 0.06), above=(0.17, 0.18, 0.26)),
         floor=Floor(),
+        floor_finish=SATIN if config.studio else None,
         sky=Sky(
             horizon=(0.56, 0.37, 0.27),
             zenith=(0.10, 0.10, 0.27),

@@ -1,46 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs demo` end to end, in its smallest form."""
+"""`nrfgs demo` end to end, in its smallest form, and what it says."""
 
 import json
-import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from nrfgs_lab.demo import CELL, METHODS, Demo, SeenView, brightest_window, where_it_shines
-from nrfgs_lab.scenes import SceneConfig
+from nrfgs_lab.demo.command import ENOUGH_STEPS, METHODS, NRF, SH, Demo, verdict
+from nrfgs_lab.demo.pictures import CELL
+from nrfgs_lab.demo.views import FRAMES, SeenView, brightest_window, turned, where_it_shines
+from nrfgs_lab.scenes import SceneConfig, dome_cameras, project
 from nrfgs_ns.cli import entrypoint
 from nrfgs_ns.errors import InputError
 
 
 @pytest.mark.usefixtures("no_cuda")
 def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
-    small = SceneConfig(mirror=0.0, views=12, width=64, height=48, points=500, test_every=4)
+    small = SceneConfig(studio=True, arc=90, views=12, width=64, height=48, points=500, test_every=4)
     monkeypatch.setattr(Demo, "scene", lambda self: small)
-    demo = Demo(out=tmp_path / "demo", quick=True, steps=6)
-    demo.main()
+    Demo(out=tmp_path / "demo", quick=True, steps=6).main()
     results = json.loads((tmp_path / "demo" / "results.json").read_text())
     assert results["steps"] == 6 and set(results["methods"]) == set(METHODS)
     shown = capfd.readouterr().out
     assert "ns-train nrfgs-sh --data" in shown and all(f" {label} " in shown for label in METHODS.values())
+    assert "Too short for a verdict" in shown and results["verdict"].startswith("Too short")
+    config = results["methods"][NRF]["train"]["config_path"]
+    assert f"nrfgs view {config}" in shown.replace("\n", "")
     for result in results["methods"].values():
-        assert result["train"]["steps"] == 6
+        assert result["train"]["steps"] == 6 and result["train"]["processor_seconds"] > 0
+        assert result["eval"]["splats"] == 500  # as many as points: none come, none go
         assert 5 < result["eval"]["psnr"] < 60
         assert 0.02 < result["shine"]["share"] < 0.9 and 5 < result["shine"]["psnr"] < 60
-    sheet = Image.open(tmp_path / "demo" / "contact_sheet.png")
-    assert sheet.width >= 5 * CELL and sheet.height >= 6 * 0.7 * CELL
+        assert len(result["shine"]["views"]) == 3
+    sheet, strip = (Image.open(tmp_path / "demo" / name) for name in ("contact_sheet.png", "highlight.png"))
+    assert sheet.width >= 6 * CELL and sheet.height >= 6 * 0.7 * CELL
+    assert strip.width >= FRAMES * CELL and strip.height >= 5 * 0.7 * CELL
 
 
 @pytest.mark.parametrize(
     "options, says",
     [({"steps": 0}, "--steps is 0"), ({"gloss": 1.5}, "gloss must lie in"), ({"seed": -1}, "seed must be")],
 )
-def test_what_cannot_be_is_told_in_a_sentence(options, says, tmp_path):
+def test_impossible_options_are_refused_in_a_sentence(options, says, tmp_path):
     with pytest.raises(InputError, match=says):
         Demo(out=tmp_path / "demo", **options).main()
     assert not (tmp_path / "demo").exists()
+
+
+def compared(nrf, sh):
+    """Results whose test views have these PSNRs where it shines."""
+    whole = {"psnr": 25.0, "ssim": 0.8}
+    return {NRF: {"eval": whole, "shine": {"views": nrf}}, SH: {"eval": whole, "shine": {"views": sh}}}
+
+
+@pytest.mark.parametrize(
+    "nrf, sh, steps, says",
+    [
+        ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS, "NRF is ahead of SH: +1.10 dB"),
+        ([24.0, 24.0, 24.9], [25.0, 25.2, 26.0], ENOUGH_STEPS, "NRF is behind SH: -1.10 dB"),
+        ([25.0, 25.1, 25.1], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # little
+        ([29.0, 21.0, 27.0], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # the views disagree
+        ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS - 1, "Too short for a verdict"),
+        ([None, None, None], [None, None, None], ENOUGH_STEPS, "Nothing shines"),
+    ],
+)
+def test_the_verdict_follows_the_measurement(nrf, sh, steps, says):
+    assert verdict(compared(nrf, sh), steps).startswith(says)
 
 
 def test_where_it_shines_is_where_gloss_changes_the_truth():
@@ -50,28 +78,21 @@ def test_where_it_shines_is_where_gloss_changes_the_truth():
     view = SeenView(truth=truth, dull=grey, rendered=truth - 0.1, base=grey)
     score = where_it_shines([view, view])
     assert score["share"] == pytest.approx(12 / 180)
-    assert score["psnr"] == pytest.approx(20.0, abs=1e-3) and score["psnr_base"] == pytest.approx(7.96, abs=1e-2)
+    assert [score["psnr"], *score["views"]] == pytest.approx([20.0] * 3, abs=1e-3)
+    assert score["psnr_base"] == pytest.approx(7.96, abs=1e-2)
     top, left, height, width = brightest_window(view.shine)
     assert (height, width) == (4, 5) and top <= 6 and top + height >= 9 and left <= 10 and left + width >= 14
-    assert where_it_shines([SeenView(grey, grey, grey, grey)]) == {"share": 0.0, "psnr": None, "psnr_base": None}
+    dull = where_it_shines([SeenView(grey, grey, grey, grey)])
+    assert dull == {"share": 0.0, "psnr": None, "psnr_base": None, "views": [None]}
 
 
-def test_help_answers_and_names_the_commands(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["nrfgs", "--help"])
-    with pytest.raises(SystemExit) as ended:
-        entrypoint()
-    assert ended.value.code == 0
-    assert {"demo", "export", "bench"} <= set(capsys.readouterr().out.split())
-
-
-def test_a_command_imports_no_other():
-    code = (
-        "import sys; from nrfgs_ns.cli import chosen; chosen(['demo', '--quick']);"
-        "others = ('nrfgs_lab.bench', 'nrfgs_ns.export', 'nrfgs_ns.prepare');"
-        "print([name for name in sys.modules if name.startswith(others)])"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.split() == ["[]"]
+def test_a_camera_that_turns_about_a_point_sees_it_at_the_same_pixel():
+    config, point = SceneConfig(), np.array([[0.4, -0.3, 0.5]])
+    pose = dome_cameras(config)[3]
+    before, after = (project(config, one, point) for one in (pose, turned(pose, point[0], 0.3)))
+    for value, expected in zip(after, before, strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-10)
+    assert np.linalg.norm(turned(pose, point[0], 0.3)[:3, 3] - pose[:3, 3]) > 0.5
 
 
 def test_a_folder_that_is_not_ours_is_refused_in_one_line(tmp_path, monkeypatch):

@@ -9,7 +9,6 @@ from PIL import Image
 from plyfile import PlyData
 
 from nrfgs_lab.scenes import (
-    FIRST_SOLID,
     SceneConfig,
     build_scene,
     camera_rays,
@@ -127,6 +126,13 @@ def test_cameras_are_rigid_upright_and_look_at_the_scene():
         assert -rotation[:, 2] @ -position / np.linalg.norm(position) > 0.98
 
 
+def test_an_arc_of_cameras_stands_on_one_side():
+    positions = dome_cameras(SceneConfig(arc=90.0, views=40))[:, :2, 3]
+    azimuths = np.sort(np.arctan2(positions[:, 1], positions[:, 0]))
+    covered = 2 * np.pi - np.diff(np.append(azimuths, azimuths[0] + 2 * np.pi)).max()
+    assert np.radians(75) < covered < np.radians(100)  # targets are jittered by 0.1 of 4.3
+
+
 def test_test_views_surround_the_scene():
     config = SceneConfig()
     positions = dome_cameras(config)[:: config.test_every, :2, 3]
@@ -200,7 +206,7 @@ def test_another_scene_is_refused_by_name(glossy):
         write_scene(other, glossy)
 
 
-def test_other_content_and_damage_are_refused(tmp_path):
+def test_other_content_is_refused(tmp_path):
     tiny = SceneConfig(views=2, width=4, height=3, samples=1, points=5)
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -214,10 +220,7 @@ def test_other_content_and_damage_are_refused(tmp_path):
         write_scene(tiny, photos)
 
     (tmp_path / "empty").mkdir()
-    done = write_scene(tiny, tmp_path / "empty")
-    (done / "images" / "view_001.png").unlink()
-    with pytest.raises(FileExistsError, match="images/view_001.png is missing or was changed"):
-        write_scene(tiny, done)
+    assert (write_scene(tiny, tmp_path / "empty") / "scene.json").is_file()
 
 
 def test_progress_counts_and_an_interruption_leaves_nothing(tmp_path):
@@ -233,14 +236,6 @@ def test_progress_counts_and_an_interruption_leaves_nothing(tmp_path):
         write_scene(tiny, tmp_path / "scene", stop_at_two)
     assert calls == [(1, 3), (2, 3)]
     assert list(tmp_path.iterdir()) == []
-
-
-def test_scene_json_tells_how_to_write_it_again(glossy):
-    record = json.loads((glossy / "scene.json").read_text())
-    assert SceneConfig(**record["config"]) == GLOSSY
-    assert [item["name"] for item in record["description"]["objects"]][0] == "chrome"
-    assert len(record["description"]["objects"]) == len(build_scene(GLOSSY).objects)
-    assert FIRST_SOLID == 2
 
 
 def test_nerfstudio_reads_it_as_we_meant_it(matt):

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo's pictures: test views with error maps, and a highlight seen along an arc."""
+
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from nrfgs_lab.demo.views import Highlight, SeenView, brightest_window
+
+CELL = 240
+"""Width of a picture, pixels."""
+ERROR_GAIN = 4.0
+"""Factor of absolute errors in the error maps."""
+RESIDUAL_GAIN = 4.0
+"""Factor of the field's view-dependent part, around mid grey."""
+GAP, TITLE = 6, 26
+
+
+def contact_sheet(views: dict[str, list[SeenView]], path: Path) -> None:
+    """Write a picture of three test views, each whole and below it where it shines most: truth, both methods, their
+    errors, and what the field adds to its base colour.
+
+    Args:
+        views: label -> its test views; the first is the field's.
+    """
+    (nrf_label, nrf), (sh_label, sh) = views.items()
+    columns = {
+        "truth": [view.truth for view in nrf],
+        nrf_label: [view.rendered for view in nrf],
+        sh_label: [view.rendered for view in sh],
+        f"error of {nrf_label} x {ERROR_GAIN:g}": [ERROR_GAIN * (view.rendered - view.truth).abs() for view in nrf],
+        f"error of {sh_label} x {ERROR_GAIN:g}": [ERROR_GAIN * (view.rendered - view.truth).abs() for view in sh],
+        f"{nrf_label}'s residual x {RESIDUAL_GAIN:g}": [0.5 + RESIDUAL_GAIN * (v.rendered - v.base) for v in nrf],
+    }
+    rows: list[list[Tensor]] = []
+    for index in range(0, len(nrf), max(len(nrf) // 3, 1))[:3]:
+        top, left, height, width = brightest_window(nrf[index].shine)
+        rows.append([images[index] for images in columns.values()])
+        rows.append([image[top : top + height, left : left + width] for image in rows[-1]])
+    grid(rows, list(columns), path)
+
+
+def strip(highlights: dict[str, Highlight], path: Path) -> None:
+    """Write a picture of a highlight: a column for each place of the camera; truth, and each method with its errors."""
+    first, *_ = highlights.values()
+    top, left, height, width = first.window
+
+    def cut(images: list[Tensor]) -> list[Tensor]:
+        return [image[top : top + height, left : left + width] for image in images]
+
+    rows, labels = [cut(first.truths)], ["truth"]
+    for label, highlight in highlights.items():
+        pairs = zip(highlight.rendered, highlight.truths, strict=True)
+        rows += [cut(highlight.rendered), cut([ERROR_GAIN * (image - truth).abs() for image, truth in pairs])]
+        labels += [label, f"error of {label} x {ERROR_GAIN:g}"]
+    grid(rows, ["the camera moves around a highlight; rows: " + ", ".join(labels)], path)
+
+
+def grid(rows: list[list[Tensor]], titles: list[str], path: Path) -> None:
+    """Write rows of pictures [H, W, 3], with values in [0, 1], as cells of one size below a line of titles."""
+    height = round(CELL * rows[0][0].shape[0] / rows[0][0].shape[1])
+    sheet = Image.new("RGB", (len(rows[0]) * (CELL + GAP) - GAP, TITLE + len(rows) * (height + GAP) - GAP), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(16)
+    for column, title in enumerate(titles):
+        draw.text((column * (CELL + GAP) + 2, 3), title, fill="black", font=font)
+    for y, row in enumerate(rows):
+        for x, image in enumerate(row):
+            pixels = (image.clamp(0, 1) * 255).round().byte().numpy()
+            cell = Image.fromarray(pixels).resize((CELL, height), Image.Resampling.BICUBIC)
+            sheet.paste(cell, (x * (CELL + GAP), TITLE + y * (height + GAP)))
+    sheet.save(path)
