@@ -85,7 +85,7 @@ def test_a_run_may_have_its_own_scenes_and_a_scene_its_own_steps():
         ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
         ({"runs": {"NRF": {"method": "nrfgs", "speed": 1}}}, "speed"),
         ({"strategies": ["mcmc@many"]}, "budget is 'many'"),
-        ({"strategies": ["original@5"]}, "original has no option 'budget'"),
+        ({"strategies": ["original,size=77"]}, "original has no option 'size'"),
         ({"steps": 0}, "steps"),
         ({"seeds": ["x"]}, "seeds"),
         ({"jobs": True}, "jobs"),
@@ -151,7 +151,12 @@ def test_presets_steps_are_those_of_the_presets():
 
 @pytest.mark.parametrize(
     "strategy, densification",
-    [("own", Splatfacto()), ("original", Original()), ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9))],
+    [
+        ("own", Splatfacto()),
+        ("original", Original()),
+        ("original@77", Original(budget=77)),
+        ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9)),
+    ],
 )
 def test_the_command_means_what_the_file_says(strategy, densification, tiny_scene, tmp_path):
     runs = {"NRF": {"method": "nrfgs", "options": "--pipeline.model.appearance.latent-dim 9"}}
