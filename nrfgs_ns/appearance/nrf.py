@@ -94,9 +94,9 @@ class NrfConfig(AppearanceHeadConfig):
         return self if self.opacity_bound or not self.opacity_residual else replace(self, opacity_bound="logit")
 
     def validate(self) -> None:
-        self.require(self.latent_dim >= 1, "latent_dim", "at least 1")
+        self.require(1 <= self.latent_dim <= 1024, "latent_dim", "from 1 to 1024")
         self.require(self.num_bands >= 1, "num_bands", "at least 1")
-        self.require(self.hidden_width >= 1, "hidden_width", "at least 1")
+        self.require(1 <= self.hidden_width <= 4096, "hidden_width", "from 1 to 4096")
         self.require(self.color_scale >= 0, "color_scale", "zero or positive")
         self.require(self.opacity_scale >= 0, "opacity_scale", "zero or positive")
         self.require(self.distance_eps > 0, "distance_eps", "positive")

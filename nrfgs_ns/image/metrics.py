@@ -29,7 +29,6 @@ import pickle
 import torch
 import torch.nn.functional as F
 from pytorch_msssim import SSIM
-from rich import get_console
 from torch import Tensor
 
 AS_THEY_ARE = ("psnr", "ssim", "ms_ssim", "l1", "lpips")
@@ -142,7 +141,7 @@ def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[
     """All metrics of one image at once, on the device of `pred`.
 
     LPIPS (Zhang et al. 2018, AlexNet) needs backbone weights that torchvision would download. They are used if they are
-    on disk and never fetched: without them `lpips` is None, and one warning per process says how to get them.
+    on disk and never fetched: without them `lpips` is None, and `lpips_advice` says how to get them.
 
     Returns:
         psnr (dB), ssim, ms_ssim, l1 and lpips, and the same colour-corrected; None where undefined.
@@ -183,7 +182,7 @@ def fit_colors(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> Tensor:
 
 def _lpips(pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
     net = _lpips_net()
-    if net is None:
+    if isinstance(net, str):
         return None
     with torch.no_grad():
         pred, gt, mask = _planes(pred, gt, mask)
@@ -235,8 +234,8 @@ def _halve(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tenso
 
 
 @functools.cache
-def _lpips_net() -> torch.nn.Module | None:
-    """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else None and a warning."""
+def _lpips_net() -> torch.nn.Module | str:
+    """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else how to get them."""
     # Both imports cost seconds, and only evaluation needs them.
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     from torchvision.models import AlexNet_Weights
@@ -244,24 +243,23 @@ def _lpips_net() -> torch.nn.Module | None:
     url = AlexNet_Weights.DEFAULT.url
     path = os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
     if not os.path.isfile(path):
-        _warn_lpips(f"{path} is missing", url)
-        return None
+        return _advice(f"{path} is missing", url)
     try:
         metric = LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
     except (OSError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
-        _warn_lpips(f"{path} cannot be loaded ({type(error).__name__}): delete it", url)
-        return None
+        return _advice(f"{path} cannot be loaded ({type(error).__name__}): delete it", url)
     # The bare network: the metric around it would keep every score it ever gave.
     return metric.net
 
 
-def _warn_lpips(finding: str, url: str) -> None:
-    """Says why LPIPS is not reported, and how to change that."""
-    get_console().print(
-        f"Warning: LPIPS is not reported: {finding}. Training and all other metrics are intact. "
-        "To get it, run this on a connected machine, and copy the file here if that is another one:\n"
-        f'  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"',
-        style="bold yellow",
-        markup=False,
-        soft_wrap=True,
+def lpips_advice() -> str | None:
+    """Why LPIPS is not reported, and how to change that; None if it is."""
+    net = _lpips_net()
+    return net if isinstance(net, str) else None
+
+
+def _advice(problem: str, url: str) -> str:
+    return (
+        f"LPIPS is not reported: {problem}. To get it, run this on a connected machine, and copy the file here if that "
+        f'is another one:\n  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"'
     )

@@ -2,13 +2,12 @@
 """The mean of a model's parameters over a training's last steps (Polyak and Juditsky, SIAM Journal on Control and
 Optimization 30, 1992).
 
-Most learning rates never fall, and each step sees one view: parameters walk about what they have learnt, and the last
-step's are one place on that walk. Their mean lies nearer to its middle.
+Most learning rates never fall, and each step sees one view: parameters fluctuate around what they have learnt. Their
+mean lies closer to the centre than the last step does.
 
-A mean over two meanings of a row is no number. It begins anew where splats were added, removed, moved onto others or
-had their opacity reset, and where the field is another one: all put other `Parameter` objects in the place of the old
-ones, even where shapes stay. The noise of MCMC, which changes the means in place at every step, is averaged away with
-the rest.
+Averaging is meaningless once a row denotes another splat. The mean therefore restarts wherever splats were added,
+removed, moved onto others or had their opacity reset: all of these replace the `Parameter` objects, even where shapes
+stay. MCMC's noise, which changes the means in place, is averaged away.
 """
 
 from collections.abc import Mapping
@@ -22,84 +21,94 @@ from torch.optim import Optimizer
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.training.optimizers import parameters_of
 
+LARGEST_SHARE = 0.05
+"""Largest share of a training's steps to average: a short training still improves within a longer window, and the mean
+would be worse than the last step."""
+
+
+def window(average_steps: int, total: int) -> int:
+    """How many of the last steps to average in a training of `total` steps: at least 1."""
+    return max(min(average_steps, int(LARGEST_SHARE * total)), 1)
+
 
 class ParameterMean:
     """A running mean, m += (p - m) / n, of all parameters that a training's optimisers hold.
 
     Attributes:
-        count: n, steps that are in the mean; 0 where there is none.
-        began_anew: whether there was one that had to be given up, because rows have come to mean something else.
+        count: n, the number of averaged steps; 0 without a mean.
+        restarted: whether an earlier mean was dropped because rows came to denote other splats.
     """
 
     def __init__(self):
         self.forget()
 
     def forget(self) -> None:
-        """Let there be no mean."""
-        self.count, self.began_anew = 0, False
+        """Drop the mean."""
+        self.count, self.restarted = 0, False
         self._means: dict[str, Tensor] = {}
-        self._of: dict[str, Tensor] = {}
+        self._parameters: dict[str, Tensor] = {}
 
     @torch.no_grad()
     def add(self, optimizers: Mapping[str, Optimizer]) -> None:
-        """Take the parameters as they are now into the mean."""
+        """Add the present parameters to the mean."""
         parameters = _parameters(optimizers)
         if not self._is_of(parameters):
-            self.began_anew = self.began_anew or self.count > 0
+            self.restarted = self.restarted or self.count > 0
             self._means = {name: torch.zeros_like(parameter) for name, parameter in parameters.items()}
-            self._of, self.count = parameters, 0
+            self._parameters, self.count = parameters, 0
         self.count += 1
         torch._foreach_lerp_(list(self._means.values()), list(parameters.values()), 1.0 / self.count)
 
     @torch.no_grad()
     def install(self) -> None:
-        """Let the parameters that it is of be the mean, if there is one; then forget it."""
-        for name, parameter in self._of.items():
+        """Set the averaged parameters to their mean, if there is one; then forget it."""
+        for name, parameter in self._parameters.items():
             parameter.copy_(self._means[name])
         self.forget()
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint must hold: numbers and tensors."""
-        return {"count": self.count, "began_anew": self.began_anew, "means": dict(self._means)}
+        """The checkpoint's entry: numbers and tensors."""
+        return {"count": self.count, "restarted": self.restarted, "means": dict(self._means)}
 
     def load_state(self, state: Mapping[str, Any], model, optimizers: Mapping[str, Optimizer]) -> None:
-        """Go on from a checkpoint's `state`, whose parameters have been loaded. A mean of others is left."""
+        """Go on from a checkpoint's `state`, whose parameters have been loaded; one of other shapes is ignored."""
         parameters = _parameters(optimizers)
         shapes = {name: parameter.shape for name, parameter in parameters.items()}
         if {name: mean.shape for name, mean in state["means"].items()} != shapes:
-            return  # of splats that the guard has taken out since
-        self.count, self.began_anew = state["count"], state["began_anew"]
+            return  # the guard has removed splats since
+        self.count, self.restarted = state["count"], state["restarted"]
         self._means = {name: mean.to(parameters[name]) for name, mean in state["means"].items()}
-        self._of = parameters
+        self._parameters = parameters
 
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
-        """Whether rows mean what they meant when it was last added to."""
+        """Whether rows still denote the splats that were averaged."""
         return self._is_of(_parameters(optimizers))
 
     def _is_of(self, parameters: Mapping[str, Tensor]) -> bool:
-        """Whether these very objects are those that it is the mean of."""
-        same = self._of.keys() == parameters.keys()
-        return same and all(parameter is self._of[name] for name, parameter in parameters.items())
+        """Whether the mean is of these very objects."""
+        same = self._parameters.keys() == parameters.keys()
+        return same and all(parameter is self._parameters[name] for name, parameter in parameters.items())
 
 
-def tell(count: int, window: int, began_anew: bool) -> None:
-    """Say what a trained model is the mean of.
+def report_mean(count: int, window: int, restarted: bool) -> None:
+    """Say over how many steps a trained model is averaged.
 
     Args:
-        began_anew: whether it is so few because splats or the field have changed.
+        window: steps that were to be averaged.
+        restarted: whether there are fewer because splats changed within them.
     """
     steps = "the last step" if count == 1 else f"the last {count} steps"
-    why = f", not {window}: before that, splats or the field still changed" if began_anew else ""
+    why = f", not {window}: until then splats were added, removed or reset" if restarted else ""
     CONSOLE.print(f"The trained model is the mean of its parameters over {steps}{why}.", soft_wrap=True)
 
 
-def tell_why_not(window: int, why: str) -> None:
-    """Say that a trained model is the last step's, though a mean was asked for."""
-    warn(f"average_steps is {window}, but nothing was averaged: {why}. The model is the last step's.")
+def report_no_mean(average_steps: int, why: str) -> None:
+    """Say why a trained model is the last step's, though a mean was asked for."""
+    warn(f"average_steps is {average_steps}, but nothing was averaged: {why}. The model is the last step's.")
 
 
 def _parameters(optimizers: Mapping[str, Optimizer]) -> dict[str, Tensor]:
-    """All parameters, by their group and their place in it."""
+    """All parameters, by group and index."""
     return {
         f"{group}.{place}": parameter
         for group, optimizer in optimizers.items()

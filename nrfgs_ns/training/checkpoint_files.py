@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checkpoint files: written whole or not at all, and read only if they are what was written.
 
-torch's files are zip archives that carry a CRC of each record, which torch itself does not look at: a flipped bit is
-loaded as another model. Here every byte is checked first, which takes 0.3 s for 500 MB. Nerfstudio's own commands read
-the file without; for them the pipeline's part carries a checksum of its own (`seal`, `check_seal`).
+torch's files are zip archives that carry a CRC of each record, which torch itself does not check: a flipped bit loads
+as another model. Here every byte is checked first, which takes 0.3 s for 500 MB. Nerfstudio's own commands read the
+file without that; for them the pipeline's part carries a checksum of its own (`seal`, `check_seal`).
 """
 
 import os
@@ -25,15 +25,15 @@ from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import ForTheUser, InputError
 
 NAME = re.compile(r"step-(\d{9,})\.ckpt")
-"""What checkpoints are called; other files in their folder are not looked at."""
+"""Names of checkpoints; other files in their folder are ignored."""
 KEPT = 2
-"""Checkpoints that stay: should the last one be damaged, there is the one before."""
+"""Checkpoints to keep: should the last one be damaged, the one before is there."""
 ABANDONED = 3600.0
-"""Seconds after which a file that was being written is taken for that of a process that was killed."""
+"""Seconds after which an unfinished file is taken for a killed process's."""
 
 
 class DiskFull(ForTheUser, RuntimeError):
-    """A checkpoint found no room. The message says what was kept."""
+    """A checkpoint could not be written: no space, a quota, or a limit on file sizes."""
 
 
 class Damaged(ValueError):
@@ -55,47 +55,56 @@ def allow_nerfstudio_checkpoints() -> None:
 def find(folder: Path) -> dict[int, Path]:
     """Checkpoints in a folder by step, the newest first; none if there is no such folder."""
     files = folder.iterdir() if folder.is_dir() else ()
-    found = {int(match[1]): file for file in files if (match := NAME.fullmatch(file.name))}
-    return dict(sorted(found.items(), reverse=True))
+    by_step = {int(match[1]): file for file in files if (match := NAME.fullmatch(file.name))}
+    return dict(sorted(by_step.items(), reverse=True))
 
 
 def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = True) -> Path:
-    """Write a checkpoint beside its folder, move it there when it is on the disk, then let go of older ones.
+    """Write a checkpoint beside its folder, sync it to disk, move it into the folder, and remove older ones.
 
     Raises:
-        DiskFull: there was no room.
+        DiskFull: it could not be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     final = folder / f"step-{step:09d}.ckpt"
     remove_abandoned(folder)
     # Beside the folder: nerfstudio's commands take every file within for a checkpoint.
-    aside = folder.with_name(f"{folder.name}.{secrets.token_hex(8)}.writing")
+    unfinished = folder.with_name(f"{folder.name}.{secrets.token_hex(8)}.writing")
     try:
-        torch.save(content, aside)
-        _to_disk(aside)
-        os.replace(aside, final)
-        _to_disk(folder)
-    except (OSError, RuntimeError) as error:  # torch says RuntimeError, and not why
-        aside.unlink(missing_ok=True)
-        needed = sum(leaf.nbytes for _, leaf in _leaves(content) if isinstance(leaf, Tensor))
-        free = shutil.disk_usage(folder).free
-        if free < 1.01 * needed + 2**20:
-            raise DiskFull(_no_room(folder, step, needed, free)) from error
-        raise
+        torch.save(content, unfinished)
+        _sync(unfinished)
+        os.replace(unfinished, final)
+        _sync(folder)
+    except (OSError, RuntimeError) as error:  # torch raises RuntimeError without the system's reason
+        if isinstance(error, torch.OutOfMemoryError):
+            raise
+        raise DiskFull(_not_written(folder, step, content, error)) from error
     finally:
-        aside.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
     if only_latest:
         for older in list(find(folder).values())[KEPT:]:
             older.unlink(missing_ok=True)
     return final
 
 
+def _not_written(folder: Path, step: int, content: Mapping[str, Any], error: Exception) -> str:
+    size = sum(leaf.nbytes for _, leaf in _leaves(content) if isinstance(leaf, Tensor)) / 1e6
+    free = shutil.disk_usage(folder).free / 1e6
+    kept = next(iter(find(folder).values()), None)
+    fix = "Make room" if free < size + 1 else "Lift the limit on file sizes (ulimit -f) or the quota"
+    reason = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
+    return (
+        f"{folder}: the disk is full or a limit reached{reason}: the checkpoint of step {step} takes {size:,.0f} MB, "
+        f"and {free:,.0f} MB are free. {f'Kept: {kept}.' if kept else 'None has been written before.'} {fix}."
+    )
+
+
 def remove_abandoned(folder: Path) -> None:
-    """Remove what processes that were killed had begun to write."""
-    for aside in folder.parent.glob(f"{folder.name}.*.writing"):
+    """Remove unfinished files of killed processes."""
+    for unfinished in folder.parent.glob(f"{folder.name}.*.writing"):
         try:
-            if time.time() - aside.stat().st_mtime > ABANDONED:
-                aside.unlink()
+            if time.time() - unfinished.stat().st_mtime > ABANDONED:
+                unfinished.unlink()
         except OSError:  # another process was faster, or it is not ours
             pass
 
@@ -116,7 +125,7 @@ def read(path: Path) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (FileNotFoundError, Damaged):
         raise
-    except Exception as error:  # whatever damage makes of a zip archive and of a pickle within
+    except Exception as error:  # damage to a zip archive, or to a pickle in it, can raise anything
         raise Damaged(str(error).splitlines()[0][:200] if str(error) else type(error).__name__) from error
     if not isinstance(content, dict) or not {"step", "pipeline"} <= content.keys():
         raise Damaged("it is not a checkpoint of nerfstudio")
@@ -140,18 +149,18 @@ def read_or_refuse(path: Path) -> dict[str, Any]:
 
 
 def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, Any]]:
-    """Read a folder's last checkpoint; where that is damaged the one before, with a warning.
+    """Read a folder's last checkpoint, or that of a step; where the last is damaged the one before, with a warning.
 
     Raises:
         InputError: there is none, or none that can be read.
     """
-    found = checkpoints_in(folder)
+    checkpoints = checkpoints_in(folder)
     if step is not None:
-        if step not in found:
-            raise InputError(f"{folder} has no checkpoint of step {step}, only of {', '.join(map(str, found))}.")
-        found = {step: found[step]}
+        if step not in checkpoints:
+            raise InputError(f"{folder} has no checkpoint of step {step}, only of {', '.join(map(str, checkpoints))}.")
+        checkpoints = {step: checkpoints[step]}
     damages = []
-    for path in found.values():
+    for path in checkpoints.values():
         try:
             content = read(path)
         except Damaged as damage:
@@ -169,15 +178,11 @@ def checkpoints_in(folder: Path) -> dict[int, Path]:
     Raises:
         InputError: there are none.
     """
-    found = find(folder)
-    if found:
-        return found
+    checkpoints = find(folder)
+    if checkpoints:
+        return checkpoints
     within = next((inner.parent for inner in sorted(folder.glob("*/step-*.ckpt"))), None)
-    fix = (
-        f"They are in {within}."
-        if within
-        else "Give the folder nerfstudio_models of a training, beside its config.yml."
-    )
+    fix = f"They are in {within}." if within else "Give the folder nerfstudio_models of a training."
     what = "holds no checkpoints (step-*.ckpt)" if folder.is_dir() else "is no folder"
     raise InputError(f"{folder} {what}. {fix}")
 
@@ -198,7 +203,7 @@ def check_seal(pipeline: Mapping[str, Any], step: int) -> None:
 
 
 def _checksum(pipeline: Mapping[str, Any], step: int) -> int:
-    """CRC32 of everything but the checksum itself."""
+    """CRC32 of everything except the checksum itself."""
     value = zlib.crc32(str(step).encode())
     for path, leaf in _leaves(pipeline):
         if path == "/_extra_state/checksum":
@@ -213,7 +218,7 @@ def _checksum(pipeline: Mapping[str, Any], step: int) -> int:
 
 
 def _leaves(tree: Any, path: str = "") -> list[tuple[str, Any]]:
-    """What a tree of dictionaries, lists and tuples holds, with its place."""
+    """The leaves of a tree of dictionaries, lists and tuples, each with its path."""
     if isinstance(tree, Mapping):
         return [leaf for key, value in tree.items() for leaf in _leaves(value, f"{path}/{key}")]
     if isinstance(tree, (list, tuple)) and any(isinstance(value, (Tensor, Mapping, list, tuple)) for value in tree):
@@ -221,30 +226,10 @@ def _leaves(tree: Any, path: str = "") -> list[tuple[str, Any]]:
     return [(path, tree)]
 
 
-def _no_room(folder: Path, step: int, needed: int, free: int) -> str:
-    kept = next(iter(find(folder).values()), None)
-    return (
-        f"The disk of {folder} is full: the checkpoint of step {step} takes {needed / 1e6:,.0f} MB, and "
-        f"{free / 1e6:,.0f} MB are free. {f'Kept: {kept}.' if kept else 'None has been written before.'} Make room."
-    )
-
-
-def _to_disk(path: Path) -> None:
+def _sync(path: Path) -> None:
     """Have the system write a file, or a folder's list of files, to the disk now."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def training_in(content: dict[str, Any]) -> dict[str, Any]:
-    """What a checkpoint says to the trainer. Version 0.1.0 kept that among the pipeline's and the model's state."""
-    if "training" in content:
-        return content["training"]
-    pipeline = content["pipeline"]
-    older = {
-        "parameter_mean": pipeline.get("_extra_state", {}).get("parameter_mean"),
-        "pace": pipeline.get("_model._extra_state", {}).get("pace"),
-    }
-    return {name: value for name, value in older.items() if value is not None}

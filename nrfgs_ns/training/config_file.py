@@ -2,24 +2,28 @@
 """config.yml read as a configuration and as nothing else.
 
 Nerfstudio saves a training's configuration as YAML with Python tags, and its own commands construct whatever those
-name: `!!python/object/apply:os.system` in a file that somebody hands on is run. Here a file may name
+name: `!!python/object/apply:os.system` in a shared file is run. Here a file may name
 
     configuration classes of nerfstudio (subclasses of its PrintableConfig) and dataclasses of this package
     what a configuration sets up (`_target`): its default's class or a subclass of it, or an optimiser of torch
     paths, tuples, and enums of either package
 
-and everything else stops with a sentence that has the line. Read in: nerfstudio 1.1.5, PyYAML 6.
+and anything else is refused with its line. Values are checked against the types of the dataclasses' fields; an option
+that is newer than the file has its default. Read in: nerfstudio 1.1.5, PyYAML 6.
 """
 
 import importlib
-from dataclasses import MISSING, fields, is_dataclass
+import types
+from collections.abc import Iterator
+from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import torch
 import yaml
 from nerfstudio.configs.base_config import PrintableConfig
+from nerfstudio.configs.experiment_config import ExperimentConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
 from nrfgs_ns.errors import InputError
@@ -30,27 +34,91 @@ NERFSTUDIO, OURS, OPTIMISERS = "nerfstudio", "nrfgs_ns", "torch.optim"
 PATHS = {
     f"{module}.{name}" for module in ("pathlib", "pathlib._local") for name in ("Path", "PosixPath", "WindowsPath")
 }
+FIX = "Name the config.yml that the training saved"
 
 
 def read_config(path: Path) -> TrainerConfig:
     """The configuration of a training.
 
     Raises:
-        InputError: there is no such file, it is no configuration, or it names what is none.
+        InputError: there is no such file, it is no whole configuration, it names anything else, or a value has another
+            type than its option.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file. Name the config.yml that the training saved.")
+        raise InputError(f"{path}: no such file. {FIX}.")
     if path.stat().st_size > LARGEST_FILE:
-        raise InputError(f"{path} is larger than {LARGEST_FILE} bytes. Name the config.yml that the training saved.")
+        raise InputError(f"{path} is larger than {LARGEST_FILE} bytes. {FIX}.")
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a configuration. Name the config.yml that the training saved.") from error
+        raise InputError(f"{path} is not a configuration. {FIX}.") from error
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise InputError(f"{path} is not a configuration: {' '.join(str(error).split())}.") from error
     if not isinstance(config, TrainerConfig):
-        raise InputError(f"{path} is not the configuration of a training. Name the config.yml that the training saved.")
+        raise InputError(f"{path} is not the configuration of a training. {FIX}.")
+    missing = {field.name for field in fields(ExperimentConfig)} - vars(config).keys()
+    if missing:
+        raise InputError(f"{path} is not whole: it lacks {', '.join(sorted(missing)[:3])}. {FIX}.")
+    _fill_in(config)
+    check_types(config, str(path))
     return config
+
+
+def check_types(config: Any, source: str, prefix: str = "") -> None:
+    """Raise InputError, naming `source`, where an option's value has another type than the dataclass's field."""
+    for name, value, hint in _options(config, prefix):
+        if not _is_a(value, hint):
+            raise InputError(f"{source}: {name} is {value!r}, which is not of its type, {_words(hint)}. Correct it.")
+
+
+def _options(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted names, values and types of a configuration's options. A value that is its field's default passes."""
+    hints = get_type_hints(type(config))
+    for field in fields(config):
+        value, name = getattr(config, field.name), f"{prefix}{field.name}"
+        if field.name.startswith("_") or (not is_dataclass(value) and value == _default(field)):
+            continue
+        yield name, value, hints[field.name]
+        nested = value.items() if isinstance(value, dict) else [("", value)]
+        for key, inner in nested:
+            groups = inner.items() if isinstance(inner, dict) else [("", inner)]
+            for part, leaf in groups:
+                if is_dataclass(leaf) and not isinstance(leaf, type):
+                    yield from _options(leaf, ".".join(filter(None, (name, key, part))) + ".")
+
+
+def _is_a(value: Any, hint: Any) -> bool:
+    """Whether a value has the type that a field's annotation names; items of containers are not looked at."""
+    kind = get_origin(hint) or hint
+    if kind in (Union, types.UnionType):
+        return any(_is_a(value, option) for option in get_args(hint))
+    if kind is Literal:
+        return value in get_args(hint)
+    if kind is tuple and isinstance(value, list):  # tyro's own defaults have either
+        return True
+    if kind in (int, float):
+        return isinstance(value, (int, kind)) and not isinstance(value, bool)
+    return not isinstance(kind, type) or isinstance(value, kind)
+
+
+def _words(hint: Any) -> str:
+    return getattr(hint, "__name__", None) if isinstance(hint, type) else str(hint).replace("typing.", "")
+
+
+def _default(field: Field) -> Any:
+    if field.default is not MISSING:
+        return field.default
+    return field.default_factory() if field.default_factory is not MISSING else MISSING
+
+
+def _fill_in(config: Any) -> None:
+    """Give options that the file does not have their defaults."""
+    for field in fields(config):
+        if field.name not in vars(config) and (default := _default(field)) is not MISSING:
+            setattr(config, field.name, default)
+        value = getattr(config, field.name, None)
+        if is_dataclass(value) and not isinstance(value, type):
+            _fill_in(value)
 
 
 class _Loader(yaml.SafeLoader):
@@ -71,51 +139,47 @@ def _part_of(name: str, package: str) -> bool:
 
 def _class(node: yaml.Node, name: str) -> type:
     """The class of this full name, if it is one of the packages' own."""
+    module, _, attribute = name.rpartition(".")
     if not any(_part_of(name, package) for package in (NERFSTUDIO, OURS, OPTIMISERS)):
         raise _refuse(node, name)
-    module, _, attribute = name.rpartition(".")
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        kind = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise _refuse(node, name) from error
-    if not isinstance(found, type) or not any(
-        _part_of(found.__module__, package) for package in (NERFSTUDIO, OURS, OPTIMISERS)
+    if not isinstance(kind, type) or not any(
+        _part_of(kind.__module__, package) for package in (NERFSTUDIO, OURS, OPTIMISERS)
     ):
         raise _refuse(node, name)
-    return found
+    return kind
 
 
 def _name(loader: _Loader, suffix: str, node: yaml.Node) -> type:
-    """`!!python/name:`, which may be a `_target`: `_object` looks whose."""
+    """`!!python/name:`, which may be a `_target`; `_object` checks whose."""
     return _class(node, suffix)
 
 
 def _object(loader: _Loader, suffix: str, node: yaml.Node):
     """`!!python/object:`, a configuration."""
     kind = _class(node, suffix)
-    config = is_dataclass(kind) and (issubclass(kind, PrintableConfig) or _part_of(kind.__module__, OURS))
-    if not config and not (_part_of(kind.__module__, OURS) and kind.__module__.endswith(".retired")):
+    if not is_dataclass(kind) or not (issubclass(kind, PrintableConfig) or _part_of(kind.__module__, OURS)):
         raise _refuse(node, suffix)
-    made = kind.__new__(kind)
-    yield made
+    config = kind.__new__(kind)
+    yield config
     values = loader.construct_mapping(node, deep=True)
     for name, value in values.items():
         if isinstance(value, type) and not (name == "_target" and _fits(kind, value)):
             raise _refuse(node, f"{value.__module__}.{value.__qualname__}")
         if callable(getattr(kind, str(name), None)) and name != "_target":
             raise _refuse(node, f"{suffix}.{name}")
-    getattr(made, "__setstate__", made.__dict__.update)(values)
+    vars(config).update(values)
 
 
 def _fits(config: type, target: type) -> bool:
-    """Whether a configuration of this class may set up objects of that one."""
+    """Whether a configuration of this class may set up objects of that class."""
     if issubclass(target, torch.optim.Optimizer):
         return True
-    for field in fields(config):
-        if field.name == "_target":
-            default = field.default_factory() if field.default is MISSING else field.default
-            return isinstance(default, type) and issubclass(target, default)
-    return False
+    default = next((_default(field) for field in fields(config) if field.name == "_target"), None)
+    return isinstance(default, type) and issubclass(target, default)
 
 
 def _apply(loader: _Loader, suffix: str, node: yaml.Node) -> Any:

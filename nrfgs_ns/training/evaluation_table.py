@@ -8,6 +8,8 @@ from typing import Any
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
+from nrfgs_ns.image.metrics import lpips_advice
+
 SHOWN = ("psnr", "cc_psnr", "ssim", "cc_ssim", "ms_ssim", "lpips", "l1", "seconds_per_image", "splats")
 ENOUGH = 5
 """Fewer views have no "rest" to be below."""
@@ -17,9 +19,12 @@ quartile less one and a half times the distance between the quartiles (Explorato
 
 
 def print_evaluation(result: Mapping[str, Any]) -> None:
-    """Show the means over the test views, and name the views that are far below the rest."""
+    """Print the means over the test views, the views far below the rest, and how to get LPIPS where it is missing."""
     names = [name for name in SHOWN if result.get(name) is not None]
-    table = Table(title=f"Means over {len(result['per_image'])} test views", title_justify="left")
+    views = len(result["per_image"])
+    title = "One test view: not a mean, and no measure of the whole" if views == 1 else f"Means over {views} test views"
+    CONSOLE.print(title, soft_wrap=True)
+    table = Table()
     for name in names:
         table.add_column(name, justify="right")
     table.add_row(*(f"{result[name]:,}" if name == "splats" else f"{result[name]:.4g}" for name in names))
@@ -32,6 +37,8 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
             markup=False,
             soft_wrap=True,
         )
+    if result.get("lpips") is None and (advice := lpips_advice()) is not None:
+        CONSOLE.print(advice, markup=False, soft_wrap=True)
 
 
 def far_below(images: Sequence[Mapping[str, Any]]) -> list[tuple[str, float, float]]:

@@ -74,37 +74,47 @@ def evidence(datamanager: Any) -> Evidence:
     return Evidence(pairs, centers, known, estimate(pairs, torch.full_like(known, torch.nan), centers))
 
 
-def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
-    """What a training learns of its photographs, and one line that says why.
+def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | None, list[str]]:
+    """The photographs' exposure model, announced in one line.
 
     Args:
         config: an NrfgsModelConfig.
         datamanager: with its images read.
 
     Returns:
-        None where nothing is learnt.
+        The model, None where nothing is learnt; and the evidence in words and numbers.
 
     Raises:
         InputError: it is asked for together with the bilateral grid.
     """
     if config.photographs == "off":
-        return None
+        return None, []
     if config.use_bilateral_grid:
         if config.photographs == "on":
             raise InputError(
                 "pipeline.model.photographs is on and use_bilateral_grid, too: both would learn the same. Use one."
             )
-        return None
+        return None, []
     found = evidence(datamanager)
     wanted, why = verdict(config.photographs, found)
-    learnt = "learnt" if wanted else "not learnt"
-    CONSOLE.print(f"Photographs: exposure and white balance {learnt}: {why}.", soft_wrap=True, markup=False)
+    outcome = f"exposure and white balance {'learnt' if wanted else 'not learnt'}"
+    CONSOLE.print(f"Photographs: {outcome}, {reason(config.photographs, found)}.", soft_wrap=True)
+    notes = [f"photographs: {outcome}: {why}"]
     if not wanted:
-        return None
+        return None, notes
     known = found.known
     looks = estimate(found.pairs, known, found.centers) if torch.isfinite(known).any() else found.seen
     names = [path.name for path in datamanager.train_dataset.image_filenames]
-    return PhotographModel(names, channels(looks.stops), looks.held)
+    return PhotographModel(names, channels(looks.stops), looks.held), notes
+
+
+def reason(choice: Choice, found: Evidence) -> str:
+    """Why photographs' exposure is learnt or not, in a few words."""
+    if choice == "on":
+        return "as asked for"
+    if found.learnt_by_itself:
+        return "since the photographs differ in brightness or colour"
+    return "since the photographs agree" if any(found.seen.random) else "since too few common points compare them"
 
 
 def verdict(choice: Choice, found: Evidence) -> tuple[bool, str]:

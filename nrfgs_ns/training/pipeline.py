@@ -29,6 +29,7 @@ from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.rasterizer import load_kernels
 from nrfgs_ns.training import optimizers
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
+from nrfgs_ns.training.config_file import check_types
 from nrfgs_ns.training.evaluation_table import print_evaluation
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
 from nrfgs_ns.training.step_graph import StepGraphs
@@ -78,11 +79,14 @@ class NrfgsPipeline(VanillaPipeline):
     """images for which a step counts in the schedules (`distributed.schedules`)"""
     graphs: StepGraphs | None = None
     """what makes steps in one launch, where it can; the trainer's"""
+    notes: tuple[str, ...] | list[str] = ()
+    """numbers behind what was chosen automatically, in sentences"""
     steps_per_log: int = 1
     """steps between two at which metrics are taken"""
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
         allow_nerfstudio_checkpoints()
+        check_types(config, "config.yml", "pipeline.")  # nerfstudio's commands construct whatever the file holds
         if test_mode == "val" and config.compact is not None:
             raise InputError(
                 f"pipeline.compact is {config.compact}, but a training does not begin with a compact file. Leave it "
@@ -96,7 +100,7 @@ class NrfgsPipeline(VanillaPipeline):
             with tried_meanwhile(_kernel_trials(self.model), self.model.device):
                 self._check_smallest_image()
                 self.datamanager.load_all_images()
-                photographs = photograph_model(config.model, self.datamanager)
+                photographs, self.notes = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
             self.model.fit_on(self.datamanager.train_dataset.cameras)

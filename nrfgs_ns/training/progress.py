@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The line that says how far a training is: steps, the PSNR of a test view, the time that is left.
+"""The progress line: steps, the PSNR of a test view, the time that is left.
 
-It takes the place of nerfstudio's table on the terminal. The test view is only looked at: a training with the line and
-one without make the same numbers.
+It replaces nerfstudio's table on the terminal. The test view is only rendered: a training gives the same numbers with
+and without the line.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from threading import Lock
 from time import perf_counter
@@ -23,16 +24,16 @@ from tyro.conf import Suppress
 from nrfgs_ns.image.metrics import psnr
 
 SHORTEST = 1.0
-"""Seconds between two looks at the test view, at least."""
+"""Least seconds between two updates on a terminal."""
 SHARE = 0.005
-"""Of the training's time that looks may take."""
-LINES_IN_A_FILE = 20
-"""Where the output is no terminal, a line is written for each so many-th part of the steps."""
+"""Largest share of the training's time for updates."""
+IN_A_FILE = 30.0
+"""Seconds between two lines where the output is no terminal."""
 
 
 @dataclass
 class ProgressLineConfig(LocalWriterConfig):
-    """The line on the terminal."""
+    """The progress line's options."""
 
     _target: type = field(default_factory=lambda: ProgressLine)
     """target class to instantiate"""
@@ -45,10 +46,7 @@ class ProgressLineConfig(LocalWriterConfig):
 
 
 def end_earlier_logs() -> None:
-    """Forget the logs of trainings that this process has set up before, and what one that was cut off left to write.
-
-    Nerfstudio would go on with both.
-    """
+    """Close the logs of this process's earlier trainings, which nerfstudio would go on writing to."""
     writer.EVENT_STORAGE.clear()
     while writer.EVENT_WRITERS:
         log = writer.EVENT_WRITERS.pop()
@@ -57,36 +55,41 @@ def end_earlier_logs() -> None:
 
 
 class ProgressLine(LocalWriter):
-    """A line that is kept up to date on a terminal, and written now and then into anything else.
+    """One line that is updated on a terminal, and repeated now and then in a file.
 
     The trainer calls `write_stats_log` after each step, nerfstudio's loop in those that are logged.
 
     Args:
         config: its options.
-        banner_messages: lines that are printed once, above it: the viewer's address.
+        banner_messages: lines printed once above it: the viewer's address.
+        clock: seconds, for tests.
     """
 
-    def __init__(self, config: ProgressLineConfig, banner_messages: list[str] | None = None):
+    def __init__(
+        self,
+        config: ProgressLineConfig,
+        banner_messages: list[str] | None = None,
+        clock: Callable[[], float] = perf_counter,
+    ):
         super().__init__(config, banner_messages)
         for message in banner_messages or []:
             CONSOLE.print(message, markup=False, soft_wrap=True)
+        self.clock = clock
         self._pipeline: Any = None
         self._view = 0, ""
         self._lock = Lock()
         self._live: Live | None = None
         self._is_over = False
         self._last: tuple[int, float] | None = None
-        """step and time of the last look"""
-        self._due = 0.0
-        self._told = -1.0
-        """share of the steps at the last line in a file"""
+        """step and time of the last update"""
+        self._due = -1.0
         self._first = 0
 
     def watch(self, pipeline: Any, lock: Lock) -> None:
-        """Look at one of this pipeline's test views, the middle one, if it has any.
+        """Report the PSNR of this pipeline's middle test view, if it has any.
 
         Args:
-            lock: is held while looking: the viewer asks the same model for pictures.
+            lock: held while rendering: the viewer uses the same model.
         """
         data = pipeline.datamanager
         views = data.eval_dataset.image_filenames
@@ -97,50 +100,47 @@ class ProgressLine(LocalWriter):
             self._pipeline, self._lock = pipeline, lock
 
     def begin(self, step: int) -> None:
-        """The training begins with this step; nerfstudio names 0 with what it has logged before."""
+        """Set the training's first step; before it nerfstudio logs under step 0."""
         self._first = step
 
     def write_stats_log(self, step: int) -> None:
-        """Bring the line up to date, if that is due."""
-        if not self._is_over and perf_counter() >= self._due:
-            self._tell(max(step, self._first))
+        """Update the line if it is due."""
+        if not self._is_over and self.clock() >= self._due:
+            self._update(max(step, self._first))
 
     def finish(self, step: int) -> None:
-        """Say what has become of it after the last step, and leave the line there."""
+        """Show the result of the last step and leave the line there."""
         if not self._is_over:
-            self._tell(step, is_last=True)
+            self._update(step, is_last=True)
             self.close()
 
     def close(self) -> None:
-        """Let go of the terminal; nothing more is said."""
+        """Release the terminal for good."""
         self._is_over = True
         self.step_aside()
 
     def step_aside(self) -> None:
-        """Let go of the terminal until there is something to say again."""
+        """Release the terminal until the next update."""
         if self._live is not None:
             self._live.stop()
             self._live = None
 
-    def _tell(self, step: int, is_last: bool = False) -> None:
-        start = perf_counter()
+    def _update(self, step: int, is_last: bool = False) -> None:
+        start = self.clock()
         total = max(writer.GLOBAL_BUFFER["max_iter"], step + 1)
         done = (step + 1) / total
-        in_file = not CONSOLE.is_terminal
-        if in_file and not is_last and int(LINES_IN_A_FILE * done) == int(LINES_IN_A_FILE * self._told):
-            return
-        parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)", *self._seen()]
+        parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)", *self._quality()]
         if self._last is not None and step > self._last[0]:
-            rate = (step - self._last[0]) / (start - self._last[1])
+            rate = (step - self._last[0]) / max(start - self._last[1], 1e-9)
             parts.append(f"{rate:.3g} steps/s")
             if not is_last:
                 parts.append(f"{duration((total - step - 1) / rate)} left")
-        self._last, self._told = (step, start), done
+        self._last = step, start
         self._show(", ".join(parts), done)
-        now = perf_counter()
-        self._due = now + max(SHORTEST, (now - start) / SHARE)
+        now = self.clock()
+        self._due = max(now + SHORTEST, now + (now - start) / SHARE) if CONSOLE.is_terminal else start + IN_A_FILE
 
-    def _seen(self) -> list[str]:
+    def _quality(self) -> list[str]:
         """The PSNR of the test view."""
         if self._pipeline is None:
             return []
@@ -157,7 +157,7 @@ class ProgressLine(LocalWriter):
         line.add_column(width=16)
         line.add_column(no_wrap=True, overflow="ellipsis")
         line.add_row(ProgressBar(total=1.0, completed=done), text)
-        if self._live is None:  # without a thread of its own that draws ten times a second
+        if self._live is None:  # without a thread that redraws ten times a second
             self._live = Live(console=CONSOLE, auto_refresh=False)
             self._live.start()
         self._live.update(line, refresh=True)
@@ -165,9 +165,8 @@ class ProgressLine(LocalWriter):
 
 @torch.no_grad()
 def psnr_of(pipeline: Any, index: int) -> float | None:
-    """PSNR of a test view, dB, as an evaluation would have it; None if its mask leaves nothing. The pipeline is in
-    training again afterwards.
-    """
+    """PSNR of a test view in dB, as in an evaluation; None if its mask leaves nothing. Leaves the pipeline in training
+    mode."""
     model, data = pipeline.model, pipeline.datamanager
     pipeline.eval()
     try:
@@ -180,7 +179,7 @@ def psnr_of(pipeline: Any, index: int) -> float | None:
 
 
 def duration(seconds: float) -> str:
-    """A time for people: 45 s, 3 min 20 s, 2 h 05 min."""
+    """A time such as 45 s, 3 min 20 s, 2 h 05 min."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's trainer, with checkpoints that are whole or not there, a guard over every number, a time budget, a mean
-over the last steps, and an end in order whatever ends it."""
+"""Nerfstudio's trainer with checkpoints that are whole or not there, a guard against numbers that are not finite, a time
+budget, a mean over the last steps, and an orderly end whatever causes it."""
 
 import gc
 import math
@@ -24,7 +24,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import ForTheUser, InputError
 from nrfgs_ns.training import checkpoint_files
-from nrfgs_ns.training.averaging import ParameterMean, tell, tell_why_not
+from nrfgs_ns.training.averaging import ParameterMean, report_mean, report_no_mean, window
 from nrfgs_ns.training.checkpoint_files import DiskFull
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
@@ -40,11 +40,7 @@ from nrfgs_ns.training.stopping import (
     rows_agree,
 )
 from nrfgs_ns.training.tracking import track
-from nrfgs_ns.training.trainer_config import (
-    NrfgsTrainerConfig,
-    nothing_left_where_refused,
-    tell_what_was_chosen,
-)
+from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, nothing_left_where_refused, report_choices
 
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
 
@@ -53,12 +49,12 @@ class NrfgsTrainer(Trainer):
     """Trainer that never leaves a torn checkpoint, or one with NaN, where `--load-dir` would find it.
 
     Attributes:
-        total_steps: steps of the whole training, those before a checkpoint included.
-        line: what the terminal shows while it trains; None: nothing, or nerfstudio's table.
-        pace: how fast the training walks through its schedules; None: a step is a step.
-        steps_are_chosen: whether the number of training views says how many steps are made.
-        mean: of the parameters over the last steps; None if none was asked for.
-        request: what signals have asked for.
+        total_steps: steps of the whole training, including those before a checkpoint.
+        line: the progress line; None: nothing is shown, or nerfstudio's table.
+        pace: how fast the training walks through its schedules; None: position and step are the same.
+        steps_are_chosen: whether the number of training views decides how many steps are made.
+        mean: the parameters' mean over the last steps; None without `average_steps`.
+        request: the signal that was received, if any.
     """
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
@@ -78,7 +74,7 @@ class NrfgsTrainer(Trainer):
 
     @property
     def stop_training(self) -> bool:
-        """Whether the step that was made is the last. Nerfstudio's loop asks, and sets it."""
+        """Whether no further step is made. Nerfstudio's loop reads and sets it."""
         return self._stop or self._is_asked_to_stop
 
     @stop_training.setter
@@ -101,15 +97,15 @@ class NrfgsTrainer(Trainer):
         except KeyboardInterrupt:
             NrfgsTrainer._end(self, NOTHING_TO_SAVE, 130)
         writer.GLOBAL_BUFFER["max_iter"] = self.total_steps
-        self.line = next((one for one in writer.EVENT_WRITERS if isinstance(one, ProgressLine)), None)
+        self.line = next((log for log in writer.EVENT_WRITERS if isinstance(log, ProgressLine)), None)
         if self.line is not None and self.world_size == 1:  # with several, no device can draw alone
             self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
-        """the last step that was made"""
+        """the last completed step"""
         self._record_steps()
         if comms.is_main_process():
-            tell_what_was_chosen(self.pipeline.model, self.steps_are_chosen)
-        if self.config.average_steps > 0:  # behind the callbacks that change parameters after a step
+            report_choices(self.config, self.pipeline, self.steps_are_chosen)
+        if self.config.average_steps > 0:  # after the callbacks that change parameters
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
     def _record_steps(self) -> None:
@@ -134,14 +130,13 @@ class NrfgsTrainer(Trainer):
         groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
         return WatchedOptimizers(self.guard, self.optimizer_configs(), groups, every, self.pace)
 
-    # Going on from a checkpoint.
+    # Resuming.
 
     def _load_checkpoint(self) -> None:
-        """Go on from the checkpoint that the configuration names, if it names one.
+        """Resume from the checkpoint that the configuration names, if any.
 
         Raises:
-            InputError: it is damaged, is of another data set or of options with another meaning, or is the end of the
-                training.
+            InputError: it is damaged, its data set or the meaning of its numbers is another, or the training is over.
         """
         config = self.config
         if config.load_dir is not None:
@@ -154,11 +149,10 @@ class NrfgsTrainer(Trainer):
         if "optimizers" not in content:
             raise InputError(f"{path} is of a compact file, which no training goes on from. Use its training's own.")
         self._start_step = content["step"] + 1
-        training = checkpoint_files.training_in(content)
-        if "scene" in training:  # older checkpoints do not say
-            check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
+        training = content["training"]
+        check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
         self.pipeline.load_pipeline(content["pipeline"], content["step"])
-        self._check_options(training.get("options", {}), path)
+        self._check_options(training["options"], path)
         self.optimizers.load_optimizers(content["optimizers"])
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
@@ -176,7 +170,7 @@ class NrfgsTrainer(Trainer):
         return f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
 
     def _check_options(self, written: dict[str, str], path: Path) -> None:
-        """Refuse to go on where that makes no sense; see `_load_checkpoint`."""
+        """Raise InputError where the options do not fit the checkpoint; name those that changed."""
         changed = check_options(written, options_of(self.config))
         if changed:
             shown = "; ".join(changed[:5]) + ("; ..." if len(changed) > 5 else "")
@@ -195,7 +189,7 @@ class NrfgsTrainer(Trainer):
         return scene_of([Path(name).name for name in data.image_filenames], data.cameras)
 
     def _follow(self, written: dict[str, Any] | None) -> None:
-        """Go on in the schedules where the checkpoint was, and at the rate that is left for the steps that are left.
+        """Take the checkpoint's position on the schedules; the remaining steps walk through the rest.
 
         Args:
             written: the state of the checkpoint's pace; None: it had none.
@@ -212,7 +206,7 @@ class NrfgsTrainer(Trainer):
         if written is not None:
             pace.load_state(written)
         if pace.position == 0.0:
-            pace.position = float(self._start_step)  # of a checkpoint whose schedules were not stretched
+            pace.position = float(self._start_step)  # the checkpoint's schedules were not stretched
         if isinstance(pace, TimedPace):
             if pace.is_spent:
                 raise InputError(
@@ -221,12 +215,12 @@ class NrfgsTrainer(Trainer):
                 )
         else:
             rate = (pace.length - pace.position) / self.config.max_num_iterations
-            if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # the same to the last bit, if it is the same
+            if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # an unchanged rate stays the same to the last bit
                 pace.rate = max(rate, 1e-9)
         self.pipeline.model.schedule_at(int(pace.position))
 
     def optimizer_configs(self) -> dict[str, Any]:
-        """The configured optimisers; the means', whose learning rate is a length, in world units."""
+        """The configured optimisers; the means' learning rate, a length, in world units."""
         groups = self.config.optimizers.copy()
         groups["means"] = in_world_units(groups["means"], self.pipeline.model.scene_unit)
         return groups
@@ -247,7 +241,7 @@ class NrfgsTrainer(Trainer):
         if self.line is not None:
             self.line.begin(self._start_step)
         gc.collect()
-        gc.freeze()  # what is there now stays: the collector need not walk through it again and again
+        gc.freeze()  # all present objects stay: the collector need not visit them
         try:
             if self.pace is not None:
                 self.pace.start()
@@ -259,9 +253,8 @@ class NrfgsTrainer(Trainer):
                 self.line.close()
 
     def _update_viewer_state(self, step: int) -> None:
-        """Nerfstudio's, and fewer events: it would send each step's duration to the log, which takes the host longer
-        than some kernels. Averages go on; they are sent with the rest, every `logging.steps_per_log` steps, for which
-        the line on the terminal does not wait."""
+        """Nerfstudio's with fewer events: logging each step's duration takes the host longer than some kernels take.
+        Averages are logged every `logging.steps_per_log` steps; the progress line is updated more often."""
         super()._update_viewer_state(step)
         if step % self.config.logging.steps_per_log != 0:
             writer.EVENT_STORAGE.clear()
@@ -270,10 +263,10 @@ class NrfgsTrainer(Trainer):
 
     @check_eval_enabled
     def eval_iteration(self, step: int) -> None:
-        """Nerfstudio's, and a look at the appearance head whenever test images are looked at."""
+        """Nerfstudio's; also logs the appearance head's components when test images are evaluated."""
         pictures = step_check(step, self.config.steps_per_eval_all_images)
         if pictures and self.line is not None:
-            self.line.step_aside()  # the evaluation shows how far it is itself
+            self.line.step_aside()  # the evaluation has a progress bar of its own
         super().eval_iteration(step)
         if pictures or step_check(step, self.config.steps_per_eval_image):
             self.pipeline.eval()
@@ -297,9 +290,9 @@ class NrfgsTrainer(Trainer):
         self._made = step
         if pace is not None:
             model.schedule_at(int(pace.position))
-        if isinstance(pace, TimedPace):  # the step that brings the time's end is the last
+        if isinstance(pace, TimedPace):
             self.stop_training = self._stop or pace.is_spent
-            writer.GLOBAL_BUFFER["max_iter"] = step + 1 + pace.steps_left  # what the terminal counts towards
+            writer.GLOBAL_BUFFER["max_iter"] = step + 1 + pace.steps_left  # the progress line's total
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     @property
@@ -308,29 +301,28 @@ class NrfgsTrainer(Trainer):
         return self._start_step + self.config.max_num_iterations - 1
 
     def _average(self, step: int) -> None:
-        """Take the step's numbers into the mean, if it is one of the last `average_steps`."""
-        mean, window = self.mean, self.config.average_steps
-        if isinstance(self.pace, TimedPace):
-            left = self.pace.steps_left  # as things look now; to within a step at a constant pace
-            is_of_earlier_steps = left >= 2 * window  # once begun it goes on, unless the end was far from foreseen
-        else:
-            left = self.last_step - step
-            is_of_earlier_steps = mean.count >= window - left  # of a training that was to end before this one does
-        if is_of_earlier_steps:
+        """Add the step's parameters to the mean if it is one of the last `average_steps` (see `averaging.window`)."""
+        mean = self.mean
+        timed = isinstance(self.pace, TimedPace)
+        left = self.pace.steps_left if timed else self.last_step - step  # timed: an estimate
+        size = window(self.config.average_steps, step + 1 + left)
+        # A timed window stays once begun, unless the estimate was far off; otherwise the mean may be of steps that were
+        # the last before the training was extended.
+        if left >= 2 * size if timed else mean.count >= size - left:
             mean.forget()
-        if left < window or mean.count > 0:
+        if left < size or mean.count > 0:
             mean.add(self.optimizers.optimizers)
 
     # The end.
 
     def _after_train(self) -> None:
-        """Nerfstudio's, whose step number is one too many when it stopped early; the model is the mean from here on."""
+        """Nerfstudio's, whose step number is one too high after an early stop; from here on the model is the mean."""
         self.step, self._is_ending = self._made, True
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
         if self._is_asked_to_stop and not timed_out and self._made < self.last_step:
             self._stop_as_asked()
         if self.mean is not None and self._stop and not timed_out:
-            tell_why_not(self.config.average_steps, "the training was stopped before its last step")
+            report_no_mean(self.config.average_steps, "the training was stopped before its last step")
         else:
             self.take_the_mean()
         if self.line is not None:
@@ -356,7 +348,7 @@ class NrfgsTrainer(Trainer):
         raise SystemExit(status)
 
     def _train_complete_viewer(self) -> None:
-        """Nerfstudio's: the viewer goes on showing the model until Ctrl-C, which may have come in the last step."""
+        """Nerfstudio's: the viewer shows the model until Ctrl-C, which may have come in the last step."""
         self.request.is_over = True
         if self.request.signal is not None:
             return
@@ -365,7 +357,7 @@ class NrfgsTrainer(Trainer):
 
     @contextmanager
     def _state_on_disk_if_it_fails(self) -> Iterator[None]:
-        """Save what there is when something else than a signal or the guard ends the training.
+        """Save the last complete step when something other than a signal or the guard ends the training.
 
         Raises:
             TrainingStopped: the memory has run out. Other exceptions are raised again.
@@ -378,18 +370,19 @@ class NrfgsTrainer(Trainer):
             if self.world_size > 1:  # one device alone cannot write the whole
                 raise
             memory, what = is_out_of_memory(error), str(error).partition("\n")[0]
-            error.__traceback__ = error.__traceback__ if not memory else None  # whose frames hold the step's tensors
-            said = self._save_what_there_is()
             if memory:
-                message = f"Out of memory in step {self.step}: {what}\n{said}"
+                error.__traceback__ = None  # its frames hold the step's tensors
+            outcome = self._save_last_step()
+            if memory:
+                message = f"Out of memory in step {self.step}: {what}\n{outcome}"
                 advice = "Fewer splats or smaller images take less (docs/troubleshooting.md)."
                 saved = self._saved_step == self._made
                 raise TrainingStopped(f"{message} {advice}", self.step, "memory", savable=saved) from None
-            print(f"The training failed in step {self.step}. {said}", flush=True)
+            print(f"The training failed in step {self.step}. {outcome}", flush=True)
             raise
 
-    def _save_what_there_is(self) -> str:
-        """Save the state after the last step that was made, if it is one; what came of it."""
+    def _save_last_step(self) -> str:
+        """Save the state after the last completed step, if it is consistent; returns a sentence about the outcome."""
         self._is_ending = True
         last = next(iter(checkpoint_files.find(self.checkpoint_dir).values()), None)
         kept = f"The last checkpoint is {last}." if last else "This training has written no checkpoint."
@@ -405,27 +398,27 @@ class NrfgsTrainer(Trainer):
         try:
             if self._saved_step != self._made:
                 self.save_checkpoint(self._made)
-        except (Exception, ForTheUser) as error:  # what has failed first is what is raised
+        except (Exception, ForTheUser) as error:  # the first failure is the one to raise
             return f"The state could not be saved ({error}). {kept}"
         return f"Step {self._made} is {self._where_it_goes_on}."
 
     def take_the_mean(self) -> None:
-        """Let the model be the mean over the last steps, if one was asked for, and say so; or say why it is not.
+        """Replace the parameters by their mean over the last steps, if there is one, and say so.
 
         Raises:
-            TrainingStopped: the last step met a number that is not finite; what is good has been written.
+            TrainingStopped: the last step met a number that is not finite; the last good state has been written.
         """
-        mean, window = self.mean, self.config.average_steps
+        mean, asked = self.mean, self.config.average_steps
         if mean is None:
             return
         with self._last_good_state_on_disk():
             self.guard.settle()
         if mean.count == 0:
-            tell_why_not(window, "the time was up sooner than foreseen")
-        else:
-            tell(mean.count, window, mean.began_anew)
-            with self.train_lock:
-                mean.install()
+            report_no_mean(asked, "the time was up sooner than foreseen")
+            return
+        report_mean(mean.count, window(asked, self._made + 1), mean.restarted)
+        with self.train_lock:
+            mean.install()
 
     # Checkpoints.
 
@@ -433,7 +426,7 @@ class NrfgsTrainer(Trainer):
         """Write a checkpoint of finite numbers. Where the disk is full the training goes on, with a warning.
 
         Raises:
-            TrainingStopped: there is a number that is not finite; what is good has been written.
+            TrainingStopped: a number is not finite; the last good state has been written.
             DiskFull: at the end of the training.
         """
         with self._last_good_state_on_disk():
@@ -471,7 +464,7 @@ class NrfgsTrainer(Trainer):
         self._saved_step = step
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
-        """What a checkpoint holds: nerfstudio's entries, and "training", what this class needs to go on."""
+        """A checkpoint's content: nerfstudio's entries, and "training", which this class needs to resume."""
         training: dict[str, Any] = {"scene": self._scene(), "options": options_of(self.config)}
         training["options"]["max_num_iterations"] = str(self.total_steps)
         if self.pace is not None:

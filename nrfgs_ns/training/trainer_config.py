@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trainer's options: what is refused before anything is read, what is chosen, where a training is written."""
+"""The trainer's options: their checks before anything is read or written, their automatic values, a training's folder."""
 
 import math
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from pkgutil import resolve_name
 
@@ -31,13 +30,19 @@ from nrfgs_ns.training.pace import (
 )
 
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
-"""What these are the options of. It reads them, and is looked up by name when it is set up."""
+"""The trainer of these options, which imports this module."""
 SEVERAL_DEVICES = "nrfgs_ns.distributed"
-"""The package that trains on several devices, likewise."""
+"""The package that trains on several devices; it imports this one."""
 AVERAGED = 200
-"""Last steps whose mean is the trained model, where their number is chosen and in the presets."""
-TIME_STAMP = re.compile(r"\d{4}-\d\d-\d\d_\d{6}")
-"""What nerfstudio calls a training's folder if it is not told."""
+"""Steps to average in the presets and where the steps are chosen by the views."""
+LARGEST_RATE = 100.0
+"""Largest learning rate: Adam moves a parameter by about this much in a step, and log-scales of 100 overflow."""
+FEW = 0.9
+"""Trust in view dependence below which its reduction is worth a word on the terminal: 180 training views."""
+PLAIN = {"markup": False, "highlight": False, "soft_wrap": True}
+"""Text for the console that may hold brackets and paths."""
+NOTES = "choices.txt"
+"""File in a training's folder: the numbers behind what was chosen automatically."""
 
 
 @dataclass
@@ -55,17 +60,17 @@ class NrfgsTrainerConfig(TrainerConfig):
     """steps for which schedules are given; they are stretched to the actual steps. None: not stretched; with a time
     budget: max_num_iterations"""
     average_steps: int | None = None
-    """last steps over which the model's parameters are averaged. 0: none. None: 200 if max_num_iterations is 0,
-    otherwise 0"""
+    """last steps over which the model's parameters are averaged, at most a share of all (docs/trade-off.md). 0: none.
+    None: 200 if max_num_iterations is 0, otherwise 0"""
 
     def setup(self, **kwargs) -> Trainer:
         """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
 
         Raises:
-            InputError: an option is out of range, cannot be had on several devices, or there is nothing to go on from.
+            InputError: as `check`.
         """
         with nothing_left_where_refused(self):
-            self._check(kwargs.get("world_size", 1))
+            self.check(kwargs.get("world_size", 1))
             if kwargs.get("world_size", 1) == 1:
                 return super().setup(**kwargs)
             # Schedules are not stretched there.
@@ -74,8 +79,15 @@ class NrfgsTrainerConfig(TrainerConfig):
             )
             return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
 
-    def _check(self, devices: int) -> None:
-        """Raise InputError where an option makes no sense on so many devices; see `setup`."""
+    def check(self, devices: int) -> None:
+        """Raise InputError where an option is out of range, is not for several devices, or names no checkpoint."""
+        for name, part in (
+            ("experiment_name", self.experiment_name),
+            ("timestamp", self.timestamp),
+            ("relative_model_dir", str(self.relative_model_dir)),
+        ):
+            if part is not None and not _is_within(part):
+                raise InputError(f"{name} is {part!r}; it must be the name of a folder within --output-dir.")
         for name in ("time_budget", "schedule_steps"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
@@ -104,13 +116,13 @@ class NrfgsTrainerConfig(TrainerConfig):
             checkpoint_files.checkpoints_in(self.load_dir)
 
     def _check_learning_rates(self) -> None:
-        """Raise InputError where a learning rate, or its schedule, is no number that a step can be made with."""
+        """Raise InputError where a learning rate or its schedule is out of range."""
         for name, group in self.optimizers.items():
             numbers = {"optimizer.lr": group["optimizer"].lr}
             schedule = group.get("scheduler")
-            lowest, needed = 0.0, "zero or positive"
+            lowest, needed = 0.0, f"from 0 to {LARGEST_RATE:g}"
             if isinstance(schedule, ExponentialDecaySchedulerConfig):
-                lowest, needed = math.ulp(0.0), "positive, since it falls exponentially"
+                lowest, needed = math.ulp(0.0), f"above 0, since it falls exponentially, and at most {LARGEST_RATE:g}"
                 numbers["scheduler.lr_final"] = schedule.lr_final
                 if schedule.max_steps <= schedule.warmup_steps:
                     raise InputError(
@@ -118,11 +130,11 @@ class NrfgsTrainerConfig(TrainerConfig):
                         f"warmup_steps, {schedule.warmup_steps}."
                     )
             for option, value in numbers.items():
-                if value is not None and not lowest <= value < math.inf:
+                if value is not None and not lowest <= value <= LARGEST_RATE:
                     raise InputError(f"optimizers.{name}.{option} is {value}; it must be {needed}.")
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
-        """The configuration with what is left open chosen: steps, schedules and mean of a training on one device."""
+        """The configuration with automatic values filled in: steps, schedules and mean of a training on one device."""
         if self.max_num_iterations > 0:
             return replace(self, average_steps=self.average_steps or 0)
         return replace(
@@ -142,11 +154,11 @@ class NrfgsTrainerConfig(TrainerConfig):
         return None if self.schedule_steps is None else Pace(length, length / self.max_num_iterations)
 
     def print_to_terminal(self) -> None:
-        """What ns-train says before it begins: one line, and on several devices whether they are there. The whole
-        configuration is in config.yml, and shown with NRFGS_DEBUG=1.
+        """Check the options before anything is written, and print ns-train's first line. The whole configuration is in
+        config.yml, and shown with NRFGS_DEBUG=1.
 
         Raises:
-            InputError: there are fewer devices than were asked for, or none were, or the seed is none.
+            InputError: as `check`; the seed or the number of devices is out of range; there is no data.
         """
         if DEBUG:
             super().print_to_terminal()
@@ -158,28 +170,32 @@ class NrfgsTrainerConfig(TrainerConfig):
         ):
             if not low <= value <= high:
                 raise InputError(f"machine.{name} is {value}; it must be from {low} to {high}.")
-        if machine.num_devices * machine.num_machines > 1:
-            resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
+        devices = machine.num_devices * machine.num_machines
+        self.check(devices)
         datamanager = self.pipeline.datamanager
-        data = self.data or datamanager.data or _absolute(datamanager.dataparser.data)
-        lines = [f"{self.method_name} on {data}"]
-        if machine.device_type == "cpu" and self.time_budget is None:
-            command = ten_minute_command(data, _name_of(datamanager.dataparser))
-            lines.append(f"No CUDA device: the CPU trains. A result in ten minutes: {command}")
-        CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+        data = self.data or datamanager.data
+        parser = datamanager.dataparser
+        is_here = not isinstance(parser, NrfgsDataParserConfig) or Path("transforms.json").exists()
+        if data is None and parser.data == Path() and not is_here:
+            raise InputError(
+                "--data is missing. Name the folder of the data set; `nrfgs prepare PHOTOS SCENE` makes one from "
+                "photographs."
+            )
+        if devices > 1:
+            resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
+        CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
 
     def save_config(self) -> None:
-        """Save config.yml, with paths that lead to the same places from any folder.
+        """Make the training's folder and save config.yml there, with paths that do not depend on the working folder.
 
         Raises:
-            InputError: nothing can be written there.
+            InputError: nothing can be written there, or the folder holds another training.
         """
         data = self.pipeline.datamanager
         dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
         pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
         try:
-            if TIME_STAMP.fullmatch(self.timestamp):
-                self._take_a_folder()
+            self._take_a_folder()
             whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
             TrainerConfig.save_config(whole)
         except OSError as error:
@@ -189,18 +205,28 @@ class NrfgsTrainerConfig(TrainerConfig):
             ) from error
 
     def _take_a_folder(self) -> None:
-        """Make this training's folder; another one may have begun in the same second."""
-        first = self.timestamp
-        for number in count(2):
+        """Make a folder that is this training's alone: a name that another one took gets a number. A training that goes
+        on from checkpoints in its own folder keeps that."""
+        if self.load_dir is not None and self.load_dir.resolve() == self.get_checkpoint_dir().resolve():
+            return
+        name = self.timestamp
+        for suffix in chain([""], (f"_{number}" for number in count(2))):
+            self.timestamp = f"{name}{suffix}"
             try:
                 self.get_base_dir().mkdir(parents=True)
                 return
             except FileExistsError:
-                self.timestamp = f"{first}_{number}"
+                if not self.get_base_dir().is_dir():
+                    raise
+
+
+def _is_within(part: str) -> bool:
+    """Whether a path leads nowhere out of the folder that it is appended to."""
+    return not Path(part).is_absolute() and ".." not in Path(part).parts
 
 
 def _name_of(parser: DataParserConfig) -> str | None:
-    """What a command calls a parser that it must name; None for ours, and for one that it cannot name."""
+    """The parser's subcommand; None for ours, which is the default, and for an unregistered one."""
     named = (name for name, known in all_dataparsers.items() if type(known) is type(parser))
     return None if isinstance(parser, NrfgsDataParserConfig) else next(named, None)
 
@@ -211,9 +237,8 @@ def _absolute(path: Path | None) -> Path | None:
 
 @contextmanager
 def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
-    """Take back the config.yml that ns-train saves before it reads the data, with the folders that this leaves empty,
-    where the training is refused before it has written anything else.
-    """
+    """Remove the config.yml that ns-train saves before it reads the data, and the folders that this leaves empty, where
+    the training is refused before it has written anything else."""
     try:
         yield
     except InputError:
@@ -228,31 +253,38 @@ def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
         raise
 
 
-def tell_what_was_chosen(model, steps_are_chosen: bool) -> None:
-    """One line: how many steps, how far the views are trusted, how much noise, and why.
+def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool) -> None:
+    """Say what was chosen automatically, and write the numbers behind it to `NOTES`.
 
     Args:
-        model: an NrfgsModel before its first step.
-        steps_are_chosen: whether their number says how many steps are made.
+        pipeline: an NrfgsPipeline before its first step.
+        steps_are_chosen: whether the number of views decides the number of steps.
     """
-    chosen = []
+    model = pipeline.model
     views, given = model.num_views, model.num_train_data
+    parts, notes = [], [*pipeline.notes]
     if steps_are_chosen:
-        chosen.append(
-            f"{steps_for(views):,} steps ({STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,})"
-        )
-    # The densification may have chosen one that is no number.
-    reduced = {name: value for name, value in (model.reduced_head or {}).items() if isinstance(value, float)}
-    if model.trust < 1.0 and reduced:
-        options = ", ".join(f"{name} {value:.2g}" for name, value in reduced.items())
-        chosen.append(f"their view dependence is trusted with {model.trust:.2g} of 1, so that it has {options}")
+        parts.append(f"{steps_for(views):,} steps")
+        notes.append(f"steps: {STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,}")
+    if model.trust < 1.0:
+        parts.append("view dependence reduced, as suits few views" * (model.trust < FEW))
+        reduced = ", ".join(f"{name} {value}" for name, value in (model.reduced_head or {}).items())
+        notes.append(f"trust in view dependence: {model.trust:.2g} of 1{f' ({reduced})' if reduced else ''}")
     if model.view_noise.sigma > 0.0:
-        beside = model.noise_factor * model.camera_spacing / model.scene_unit
-        chosen.append(
-            f"in training the head sees each splat from about {beside:.2g} scene units beside the camera, "
-            f"{model.noise_factor:.2g} times the distance between neighbouring cameras"
+        offset = model.noise_factor * model.camera_spacing / model.scene_unit
+        notes.append(
+            f"noise on the camera centre in training: about {offset:.2g} scene units, {model.noise_factor:.2g} times "
+            "the distance between neighbouring cameras"
         )
-    if chosen:
-        noun = "training view" if given == 1 else "training views"
-        count = f"{given} {noun}" if views == given else f"{views} different training views of {given}"
-        CONSOLE.print(f"{count}: {'; '.join(chosen)} (docs/captures.md).", soft_wrap=True)
+    noun = "training view" if given == 1 else "training views"
+    count = f"{given} {noun}" if views == given else f"{views} different training views of {given}"
+    if any(parts):
+        CONSOLE.print(f"{count}: {', '.join(filter(None, parts))} (docs/captures.md).", soft_wrap=True)
+    parser, is_full_size = config.pipeline.datamanager.dataparser, config.pipeline.datamanager.camera_res_scale_factor == 1
+    is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS and is_full_size
+    if config.machine.device_type == "cpu" and is_long:
+        command = ten_minute_command(_absolute(parser.data), _name_of(parser))
+        CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {command}", **PLAIN)
+    folder = config.get_base_dir()
+    if notes and folder.is_dir():
+        (folder / NOTES).write_text("\n".join([f"{count}", *notes]) + "\n", encoding="utf-8")

@@ -13,14 +13,15 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import relocation
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training.averaging import ParameterMean
+from nrfgs_ns.training import averaging
+from nrfgs_ns.training.averaging import ParameterMean, window
 from nrfgs_ns.training.checkpoint_files import read_latest
 from nrfgs_ns.training.guard import TrainingStopped, remove_splats
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.run import parse
 from nrfgs_ns.training.trainer import NrfgsTrainer
 
-pytestmark = pytest.mark.usefixtures("no_cuda")
+pytestmark = pytest.mark.usefixtures("no_cuda", "any_share")
 
 CALM = {
     "--pipeline.model.num-downscales": 0,
@@ -30,6 +31,14 @@ CALM = {
 """Nothing but the optimisers changes parameters, after the reset of opacity at step 0."""
 RESET = {"--pipeline.model.densification": "splatfacto,refine_every=2,reset_alpha_every=4"}
 """Opacity is reset at steps 0 and 8. Splats neither come nor go: they wait for longer than that after a reset."""
+
+
+@pytest.fixture(scope="module")
+def any_share():
+    """Trainings of a few steps may average over any share of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(averaging, "LARGEST_SHARE", 1.0)
+        yield
 
 
 def calm(scene, out, *more: dict, steps: int = 10) -> NrfgsTrainer:
@@ -116,11 +125,17 @@ def test_what_gives_rows_another_meaning_begins_anew(change, anew, trainer):
         mean.add(trainer.optimizers.optimizers)
     change(model, trainer.pipeline.datamanager, trainer.optimizers)
     mean.add(trainer.optimizers.optimizers)
-    assert (mean.count, mean.began_anew) == ((1, True) if anew else (3, False))
+    assert (mean.count, mean.restarted) == ((1, True) if anew else (3, False))
     if anew:  # nothing of the earlier rows is left in it
         now = {name: value.detach().clone() for name, value in model.gauss_params.items()}
         mean.install()
         assert_close(dict(model.gauss_params.items()), now, rtol=0, atol=0, check_stride=False)
+
+
+@pytest.mark.parametrize("asked, total, size", [(200, 30_000, 200), (200, 300, 6), (200, 20, 1), (7, 300, 6), (3, 300, 3)])
+def test_a_short_training_averages_a_share_of_its_steps(asked, total, size, monkeypatch):
+    monkeypatch.setattr(averaging, "LARGEST_SHARE", 0.02)
+    assert window(asked, total) == size
 
 
 def counts(trainer: NrfgsTrainer, steps: range) -> list[int]:
@@ -186,7 +201,7 @@ def test_a_timed_window_that_begins_much_too_early_is_given_up(trainer):
 
 
 @pytest.fixture(scope="module")
-def averaged(tiny_scene, tmp_path_factory):
+def averaged(tiny_scene, tmp_path_factory, any_share):
     """Trainings of 12 steps that average over the last 6, with their parameters after each step, what they have said,
     and the checkpoint of step 7."""
     done = {}

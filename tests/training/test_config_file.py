@@ -107,6 +107,46 @@ def test_a_file_that_asks_for_more_is_refused(saved, tmp_path, text):
         assert "it asks for" in str(refused.value) or "could not determine a constructor" in str(refused.value)
 
 
+TYPES = {
+    "hidden_width: 64": ("hidden_width: wide", "pipeline.model.appearance.hidden_width is 'wide'"),
+    "max_num_iterations: 0": ("max_num_iterations: [1]", r"max_num_iterations is \[1\]"),
+    "vis: viewer": ("vis: view", "vis is 'view'"),
+    "load_scheduler: true": ("load_scheduler: 3", "load_scheduler is 3"),
+    "lr: 0.05": ("lr: fast", "optimizers.opacities.optimizer.lr is 'fast'"),
+}
+
+
+@pytest.mark.parametrize("old", TYPES)
+def test_a_value_of_another_type_is_refused(saved, old):
+    assert old in WHOLE
+    new, message = TYPES[old]
+    with pytest.raises(InputError, match=f"config.yml: {message}, which is not of its type"):
+        read_config(saved(WHOLE.replace(old, new)))
+
+
+def test_a_pipeline_refuses_it_too():
+    """nerfstudio's own commands read the file without these checks."""
+    config = replace(method_config.nrfgs.config.pipeline, model=3)
+    with pytest.raises(InputError, match="pipeline.model is 3, which is not of its type, NrfgsModelConfig"):
+        config.setup(device="cpu")
+
+
+def test_a_file_that_is_cut_off_is_refused(saved):
+    for length in [*range(1, len(WHOLE), 997), len(WHOLE) - 2]:
+        with pytest.raises(InputError):
+            read_config(saved(WHOLE[:length]))
+
+
+def test_an_option_that_is_newer_than_the_file_has_its_default(saved):
+    config = replace(method_config.nrfgs.config, average_steps=3)
+    text = yaml.dump(config)
+    for line in ("average_steps: 3\n", "    view_noise: 0.5\n"):
+        assert line in text
+        text = text.replace(line, "")
+    read = read_config(saved(text))
+    assert read.average_steps is None and read.pipeline.model.view_noise == 0.0
+
+
 def test_a_file_that_is_not_there_or_no_configuration(tmp_path):
     with pytest.raises(InputError, match="no such file. Name the config.yml"):
         read_config(tmp_path / "config.yml")

@@ -321,8 +321,9 @@ def test_the_chosen_steps_are_made_and_an_interrupted_training_goes_on_to_their_
     whole = trained(command_line("nrfgs", tiny_scene, tmp_path / "whole", 0, SMALL))
     assert checkpoint_of(whole)["step"] == 11
     said = " ".join(capsys.readouterr().out.split())
-    assert f"{VIEWS} training views: 12 steps (1 a view, at least 12 and at most 30); " in said
-    assert f" beside the camera, {0.5 * (VIEWS + 20) / VIEWS:.2g} times the distance between neighbouring" in said
+    assert f"{VIEWS} training views: 12 steps, view dependence reduced" in said
+    notes = next((tmp_path / "whole").rglob("choices.txt")).read_text()
+    assert f"{0.5 * (VIEWS + 20) / VIEWS:.2g} times the distance between neighbouring" in notes
 
     trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path / "half", 0, SMALL, {"--steps-per-save": 5}))
     step_of = trainer.train_iteration

@@ -86,3 +86,5 @@ def test_the_table_has_what_was_measured(capsys):
     said = capsys.readouterr().out
     assert "Means over 7 test views" in said and "25.25" in said and "12,345" in said and "lpips" not in said
     assert "6.png: 9.0 dB, 16.0 below the median view." in said
+    print_evaluation({"psnr": 25.25, "per_image": views(25.25)})
+    assert "One test view: not a mean" in capsys.readouterr().out
