@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's trainer with checkpoints that are whole or not there, a guard against numbers that are not finite, a time
-budget, a mean over the last steps, and an orderly end whatever causes it."""
+"""Nerfstudio's trainer with checkpoints that are whole or not there, a guard against numbers that are not finite, a
+time budget, a mean over the last steps, and an orderly end whatever causes it."""
 
 import gc
 import math

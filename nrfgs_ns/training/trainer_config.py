@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trainer's options: their checks before anything is read or written, their automatic values, a training's folder."""
+"""The trainer's options: checks before anything is read or written, automatic values, a training's folder."""
 
 import math
 from collections.abc import Iterator
@@ -60,8 +60,8 @@ class NrfgsTrainerConfig(TrainerConfig):
     """steps for which schedules are given; they are stretched to the actual steps. None: not stretched; with a time
     budget: max_num_iterations"""
     average_steps: int | None = None
-    """last steps over which the model's parameters are averaged, at most a share of all (docs/trade-off.md). 0: none.
-    None: 200 if max_num_iterations is 0, otherwise 0"""
+    """last steps over which the model's parameters are averaged, at most a twentieth of all. 0: none. None: 200 if
+    max_num_iterations is 0, otherwise 0"""
 
     def setup(self, **kwargs) -> Trainer:
         """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
@@ -280,7 +280,10 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
     count = f"{given} {noun}" if views == given else f"{views} different training views of {given}"
     if any(parts):
         CONSOLE.print(f"{count}: {', '.join(filter(None, parts))} (docs/captures.md).", soft_wrap=True)
-    parser, is_full_size = config.pipeline.datamanager.dataparser, config.pipeline.datamanager.camera_res_scale_factor == 1
+    parser, is_full_size = (
+        config.pipeline.datamanager.dataparser,
+        config.pipeline.datamanager.camera_res_scale_factor == 1,
+    )
     is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS and is_full_size
     if config.machine.device_type == "cpu" and is_long:
         command = ten_minute_command(_absolute(parser.data), _name_of(parser))

@@ -132,7 +132,9 @@ def test_what_gives_rows_another_meaning_begins_anew(change, anew, trainer):
         assert_close(dict(model.gauss_params.items()), now, rtol=0, atol=0, check_stride=False)
 
 
-@pytest.mark.parametrize("asked, total, size", [(200, 30_000, 200), (200, 300, 6), (200, 20, 1), (7, 300, 6), (3, 300, 3)])
+@pytest.mark.parametrize(
+    "asked, total, size", [(200, 30_000, 200), (200, 300, 6), (200, 20, 1), (7, 300, 6), (3, 300, 3)]
+)
 def test_a_short_training_averages_a_share_of_its_steps(asked, total, size, monkeypatch):
     monkeypatch.setattr(averaging, "LARGEST_SHARE", 0.02)
     assert window(asked, total) == size

@@ -154,7 +154,9 @@ def test_known_exposures_are_found(exposed_scene, finished):
 def test_resumed_is_the_unbroken_one(exposed_scene, finished, tmp_path, capsys):
     scene, _ = exposed_scene
     half = trained(command_line("nrfgs-sh", scene, tmp_path / "half", 2, QUICK))
-    assert "Photographs: exposure and white balance learnt, since the photographs differ" in " ".join(capsys.readouterr().out.split())
+    assert "Photographs: exposure and white balance learnt, since the photographs differ" in " ".join(
+        capsys.readouterr().out.split()
+    )
     rest = trained(command_line("nrfgs-sh", scene, tmp_path / "rest", 4, QUICK, {"--load-dir": models_of(half)}))
     assert_same_training(checkpoint_of(finished), checkpoint_of(rest), rtol=0, atol=0)
 
