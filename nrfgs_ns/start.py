@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makes nerfstudio's commands start sooner. Nothing here imports torch's compiler or nerfstudio's models.
+"""A quicker and quieter start of nerfstudio's commands. Nothing here imports torch's compiler or nerfstudio's models.
 
-Nerfstudio imports this package twice: for its data parsers, when most is yet to be imported, and for its methods, right
-before it asks for external ones and reads the command line.
+Nerfstudio imports this package twice: for its data parsers, before most other imports, and for its methods, right
+before it lists external ones and reads the command line. It offers no hook for either replacement below; `host.py` has
+their names.
 """
 
 import atexit
 import functools
 import gc
 import sys
+import warnings
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -16,31 +18,32 @@ from typing import Any
 from nerfstudio.configs import external_methods
 from nerfstudio.utils import misc
 
+from nrfgs_ns.errors import DEBUG
+
 
 def with_data_parsers() -> None:
-    """Make what nerfstudio imports next come sooner."""
-    _leave_modules_alone()
-    atexit.register(gc.unfreeze)  # what is frozen is not taken down in order at the end, and Triton's bindings complain
+    """Speed up nerfstudio's next imports, and silence their deprecation warnings unless NRFGS_DEBUG=1."""
+    gc.freeze()  # imported objects stay: the collector need not visit them
+    atexit.register(gc.unfreeze)  # frozen objects are not destroyed in order, and Triton's bindings complain
+    if not DEBUG:
+        warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio)(\.|$)")
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a path that the terminal's encoding lacks must not end a training
+            stream.reconfigure(errors="backslashreplace")
     if not hasattr(misc.torch_compile, "__wrapped__"):
         misc.torch_compile = _compile_when_called(misc.torch_compile)
 
 
 def with_methods() -> None:
-    """Make what nerfstudio does before it reads the command line come sooner."""
-    _leave_modules_alone()
-    external_methods.inspect = SimpleNamespace(stack=_names_of_callers)
-
-
-def _leave_modules_alone() -> None:
-    """Keep the garbage collector off what has been imported, which stays."""
+    """Speed up nerfstudio's work before it reads the command line."""
     gc.freeze()
+    external_methods.inspect = SimpleNamespace(stack=_names_of_callers)
 
 
 def _compile_when_called(torch_compile: Callable) -> Callable:
     """Nerfstudio's `torch_compile`, which as a decorator waits for the function's first call.
 
-    torch.compile imports torch's compiler, a tenth of the time that a command takes to start, for one function of
-    splatfacto's.
+    torch.compile imports torch's compiler, a tenth of a command's start, for one function of splatfacto's.
     """
 
     @functools.wraps(torch_compile)
@@ -58,11 +61,10 @@ def _compile_when_called(torch_compile: Callable) -> Callable:
 
 
 def _names_of_callers() -> list[SimpleNamespace]:
-    """Names of the functions that are running, the caller's first, as inspect.stack() has them.
+    """Names of the running functions, the caller's first, as inspect.stack() has them.
 
-    When nerfstudio lists the methods that could be installed, it asks 26 times for the function two calls up, by
-    inspect.stack(), which looks for the source of every frame in every module: two fifths of the time that a command
-    takes to start, for nothing but the names.
+    When nerfstudio lists the methods that could be installed, it asks 26 times for the function two calls up through
+    inspect.stack(), which reads the source of every frame: two fifths of a command's start.
     """
     frame, frames = sys._getframe(1), []
     while frame is not None:

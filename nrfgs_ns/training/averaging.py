@@ -21,9 +21,9 @@ from torch.optim import Optimizer
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.training.optimizers import parameters_of
 
-LARGEST_SHARE = 0.05
-"""Largest share of a training's steps to average: a short training still improves within a longer window, and the mean
-would be worse than the last step."""
+LARGEST_SHARE = 0.02
+"""Largest share of a training's steps to average, 200 of 10,000. Within a longer window a short training still
+improves, so that the mean is worse than the last step."""
 
 
 def window(average_steps: int, total: int) -> int:

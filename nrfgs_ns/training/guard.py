@@ -5,19 +5,18 @@ Between the backward pass and the optimisers, the guard takes the largest absolu
 loss and of each gradient, all in one fused call. NaN, infinity, or a gradient beyond `MAX_GRADIENT` (which Adam cannot
 square) condemns the step. What happens then:
 
-- On a CPU, the numbers are at hand: the training stops before the optimisers step.
-- On a GPU, reading them would make the host wait in every step. Instead the verdict stays on the device, where fused
-  Adam reads it (`found_inf`) and leaves parameters and moments as they are. A copy travels to the host meanwhile and is
-  read before the next step is computed: when all is ready for that, in a step of `step_graph.py`, and at its head in
-  one whose projection would wait for the same work anyway. An optimiser that cannot read
-  the verdict on the device is treated as on a CPU, waiting included.
+- On a CPU the training stops before the optimisers step.
+- On a GPU, reading the numbers would make the host wait in every step. Instead the verdict stays on the device, where
+  fused Adam reads it (`found_inf`) and leaves parameters and moments as they are. A copy travels to the host meanwhile
+  and is read before the next step is computed. An optimiser that cannot read the verdict on the device is treated as on
+  a CPU, waiting included.
 
-Either way the parameters and moments that are left are those from before the condemned step, and the trainer writes
-them as that step's checkpoint: training continued from it has skipped the step. On a GPU, densification may have run in
+Either way the remaining parameters and moments are those from before the condemned step, and the trainer writes them as
+that step's checkpoint: a training continued from it has skipped the step. On a GPU, densification may have run in
 between; gradients that are not finite enter its statistics as zero.
 
-Parameters are looked at before each checkpoint and every `PARAMETERS_EVERY` steps. Splats that are not finite (the
-rasterizer does not draw them, so no gradient betrays them) are taken out before the checkpoint is written.
+Parameters are checked before each checkpoint and every `PARAMETERS_EVERY` steps. Splats that are not finite (the
+rasterizer does not draw them, so no gradient shows them) are removed before the checkpoint is written.
 """
 
 import math
@@ -30,27 +29,33 @@ from torch import Tensor
 
 from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.errors import ForTheUser
-from nrfgs_ns.training.guard_report import Finding, report
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 
 MAX_GRADIENT = 2.0**63
-"""Largest gradient that is let through. Its square, 2^126, and Adam's mean of squares stay below float32's 2^128; from
-there on the second moment would be infinite and the parameter would never move again, in silence."""
+"""Largest gradient that passes. Its square, 2^126, and Adam's mean of squares stay below float32's 2^128; beyond that
+the second moment would be infinite and the parameter would never move again, in silence."""
 PARAMETERS_EVERY = 100
-"""Steps between two looks at the parameters."""
+"""Steps between two checks of the parameters."""
 PATIENCE = 100
-"""Steps in a row, each with another view's turn, without a visible splat after which there will be none."""
+"""Steps in a row without a visible splat after which the training stops."""
+SHOWN = 3
+"""Splats named in a message."""
+HUGE_BY_GROUP = {"scales": 20.0, "means": 1e6, "quats": math.inf}
+"""Values (log-scales, scene units) that no training reaches with suitable learning rates. Quaternions are normalised,
+so theirs may have any length."""
+HUGE = 1e3
+"""The same for all other tensors: logits, a head's per-splat tensors, shared weights."""
 
 Origin = Literal["rendering", "gradient", "parameter", "elsewhere", "nothing visible", "memory"]
-"""What stops a training: a number in the image or a loss, in a gradient or a parameter, or on another device; that
-nothing is visible; or that the memory has run out."""
+"""Cause of a stop: a number in the image or a loss, in a gradient or a parameter, or on another device; that nothing is
+visible; or that the memory has run out."""
 
 
 class TrainingStopped(ForTheUser, RuntimeError):
     """A training cannot go on: it met a number that is not finite, sees nothing, or its memory has run out.
 
     Args:
-        savable: whether the state that is left is good.
+        savable: whether the remaining state is good.
     """
 
     def __init__(self, message: str, step: int, origin: Origin, savable: bool = True):
@@ -61,19 +66,29 @@ class TrainingStopped(ForTheUser, RuntimeError):
 
 
 @dataclass
+class Finding:
+    """A tensor that condemned a step."""
+
+    name: str
+    size: float
+    """its largest absolute value: NaN, infinite, or too large"""
+    tensor: Tensor
+
+
+@dataclass
 class Verdict:
-    """A step that has been looked at, and whose numbers are on their way to the host."""
+    """The largest absolute values of a step, on their way to the host."""
 
     step: int
     names: list[str]
-    """what was looked at; of gradients, the name of their optimiser"""
+    """names of the tensors; of gradients, their optimiser's"""
     origins: list[Origin]
     tensors: list[Tensor]
     sizes: Tensor
     """largest absolute values, in host memory once `arrived` has happened"""
     arrived: torch.cuda.Event | None
     owners: list[Tensor | None]
-    """the parameters whose gradients were looked at"""
+    """of gradients, their parameters"""
 
 
 class Guard:
@@ -84,7 +99,7 @@ class Guard:
         self.step = 0
         self.blind_steps = 0
         self._verdict: Verdict | None = None
-        # Pinned memory and events are dear to make; one of each will do, for a verdict is read before the next is made.
+        # Pinned memory and events are expensive to make; one of each suffices, since a verdict is read before the next.
         self._in_host_memory: Tensor | None = None
         self._arrival: torch.cuda.Event | None = None
 
@@ -93,13 +108,13 @@ class Guard:
         return self.pipeline.model
 
     def before_first_step(self, step: int, optimizers: LeanOptimizers) -> None:
-        """A training is about to begin, or to go on, at a step: its parameters must be finite."""
+        """Check the parameters before a training begins, or goes on, at a step."""
         self.step = step
         self.check_parameters(optimizers)
 
     def begin(self, step: int, optimizers: LeanOptimizers) -> None:
-        """Head of a training step: learn about the step before, unless `step_graph.py` will ask when it has prepared
-        this one, and now and then look at the parameters.
+        """Read the verdict on the step before, unless `step_graph.py` does when it has prepared this one, and now and
+        then check the parameters.
 
         Raises:
             TrainingStopped: the step before was condemned, a parameter is not finite, or nothing is visible any more.
@@ -127,11 +142,11 @@ class Guard:
             self.check_parameters(optimizers)
 
     def before_optimizers(self, optimizers: LeanOptimizers, gradients_are_scaled: bool) -> None:
-        """Look at image, losses and gradients, and condemn the step if one is not finite.
+        """Check image, losses and gradients, and condemn the step if one is not finite.
 
         Args:
-            gradients_are_scaled: a GradScaler is at work, which meets infinite gradients as a matter of course and
-                skips such steps itself: only the image and the losses are looked at.
+            gradients_are_scaled: a GradScaler meets infinite gradients as a matter of course and skips such steps
+                itself: only the image and the losses are checked.
 
         Raises:
             TrainingStopped: on a CPU, if the step is condemned.
@@ -140,30 +155,30 @@ class Guard:
         watched = [(name, "rendering", value, None) for name, value in self.model.watched.items()]
         if not gradients_are_scaled:
             for name, optimizer in optimizers.optimizers.items():
-                found = [one for one in parameters_of(optimizer) if one.grad is not None and one.numel() > 0]
-                watched += [(name, "gradient", parameter.grad, parameter) for parameter in found]
+                for parameter in parameters_of(optimizer):
+                    if parameter.grad is not None and parameter.numel() > 0:
+                        watched.append((name, "gradient", parameter.grad, parameter))
         names, origins, tensors, owners = [list(column) for column in zip(*watched, strict=True)]
         sizes = torch.stack(torch._foreach_norm(tensors, math.inf))
-        own = Verdict(self.step, names, origins, tensors, sizes, None, owners)
-        self._verdict = self._share(own)
+        self._verdict = self._share(Verdict(self.step, names, origins, tensors, sizes, None, owners))
         sizes = self._verdict.sizes
-        if not gradients_are_scaled and optimizers.all_fused:
-            verdict = (~(sizes <= MAX_GRADIENT)).any().float()  # NaN compares as false
-            for optimizer in optimizers.optimizers.values():
-                optimizer.found_inf = verdict
-            self._silence_densification()
-            if sizes.is_cuda:
-                self._send_home(self._verdict)
-        else:
+        if gradients_are_scaled or not optimizers.all_fused:
             self.settle()
+            return
+        condemned = (~(sizes <= MAX_GRADIENT)).any().float()  # NaN compares as false
+        for optimizer in optimizers.optimizers.values():
+            optimizer.found_inf = condemned
+        self._silence_densification()
+        if sizes.is_cuda:
+            self._send_home(self._verdict)
 
     def _is_empty(self) -> bool:
         """Whether no splat is left."""
         return self.model.num_points == 0
 
     def _out_of_sight(self) -> bool:
-        """Whether nothing has been visible in the last `PATIENCE` steps. The host knows how many rows there were, or
-        where all splats have one (`step_graph.py`) how many pairs of splats and tiles."""
+        """Whether nothing has been visible in the last `PATIENCE` steps: no rows, or, where all splats have one
+        (`step_graph.py`), no pairs of splats and tiles."""
         info = getattr(self.model, "info", {})
         rows = info.get("gaussian_ids")
         blind = rows is not None and (len(rows) == 0 or info.get("pairs") == 0)
@@ -171,7 +186,7 @@ class Guard:
         return self.blind_steps >= PATIENCE
 
     def _share(self, verdict: Verdict) -> Verdict:
-        """Here joins in what other devices have found, where there are any (`distributed`)."""
+        """Add other devices' findings, where there are any (`distributed`)."""
         return verdict
 
     def _send_home(self, verdict: Verdict) -> None:
@@ -213,7 +228,7 @@ class Guard:
         return verdict.sizes.tolist()
 
     def _full_name(self, name: str, owner: Tensor | None) -> str:
-        """Of a gradient, known by its optimiser's name only: which parameter's it is."""
+        """The name of a gradient's parameter, given its optimiser's; other names stay."""
         if owner is None:
             return name
         owners = [known for known, parameter in self.pipeline.named_parameters() if parameter is owner]
@@ -222,10 +237,10 @@ class Guard:
         return f"the gradient of {(owners or [name])[0].removeprefix('_model.')}"
 
     def check_parameters(self, optimizers: LeanOptimizers) -> None:
-        """Look at every parameter, and take out the splats that are not finite.
+        """Check every parameter, and remove the splats that are not finite.
 
         Raises:
-            TrainingStopped: one is not finite. What is left is good, unless it was one of the shared weights.
+            TrainingStopped: one is not finite. The rest is good, unless it was one of the shared weights.
         """
         named = {name: value for name, value in self.pipeline.named_parameters() if value.numel() > 0}
         sizes = torch.stack([size.float() for size in torch._foreach_norm(list(named.values()), math.inf)]).tolist()
@@ -239,7 +254,7 @@ class Guard:
         message = report(self.pipeline, self.step, findings, torch.finfo(torch.float32).max)
         only_splats = all(finding.name.startswith("gauss_params.") for finding in findings)
         if only_splats:
-            bad = torch.stack([_bad_rows(finding.tensor) for finding in findings]).any(0)
+            bad = torch.stack([~_within(finding.tensor, torch.finfo(torch.float32).max) for finding in findings]).any(0)
             remove_splats(self.model, optimizers.optimizers, bad)
             message += f"\nThe checkpoint of step {self.step} is this state without them; with --load-dir, it goes on."
         else:
@@ -247,7 +262,7 @@ class Guard:
         raise TrainingStopped(message, self.step, "parameter", savable=only_splats)
 
     def _silence_densification(self) -> None:
-        """Let a gradient on the image plane that is not finite count as zero in densification's statistics."""
+        """Set gradients on the image plane that are not finite to zero for densification's statistics."""
         means2d = getattr(self.model, "info", {}).get("means2d")
         if means2d is None or not means2d.retains_grad:  # densification is over, or needs none
             return
@@ -257,7 +272,7 @@ class Guard:
 
 
 class WatchedOptimizers(LeanOptimizers):
-    """The optimisers; each step is shown to the guard first."""
+    """The optimisers, behind the guard."""
 
     def __init__(self, guard: Guard, *args: Any):
         super().__init__(*args)
@@ -276,7 +291,7 @@ class WatchedOptimizers(LeanOptimizers):
 
 
 def remove_splats(model, optimizers: Mapping[str, torch.optim.Optimizer], bad: Tensor) -> None:
-    """Take splats out of the parameters, out of their optimisers' moments and out of densification's statistics.
+    """Remove splats from the parameters, their optimisers' moments and densification's statistics.
 
     Args:
         optimizers: by group; those of `gauss_params` among them.
@@ -285,6 +300,45 @@ def remove_splats(model, optimizers: Mapping[str, torch.optim.Optimizer], bad: T
     take_rows(model, optimizers, (~bad).nonzero()[:, 0])
 
 
-def _bad_rows(tensor: Tensor) -> Tensor:
-    """Rows with a number that is not finite, bool [N]."""
-    return ~torch.isfinite(tensor).reshape(len(tensor), -1).all(dim=1)
+def report(pipeline, step: int, findings: list[Finding], limit: float) -> str:
+    """The message of a stop: tensors, splats, and the likely cause."""
+    first, others = findings[0], ", ".join(finding.name for finding in findings[1:4])
+    what = f"reaches {first.size:.2g}, which Adam cannot square"
+    if not math.isfinite(first.size):
+        what = "has NaN" if math.isnan(first.size) else "is infinite"
+    lines = [f"Training stopped at step {step}: {first.name} {what}." + (f" Also: {others}." if others else "")]
+    per_splat = next((finding for finding in findings if "gauss_params." in finding.name), None)
+    if per_splat is not None:
+        rows = (~_within(per_splat.tensor, limit)).nonzero().flatten().tolist()
+        shown = ", ".join(map(str, rows[:SHOWN])) + (", ..." if len(rows) > SHOWN else "")
+        lines.append(f"{per_splat.name}: {len(rows)} of {len(per_splat.tensor)} splats, first {shown}.")
+    return "\n".join([*lines, f"Likely cause: {_cause(pipeline, [finding.name for finding in findings])}"])
+
+
+def _within(tensor: Tensor, limit: float) -> Tensor:
+    """Rows whose numbers are finite and at most `limit` in absolute value, bool [N]."""
+    return (tensor.abs() <= limit).reshape(len(tensor), -1).all(dim=1)
+
+
+def _cause(pipeline, names: list[str]) -> str:
+    """The likeliest cause of non-finite tensors, and what to do about it."""
+    model = pipeline.model
+    index = getattr(model, "watched_image", None)
+    image = "of this step" if index is None else pipeline.datamanager.train_dataset.image_filenames[index]
+    for name, value in model.named_parameters():
+        if value.numel() and not bool(torch.isfinite(value).all()):
+            return (
+                f"the parameter {name} is not finite. It was loaded or edited so, or an update overflowed: go back to "
+                "an older checkpoint, and lower its learning rate if it happens again."
+            )
+    if "loss main_loss" in names and "the rendered image" not in names:
+        return f"the rendering is finite and its loss is not, so the image or mask is broken: {image}. Replace it."
+    sizes = [(name, value, HUGE_BY_GROUP.get(name, HUGE)) for name, value in model.gauss_params.items()]
+    sizes += [("field", weight, HUGE) for weight in model.head.parameters()]
+    for group, value, huge in sizes:
+        if value.numel() and (reached := float(value.abs().max())) > huge:
+            return (
+                f"a learning rate that is too high: {group} have reached {reached:.2g}. Lower "
+                f"--optimizers.{group}.optimizer.lr and start from an older checkpoint."
+            )
+    return f"not clear. The image was {image}: check it and its pose, then lower the learning rates."

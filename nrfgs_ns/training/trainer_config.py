@@ -60,7 +60,7 @@ class NrfgsTrainerConfig(TrainerConfig):
     """steps for which schedules are given; they are stretched to the actual steps. None: not stretched; with a time
     budget: max_num_iterations"""
     average_steps: int | None = None
-    """last steps over which the model's parameters are averaged, at most a twentieth of all. 0: none. None: 200 if
+    """last steps over which the model's parameters are averaged, at most a fiftieth of all. 0: none. None: 200 if
     max_num_iterations is 0, otherwise 0"""
 
     def setup(self, **kwargs) -> Trainer:
@@ -88,6 +88,9 @@ class NrfgsTrainerConfig(TrainerConfig):
         ):
             if part is not None and not _is_within(part):
                 raise InputError(f"{name} is {part!r}; it must be the name of a folder within --output-dir.")
+        for path in (self.get_base_dir(), self.data):
+            if path is not None and any("\udc80" <= letter <= "\udcff" for letter in str(path)):
+                raise InputError(f"{str(path)!r} has letters beyond this system's encoding. Set PYTHONUTF8=1.")
         for name in ("time_budget", "schedule_steps"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

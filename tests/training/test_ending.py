@@ -250,6 +250,13 @@ def test_options_without_sense_are_refused(option, bad, tiny_scene, tmp_path):
         config.setup(local_rank=0, world_size=1)
 
 
+def test_a_folder_beyond_the_systems_encoding_is_refused(tiny_scene, tmp_path):
+    """As a system in LC_ALL=C without UTF-8 hands it over; tensorboard could not open its log."""
+    config = parse(command_line("nrfgs", tiny_scene, tmp_path / os.fsdecode(b"caf\xe9"), STEPS))
+    with pytest.raises(InputError, match="beyond this system's encoding. Set PYTHONUTF8=1"):
+        config.print_to_terminal()
+
+
 @pytest.mark.parametrize(
     "more", [{"--pipeline.model.num-downscales": 5}, {"--pipeline.datamanager.camera-res-scale-factor": 0.01}]
 )

@@ -150,40 +150,19 @@ def test_large_gradients_that_adam_can_square_pass(start):
     assert torch.isfinite(moments).all() and moments.max() > 1e33
 
 
-def test_the_message_names_tensor_rows_values_and_cause(start):
+def test_the_message_names_tensor_rows_and_cause(start):
     trainer = start()
     poison(trainer, at=2, name="latents", value=NAN, row=5)
     with pytest.raises(TrainingStopped) as stopped:
         trainer.train()
     message = str(stopped.value)
-    model = trainer.pipeline.model
-    mean = " ".join(f"{x:.4g}" for x in model.means[5].tolist())
     for part in (
         "Training stopped at step 2: the gradient of gauss_params.latents has NaN.",
-        f"1 of {model.num_points} splats, first 5.",
-        f"splat 5: mean ({mean}), scales (",
+        f"1 of {trainer.pipeline.model.num_points} splats, first 5.",
         "Likely cause: ",
         "The update of step 2 was not made.",
     ):
         assert part in message, message
-
-
-def test_the_cause_splat_on_the_camera(start):
-    trainer = start()
-    model = trainer.pipeline.model
-    poison(trainer, at=2, name="means", value=NAN, row=5)
-    original = model.get_outputs
-
-    def planted(camera):
-        outputs = original(camera)
-        model.info["gaussian_ids"], model.info["depths"] = torch.tensor([5]), torch.tensor([0.011])
-        return outputs
-
-    trainer.guard.begin(0, trainer.optimizers)
-    model.get_outputs = planted
-    trainer.callbacks.clear()  # densification has no use for that info
-    with pytest.raises(TrainingStopped, match=r"splat on the camera, at depth 0.011 in image .*view_\d+.png"):
-        trainer.train()
 
 
 def test_the_cause_broken_image(start):
