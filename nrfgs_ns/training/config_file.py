@@ -93,7 +93,7 @@ def _is_a(value: Any, hint: Any) -> bool:
     if kind in (Union, types.UnionType):
         return any(_is_a(value, option) for option in get_args(hint))
     if kind is Literal:
-        return value in get_args(hint)
+        return value in get_args(hint) or value == ""  # `vis` without any log
     if kind is tuple and isinstance(value, list):  # tyro's own defaults have either
         return True
     if kind in (int, float):

@@ -111,27 +111,6 @@ def test_a_checkpoint_keeps_its_head_whatever_the_number_of_views(tiny_scene, tm
         assert_close(other.head.state_dict()["low.0.weight"], state["head.low.0.weight"])
 
 
-@pytest.mark.parametrize("bands", [3, 1])
-def test_a_training_goes_on_with_the_head_that_it_had(bands, tiny_scene, tmp_path, no_cuda, capsys):
-    """Whatever version wrote the checkpoint: one without a head for few views, or one with fewer bands there."""
-    whole = {"--pipeline.model.few-views": "off", "--pipeline.model.appearance.num-bands": bands}
-    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "old", 2, QUICK, whole))
-    checkpoint = next(models_of(config).glob("*.ckpt"))
-    content = torch.load(checkpoint, weights_only=True)
-    extra = content["pipeline"]["_model._extra_state"]
-    if bands < 3:
-        extra["capacity"] = {"head": {"num_bands": bands}}
-    content["pipeline"]["_extra_state"].pop("checksum")
-    content["training"].pop("options")
-    torch.save(content, checkpoint)
-    trainer = ready(tiny_scene, tmp_path / "new", 4, {"--load-dir": models_of(config)})
-    model = trainer.pipeline.model
-    assert model.head.config == NrfConfig(num_bands=bands)
-    weights = [weight.detach().clone() for weight in model.head.parameters()]
-    trainer.train_iteration(2)
-    assert not any(map(torch.equal, model.head.parameters(), weights)), "the optimiser holds others"
-
-
 def test_only_a_field_can_be_trusted_less():
     less = NrfConfig(latent_dim=8).trusted(0.5)
     assert differences(NrfConfig(latent_dim=8), less) == {"opacity_scale": 0.1}

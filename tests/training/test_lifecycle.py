@@ -18,6 +18,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.checkpoint_files import DiskFull, read_latest
 from nrfgs_ns.training.run import evaluate, parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -30,13 +31,14 @@ BUSY = {
     "--pipeline.model.num-downscales": 1,
 }
 """Densify every 4th step, reset opacity every 24th. 8 training views hold densification back for 12 steps after it."""
-
+STEPS, HALF = 26, 13
+"""Refinements at steps 12, 16 and 20, a reset at step 24; a checkpoint after the step in the middle."""
 
 METHODS = {
     "nrfgs": {"--pipeline.model.few-views": "off"},
     "nrfgs-sh": {},
     "nrfgs-vdgs": {},
-    "nrfgs-gsnb": {"--pipeline.model.appearance.ramp-steps": 30},
+    "nrfgs-gsnb": {"--pipeline.model.appearance.ramp-steps": 20},
     "nrfgs-sg": {"--pipeline.model.appearance.start-step": 10},
 }
 """Each method, with the options that let all of it happen within a test: the first lobes come after splits."""
@@ -50,19 +52,20 @@ STORED = {
 """Colour numbers per splat, and shared weights."""
 
 
-def options(scene: Path, out: Path, method: str = "nrfgs", *more: dict, steps: int = 20) -> list[str]:
+def options(scene: Path, out: Path, method: str = "nrfgs", *more: dict, steps: int = STEPS) -> list[str]:
     """A command line for ns-train."""
     return command_line(method, scene, out, steps, BUSY, METHODS[method], *more)
 
 
 @pytest.fixture(scope="module")
 def finished(tiny_scene, tmp_path_factory):
-    """config.yml of a finished 20-step training of each method."""
+    """config.yml of a finished training of each method, which has the checkpoint of step `HALF`, too."""
     done = {}
 
     def config_of(method: str) -> Path:
         if method not in done:
-            done[method] = trained(options(tiny_scene, tmp_path_factory.mktemp(method), method))
+            out = tmp_path_factory.mktemp(method)
+            done[method] = trained(options(tiny_scene, out, method, {"--steps-per-save": HALF}))
         return done[method]
 
     return config_of
@@ -79,7 +82,7 @@ def test_train_eval_render(method, finished, tmp_path, tiny_scene):
     # 48 x 36 is too small for MS-SSIM's five scales, and LPIPS has no weights here: no number, and no crash.
     assert results["ms_ssim"] is None and results["lpips"] is None
     _, pipeline, path, step = eval_setup(config)
-    assert step == 19
+    assert step == STEPS - 1
     assert results["splats"] == pipeline.model.num_points
     assert results["parameter_bytes"] == pipeline.model.parameter_bytes
     colors, shared = STORED[method]
@@ -125,23 +128,21 @@ def test_all_that_a_head_adds_is_learning(method, groups, finished):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_resumed_training_is_the_unbroken_one(method, finished, tiny_scene, tmp_path):
-    """40 steps at once, against 20 and 20 more from the checkpoint.
-
-    In both halves splats are split (with random samples), pruned and their Adam state carried along; step 24 resets
-    opacities.
-    """
-    whole = trained(options(tiny_scene, tmp_path / "whole", method, steps=40))
-    half = finished(method)
-    rest = trained(options(tiny_scene, tmp_path / "rest", method, {"--load-dir": models_of(half)}, steps=40))
-    assert checkpoint_of(rest)["step"] == 39
-    counts = [len(checkpoint_of(run)["pipeline"]["_model.gauss_params.means"]) for run in (half, whole)]
-    assert counts[0] != counts[1], "nothing was densified in the second half: the test would prove nothing"
-    assert_same_training(checkpoint_of(rest), checkpoint_of(whole))
+    """From the checkpoint in the middle. In both parts splats are split (with random samples), pruned and their Adam
+    state carried along; the second resets opacities."""
+    folder = models_of(finished(method))
+    load = {"--load-dir": folder, "--load-step": HALF}
+    rest = checkpoint_of(trained(options(tiny_scene, tmp_path, method, load)))
+    whole, half = (read_latest(folder, step)[1] for step in (STEPS - 1, HALF))
+    counts = [len(part["pipeline"]["_model.gauss_params.means"]) for part in (half, whole)]
+    assert counts[0] != counts[1], "nothing was densified in the second part: the test would prove nothing"
+    assert_same_training(rest, whole)
 
 
 def test_optimisers_hold_the_loaded_parameters(finished, tiny_scene, tmp_path):
     """The host's way, replacing parameters on load, would leave the optimisers with orphans."""
-    trainer = set_up(options(tiny_scene, tmp_path, "nrfgs", {"--load-dir": models_of(finished("nrfgs"))}, steps=21))
+    load = {"--load-dir": models_of(finished("nrfgs"))}
+    trainer = set_up(options(tiny_scene, tmp_path, "nrfgs", load, steps=STEPS + 1))
     for name, parameter in trainer.pipeline.model.gauss_params.items():
         (held,) = trainer.optimizers.optimizers[name].param_groups[0]["params"]
         assert held is parameter
@@ -155,7 +156,7 @@ def test_learning_rates_of_the_command_count_where_a_training_goes_on(finished, 
     faster |= {"--optimizers.means.scheduler.lr-final": 1.6e-5, "--optimizers.quats.optimizer.eps": 1e-9}
     rates = []
     for name, more in (("same", {}), ("faster", faster)):
-        trainer = set_up(options(tiny_scene, tmp_path / name, "nrfgs", load, more, steps=22))
+        trainer = set_up(options(tiny_scene, tmp_path / name, "nrfgs", load, more, steps=STEPS + 2))
         groups = {name: trainer.optimizers.optimizers[name].param_groups[0] for name in ("means", "quats")}
         before = [group["lr"] for group in groups.values()]
         trainer.train()
@@ -242,6 +243,6 @@ def test_checkpoint_is_written_aside_and_moved(tiny_scene, tmp_path, monkeypatch
         raise OSError("disk full")
 
     monkeypatch.setattr(torch, "save", torn)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(DiskFull):
         trainer.save_checkpoint(5)
     assert sorted(folder.iterdir()) == before
