@@ -16,6 +16,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
+from nrfgs_ns.appearance import gsnb, sg
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.checkpoint_files import DiskFull, read_latest
@@ -38,10 +39,10 @@ METHODS = {
     "nrfgs": {"--pipeline.model.few-views": "off"},
     "nrfgs-sh": {},
     "nrfgs-vdgs": {},
-    "nrfgs-gsnb": {"--pipeline.model.appearance.ramp-steps": 20},
-    "nrfgs-sg": {"--pipeline.model.appearance.start-step": 10},
+    "nrfgs-gsnb": {},
+    "nrfgs-sg": {},
 }
-"""Each method, with the options that let all of it happen within a test: the first lobes come after splits."""
+"""Each method, with options for a test."""
 STORED = {
     "nrfgs": (3 + 32, 6664),
     "nrfgs-sh": (48, 0),
@@ -55,6 +56,15 @@ STORED = {
 def options(scene: Path, out: Path, method: str = "nrfgs", *more: dict, steps: int = STEPS) -> list[str]:
     """A command line for ns-train."""
     return command_line(method, scene, out, steps, BUSY, METHODS[method], *more)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def schedules():
+    """All of a head happens within a test: the first lobes come after splits."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gsnb, "RAMP_STEPS", 20)
+        patch.setattr(sg, "START_STEP", 10)
+        yield
 
 
 @pytest.fixture(scope="module")
