@@ -115,7 +115,7 @@ class StepParts:
             _set_random_seed(config.machine.seed)
             trainer = config.setup(local_rank=0, world_size=1)
             trainer.setup()
-            model, graphs = trainer.pipeline.model, trainer.pipeline.graphs
+            model, graphs = trainer.pipeline.model, trainer.graphs
             watch: list[Any] = []
             busy: list[float] = []
 
@@ -129,7 +129,7 @@ class StepParts:
                 name, closed = variants[which]
                 if at == 0:
                     model.densification.strategy.refine_stop_iter = 0 if "at rest" in name else NEVER
-                    trainer.pipeline.graphs = None if "graph" in closed else graphs
+                    trainer.graphs = None if "graph" in closed else graphs
                     closing.enter_context(shut(closed))
                 if 5 <= at <= 5 + self.steps:
                     busy.append(perf_counter() - waited[0])
@@ -156,7 +156,7 @@ class StepParts:
                 trainer.train()
         model.eval()
         own = [camera for camera, _ in trainer.pipeline.datamanager.fixed_indices_eval_dataloader]
-        trainer.pipeline.graphs = None
+        trainer.graphs = None
         gc.collect()
         return rows, (model, {"own": own, "1080p": [at_size(camera, *FULL_HD) for camera in own]})
 

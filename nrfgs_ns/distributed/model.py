@@ -16,6 +16,7 @@ from nrfgs_ns.distributed.schedules import fewer
 from nrfgs_ns.distributed.shards import cut_model_state, rebalance, rows_of, shard_counts
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
+from nrfgs_ns.model.loss import shrinkage
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import View, project_splats, project_view
@@ -153,7 +154,11 @@ class ShardedModel(NrfgsModel):
         if not self.training:
             return losses
         devices = comm.world()
-        over_splats = {"scale_reg", *self.densification.regularisation(self.gauss_params), *self.shrinking()}
+        over_splats = {
+            "scale_reg",
+            *self.densification.regularisation(self.gauss_params),
+            *shrinkage(self, self.gauss_params),
+        }
         share = self.num_points * devices / sum(self.counts)
         for name in over_splats & losses.keys():
             if self.num_points == 0:

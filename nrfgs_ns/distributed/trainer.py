@@ -57,7 +57,7 @@ class ShardedPipeline(NrfgsPipeline):
         torch.manual_seed(torch.initial_seed() + 1 + comm.rank())
 
     @profiler.time_function
-    def get_train_loss_dict(self, step: int):
+    def get_train_loss_dict(self, step: int, graphs: None = None):
         """One camera for each device; see `NrfgsPipeline.get_train_loss_dict`."""
         cameras, batch = self.datamanager.next_train_views(comm.world(), comm.rank())
         outputs = self.model.get_outputs_everywhere(cameras)

@@ -14,7 +14,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
+from nerfstudio.model_components.lib_bilagrid import BilateralGrid
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.colors import get_color
 from torch import Tensor
@@ -28,13 +28,13 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
 from nrfgs_ns.image.metrics import image_metrics
 from nrfgs_ns.image.photograph import PhotographModel
-from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.model.checkpoint import check_compatible, differences, reduced_config
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.model.initial_splats import initial_splats
 from nrfgs_ns.model.look import look_asked_for, warn_if_asked
+from nrfgs_ns.model.loss import loss_of, photometric
 from nrfgs_ns.model.pinhole import Pinhole, Pinholes
 from nrfgs_ns.model.renderer import View, composite_view, project_view, projection_options
 from nrfgs_ns.model.training_views import TrainingPictures
@@ -341,47 +341,17 @@ class NrfgsModel(SplatfactoModel):
         self._scheduled = step
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """Splatfacto's losses, and in training what the densification strategy adds to them.
-
-        Terms that are zero in this step are left out. Nothing waits for the GPU.
-        """
-        losses = {"main_loss": self.photometric_loss(outputs, batch)}
-        if self.config.use_scale_regularization and self.step % 10 == 0:
-            scales = self.scales.exp()
-            ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
-            losses["scale_reg"] = 0.1 * (ratios - self.config.max_gauss_ratio).clamp_min(0.0).mean()
+        """The terms of the loss by name (`loss.loss_of`)."""
+        losses = loss_of(self, self.gauss_params, outputs, batch)
         if self.training:
-            self.camera_optimizer.get_loss_dict(losses)
-            if self.config.use_bilateral_grid:
-                losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
-            losses |= self.densification.regularisation(self.gauss_params) | self.shrinking()
             watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
             self.watched = {name: value.detach() for name, value in watched.items()}  # by the training's guard
             self.watched_image = batch.get("image_idx")
         return losses
 
     def photometric_loss(self, outputs, batch) -> Tensor:
-        """Splatfacto's loss of an image against its photograph, a scalar."""
-        truth = self.truth_of(batch, outputs["background"])
-        rgb = outputs["rgb"]
-        if "mask" in batch:  # what is outside is black in both
-            mask = self._downscale_if_required(batch["mask"]).to(self.device)
-            truth, rgb = truth * mask, rgb * mask
-        if self.trimming is not None and self.training and self.schedule_step >= robust.FIRST_STEP:
-            kept = self.trimming(rgb, truth, self.schedule_step, mask if "mask" in batch else None)
-            truth, rgb = truth * kept, rgb * kept
-        return photometric_loss(rgb, truth, self.config.ssim_lambda)
-
-    def shrinking(self, splats: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
-        """What `shrinkage` adds to the loss. `splats`: another table than the model's."""
-        splats = self.gauss_params if splats is None else splats
-        weight = self.config.shrinkage_weight(self.num_views)
-        if weight == 0.0:
-            return {}
-        return {
-            "shrink_opacities": weight * self.densification.mean_opacity(splats["opacities"]),
-            "shrink_scales": weight / self.scene_unit * splats["scales"].exp().mean(),
-        }
+        """Splatfacto's loss of an image against its photograph (`loss.photometric`)."""
+        return photometric(self, outputs, batch)
 
     def truth_of(self, batch: Mapping[str, Any], background: Tensor) -> Tensor:
         """The photograph at the rendered size, [H, W, 3]; where it is transparent, with what is behind the splats."""

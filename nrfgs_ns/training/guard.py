@@ -112,14 +112,16 @@ class Guard:
         self.step = step
         self.check_parameters(optimizers)
 
-    def begin(self, step: int, optimizers: LeanOptimizers) -> None:
-        """Read the verdict on the step before, unless `step_graph.py` does when it has prepared this one, and now and
-        then check the parameters.
+    def begin(self, step: int, optimizers: LeanOptimizers, settled_later: bool = False) -> None:
+        """Read the verdict on the step before, and now and then check the parameters.
+
+        Args:
+            settled_later: `step_graph.py` reads the verdict when it has prepared this step.
 
         Raises:
             TrainingStopped: the step before was condemned, a parameter is not finite, or nothing is visible any more.
         """
-        if self.pipeline.graphs is None or step % PARAMETERS_EVERY == 0:
+        if not settled_later or step % PARAMETERS_EVERY == 0:
             self.settle()
         self.step = step
         if self._is_empty():

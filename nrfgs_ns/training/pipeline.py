@@ -77,8 +77,6 @@ class NrfgsPipeline(VanillaPipeline):
     config: NrfgsPipelineConfig
     images_per_step: int = 1
     """images for which a step counts in the schedules (`distributed.schedules`)"""
-    graphs: StepGraphs | None = None
-    """what makes steps in one launch, where it can; the trainer's"""
     notes: tuple[str, ...] | list[str] = ()
     """numbers behind what was chosen automatically, in sentences"""
     steps_per_log: int = 1
@@ -139,10 +137,15 @@ class NrfgsPipeline(VanillaPipeline):
             self.steps_per_log = attributes.trainer.config.logging.steps_per_log
         return super().get_training_callbacks(attributes)
 
-    def get_train_loss_dict(self, step: int):
-        """Nerfstudio's step, whose metrics are taken only when they are logged."""
+    def get_train_loss_dict(self, step: int, graphs: StepGraphs | None = None):
+        """Outputs, losses and metrics of a step; metrics only when they are logged.
+
+        Args:
+            graphs: of the training, if steps are recorded. The losses of a recorded step need no gradient: the
+                parameters have theirs.
+        """
         camera, batch = self.datamanager.next_train(step)
-        done = None if self.graphs is None else self.graphs.losses(camera, batch, step)
+        done = None if graphs is None else graphs.losses(camera, batch, step)
         outputs = self._model(camera) if done is None else done[0]
         metrics = self.model.get_metrics_dict(outputs, batch) if step % self.steps_per_log == 0 else {}
         losses = self.model.get_loss_dict(outputs, batch, metrics) if done is None else done[1]

@@ -20,10 +20,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
-from torch.amp import GradScaler
 from torch.func import functional_call
 
 from nrfgs_ns.data.checks import warn
+from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import composite_view, project_view
 
@@ -51,8 +51,6 @@ class StepGraphs:
         self._how: dict[str, Any] = {}
         self._pairs_for_each = 0.0
         """the most pairs of a view, for each splat, at this resolution"""
-        self.at_hand = False
-        """whether the gradients of the step have been computed with its losses"""
         self._given_up = False
         self._has_said_why = False
 
@@ -91,13 +89,12 @@ class StepGraphs:
     def losses(
         self, camera: Cameras, batch: Mapping[str, Any], step: int
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]] | None:
-        """Outputs and losses as of the model, and the gradients of the losses' sum to all parameters. None: the step is
-        the first of its kind, or cannot be recorded.
+        """The model's outputs and losses, both without gradients of their own: those of the losses' sum are already in
+        the parameters. None: the step is the first of its kind, or cannot be recorded.
 
         Raises:
             TrainingStopped: the step before was condemned.
         """
-        self.at_hand = False
         if not self._takes(step, batch) or self._is_new():
             self.guard.settle()
             return None
@@ -111,7 +108,7 @@ class StepGraphs:
             graph = self._record(kind, *now)
         if graph is None:
             return None
-        losses, self.at_hand = graph.run(), True
+        losses = graph.run()
         model.info = {**graph.info, "pairs": graph.last_pairs}
         model.watched = {"the rendered image": graph.outputs["rgb"]}
         model.watched |= {f"loss {name}": loss for name, loss in losses.items()}
@@ -287,7 +284,7 @@ class _StepGraph:
             stored = torch.sigmoid(splats["opacities"]).flatten()  # what nobody is shown otherwise
             shown = torch.where(info["radii"] > 0, appearance.opacities, stored)
             model.densification.pre_backward(model.step, info, shown, splats["opacities"])
-            losses = {"main_loss": model.photometric_loss(outputs, self.batch), **model.shrinking(splats)}
+            losses = loss_of(model, splats, outputs, self.batch)
             sum(losses.values()).backward()
         self.gradients = {name: leaf.grad for name, leaf in leaves.items()}
         if shot is not None:
@@ -340,23 +337,3 @@ class _StepGraph:
             if gradient is not None:
                 parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
         return self.losses
-
-
-class Unscaled(GradScaler):
-    """Scales nothing, and where a graph has left the gradients, does not let autograd look for them: it would find
-    nothing to do, after a turn through a thread of its own that takes longer than many a kernel."""
-
-    def __init__(self):
-        super().__init__("cuda", enabled=False)
-        self.graphs: StepGraphs | None = None
-
-    def scale(self, loss: Tensor) -> Tensor | AtHand:
-        at_hand = self.graphs is not None and self.graphs.at_hand
-        return AtHand() if at_hand and not loss.requires_grad else loss
-
-
-class AtHand:
-    """A loss whose gradients are there."""
-
-    def backward(self) -> None:
-        """Nothing."""

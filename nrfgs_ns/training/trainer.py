@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_eval_enabled
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import ForTheUser, InputError
@@ -31,7 +33,7 @@ from nrfgs_ns.training.identity import check_options, check_scene, options_of, s
 from nrfgs_ns.training.optimizers import in_world_units
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
-from nrfgs_ns.training.step_graph import StepGraphs, Unscaled, tell_why_not_recorded
+from nrfgs_ns.training.step_graph import StepGraphs, tell_why_not_recorded
 from nrfgs_ns.training.stopping import (
     StopRequest,
     command_to_go_on,
@@ -63,12 +65,11 @@ class NrfgsTrainer(Trainer):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's GradScaler
             super().__init__(config, local_rank, world_size)
-        if not self.use_grad_scaler:
-            self.grad_scaler = Unscaled()
         self.total_steps = config.max_num_iterations
         self.steps_are_chosen = False
         self.pace: Pace | None = None
         self.mean: ParameterMean | None = None
+        self.graphs: StepGraphs | None = None
         self._saved_step: int | None = None
         self._is_ending = False
 
@@ -110,14 +111,13 @@ class NrfgsTrainer(Trainer):
 
     def _record_steps(self) -> None:
         """Let steps be CUDA graphs, where they can; where no step of this training can, say so."""
-        if self.world_size > 1 or not isinstance(self.grad_scaler, Unscaled):
+        if self.world_size > 1 or self.use_grad_scaler:
             if self.pipeline.model.device.type == "cuda" and comms.is_main_process():
                 tell_why_not_recorded(
                     "several devices share the splats" if self.world_size > 1 else "precision is mixed"
                 )
             return
-        graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
-        self.pipeline.graphs = self.grad_scaler.graphs = graphs
+        self.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
 
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
@@ -285,8 +285,8 @@ class NrfgsTrainer(Trainer):
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         with self._last_good_state_on_disk():
-            self.guard.begin(step, self.optimizers)
-            loss, losses, metrics = super().train_iteration(step)
+            self.guard.begin(step, self.optimizers, settled_later=self.graphs is not None)
+            loss, losses, metrics = self._descend(step)
         self._made = step
         if pace is not None:
             model.schedule_at(int(pace.position))
@@ -294,6 +294,28 @@ class NrfgsTrainer(Trainer):
             self.stop_training = self._stop or pace.is_spent
             writer.GLOBAL_BUFFER["max_iter"] = step + 1 + pace.steps_left  # the progress line's total
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
+
+    def _descend(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
+        """Nerfstudio's `Trainer.train_iteration`, for steps whose gradients may be there with their losses."""
+        optimizers, every = self.optimizers, self.gradient_accumulation_steps
+        optimizers.zero_grad_some([group for group in optimizers.parameters if step % every[group] == 0])
+        with torch.autocast(device_type=torch.device(self.device).type, enabled=self.mixed_precision):
+            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs)
+            loss = reduce(torch.add, losses.values())
+        if loss.requires_grad:  # not that of a recorded step
+            self.grad_scaler.scale(loss).backward()
+        due = [group for group in optimizers.parameters if step % every[group] == every[group] - 1]
+        optimizers.optimizer_scaler_step_some(self.grad_scaler, due)
+        if self.config.log_gradients:
+            named = self.pipeline.model.named_parameters()
+            norms = {name: value.grad.norm() for name, value in named if value.grad is not None}
+            metrics |= {f"Gradients/{name}": norm for name, norm in norms.items()}
+            metrics["Gradients/Total"] = sum(norms.values())
+        scale = self.grad_scaler.get_scale()
+        self.grad_scaler.update()
+        if scale <= self.grad_scaler.get_scale():  # a smaller one: the optimisers have made no step
+            optimizers.scheduler_step_all(step)
+        return loss, losses, metrics
 
     @property
     def last_step(self) -> int:

@@ -124,14 +124,14 @@ def stops_together(scene: Path, folder: Path) -> None:
     def break_image(trainer) -> None:
         step = trainer.pipeline.get_train_loss_dict
 
-        def broken(step_number: int, **kwargs):
+        def broken(step_number: int, graphs):
             outputs, losses, metrics = step(step_number)
             if step_number == 7 and dist.get_rank() == 1:
                 losses["main_loss"] = losses["main_loss"] * float("nan")
                 trainer.pipeline.model.watched["loss main_loss"] = losses["main_loss"].detach()
             return outputs, losses, metrics
 
-        trainer.pipeline.get_train_loss_dict = lambda step: broken(step)
+        trainer.pipeline.get_train_loss_dict = broken
 
     try:
         train(scene, folder / "stopped", dist.get_world_size(), 10, watch=break_image, **PLAIN)

@@ -13,6 +13,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.densification import Mcmc
 from nrfgs_ns.model.checkpoint import differences, reduced_config
+from nrfgs_ns.model.loss import shrinkage
 
 QUICK = {
     "--pipeline.model.num-downscales": 0,
@@ -57,7 +58,10 @@ def test_copies_of_photographs_raise_no_trust(twice, tiny_scene, tmp_path, no_cu
     assert model.num_train_data == 16 and model.num_views == single.num_views == 8
     assert (model.trust, model.head.config) == (single.trust, single.head.config)
     assert model.noise_factor == single.noise_factor
-    assert_close(model.shrinking()["shrink_opacities"], single.shrinking()["shrink_opacities"])
+    assert_close(
+        shrinkage(model, model.gauss_params)["shrink_opacities"],
+        shrinkage(single, single.gauss_params)["shrink_opacities"],
+    )
 
 
 def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_cuda):
@@ -125,22 +129,22 @@ def test_shrinkage_halves_with_every_twelve_views(tiny_scene, tmp_path, no_cuda)
     model = ready(tiny_scene, tmp_path, 1, {"--pipeline.model.shrinkage": 0.5}).pipeline.model
     assert model.num_views == 8
     table, weight = model.gauss_params, 0.005 * 0.5 ** (8 / 12)
-    terms = model.shrinking()
+    terms = shrinkage(model, model.gauss_params)
     assert_close(terms["shrink_opacities"], weight * torch.sigmoid(table["opacities"]).mean())
     assert_close(terms["shrink_scales"], weight * table["scales"].exp().mean() / model.scene_unit)
     model.num_views = 20
-    for name, term in model.shrinking().items():
+    for name, term in shrinkage(model, model.gauss_params).items():
         assert_close(term, terms[name] / 2)
     model.num_views = 148  # of which Adam would make whole steps
-    assert model.shrinking() == {}
+    assert shrinkage(model, model.gauss_params) == {}
     model.num_views = 8
     rows = torch.tensor([0, 2])
     shown = torch.tensor([0.9, 0.8], requires_grad=True)
     model.densification.pre_backward(10**6, {"gaussian_ids": rows}, shown, table["opacities"])
     stored = torch.sigmoid(table["opacities"]).flatten()
-    term = model.shrinking()["shrink_opacities"]
+    term = shrinkage(model, model.gauss_params)["shrink_opacities"]
     assert_close(term, weight * (stored.sum() - stored[rows].sum() + 1.7) / len(stored))
     by_logit = torch.autograd.grad(term, table["opacities"])[0].flatten()
     assert by_logit[1] > 0.0 and by_logit[rows].abs().max() < 1e-9, "a head that adds opacity is paid for it"
     model.config.densification = Mcmc()  # which has terms of its own
-    assert model.shrinking() == {}
+    assert shrinkage(model, model.gauss_params) == {}

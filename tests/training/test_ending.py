@@ -43,10 +43,10 @@ def at_step(trainer: NrfgsTrainer, step: int, then) -> None:
     """Call `then` in the middle of a step."""
     original = trainer.pipeline.get_train_loss_dict
 
-    def spoilt(step_now: int = -1, **named):
-        if (named.get("step", step_now)) == step:
+    def spoilt(now: int, graphs):
+        if now == step:
             then()
-        return original(step=named.get("step", step_now))
+        return original(now, graphs)
 
     trainer.pipeline.get_train_loss_dict = spoilt
 

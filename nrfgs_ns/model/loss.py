@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training loss, as functions that the eager step, the recorded step (`training/step_graph.py`) and each of several
+devices (`distributed/model.py`) share."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from nerfstudio.model_components.lib_bilagrid import total_variation_loss
+from torch import Tensor
+
+from nrfgs_ns.image import robust
+from nrfgs_ns.image.ssim import photometric_loss
+
+
+def loss_of(model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], batch: Mapping[str, Any]):
+    """The terms of the loss of one rendered camera, by name; a step descends their sum.
+
+    Terms that are zero in this step are left out. Nothing waits for the GPU.
+
+    Args:
+        model: an NrfgsModel. In evaluation the photometric term, and scale regularisation, stand alone.
+        splats: the table that was rendered, whose tensors get gradients.
+        outputs: "rgb" [H, W, 3] in [0, 1] and "background" [3], as rendered.
+        batch: "image", and "mask" if there is one, as the datamanager gives them.
+
+    Returns:
+        Scalars by name.
+    """
+    config = model.config
+    losses = {"main_loss": photometric(model, outputs, batch)}
+    if config.use_scale_regularization and model.step % 10 == 0:
+        scales = splats["scales"].exp()
+        ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
+        losses["scale_reg"] = 0.1 * (ratios - config.max_gauss_ratio).clamp_min(0.0).mean()
+    if model.training:
+        model.camera_optimizer.get_loss_dict(losses)
+        if config.use_bilateral_grid:
+            losses["tv_loss"] = 10 * total_variation_loss(model.bil_grids.grids)
+        losses |= model.densification.regularisation(splats) | shrinkage(model, splats)
+    return losses
+
+
+def photometric(model, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> Tensor:
+    """Splatfacto's loss of an image against its photograph, (1 - lambda) L1 + lambda (1 - SSIM), a scalar."""
+    truth = model.truth_of(batch, outputs["background"])
+    rgb = outputs["rgb"]
+    mask = None
+    if "mask" in batch:  # what is outside is black in both
+        mask = model._downscale_if_required(batch["mask"]).to(model.device)
+        truth, rgb = truth * mask, rgb * mask
+    if model.trimming is not None and model.training and model.schedule_step >= robust.FIRST_STEP:
+        kept = model.trimming(rgb, truth, model.schedule_step, mask)
+        truth, rgb = truth * kept, rgb * kept
+    return photometric_loss(rgb, truth, model.config.ssim_lambda)
+
+
+def shrinkage(model, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Terms for the splats' mean opacity, and mean size in scene units; none where their weight is zero."""
+    weight = model.config.shrinkage_weight(model.num_views)
+    if weight == 0.0:
+        return {}
+    return {
+        "shrink_opacities": weight * model.densification.mean_opacity(splats["opacities"]),
+        "shrink_scales": weight / model.scene_unit * splats["scales"].exp().mean(),
+    }
