@@ -10,7 +10,6 @@ Vectors are stored component first, [3, N], because numpy is fast along the last
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -35,27 +34,6 @@ def column(values: Sequence[float], dtype: np.dtype) -> Array:
     return np.asarray(values, dtype=dtype)[:, None]
 
 
-class Solid(Protocol):
-    """A convex body."""
-
-    def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Ray parameters [N] at which the infinite line enters and leaves the body; enter > leave on a miss."""
-
-    def local(self, points: Array) -> Array:
-        """World points [3, N] in the body's frame, in which its surface lies within [-1, 1] on each axis."""
-
-    def normals(self, points: Array) -> Array:
-        """Outward unit normals [3, N] at surface points [3, N]."""
-
-    @property
-    def middle(self) -> tuple[float, float, float]:
-        """Centre, world units."""
-
-    @property
-    def ball_radius(self) -> float:
-        """Radius of the ball of the same volume, world units."""
-
-
 @dataclass(frozen=True)
 class Sphere:
     """A sphere: |p - middle| = radius."""
@@ -65,9 +43,11 @@ class Sphere:
 
     @property
     def ball_radius(self) -> float:
+        """Radius of the ball of the same volume, world units."""
         return self.radius
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        """Ray parameters [N] at which the infinite line enters and leaves the body; enter > leave on a miss."""
         # |o + t d - c|^2 = r^2 with |d| = 1 is t^2 + 2 b t + c = 0. The discriminant b^2 - c is computed from the
         # distance of the centre to the line, r^2 - |m - b d|^2, which does not cancel for far, small spheres.
         m = origins - column(self.middle, origins.dtype)
@@ -79,9 +59,11 @@ class Sphere:
         return enter, half_chord - b
 
     def local(self, points: Array) -> Array:
+        """World points [3, N] in the body's frame, in which its surface lies within [-1, 1] on each axis."""
         return (points - column(self.middle, points.dtype)) / self.radius
 
     def normals(self, points: Array) -> Array:
+        """Outward unit normals [3, N] at surface points [3, N]."""
         return normalize(self.local(points))
 
 
@@ -121,6 +103,9 @@ class Box:
     def _turn(vectors: Array, angle: float) -> Array:
         c, s = float(np.cos(angle)), float(np.sin(angle))
         return np.stack([c * vectors[0] - s * vectors[1], s * vectors[0] + c * vectors[1], vectors[2]])
+
+
+Solid = Sphere | Box
 
 
 @dataclass(frozen=True)
