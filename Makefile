@@ -8,7 +8,7 @@ INSTALL := $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python -
 
 .PHONY: demo test test-slow test-browser lint clean
 
-demo: $(VENV)/.installed  ## make a scene, train NRF and SH on it, compare them
+demo: $(VENV)/.installed  ## make a scene, train the field on it, show what it adds
 	$(BIN)/nrfgs demo $(DEMO_ARGS)
 
 test: $(VENV)/.installed  ## the default test suite, a process for each core

@@ -18,21 +18,20 @@ GAP, TITLE = 6, 26
 
 
 def contact_sheet(views: dict[str, list[SeenView]], path: Path) -> None:
-    """Write a picture of three test views, each whole and below it where it shines most: truth, both methods, their
-    errors, and what the field adds to its base colour.
+    """Write a picture of three test views, each whole and below it where it shines most: truth, each method and its
+    error, and what the field adds to its base colour.
 
     Args:
         views: label -> its test views; the first is the field's.
     """
-    (nrf_label, nrf), (sh_label, sh) = views.items()
-    columns = {
-        "truth": [view.truth for view in nrf],
-        nrf_label: [view.rendered for view in nrf],
-        sh_label: [view.rendered for view in sh],
-        f"error of {nrf_label} x {ERROR_GAIN:g}": [ERROR_GAIN * (view.rendered - view.truth).abs() for view in nrf],
-        f"error of {sh_label} x {ERROR_GAIN:g}": [ERROR_GAIN * (view.rendered - view.truth).abs() for view in sh],
-        f"{nrf_label}'s residual x {RESIDUAL_GAIN:g}": [0.5 + RESIDUAL_GAIN * (v.rendered - v.base) for v in nrf],
-    }
+    label, nrf = next(iter(views.items()))
+    columns = {"truth": [view.truth for view in nrf]}
+    for name, seen in views.items():
+        columns[name] = [view.rendered for view in seen]
+        columns[f"error of {name} x {ERROR_GAIN:g}"] = [ERROR_GAIN * (v.rendered - v.truth).abs() for v in seen]
+    columns[f"{label}'s base colour alone"] = [view.base for view in nrf]
+    columns[f"its error x {ERROR_GAIN:g}"] = [ERROR_GAIN * (view.base - view.truth).abs() for view in nrf]
+    columns[f"{label}'s residual x {RESIDUAL_GAIN:g}"] = [0.5 + RESIDUAL_GAIN * (v.rendered - v.base) for v in nrf]
     rows: list[list[Tensor]] = []
     for index in range(0, len(nrf), max(len(nrf) // 3, 1))[:3]:
         top, left, height, width = brightest_window(nrf[index].shine)

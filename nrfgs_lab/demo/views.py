@@ -117,7 +117,8 @@ def where_it_shines(views: list[SeenView]) -> dict[str, Any]:
     """PSNR of the pixels whose truth gloss changes by more than SHINES, None where there are none.
 
     Returns:
-        "psnr" over all views, "psnr_base" of the base colour alone, "views" of each view, "share" of such pixels.
+        "psnr" over all views and "views" of each, the same of the base colour alone ("psnr_base", "views_base"), and
+        "share" of such pixels.
     """
     shines = [view.shine > SHINES for view in views]
 
@@ -131,4 +132,5 @@ def where_it_shines(views: list[SeenView]) -> dict[str, Any]:
         "psnr": psnr("rendered", everything),
         "psnr_base": psnr("base", everything),
         "views": [psnr("rendered", [i]) for i in everything],
+        "views_base": [psnr("base", [i]) for i in everything],
     }

@@ -21,7 +21,7 @@ from nrfgs_ns.errors import InputError
 def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
     small = SceneConfig(studio=True, arc=90, views=12, width=64, height=48, points=500, test_every=4)
     monkeypatch.setattr(Demo, "scene", lambda self: small)
-    Demo(out=tmp_path / "demo", quick=True, steps=6).main()
+    Demo(out=tmp_path / "demo", quick=True, steps=6, compare=True).main()
     results = json.loads((tmp_path / "demo" / "results.json").read_text())
     assert results["steps"] == 6 and set(results["methods"]) == set(METHODS)
     shown = capfd.readouterr().out
@@ -36,7 +36,7 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
         assert 0.02 < result["shine"]["share"] < 0.9 and 5 < result["shine"]["psnr"] < 60
         assert len(result["shine"]["views"]) == 3
     sheet, strip = (Image.open(tmp_path / "demo" / name) for name in ("contact_sheet.png", "highlight.png"))
-    assert sheet.width >= 6 * CELL and sheet.height >= 6 * 0.7 * CELL
+    assert sheet.width >= 8 * CELL and sheet.height >= 6 * 0.7 * CELL
     assert strip.width >= FRAMES * CELL and strip.height >= 5 * 0.7 * CELL
 
 
@@ -53,7 +53,8 @@ def test_impossible_options_are_refused_in_a_sentence(options, says, tmp_path):
 def compared(nrf, sh):
     """Results whose test views have these PSNRs where it shines."""
     whole = {"psnr": 25.0, "ssim": 0.8}
-    return {NRF: {"eval": whole, "shine": {"views": nrf}}, SH: {"eval": whole, "shine": {"views": sh}}}
+    field = {"views": nrf, "views_base": [20.0, 20.5, 20.1]}
+    return {NRF: {"eval": whole, "shine": field}, SH: {"eval": whole, "shine": {"views": sh}}}
 
 
 @pytest.mark.parametrize(
@@ -71,6 +72,13 @@ def test_the_verdict_follows_the_measurement(nrf, sh, steps, says):
     assert verdict(compared(nrf, sh), steps).startswith(says)
 
 
+def test_alone_the_field_is_compared_with_its_base_colour():
+    results = compared([25.0, 25.2, 26.0], [])
+    del results[SH]
+    said = "NRF is ahead of its base colour alone: +5.20 dB where it shines (ahead in 3 of 3 test views)."
+    assert verdict(results, ENOUGH_STEPS) == said
+
+
 def test_where_it_shines_is_where_gloss_changes_the_truth():
     grey = torch.full((12, 15, 3), 0.5)
     truth = grey.clone()
@@ -83,7 +91,7 @@ def test_where_it_shines_is_where_gloss_changes_the_truth():
     top, left, height, width = brightest_window(view.shine)
     assert (height, width) == (4, 5) and top <= 6 and top + height >= 9 and left <= 10 and left + width >= 14
     dull = where_it_shines([SeenView(grey, grey, grey, grey)])
-    assert dull == {"share": 0.0, "psnr": None, "psnr_base": None, "views": [None]}
+    assert dull == {"share": 0.0, "psnr": None, "psnr_base": None, "views": [None], "views_base": [None]}
 
 
 def test_a_camera_that_turns_about_a_point_sees_it_at_the_same_pixel():
