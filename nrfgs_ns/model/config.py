@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import dataclass, field
+from pkgutil import resolve_name
 from typing import Literal
 
 import tyro
@@ -14,26 +15,22 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import DensificationChoice, DensificationConfig, Splatfacto
 from nrfgs_ns.errors import InputError
 
+MODEL = "nrfgs_ns.model.model:NrfgsModel"
+"""The class that these are the options of, which imports them."""
 PRIOR_VIEWS = 20
-"""So many training views are half of what a head needs: `few_views` trusts it by that."""
+"""Training views with which `few_views` trusts the head by a half."""
 HALVING_VIEWS = 12
-"""So many more training views halve `shrinkage`."""
+"""Training views that halve `shrinkage`."""
 NEGLIGIBLE = 1e-6
 """Weights of shrinkage below it are treated as zero: Adam makes whole steps of any for splats that no view sees."""
 EPSILON = math.ulp(1.0)
-
-
-def _model() -> type:
-    from nrfgs_ns.model.model import NrfgsModel
-
-    return NrfgsModel
 
 
 @dataclass
 class NrfgsModelConfig(ModelConfig):
     """Options of the model: this package's own, then those of splatfacto that are not the densification's."""
 
-    _target: type = field(default_factory=_model)
+    _target: type = field(default_factory=lambda: resolve_name(MODEL))
     """target class to instantiate"""
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
@@ -129,15 +126,15 @@ class NrfgsModelConfig(ModelConfig):
                     raise InputError(f"pipeline.model.{name} is {value}; it must be {needed}.")
 
     def trust(self, views: int) -> float:
-        """How far so many training views trust the head, in (0, 1]."""
+        """Trust in the head with this number of training views, in (0, 1]."""
         return views / (views + PRIOR_VIEWS) if self.few_views == "auto" and views > 0 else 1.0
 
     def suited_appearance(self, views: int) -> AppearanceHeadConfig:
-        """The head's configuration as so many training views, and the densification, want it."""
+        """The head's configuration for this number of training views, and for the densification."""
         head = self.appearance.trusted(self.trust(views))
         return head.for_copies() if self.densification.copies_splats else head
 
     def shrinkage_weight(self, views: int) -> float:
-        """What `shrinkage` is with so many training views."""
+        """Weight of `shrinkage` in the loss with this number of training views."""
         weight = self.shrinkage / 100 * 0.5 ** (views / HALVING_VIEWS)
         return weight if weight >= NEGLIGIBLE and not self.densification.regularises else 0.0

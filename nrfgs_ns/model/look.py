@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which photograph's exposure and colour a rendering has that is not made in training."""
+"""The photograph whose exposure and colour renderings outside of training have."""
 
 import os
 
@@ -21,9 +21,7 @@ def look_asked_for(photograph: PhotographModel) -> int | None:
     if not name:
         return None
     if name not in photograph.names:
-        raise InputError(
-            f"{LOOK} is {name!r}, which is none of the training photographs, such as {photograph.names[0]!r}."
-        )
+        raise InputError(f"{LOOK} is {name!r}, which is not a training photograph, such as {photograph.names[0]!r}.")
     return photograph.names.index(name)
 
 

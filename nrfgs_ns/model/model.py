@@ -42,8 +42,6 @@ from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.rasterizer import ProjectionOptions
 
-__all__ = ["NrfgsModel", "NrfgsModelConfig"]  # a config.yml names both here
-
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
 

@@ -9,8 +9,8 @@ import pytest
 from filelock import FileLock
 
 DEVICE = Path(__file__).with_name("device.py")
-TIMEOUT = 500
-"""Seconds after which processes that wait for each other are ended."""
+TIMEOUT = 3600
+"""Seconds after which processes that wait for each other for good are ended, on however slow a machine."""
 
 
 def meet(job: str, scene: Path, folder: Path, world: int = 2, device_type: str = "cpu") -> Path:
