@@ -22,7 +22,9 @@ from nrfgs_ns.training.checkpoint_files import read_latest
 @pytest.fixture
 def config(tmp_path):
     machine = replace(nrfgs.config.machine, num_devices=2, device_type="cpu")
-    return replace(nrfgs.config, output_dir=tmp_path, machine=machine, experiment_name="x", timestamp="now")
+    return replace(
+        nrfgs.config, data=tmp_path, output_dir=tmp_path, machine=machine, experiment_name="x", timestamp="now"
+    )
 
 
 def test_a_killed_process_is_named_and_the_checkpoint_shown(config):

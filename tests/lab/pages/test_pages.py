@@ -23,6 +23,7 @@ from nrfgs_lab.pages.tables import pages
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import chosen, commands
+from nrfgs_ns.densification import strategy_from
 from nrfgs_ns.training import run
 from nrfgs_ns.training.run import evaluate, parse, train
 from nrfgs_ns.viewer.pictures import modes
@@ -161,8 +162,16 @@ def test_options_that_pages_name_are_there():
     shown = {
         flag for path in pages() for flag in re.findall(r"--(pipeline\.[\w.-]*\w)", path.read_text(encoding="utf-8"))
     }
-    assert len(shown) > 20
+    assert len(shown) > 15
     assert {flag.replace("_", "-") for flag in shown} <= known
+
+
+def test_strategies_that_pages_name_are_there():
+    text = "".join(path.read_text(encoding="utf-8") for path in pages())
+    words = set(re.findall(r"--pipeline\.model\.densification ([a-z]\w*(?:,\w+=[\w.-]*\w)*)", text))
+    assert len(words) > 4
+    for word in words:
+        strategy_from(word)
 
 
 def commands_shown() -> list[str]:
