@@ -81,10 +81,12 @@ def over_host_where_seen() -> str:
 
 
 def demo(what: str) -> str:
-    """Gain of the field in the demo, of each seed: over whole pictures, or where it shines."""
-    part = {"whole": "eval", "shine": "shine"}[what]
-    seeds = [record["methods"] for _, record in sorted(records("demo").items())]
-    return ", ".join(signed(one["nrfgs"][part]["psnr"] - one["nrfgs-sh"][part]["psnr"], 2) for one in seeds)
+    """The demo's gain where it shines by the field's residual, of each seed, or the seconds of its trainings."""
+    seeds = [record["methods"]["nrfgs"] for _, record in sorted(records("demo").items())]
+    if what == "gain":
+        return ", ".join(signed(one["shine"]["psnr"] - one["shine"]["psnr_base"], 1) for one in seeds)
+    seconds = [one["train"]["processor_seconds"] for one in seeds]
+    return f"{min(seconds):.0f} to {max(seconds):.0f}"
 
 
 def _value(runs: Trainings, metric: str) -> float | None:
