@@ -17,8 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 from torch import Tensor
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.reduce import (
     LatentBasis,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a splat sees the camera: direction, distance, and the direction's Fourier bands.
+"""Directions and distances from cameras to splats, and the Fourier bands of directions.
 
 For camera centre o and mean x: v = o - x, r = max(|v|, eps), d = v / r, distance feature log r. The floor is applied
-once, inside the square root, so that direction, distance and both their gradients stay finite when the camera sits on
-the splat: there |d| < 1, log r = log eps, and the gradient of d is bounded by 1 / eps.
+once, inside the square root, so that direction, distance and their gradients stay finite when the camera sits on the
+splat: there |d| < 1, log r = log eps, and the gradient of d is bounded by 1 / eps.
 """
 
 import math
@@ -27,12 +27,20 @@ def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float
         unit: world units in a scene unit.
 
     Returns:
-        directions [M, 3] with norm <= 1 (1 wherever |v| >= eps), and logs of the distances in scene units, [M, 1],
-        >= log eps.
+        directions [M, 3], of norm 1 wherever |v| >= eps and shorter elsewhere; logs of the distances in scene units,
+        [M, 1], >= log eps.
     """
     v = (camera_centers - means).clamp(-FARTHEST, FARTHEST)
     r = v.square().sum(dim=-1, keepdim=True).clamp_min((eps * unit) ** 2).sqrt()
     return v / r, r.log() - math.log(unit)
+
+
+def unit_vectors(vectors: Tensor, floor: float) -> Tensor:
+    """V / max(|v|, floor), [..., 3], for finite v and floor > 0; its gradient is at most 1 / floor.
+
+    Spherical harmonics and lobes look from the camera to the splat, and `view_geometry` the other way.
+    """
+    return vectors / vectors.square().sum(dim=-1, keepdim=True).clamp_min(floor * floor).sqrt()
 
 
 def high_dim(num_bands: int) -> int:
@@ -41,16 +49,10 @@ def high_dim(num_bands: int) -> int:
 
 
 def fourier_bands(directions: Tensor, num_bands: int) -> tuple[Tensor, Tensor]:
-    """Split Fourier encoding of directions.
-
-    Band k holds sin(2^k pi d) and cos(2^k pi d). Low: raw d and band 0. High: bands 1..K-1.
-
-    Args:
-        directions: [M, 3].
-        num_bands: K >= 1.
+    """Fourier bands of directions [M, 3], K >= 1: band k holds sin(2^k pi d) and cos(2^k pi d).
 
     Returns:
-        low [M, 9] and high [M, 6 (K - 1)].
+        low [M, 9], raw d and band 0; high [M, 6 (K - 1)], the others.
     """
     frequencies = math.pi * 2.0 ** torch.arange(num_bands, device=directions.device, dtype=directions.dtype)
     angles = directions[:, None, :] * frequencies[:, None]  # [M, K, 3]

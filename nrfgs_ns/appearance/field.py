@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A field: a head and the table of splats that it draws. What is rendered, exported or made smaller is one."""
+"""A field: a head and the table of splats that it draws, some of which may be diffuse.
+
+A table may have the entry "diffuse", bool [N]. A diffuse splat has its base colour and base opacity from everywhere,
+whatever its other numbers are. The entry is no parameter: nothing learns it, and other heads never see it.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.head import AppearanceHead, Component, SplatAppearance
+
+DIFFUSE = "diffuse"
+"""Name of the table's entry."""
 
 
 class Sight(Protocol):
@@ -27,19 +34,18 @@ class Field(NamedTuple):
 
     head: AppearanceHead
     splats: Mapping[str, Tensor]
-    """"means", "opacities" and the head's `splat_params`, [N, ...]; with "diffuse" (`diffuse.py`) if it is known which
-    are"""
+    """"means", "opacities" and the head's `splat_params`, [N, ...]; "diffuse", if some are"""
 
     def seen_from(self, view: Sight) -> SplatAppearance:
         """Colours and opacities of the M splats that a view sees."""
         return self.head(self.splats, view.visible, view.center)
 
     def base_of(self, view: Sight) -> SplatAppearance:
-        """The part of them that does not depend on the camera."""
+        """Their part that does not depend on the camera."""
         return self.head.base_appearance(self.splats, view.visible)
 
     def components_of(self, view: Sight) -> dict[str, Component]:
-        """What the head's answer is made of (`AppearanceHead.components`)."""
+        """Parts of the head's result (`AppearanceHead.components`)."""
         return self.head.components(self.splats, view.visible, view.center)
 
     def detached(self) -> "Field":
@@ -48,8 +54,7 @@ class Field(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """Bytes that a renderer needs in float32: of diffuse splats not what only a residual reads, and a bit each that
-        says so."""
+        """Bytes that a renderer needs in float32; diffuse splats need a bit, and no residual's parameters."""
         size = sum(weight.numel() * weight.element_size() for weight in self.head.parameters())
         diffuse = self.splats.get(DIFFUSE)
         for name, value in self.splats.items():
@@ -60,3 +65,36 @@ class Field(NamedTuple):
                 rows = int((~diffuse).sum()) if left_out else len(value)
                 size += rows * value[:1].numel() * value.element_size()
         return size
+
+
+class Others:
+    """The visible splats that are not diffuse, for heads in PyTorch; finding them waits for the device.
+
+    Args:
+        splats, visible, camera_centers: as for `AppearanceHead.forward`, with "diffuse" among the splats.
+
+    Attributes:
+        arguments: the same three for the others alone, without the entry.
+    """
+
+    def __init__(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor):
+        self.count = len(visible)
+        self.rows = (~splats[DIFFUSE].index_select(0, visible)).nonzero()[:, 0]
+        centers = camera_centers if camera_centers.dim() == 1 else camera_centers.index_select(0, self.rows)
+        table = {name: value for name, value in splats.items() if name != DIFFUSE}
+        self.arguments = table, visible.index_select(0, self.rows), centers
+
+    def over(self, base: SplatAppearance, appearance: SplatAppearance) -> SplatAppearance:
+        """The base appearance of all M visible splats, with the others' appearance put in."""
+        return SplatAppearance(
+            colors=base.colors.index_copy(0, self.rows, appearance.colors.to(base.colors.dtype)),
+            opacities=base.opacities.index_copy(0, self.rows, appearance.opacities.to(base.opacities.dtype)),
+        )
+
+    def spread(self, components: Mapping[str, Component]) -> dict[str, Component]:
+        """Components of all M visible splats: zeros where there is no residual."""
+        spread = {}
+        for name, (values, kind) in components.items():
+            whole = torch.zeros(self.count, *values.shape[1:], dtype=values.dtype, device=values.device)
+            spread[name] = Component(whole.index_copy(0, self.rows, values), kind)
+        return spread

@@ -6,16 +6,12 @@ Seen from the direction d from camera to splat, with coefficients k per splat an
     colour = max(0, 1/2 + sum_{j < B_active} k_j Y_j(d) + rho sum_{j < B} k_j phi_j(d)),
 
 where B = 16 at degree 3 and both sums have the same 48 coefficients. phi is the Fourier encoding of d with 6 bands,
-two hidden layers of 64 leaky ReLUs, and tanh: 39 -> 64 -> 64 -> 16. rho grows from 0 to 1 over the first 5,000
-steps; the harmonics' degree grows as it does without phi. The encoding keeps d itself: sines and cosines of whole
-multiples of pi cannot tell +x from -x. Opacity does not depend on the view. Source: the paper "Gaussian Splatting with
-Neural Basis Extension", called GSNB.
+two hidden layers of 64 leaky ReLUs, and tanh: 39 -> 64 -> 64 -> 16, 7,760 shared weights. rho grows from 0 to 1 over
+the first 5,000 steps. The encoding keeps d itself: sines and cosines of whole multiples of pi cannot tell +x from -x.
+Opacity does not depend on the view. Source: the paper "Gaussian Splatting with Neural Basis Extension", called GSNB.
 
-Sizes at the defaults: 48 colour numbers per splat, as with harmonics alone; 7,760 shared weights.
-
-The reference also ramps the resolution from 0.125 to 1 over 20,000 steps, adds a patch loss, and has learning rates of
-its own for the coefficients (0.005, and 0.005 / 20). These are not the colour model: here all methods have the host's
-resolution schedule, loss and rates, and only the basis network has the reference's optimiser, AdamW at 1e-3.
+The reference's resolution ramp, patch loss and learning rates are not the colour model: here all methods have the
+host's; only the basis network has the reference's optimiser, AdamW at 1e-3 (docs/deviations.md).
 """
 
 from collections.abc import Hashable, Mapping
@@ -24,11 +20,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.directions import unit_vectors
-from nrfgs_ns.appearance.encoding import fourier_bands
+from nrfgs_ns.appearance.encoding import fourier_bands, unit_vectors
 from nrfgs_ns.appearance.head import SplatAppearance, base_opacities
-from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics
-from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
+from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh, num_bases
 
 RAMP_STEPS = 5000
 """Training steps over which the learnt basis is faded in."""
@@ -51,8 +45,8 @@ class GsnbConfig(ShConfig):
 
     def validate(self) -> None:
         super().validate()
-        self.require(self.num_bands >= 1, "num_bands", "at least 1")
-        self.require(self.hidden_width >= 1, "hidden_width", "at least 1")
+        for name in ("num_bands", "hidden_width"):
+            self.require(getattr(self, name) >= 1, name, "at least 1")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
 
 

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spherical harmonics up to degree 3 in Triton: one kernel forward, one backward; PyTorch's twin is `sh_bases`.
 
-Gsplat 1.4 launches its own on the legacy stream, whatever stream is current, so that a CUDA graph does not record them.
-
-The harmonics are polynomials of a unit direction d = v / |v|. What they pass back through v is the part of their slope
-that is orthogonal to d, divided by |v|.
+gsplat 1.4 launches its own on the legacy stream, which a CUDA graph does not record. The harmonics are polynomials of a
+unit direction d = v / |v|; v's gradient is the part of d's that is orthogonal to d, divided by |v|.
 """
 
 import math
@@ -23,7 +21,7 @@ WARPS = 4
 MAX_DEGREE = 3
 
 SMALLEST = tl.constexpr(1e-12)
-"""Length that a shorter direction counts as having, as in `torch.nn.functional.normalize`."""
+"""Shortest length of a direction, as in `torch.nn.functional.normalize`."""
 C0 = tl.constexpr(math.sqrt(1 / (4 * math.pi)))
 C1 = tl.constexpr(math.sqrt(3 / (4 * math.pi)))
 C2 = tl.constexpr(math.sqrt(15 / (4 * math.pi)))
@@ -155,9 +153,9 @@ class Harmonics(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, d_colors: Tensor) -> tuple[None, Tensor, Tensor]:
         directions, coefficients = ctx.saved_tensors
-        found = torch.empty_like(directions), torch.empty_like(coefficients)
-        _launch(launch_backward, ctx.used, directions, coefficients, d_colors.contiguous(), *found)
-        return None, *found
+        gradients = torch.empty_like(directions), torch.empty_like(coefficients)
+        _launch(launch_backward, ctx.used, directions, coefficients, d_colors.contiguous(), *gradients)
+        return None, *gradients
 
 
 def _launch(kernel: Launcher, used: int, directions: Tensor, coefficients: Tensor, *others: Tensor) -> None:

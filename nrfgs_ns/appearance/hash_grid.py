@@ -7,22 +7,20 @@ finds its own in row
 
     (i p_1) xor (j p_2) xor (k p_3)  mod T,    p = 1, 2654435761, 805459861
 
-(T. Mueller, A. Evans, C. Schied, A. Keller, "Instant Neural Graphics Primitives with a Multiresolution Hash
-Encoding", SIGGRAPH 2022). That paper normalises positions to the unit cube. Here they are coordinates in scene units
-as they are: the lattice has no end and the hash is defined on all of it, negative integers included, so that nothing is
-clamped however far a splat lies. The integers are in two's complement: T is a power of two, and modulo T the hash is
-that of unsigned 32-bit arithmetic.
+(T. Mueller, A. Evans, C. Schied, A. Keller, "Instant Neural Graphics Primitives with a Multiresolution Hash Encoding",
+SIGGRAPH 2022). Positions are coordinates in scene units, not normalised to a cube: the hash is defined on the whole
+lattice, in two's complement, and nothing is clamped. T is a power of two, so that modulo T the hash is that of unsigned
+32-bit arithmetic.
 
 Where a level's lattice over [-1, 1]^3, to which nerfstudio scales its scenes, has no more points than the table has
-rows, (2 N_l)^3 <= T, points are not hashed but numbered, and no two inside that cube share a row:
+rows, (2 N_l)^3 <= T, points are not hashed but numbered:
 
     (i mod 2 N_l) + 2 N_l (j mod 2 N_l) + (2 N_l)^2 (k mod 2 N_l).
 
-Beyond the cube such a level repeats itself every 2 units (the cube's far faces are its near ones already); the hashed
-levels tell the repetitions apart. With N_0 = 16 and T = 2^15 level 0 is of this kind, and fills its table exactly.
+Beyond the cube such a level repeats itself every 2 units; the hashed levels tell the repetitions apart. With N_0 = 16
+and T = 2^15 level 0 is of this kind, and fills its table exactly.
 
-On CUDA, two Triton kernels compute all this and its gradients (`hash_grid_triton.py`); everywhere else, and for other
-dtypes than float32, PyTorch does. The kernels' gradients cannot be differentiated again.
+On CUDA, two Triton kernels compute all this in float32 and its gradients (`hash_grid_triton.py`), once differentiable.
 """
 
 from collections.abc import Callable
@@ -35,7 +33,7 @@ from nrfgs_ns.kernels.trial import Gate
 PRIMES = (1, 2654435761, 805459861)
 """The hash's multipliers for x, y, z; `hash_grid_triton.py` repeats them."""
 INITIAL_RANGE = 1e-4
-"""Features start uniform in +- this, as in the paper: next to nothing, and no two the same."""
+"""Features start uniform in +- this, as in the paper."""
 
 
 class HashGrid(nn.Module):
@@ -79,14 +77,7 @@ class HashGrid(nn.Module):
         return len(self.resolutions) * self.table.shape[1]
 
     def forward(self, positions: Tensor) -> Tensor:
-        """Interpolated features.
-
-        Args:
-            positions: [M, 3], scene units.
-
-        Returns:
-            [M, levels * features], level by level.
-        """
+        """Interpolated features [M, levels * features], level by level, of positions [M, 3] in scene units."""
         if self._kernels_take(positions):
             from nrfgs_ns.appearance.hash_grid_triton import Interpolation
 

@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hash grid in two Triton kernels, one forward and one backward. Equations: `hash_grid.py`.
 
-A thread takes positions and walks over the eight corners of a level's cell; rows, weights and gathered features live in
-registers and never reach memory. Forward, a program has one level, so that neighbouring programs gather from the same
-level's table. Backward, it has all of them: a position's gradient is their sum, written once. The table's gradient is
-added up by atomics, in whatever order, so its last bits differ from run to run, as those of PyTorch's index_select do.
-Of the two, only what autograd asks for is computed.
+A thread takes positions and walks over the eight corners of a level's cell, all in registers. Forward, a program has
+one level, so that neighbouring programs gather from the same table. Backward, it has all of them: a position's gradient
+is their sum, written once. The table's gradient is added up by atomics, so its last bits differ from run to run, as
+those of PyTorch's index_select do. Only the gradients that autograd asks for are computed.
 
 The number of features is a power of two; up to four are read, and on recent cards added, at once.
 
-Lattice coordinates are int32, and the hash is unsigned 32-bit arithmetic, of which T rows see the last bits: the rows
-are those of `hash_grid.py` wherever coordinates are below 2^31. Beyond, coordinates stay at the last float32 below 2^31
-and features at those of that lattice point, where PyTorch's go on to 2^63. A position that is no number, or infinite on
-the lattice, gets NaN, as it does in PyTorch; its rows are in the table like all others, so nothing is read beyond it.
+Lattice coordinates are int32 and the hash is unsigned 32-bit: the rows are those of `hash_grid.py` wherever coordinates
+are below 2^31, and stay at the last float32 below it beyond. A position that is NaN, or infinite on the lattice, gets
+NaN, as in PyTorch; no row is beyond the table.
 """
 
 import torch
@@ -38,7 +36,7 @@ CORNERS = tl.constexpr(8)
 
 @triton.jit
 def _block(positions, count, F: tl.constexpr, B: tl.constexpr):
-    """A program's positions: which they are, int64 [B], which of them are there, x, y and z; lanes [1, F]."""
+    """A program's positions: int64 [B], which are valid, x, y and z; lanes [1, F]."""
     items = tl.program_id(0).to(tl.int64) * B + tl.arange(0, B)
     lanes = tl.arange(0, F)[None, :]
     valid = items < count
@@ -59,7 +57,7 @@ def _split(coordinate, resolution):
 
 @triton.jit
 def _keys(cell, numbered, side, stride, PRIME: tl.constexpr):
-    """What an axis gives to the rows of the lower and the upper neighbour, uint32."""
+    """An axis's share of the rows of the lower and the upper neighbour, uint32."""
     if numbered:
         lower = cell % side  # has the sign of the cell
         lower = tl.where(lower < 0, lower + side, lower)
@@ -126,10 +124,8 @@ def backward_kernel(
     count, levels, numbered_levels, table_size,
     F: tl.constexpr, B: tl.constexpr, BY_POSITION: tl.constexpr, BY_TABLE: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of the positions, written, and of the table, added, from those of the features.
-
-    Without BY_POSITION, or without BY_TABLE, that one is not computed, and any tensor can be passed for it.
-    """
+    """Gradients of positions (written) and table (added); one that is not computed, without BY_POSITION or BY_TABLE,
+    may be any tensor."""
     items, valid, x, y, z, lanes = _block(positions, count, F, B)
     here = valid[:, None]
 
@@ -173,7 +169,7 @@ launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_ke
 class Interpolation(torch.autograd.Function):
     """(positions [M, 3], table [L T, F], resolutions [L]) -> features [M, L F]; all float32 on one device.
 
-    Besides tensors: how many levels are numbered, the first ones, and T, a power of two up to 2^24.
+    The first `numbered_levels` are numbered; T is a power of two up to 2^24.
     """
 
     @staticmethod

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The appearance head: the one seam between a splat's colours and opacity and everything else.
 
-A head defines three things: the numbers that a splat stores (`splat_params`), which join the model's `gauss_params`, so
-that densification, optimisers and checkpoints carry them without knowing their meaning; the colours and opacities of
-the splats that a camera sees (`forward`); and their part that does not depend on the view (`base_appearance`). Shared
-weights are the head's own parameters and never enter `gauss_params`. `components` splits the result for the viewer.
-
-Nothing here knows nerfstudio or the rasterizer.
+A head defines the numbers that a splat stores (`splat_params`), which join the model's `gauss_params`, so that
+densification, optimisers and checkpoints carry them without knowing their meaning; the colours and opacities of the
+splats that a camera sees (`forward`); and their part that does not depend on the view (`base_appearance`). Shared
+weights are the head's own parameters. Nothing here knows nerfstudio or the rasterizer.
 """
 
 from abc import ABC, abstractmethod
@@ -38,7 +36,7 @@ class Component(NamedTuple):
     values: Tensor
     """[M, 3] for a change of colour, in units of white; [M, 1] otherwise."""
     kind: Literal["color", "opacity", "weight"]
-    """color, opacity: a change of it, of either sign, 0 where the head changes nothing. weight: a share, in [0, 1]."""
+    """color, opacity: a signed change, 0 where the head changes nothing. weight: a share, in [0, 1]."""
 
 
 @dataclass
@@ -49,13 +47,10 @@ class AppearanceHeadConfig:
     """the head class that this configuration builds"""
 
     STEPS: ClassVar[tuple[str, ...]] = ()
-    """Fields that are numbers of training steps: where schedules are stretched, so are they."""
+    """Fields that are numbers of training steps, stretched with the schedules."""
 
     def setup(self, scene_unit: float = 1.0) -> "AppearanceHead":
-        """Build the head.
-
-        Args:
-            scene_unit: world units in a scene unit.
+        """Build the head; `scene_unit` is the world units in a scene unit.
 
         Raises:
             InputError: a field is out of range; the message names it.
@@ -69,7 +64,7 @@ class AppearanceHeadConfig:
         """Raise InputError, naming the field and the fix, if a value cannot work."""
 
     def trusted(self, share: float) -> "AppearanceHeadConfig":
-        """The configuration of a head that the capture trusts with a share, in (0, 1], of what it may do."""
+        """The configuration for a capture that supports only a share, in (0, 1], of the view dependence."""
         return self
 
     def for_copies(self) -> "AppearanceHeadConfig":
@@ -97,17 +92,14 @@ class AppearanceHead(nn.Module, ABC):
     sh_degree: int = 0
     """Degree of the spherical harmonics among the splats' parameters; 0 if there are none."""
     scene_unit: float = 1.0
-    """World units in a scene unit: a head works in scene units, so that a scene looks the same in any unit."""
+    """World units in a scene unit. A head works in scene units, so that the world's unit does not matter."""
     residual_params: tuple[str, ...] = ()
-    """Those of `splat_params` that only the residual reads: a diffuse splat need not store them."""
+    """`splat_params` that only the residual reads: a diffuse splat need not store them."""
     is_harmonics: bool = False
     """Whether colours are exactly the harmonics in `features_dc` and `features_rest`, and opacities the base's."""
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
-        """The tensors that each splat stores for this head, at the start of a training.
-
-        Args:
-            rgb: initial base colours [N, 3] in [0, 1].
+        """Initial per-splat tensors, for base colours rgb [N, 3] in [0, 1].
 
         Returns:
             name -> tensor [N, ...] on rgb's device. Each name needs an optimiser of the same name in the method's
@@ -135,8 +127,8 @@ class AppearanceHead(nn.Module, ABC):
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
         """Parts of the head's result, for the viewer and for logs; never called in training.
 
-        A head that has more to show than its residual overrides this; every entry becomes a mode of the viewer under
-        its name. Which entries there are must not depend on the arguments, and no visible splats (M = 0) must do.
+        Every entry becomes a mode of the viewer under its name. The names must not depend on the arguments; M = 0 must
+        work.
 
         Args:
             splats, visible, camera_centers: as for `forward`.
@@ -148,39 +140,23 @@ class AppearanceHead(nn.Module, ABC):
         return {"residual": Component(colors - self.base_appearance(splats, visible).colors, "color")}
 
     def set_step(self, step: int) -> None:  # noqa: B027  (most heads have no schedule)
-        """Tell the head which training step it is, for heads that grow with training."""
+        """Set the training step, for heads that grow with training."""
 
     @property
     def phase(self) -> Hashable:
-        """What `set_step` has decided: in steps of one phase the head computes the same."""
+        """The state that `set_step` sets: in steps of one phase the head computes the same."""
         return None
 
     def try_kernels(self, device: torch.device) -> None:  # noqa: B027  (most heads have none)
         """Try the head's own kernels on a CUDA device, which compiles them before the first step."""
 
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor | None:
-        """Distance of the head from adding nothing to the base appearance, a scalar to minimise in the warm-up.
-
-        None if the head has no shared weights to train.
-        """
+        """Mean squared residual, a scalar to minimise in the warm-up; None without shared weights to train."""
         return None
 
 
-def picked(table: Tensor, visible: Tensor, camera_centers: Tensor) -> Tensor:
-    """The visible rows of a table [N, ...]. One camera's ascend, so that N of them are the table, which is not copied.
-
-    Args:
-        visible, camera_centers: as for `AppearanceHead.forward`.
-    """
-    everything = camera_centers.dim() == 1 and len(visible) == len(table)
-    return table if everything else table.index_select(0, visible)
-
-
 def base_opacities(logits: Tensor) -> Tensor:
-    """Base opacities [M] from the stored logits [M, 1].
-
-    Rows are picked first, then comes the sigmoid: in the other order the last bit may differ.
-    """
+    """Base opacities [M] from stored logits [M, 1]. Picking rows after the sigmoid may change the last bit."""
     return torch.sigmoid(logits).squeeze(-1)
 
 

@@ -10,10 +10,9 @@ direction's Fourier bands split into low(d) and high(d) (`encoding.py`):
     colour  = c     + s_c     tanh(dc_low + sigmoid(w) dc_high)
     opacity = alpha + s_alpha tanh(d_alpha)
 
-The low branch carries what changes slowly with direction; the high branch's detail passes a gate w that the splat
-opens only where detail pays. Both are one hidden layer of ReLUs: 46 -> 64 -> 4 and 48 -> 64 -> 4, 6,664 weights in
-all at the default sizes. Without the split there is one branch of twice the width that sees everything
-(58 -> 128 -> 4, 8,068 weights) and no gate.
+The high branch's detail passes a gate w that the splat opens only where detail pays. Both branches are one hidden layer
+of ReLUs: 46 -> 64 -> 4 and 48 -> 64 -> 4, 6,664 weights at the default sizes. Without the split, one branch of twice
+the width sees everything (58 -> 128 -> 4, 8,068 weights), without a gate.
 
 Two bounds keep opacity in [0, 1], with t = tanh(d_alpha) and x = alpha + s_alpha t:
 
@@ -21,7 +20,6 @@ Two bounds keep opacity in [0, 1], with t = tanh(d_alpha) and x = alpha + s_alph
     logit              sigmoid(logit + 4 s_alpha t); at half opacity, to first order, alpha + s_alpha t
 
 On the logit the residual scales with the opacity: n copies of a splat, each of about alpha / n, together look like one.
-
 `fused/` computes the same in two GPU kernels.
 """
 
@@ -32,8 +30,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE, Others
 from nrfgs_ns.appearance.encoding import LOW_DIM, fourier_bands, high_dim, view_geometry
+from nrfgs_ns.appearance.field import DIFFUSE, Others
 from nrfgs_ns.appearance.fused import FusedField
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, Component, SplatAppearance, base_colors
 
@@ -85,23 +83,23 @@ class NrfConfig(AppearanceHeadConfig):
         return self.opacity_bound or "straight-through"
 
     def trusted(self, share: float) -> "NrfConfig":
-        """Opacity that changes less with the view: an opacity for each view is a geometry for each."""
+        """A smaller opacity residual: view-dependent opacity lets each view have its own geometry."""
         return replace(self, opacity_scale=share * self.opacity_scale) if self.opacity_residual else self
 
     def for_copies(self) -> "NrfConfig":
-        """Residuals on the logit, unless another bound is asked for: n copies of a splat have 1/n of its opacity each,
-        but would each add a whole residual to it."""
+        """Residuals on the logit, by default: n copies of a splat have 1/n of its opacity each, but would each add a
+        whole residual to it."""
         return self if self.opacity_bound or not self.opacity_residual else replace(self, opacity_bound="logit")
 
     def validate(self) -> None:
         self.require(1 <= self.latent_dim <= 1024, "latent_dim", "from 1 to 1024")
         self.require(self.num_bands >= 1, "num_bands", "at least 1")
         self.require(1 <= self.hidden_width <= 4096, "hidden_width", "from 1 to 4096")
-        self.require(self.color_scale >= 0, "color_scale", "zero or positive")
-        self.require(self.opacity_scale >= 0, "opacity_scale", "zero or positive")
+        for name in ("color_scale", "opacity_scale"):
+            self.require(getattr(self, name) >= 0, name, "zero or positive")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
-        self.require(self.output_init in ("zero", "default"), "output_init", "'zero' or 'default'")
         for name, choices in (
+            ("output_init", ("zero", "default")),
             ("opacity_bound", (None, *OPACITY_BOUNDS)),
             ("implementation", ("auto", "torch", "fused")),
             ("precision", ("fp32", "tf32", "bf16", "fp16")),
@@ -110,10 +108,10 @@ class NrfConfig(AppearanceHeadConfig):
 
 
 class BranchOutputs(NamedTuple):
-    """What the branches answer for M splats, before any tanh; None for what the configuration leaves out."""
+    """The branches' outputs before any tanh; None for what the configuration leaves out."""
 
     dc_low: Tensor
-    """[M, 3]; of the one branch, if there is only one."""
+    """[M, 3]; of the single branch, if there is only one."""
     dc_high: Tensor | None
     """[M, 3]"""
     gate: Tensor | None
@@ -172,10 +170,10 @@ class NeuralResidualField(AppearanceHead):
         )
 
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
-        """The residuals, before colours are clamped at black, and the branches and the gate, if there are two branches.
+        """The residuals, before colours are clamped at black; branches and gate, if there are two branches.
 
-        "low branch" is the residual that a shut gate would leave, and "high branch" what the gate lets through makes
-        of it: s_c tanh(dc_low), and s_c (tanh(dc_low + sigmoid(w) dc_high) - tanh(dc_low)). They add up to "residual".
+        "low branch" is the residual with a shut gate, s_c tanh(dc_low), and "high branch" the rest of "residual":
+        s_c (tanh(dc_low + sigmoid(w) dc_high) - tanh(dc_low)).
         """
         if DIFFUSE in splats:
             others = Others(splats, visible, camera_centers)
@@ -210,7 +208,7 @@ class NeuralResidualField(AppearanceHead):
     def _residual(
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, color: Tensor, logit: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """What the scales multiply, in [-1, 1]: colour's [M, 3]; opacity's [M, 1], or None if it is switched off."""
+        """The residuals before scaling, in [-1, 1]: colour's [M, 3]; opacity's [M, 1], or None if switched off."""
         d_color, dc_high, gate, d_alpha = self._branches(splats, visible, camera_centers, color, logit)
         if dc_high is not None:
             d_color = d_color + gate * dc_high
@@ -219,7 +217,7 @@ class NeuralResidualField(AppearanceHead):
     def _branches(
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, color: Tensor, logit: Tensor
     ) -> BranchOutputs:
-        """Both branches, for the visible splats with base colours [M, 3] and base opacities' logits [M, 1]."""
+        """Both branches' outputs, from base colours [M, 3] and base opacities' logits [M, 1]."""
         means = splats["means"].index_select(0, visible)
         latents = splats["latents"].index_select(0, visible)
         directions, log_distance = view_geometry(means, camera_centers, self.config.distance_eps, self.scene_unit)
@@ -241,15 +239,12 @@ def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 def bounded_opacity(logit: Tensor, residual: Tensor, scale: float, bound: OpacityBound) -> Tensor:
-    """Opacity with its residual, in [0, 1].
+    """Opacity with its residual, in [0, 1]: [M, 1].
 
     Args:
         logit: base opacities' logits, [M, 1].
         residual: t, [M, 1], in [-1, 1].
         scale: s_alpha >= 0, the largest change of opacity (for "logit": at half opacity and to first order).
-
-    Returns:
-        [M, 1].
     """
     if bound == "logit":
         return torch.sigmoid(logit + LOGIT_SLOPE * scale * residual)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained neural residual field with shorter latents or diffuse splats: a new head with edited weights, and the
-splats' tables that go with it. Nothing here trains.
+"""A trained neural residual field with shorter latents or diffuse splats; nothing here trains.
 
 Latents that lie in a subspace are folded into the first layer, which is exact: with z = m + B y,
 
     W z + b = (W B) y + (W m + b).
 """
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -14,8 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 
 Layers = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -23,26 +22,19 @@ Layers = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def input_columns(config: NrfConfig, branch: str) -> dict[str, list[int]]:
-    """Where the inputs lie in the first layer of the branch "low" (or the only one) or "high": name -> columns.
+    """Columns of the first layer's inputs, of the branch "low" (or the only one) or "high", by name.
 
     Names: latents, color, distance, opacity, direction, "band 0", "band 1", ...
     """
-    bands = {f"band {k}": 6 for k in range(config.num_bands)}
-    high_bands = dict(list(bands.items())[1:])
     sizes = {"latents": config.latent_dim, "color": 3}
     if config.use_distance:
         sizes["distance"] = 1
     if branch == "low":
         sizes |= {"opacity": 1, "direction": 3, "band 0": 6}
-        if not config.split_bands:
-            sizes |= high_bands
-    else:
-        sizes |= high_bands
-    columns, first = {}, 0
-    for name, size in sizes.items():
-        columns[name] = list(range(first, first + size))
-        first += size
-    return columns
+    if branch == "high" or not config.split_bands:
+        sizes |= {f"band {k}": 6 for k in range(1, config.num_bands)}
+    ends = list(itertools.accumulate(sizes.values()))
+    return {name: list(range(end - size, end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
 
 class LatentBasis(NamedTuple):
@@ -61,12 +53,11 @@ class LatentBasis(NamedTuple):
 def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     """Principal components of the latents, in the metric of the first layer's outputs.
 
-    A direction of the latents counts by how far it moves the hidden units, |W (z - z')|^2 over both branches: the
-    components are those whose first r predict W z with the least squared error, weighted, for each r.
+    A direction of the latents counts by how far it moves the hidden units, |W (z - z')|^2 over both branches: the first
+    r components predict W z with the least squared error, weighted, for each r.
 
     Args:
-        weight: of each splat, >= 0; equal if their sum is 0. Diffuse splats, whose latents nothing reads, do not
-            count. [N]
+        weight: of each splat, >= 0; equal if their sum is 0. Diffuse splats do not count. [N]
     """
     latents = field.splats["latents"].detach().double()
     if DIFFUSE in field.splats:
@@ -75,10 +66,9 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
         weight = torch.ones_like(weight)
     weight = (weight / weight.sum()).double()[:, None]
     mean = (weight * latents).sum(dim=0)
-    seen_by_units = torch.cat(
-        [layers(branch)[0][:, : latents.shape[1]].double() for _, branch in branches_of(field.head)]
-    )
-    gram = seen_by_units.T @ seen_by_units
+    size = latents.shape[1]
+    first_layers = torch.cat([layers(branch)[0][:, :size].double() for _, branch in branches_of(field.head)])
+    gram = first_layers.T @ first_layers
     values, vectors = torch.linalg.eigh(gram)
     # Latents beside the layer's row space keep a millionth of the strongest one's metric: everything can be inverted.
     roots = values.clamp_min(max(float(values[-1]) * 1e-12, 1e-300)).sqrt()
@@ -90,7 +80,7 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
 
 
 def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
-    """Latents of `rank` numbers, 1..D: their first principal components, with the basis folded into the first layer."""
+    """Latents of `rank` numbers, 1..D: their first principal components, folded into the first layer."""
     size = field.head.config.latent_dim
     latents = field.splats["latents"]
     reduced = (latents.detach().double() - basis.mean) @ basis.inverse[:rank].T
@@ -105,7 +95,7 @@ def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
 
 
 def with_components(field: Field, columns: Tensor) -> Field:
-    """Only these components of the latents [R], of which there is at least one; the others are 0 for every splat."""
+    """Only these components of the latents, [R], at least one; the others are 0 for every splat."""
     size = field.head.config.latent_dim
     changed = []
     for _, branch in branches_of(field.head):
@@ -116,19 +106,10 @@ def with_components(field: Field, columns: Tensor) -> Field:
 
 
 def with_diffuse(field: Field, diffuse: Tensor, features_dc: Tensor, opacities: Tensor) -> Field:
-    """Some splats without residual.
-
-    Args:
-        diffuse: which, bool [N].
-        features_dc, opacities: their appearance instead, [N, 3] and [N, 1]; other rows are ignored.
-    """
-    rows = diffuse[:, None]
-    splats = {
-        **field.splats,
-        "features_dc": torch.where(rows, features_dc, field.splats["features_dc"].detach()),
-        "opacities": torch.where(rows, opacities, field.splats["opacities"].detach()),
-        DIFFUSE: diffuse,
-    }
+    """The splats `diffuse`, bool [N], without residual, and their appearance instead: [N, 3] and logits [N, 1]."""
+    splats = {**field.splats, DIFFUSE: diffuse}
+    for name, value in (("features_dc", features_dc), ("opacities", opacities)):
+        splats[name] = torch.where(diffuse[:, None], value, field.splats[name].detach())
     return Field(field.head, splats)
 
 

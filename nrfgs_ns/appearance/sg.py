@@ -6,15 +6,13 @@ Seen from the direction d from camera to splat, splat i with base colour c and L
     colour = max(0, c + sum_{j <= L} a_j exp(|s_j| (d . mu_j - 1))),
 
 with amplitude a_j (3 numbers, any sign), sharpness |s_j| (1 number) and unit axis mu_j (3 numbers, stored at any
-length). Opacity does not depend on the view. Sources: the papers "SG-Splatting" (three lobes about the fixed axes x,
-y, z, from step 2,000) and "MEGS2" (free axes, |s|), which this follows.
-
-A splat stores 3 + 7 L = 24 colour numbers, half of what harmonics of degree 3 take; nothing is shared.
+length): 3 + 7 L = 24 colour numbers, half of what harmonics of degree 3 take. Opacity does not depend on the view.
+Sources: the papers "SG-Splatting" (three lobes about the fixed axes x, y, z, from step 2,000) and "MEGS2" (free axes,
+|s|), which this follows.
 
 Axes start at x, y, z: at right angles the lobes can follow a gradient of colour in every direction equally well.
-Amplitudes start at zero, so that switching the lobes on changes nothing. Sharpness starts at 2: a lobe has 56 % of its
-height halfway to the next axis, so that neighbours overlap, and 2 % opposite its own axis, so that each has directions
-to itself.
+Amplitudes start at zero, so that switching the lobes on changes nothing; sharpness at 2, so that neighbours overlap (56
+% of the height halfway to the next axis), and each has directions to itself (2 % opposite its axis).
 """
 
 from collections.abc import Hashable, Mapping
@@ -23,7 +21,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.directions import unit_vectors
+from nrfgs_ns.appearance.encoding import unit_vectors
 from nrfgs_ns.appearance.head import (
     AppearanceHead,
     AppearanceHeadConfig,
@@ -36,8 +34,7 @@ START_STEP = 2000
 """Training step of the first lobes; before it only the base colour is trained."""
 INITIAL_SHARPNESS = 2.0
 SHORTEST_AXIS = 1e-3
-"""Stored axes shorter than this are divided by it instead of their length: they start at 1, and the bound is for the
-gradient of one that training leads through zero."""
+"""Stored axes shorter than this are divided by it instead of their length, which bounds their gradient."""
 
 
 @dataclass
@@ -69,11 +66,8 @@ class SphericalGaussians(AppearanceHead):
         """whether there are lobes yet."""
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
-        """Base colours and lobes.
-
-        "features_dc" [N, 3]; "sg_axes" [N, L, 3], of any length but zero; "sg_sharpness" [N, L], of any sign;
-        "sg_colors" [N, L, 3], amplitudes in units of white.
-        """
+        """Base colours "features_dc" [N, 3] and lobes: "sg_axes" [N, L, 3], of any length but zero; "sg_sharpness" [N,
+        L], of any sign; "sg_colors" [N, L, 3], amplitudes in units of white."""
         count, lobes = len(rgb), self.config.lobes
         axes = torch.eye(3, device=rgb.device)
         return {

@@ -6,17 +6,12 @@ Seen from the direction d from camera to splat, splat i with mean x, opacity log
     f       = sigmoid(network(d, grid(x))),
     opacity = sigmoid(o) f,       colour = max(0, 1/2 + sum_{l <= L} sum_m k_{l, m} Y_{l, m}(d)),
 
-where grid is a hash grid of the mean in scene units (`hash_grid.py`: 4 levels of 4 features) and the network has two
-hidden layers of 32 leaky ReLUs: 19 -> 32 -> 32 -> 1. Source: the paper "Gaussian Splatting with NeRF-based Color and
-Opacity", called VDGS, in the mode that multiplies opacity.
+where grid is a hash grid of the mean in scene units (`hash_grid.py`: 4 levels of 4 features, 524,288 shared numbers)
+and the network has two hidden layers of 32 leaky ReLUs: 19 -> 32 -> 32 -> 1, 1,729 weights. f starts near 1/2. Source:
+the paper "Gaussian Splatting with NeRF-based Color and Opacity", called VDGS, in the mode that multiplies opacity.
 
-Sizes at the defaults: 48 colour numbers per splat, as with harmonics alone; shared, 524,288 in the grid and 1,729 in
-the network. f starts near 1/2, so a splat starts at half its opacity. Pruning sees the base opacity sigmoid(o), except
-in `mcmc`, which sees the largest that views have shown.
-
-The grid and the network have the reference's optimiser, Adam at 1e-3 without a schedule; all else has the host's. The
-reference trains with opacity resets switched off. That is a matter of densification and not of the colour model;
-here every method is densified in the same way, resets included.
+Grid and network have the reference's optimiser, Adam at 1e-3 without a schedule; all else is the host's, opacity resets
+included, which the reference switches off. Pruning sees sigmoid(o), except in `mcmc` (the largest opacity shown).
 """
 
 from collections.abc import Mapping
@@ -25,11 +20,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.directions import unit_vectors
+from nrfgs_ns.appearance.encoding import unit_vectors
 from nrfgs_ns.appearance.hash_grid import HashGrid
 from nrfgs_ns.appearance.head import Component, SplatAppearance, base_opacities
-from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics
-from nrfgs_ns.appearance.spherical_harmonics import eval_sh
+from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh
 
 
 @dataclass
@@ -47,8 +41,8 @@ class VdgsConfig(ShConfig):
 
     def validate(self) -> None:
         super().validate()
-        self.require(self.hidden_width >= 1, "hidden_width", "at least 1")
-        self.require(self.grid_base_resolution >= 1, "grid_base_resolution", "at least 1")
+        for name in ("hidden_width", "grid_base_resolution"):
+            self.require(getattr(self, name) >= 1, name, "at least 1")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
 
 

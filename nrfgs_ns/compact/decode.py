@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.encode import FORMAT, GROUPS
 from nrfgs_ns.compact.format import LARGEST_RATIO, SMALL, read_container

@@ -35,8 +35,7 @@ import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.compact.format import Table
 from nrfgs_ns.compact.quantise import MOST_BITS, Grid, morton
 from nrfgs_ns.compact.tables import COLUMNS, Precision, steps_of, tables_of

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.head import SH_C0, base_colors
 from nrfgs_ns.compact.quantise import nearest_turn
 

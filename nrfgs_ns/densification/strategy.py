@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.errors import InputError
 
 OpacitySeen = Literal["base", "peak"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.spherical_harmonics import sh_bases
+from nrfgs_ns.appearance.sh import sh_bases
 from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 

@@ -6,18 +6,15 @@ Conventions, for every function of this module:
 - `pred` and `gt` are images [H, W, 3] in [0, 1] of a floating dtype; `mask` is [H, W, 1] bool, True inside, or None for
   the whole image.
 - The result is a Python float, or None where the metric is undefined: an empty mask, or an image (or a mask) too small
-  for the metric's window. It is NaN only if the prediction itself is not finite, so that a diverged model is seen.
-- Without a mask the values are those that the host reports (torchmetrics, pytorch_msssim); an all-True mask changes
-  nothing.
+  for the metric's window. It is NaN only if the prediction is not finite, so that a diverged model is seen.
+- Without a mask the values are those that the host reports (torchmetrics, pytorch_msssim).
 - Under a mask PSNR and L1 are means over the pixels inside. The windowed metrics first replace the prediction outside
-  the mask by the truth, so that nothing outside can cost anything; SSIM and MS-SSIM then average over the windows whose
-  centre is inside. LPIPS cannot leave pixels out of its average: under a mask it is a lower bound.
-- Colour-corrected metrics (cc_psnr, cc_ssim, ...) are those of the prediction after the affine map of its colours that
-  is nearest to the truth (`fit_colors`), one for each image: the error that is left without the test photograph's
-  exposure and white balance, which no method can know. Never quote them alone.
-- Arithmetic is float32, or float64 if the images are, or if they are on CUDA: there a float32 convolution may run in
-  TF32, whose 10 bits of mantissa SSIM's differences of squares cannot stand. On a CPU float64 convolutions are several
-  times slower, and not needed. No gradient is recorded.
+  the mask by the truth; SSIM and MS-SSIM then average over the windows whose centre is inside. LPIPS cannot leave
+  pixels out of its average: under a mask it is a lower bound.
+- Colour-corrected metrics (cc_psnr, cc_ssim, ...) are those of the prediction after `fit_colors`: the error that is
+  left without the test photograph's exposure and white balance, which no method can know. Never quote them alone.
+- Arithmetic is float32 on a CPU; it is float64 if the images are, and on CUDA, where a float32 convolution may run in
+  TF32, whose 10 bits of mantissa SSIM's differences of squares cannot stand. No gradient is recorded.
 """
 
 from __future__ import annotations
@@ -43,8 +40,7 @@ REACH = WINDOW_SIZE // 2
 LIBRARY = SSIM(data_range=1.0, size_average=True, channel=3, win_size=WINDOW_SIZE, win_sigma=WINDOW_SIGMA)
 """SSIM of pytorch_msssim, of images [1, 3, H, W]."""
 WEIGHTS = tuple(LIBRARY.win[0].flatten().tolist())
-"""The window along one axis, rounded to float32 like the library's: where an image is bright and flat, E[xx] - E[x]^2
-feels that they do not quite add up to 1."""
+"""The window along one axis, rounded to float32 like the library's, which bright flat images feel."""
 SSIM_C1 = 0.01**2
 """Stabiliser of the luminance term, (K1 * data range)^2."""
 SSIM_C2 = 0.03**2
@@ -54,10 +50,9 @@ MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 MS_SSIM_MIN_SIDE = (WINDOW_SIZE - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1) + 1
 """Smallest image side with a full window at the coarsest scale: 161 pixels."""
 MIN_MSE = 1e-10
-"""Floor of the mean squared error: PSNR is capped at 100 dB. A perfect prediction would be infinite, which neither JSON
-nor an average can hold; rounding the truth to 8 bits alone costs 59 dB, so no real image comes near the cap."""
+"""Floor of the mean squared error, PSNR's cap of 100 dB: JSON and averages cannot hold infinity."""
 LPIPS_MIN_SIDE = 31
-"""Smallest image side that passes AlexNet's first convolution (11, stride 4, padding 2) and its pools (3, stride 2)."""
+"""Smallest image side that passes AlexNet's first convolution and pools."""
 
 
 def psnr(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
@@ -88,9 +83,8 @@ def ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
 def ms_ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
     """Multi-scale SSIM (Wang et al. 2003) over five scales: prod_j cs_j^w_j, times ssim^w at the coarsest scale.
 
-    Each channel's means are clamped at zero before the powers, and the product is averaged over the channels. From one
-    scale to the next the images are averaged over 2 x 2 pixels; a coarse pixel is inside the mask if any of its fine
-    pixels is, so that a thin mask does not vanish on the way.
+    Each channel's means are clamped at zero before the powers, and the product is averaged over the channels. Scales
+    are averages over 2 x 2 pixels; a coarse pixel is inside the mask if any of its fine pixels is.
 
     None if a side is shorter than 161 pixels, or if at some scale no valid window has its centre inside the mask.
     """
@@ -118,11 +112,10 @@ def ssim_maps(pred: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
     cs = (2 cov + C2) / (var_p + var_g + C2), ssim = cs (2 mu_p mu_g + C1) / (mu_p^2 + mu_g^2 + C1).
 
     Args:
-        pred: [3, H, W], sides of at least 11.
-        gt: [3, H, W].
+        pred, gt: [3, H, W], sides of at least 11.
 
     Returns:
-        ssim [3, H - 10, W - 10] and cs [3, H - 10, W - 10]; entry (i, j) is the window centred on pixel (i + 5, j + 5).
+        ssim and cs, [3, H - 10, W - 10] each; entry (i, j) is the window centred on pixel (i + 5, j + 5).
     """
     taps = torch.arange(WINDOW_SIZE, dtype=gt.dtype, device=gt.device) - WINDOW_SIZE // 2
     gauss = torch.exp(-taps.square() / (2 * WINDOW_SIGMA**2))
@@ -158,25 +151,20 @@ def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[
 
 @torch.no_grad()
 def fit_colors(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Apply the affine map of colours that takes a prediction nearest to the truth.
+    """The prediction after the affine map of colours, 12 numbers, that takes it nearest to the truth, clamped to [0,
+    1].
 
-    Least squares over the pixels inside the mask: 12 numbers for an image, the same for all of its pixels.
-
-    Args:
-        pred, gt: [H, W, 3] in [0, 1].
-        mask: [H, W, 1] bool, True inside; None: everywhere.
-
-    Returns:
-        [H, W, 3] in [0, 1]. A prediction that is not finite, or has nothing inside the mask, comes back as it is.
+    Least squares over the pixels inside the mask. A prediction that is not finite, or has nothing inside, comes back as
+    it is.
     """
     colors = torch.cat([pred.double(), torch.ones_like(pred[..., :1], dtype=torch.float64)], dim=-1)
-    inside, wanted = (
+    inside, target = (
         image.reshape(-1, image.shape[-1]) if mask is None else image[mask[..., 0]] for image in (colors, gt.double())
     )
     if len(inside) == 0 or not torch.isfinite(inside).all():
         return pred
     # The pseudo-inverse: an image of one colour determines fewer than 12 numbers.
-    affine = torch.linalg.pinv(inside.T @ inside, hermitian=True) @ (inside.T @ wanted)
+    affine = torch.linalg.pinv(inside.T @ inside, hermitian=True) @ (inside.T @ target)
     return (colors @ affine).clamp(0.0, 1.0).to(pred.dtype)
 
 
@@ -194,7 +182,7 @@ def _lpips(pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
 
 
 def _precise(image: Tensor) -> Tensor:
-    """The image in the dtype that this module calculates in (see its docstring)."""
+    """The image in the dtype of this module's arithmetic."""
     return image.to(torch.promote_types(image.dtype, torch.float64 if image.is_cuda else torch.float32))
 
 

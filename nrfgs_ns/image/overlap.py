@@ -2,10 +2,8 @@
 """Exposure and white balance of photographs, estimated from the points that they share.
 
 Photographs taken next to each other share most points of the reconstruction, seen under almost the same angle. Their
-light differs by a shift, in stops:
-
-- If exposure or white balance changed, the shift is the same all over the image.
-- If surfaces shine, points are occluded or the sun has moved, it varies over the image.
+light differs by a shift, in stops. If exposure or white balance changed, the shift is the same all over the image; if
+surfaces shine, points are occluded or the sun has moved, it varies.
 
 So an image is divided into regions. The shift of a pair of photographs is the median over the regions' medians, and its
 noise is the spread of the regions. Differences that the camera positions explain do not count (`estimate`).
@@ -25,17 +23,17 @@ from nrfgs_ns.image.photograph import GAMMA, TOE
 LONGEST_SIDE = 400
 """Pixels of the longest side after averaging around each point: its position is not exact to the pixel."""
 MOST_POINTS = 20_000
-"""Of the reconstruction; of more, this number is drawn."""
+"""Points of the reconstruction; of more, this number is drawn."""
 CELL, NEARER = 8, 0.02
 """Side of a cell in averaged pixels; a point is hidden if another in its cell is nearer by more than this share."""
 DARKEST, BRIGHTEST = 0.06, 0.94
 """Range of usable pixel values: noise below, clipping above."""
 REGIONS = 4
-"""Along each side of an image."""
+"""Regions along each side of an image."""
 FEWEST_POINTS, FEWEST_REGIONS = 12, 4
 """Minimum points in a region, and regions of a pair."""
 NEIGHBOURS, CANDIDATES = 4, 12
-"""Other photographs that each is compared with, and how many of the nearest are tried."""
+"""Photographs that each is compared with, and nearest ones that are tried."""
 
 ENOUGH_STOPS = 0.12, 0.06, 0.06
 """Minimum spread of exposure, log2(R/G) or log2(B/G) between photographs, beyond what their positions explain, for them
@@ -84,17 +82,13 @@ class Sighting(NamedTuple):
 
 
 def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tensor | None = None) -> Sighting:
-    """Look points up in a photograph.
+    """Look points [N, 3] up in a photograph; the result is on the host.
 
     Args:
-        points: [N, 3].
         viewmat: world to camera, x right, y down, z forward. [4, 4]
         K: intrinsics in pixels. [3, 3]
         image: uint8, or in [0, 1]. [H, W, 3]
         mask: bool [H, W], True inside; None: everywhere.
-
-    Returns:
-        On the host.
     """
     height, width = image.shape[:2]
     window = max(round(max(height, width) / LONGEST_SIDE), 1)
@@ -135,12 +129,7 @@ def drawn(points: Tensor) -> Tensor:
 
 
 def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
-    """Compare photographs with those that were taken next to them.
-
-    Args:
-        sightings: of each photograph. [V]
-        centers: where they were taken, [V, 3].
-    """
+    """Compare photographs, from their sightings [V] and camera centres [V, 3], with those taken next to them."""
     distance = torch.cdist(centers.double(), centers.double())
     distance.fill_diagonal_(torch.inf)
     nearest = distance.argsort(dim=1)[:, :CANDIDATES]
@@ -209,11 +198,7 @@ def varies(known: Tensor) -> bool:
 
 
 def slope(pairs: Pairs, known: Tensor) -> tuple[float, float | None]:
-    """Regression of the photographs' brightness on their known exposures.
-
-    Args:
-        pairs: of the photographs.
-        known: exposure of each in stops, NaN where it is not known. [V]
+    """Regression of the photographs' brightness on their known exposures (stops, NaN where unknown, [V]).
 
     Returns:
         Stops of brightness for a stop of known exposure, 0 to 1; and the share of the shifts' squares that this
@@ -236,11 +221,9 @@ class Looks(NamedTuple):
     stops: Tensor
     """maximum-likelihood value of each photograph, mean 0, [V, 3]"""
     held: tuple[Tensor, Tensor, Tensor]
-    """for each column, orthonormal patterns over the photographs that belong to the scene, the constant among them,
-    [V, K]"""
+    """for each column, orthonormal patterns over the photographs that belong to the scene, with the constant, [V, K]"""
     random: tuple[float, float, float]
-    """standard deviation between photographs beyond what their positions explain, in stops; 0 where there are too few
-    pairs"""
+    """standard deviation between photographs beyond what positions explain, in stops; 0 with too few pairs"""
 
 
 def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
@@ -249,11 +232,9 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
     A photograph's brightness is d = s + g: its exposure s, independent for each photograph (variance a), and a part g
     that changes slowly with the position (a Gaussian process over the cameras, covariance b exp(-distance / scale)):
     light, gloss, and exposure that follows the scene. a, b and the scale maximise the likelihood of the pairs' shifts,
-    and b = 0 unless Schwarz's criterion favours b > 0. Patterns with more variance in g than in s belong to the scene:
-    view dependence learns them, and test views show them, too.
+    and b = 0 unless Schwarz's criterion favours b > 0. Patterns with more variance in g than in s belong to the scene.
 
     Args:
-        pairs: of the photographs.
         known: exposure of each in stops, NaN where it is not known. [V]
         centers: where they were taken. [V, 3]
     """
@@ -302,8 +283,7 @@ def _constant(count: int) -> Tensor:
 
 
 def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Covariance of g for each scale, of variance 1 and with mean 0 over the photographs: eigenvalues [V], falling, and
-    eigenvectors [V, V]."""
+    """For each scale, g's covariance of variance 1 and mean 0: eigenvalues [V], falling, and eigenvectors [V, V]."""
     distance = torch.cdist(centers.double(), centers.double())
     spacing = distance.sort(dim=1).values[:, 1 : 1 + NEIGHBOURS].mean().clamp_min(1e-12)
     bases = []
@@ -318,11 +298,11 @@ def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
 def _split(
     places: list[tuple[Tensor, Tensor]], precision: Tensor, seen: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, float]:
-    """Separation of the brightness: covariance of s and of d, patterns that belong to g, standard deviation of s.
+    """Covariance of s and of d, patterns that belong to g, standard deviation of s.
 
     Args:
         places: of `_places`.
-        precision, seen: of the brightness by the pairs: the likeliest solves precision @ d = seen. [V, V], [V]
+        precision, seen: the likeliest brightness solves precision @ d = seen. [V, V], [V]
     """
     count = len(seen)
     eye = torch.eye(count, dtype=torch.float64)

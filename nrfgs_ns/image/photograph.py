@@ -6,18 +6,14 @@ by 2^s, s in stops. Under sRGB's curve above its linear toe a pixel becomes
 
     y = k (x + a) - a,    k = 2^(s / GAMMA),    a = TOE,
 
-which is affine in x, and y = x where s = 0. Three numbers of a photograph give its s for red, green and blue:
-
-    exposure        the same in all channels
-    white balance   log2(R/G) and log2(B/G), with mean zero over the channels
+which is affine in x, and y = x where s = 0. A photograph has three numbers: exposure, the same in all channels, and
+white balance, log2(R/G) and log2(B/G), with mean zero over the channels.
 
 Changes that all photographs have in common belong to the scene: each number has mean zero over the photographs
-(`center_`, after each step), so that the scene, and every export of it, has the photographs' mean look. Patterns over
-the photographs that more likely belong to the scene, such as brightness that changes slowly with the position
-(`overlap.estimate`), keep their initial values.
+(`center_`, after each step). Patterns over the photographs that more likely belong to the scene, such as brightness
+that changes slowly with the position (`overlap.estimate`), keep their initial values.
 
-This is the exposure and color part of PPISP (Deutsch et al., arXiv 2601.18336), applied to pixels instead of linear
-light.
+This is the exposure and color part of PPISP (Deutsch et al., arXiv 2601.18336), on pixels instead of linear light.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,9 +36,9 @@ class PhotographModel(nn.Module):
 
     Args:
         names: of the photographs. [P]
-        start: initial stops of red, green and blue; 0 if left out. [P, 3]
+        start: initial stops of red, green and blue; None: 0. [P, 3]
         held: for exposure, log2(R/G) and log2(B/G), orthonormal patterns over the photographs that keep their initial
-            values, the constant among them; the constants alone if left out. [P, K] each
+            values, the constant among them; None: the constants alone. [P, K] each
     """
 
     def __init__(self, names: Sequence[str], start: Tensor | None = None, held: Sequence[Tensor] | None = None):
@@ -65,14 +61,9 @@ class PhotographModel(nn.Module):
         self.register_buffer("kept", self.held @ self.shots.detach().flatten())
 
     def forward(self, image: Tensor, index: int) -> Tensor:
-        """Apply one photograph's exposure and white balance.
+        """Apply a photograph's exposure and white balance: [H, W, 3] in [0, 1].
 
-        Args:
-            image: colours of the mean look, [H, W, 3]; not clamped, because white can be darker in another photograph.
-            index: of the photograph.
-
-        Returns:
-            [H, W, 3] in [0, 1].
+        The image, in the mean look, need not be clamped: white can be darker in another photograph.
         """
         return with_gain(image, (self.exponents @ self.shots[index]).exp2()).clamp(0.0, 1.0)
 
@@ -86,8 +77,6 @@ class PhotographModel(nn.Module):
     def stops(self) -> Tensor:
         """Stops of each photograph in red, green and blue, [P, 3], on the host."""
         return (self.shots @ self.basis).cpu()
-
-    # Checkpoints.
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"names": self.names}

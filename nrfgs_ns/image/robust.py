@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pixels of a photograph show what the scene does not: passers-by, shadows, whatever moved.
+"""Trimming: pixels of a photograph that show what the scene does not, such as passers-by, lose their weight.
 
 The statistics of SpotLessSplats (Sabour et al., arXiv 2406.20055), without its features: a pixel is trimmed if its
-residual is among the largest of the photographs seen lately, unless most pixels around it are not. The photographs
-share one threshold, so that much is trimmed of a photograph in which much has moved, and little of one in which
-nothing has. What a scene has not learnt yet has large residuals, too, and must not be left out for good:
+residual is among the largest of recent photographs, unless most pixels around it are not. The photographs share one
+threshold, so that much is trimmed of a photograph in which much has moved. So that a scene is not kept from learning:
 
 - Only residuals far above the usual one count, so that of a clean capture almost nothing is trimmed.
 - What moved is large: a pixel is kept where many in a patch around it are (as in RobustNeRF, arXiv 2302.00833).
-- Trimmed pixels lose their weight little by little (in SpotLessSplats they are drawn at random, more and more seldom).
+- Trimmed pixels lose their weight little by little.
 """
 
 import torch
@@ -16,26 +15,23 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 BINS = 1000
-"""Of the histogram of residuals in [0, 1]."""
+"""Bins of the histogram of residuals in [0, 1]."""
 MEMORY = 0.95
-"""What is left of a photograph in the histogram when the next one comes."""
+"""Weight of older photographs in the histogram when the next one comes."""
 USUAL = 5.0
-"""Times the median residual that a pixel's must be at least."""
+"""Least residual of a trimmed pixel, in median residuals."""
 WINDOW = 3
 """Side of the square around a pixel, in pixels."""
 PATCH, MOST_KEPT = 0.04, 0.6
-"""Side of the patch around a pixel, as a share of the image's longer side, and which share of it is kept at most."""
+"""Side of the patch around a pixel, as a share of the image's longer side; largest share of it that is kept."""
 FIRST_STEP = 500
-"""Before it nothing is trimmed: a scene that has just begun fits nothing."""
+"""First step at which pixels are trimmed."""
 FADE_STEPS = 1500
-"""In which trimmed pixels lose their weight from then on."""
+"""Steps in which trimmed pixels lose their weight from then on."""
 
 
 class Trimming(nn.Module):
-    """Remembers how large residuals are, and trims the largest.
-
-    Args:
-        share: of the pixels that are trimmed at most, above 0 and below 1.
+    """Remembers how large residuals are, and trims the largest; at most a `share` of the pixels, in (0, 1).
 
     Raises:
         ValueError: the share is out of range.
@@ -67,7 +63,7 @@ class Trimming(nn.Module):
 
     @torch.no_grad()
     def kept(self, prediction: Tensor, truth: Tensor) -> Tensor:
-        """Which pixels are kept, 1.0 or 0.0, by the residuals remembered, without remembering these. [H, W, 1]"""
+        """1.0 for pixels that the remembered residuals keep, else 0.0; remembers nothing. [H, W, 1]"""
         error = (prediction - truth).abs().mean(dim=-1)
         threshold = torch.maximum(self._quantile(1.0 - self.share), USUAL * self._quantile(0.5))
         kept = (error <= threshold).to(prediction.dtype)

@@ -7,13 +7,12 @@ places where the window lies within the image, mean over places and channels. Wi
     S = A B / (C D)     A = 2 E[x] E[y] + C1        B = 2 (E[xy] - E[x] E[y]) + C2
                         C = E[x]^2 + E[y]^2 + C1    D = (E[xx] - E[x]^2) + (E[yy] - E[y]^2) + C2
 
-The window is symmetric, so what S passes back through a moment is blurred like the moment itself: the gradient by x is
-blur(dS/dE[x]) + 2 x blur(dS/dE[xx]) + y blur(dS/dE[xy]). Forward keeps those three slopes and no moments. On CUDA one
-Triton kernel does each direction (`ssim_triton.py`); everywhere else, and for other dtypes than float32, PyTorch does,
-all moments in one convolution.
+The window is symmetric, so the gradient by x is blur(dS/dE[x]) + 2 x blur(dS/dE[xx]) + y blur(dS/dE[xy]): forward keeps
+those three slopes and no moments. On CUDA one Triton kernel does each direction, in float32 (`ssim_triton.py`);
+elsewhere PyTorch does, all moments in one convolution.
 
-Conventions: images are [H, W, 3] in [0, 1], of one floating dtype and on one device. The truth gets no gradient.
-Images with a side shorter than the window go to pytorch_msssim, which warns and leaves that side unblurred.
+Images are [H, W, 3] in [0, 1], of one floating dtype and on one device. The truth gets no gradient. Images with a side
+shorter than the window go to pytorch_msssim, which warns and leaves that side unblurred.
 """
 
 import torch
@@ -29,23 +28,12 @@ MAX_NUMBERS = 2**31
 
 
 def ssim(prediction: Tensor, truth: Tensor) -> Tensor:
-    """Mean structural similarity, a scalar in [-1, 1]; 1 is identical.
-
-    Args:
-        prediction: [H, W, 3].
-        truth: [H, W, 3], without gradient.
-    """
+    """Mean structural similarity of images [H, W, 3], a scalar in [-1, 1]; 1 is identical."""
     return _weighted_sum(prediction, truth, 0.0, 1.0, 0.0)
 
 
 def photometric_loss(prediction: Tensor, truth: Tensor, ssim_lambda: float) -> Tensor:
-    """(1 - ssim_lambda) mean |prediction - truth| + ssim_lambda (1 - SSIM), a scalar.
-
-    Args:
-        prediction: [H, W, 3].
-        truth: [H, W, 3], without gradient.
-        ssim_lambda: weight of SSIM, in [0, 1].
-    """
+    """(1 - ssim_lambda) mean |prediction - truth| + ssim_lambda (1 - SSIM), a scalar; ssim_lambda in [0, 1]."""
     return _weighted_sum(prediction, truth, 1.0 - ssim_lambda, -ssim_lambda, ssim_lambda)
 
 
@@ -61,11 +49,6 @@ def _weighted_sum(prediction: Tensor, truth: Tensor, l1_weight: float, ssim_weig
         similarity = SsimInTorch.apply(prediction, truth)
     total = ssim_weight * similarity + constant
     return total if l1_weight == 0.0 else total + l1_weight * (prediction - truth).abs().mean()
-
-
-def try_kernels(device: torch.device) -> None:
-    """Try the kernels on a CUDA device, which compiles them before the first step."""
-    _kernels_run_on(device)
 
 
 class SsimInTorch(torch.autograd.Function):
@@ -90,7 +73,7 @@ class SsimInTorch(torch.autograd.Function):
 
 
 def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor, slopes: bool) -> tuple[Tensor, ...]:
-    """S, and if asked for its slopes by E[x], E[xx], E[xy], from the moments; all [3, h, w]."""
+    """S and, on demand, its slopes by E[x], E[xx], E[xy], from the moments; all [3, h, w]."""
     product, squares = x * y, x * x + y * y
     A, B = 2 * product + SSIM_C1, 2 * (xy - product) + SSIM_C2
     C, D = squares + SSIM_C1, xx + yy - squares + SSIM_C2
@@ -117,15 +100,15 @@ def _kernels_take(prediction: Tensor, truth: Tensor) -> bool:
         and truth.is_cuda
         and prediction.dtype == truth.dtype == torch.float32
         and 3 * prediction.numel() < MAX_NUMBERS
-        and _kernels_run_on(prediction.device)
+        and kernels_run_on(prediction.device)
     )
 
 
 _GATE = Gate("SSIM")
 
 
-def _kernels_run_on(device: torch.device) -> bool:
-    """Whether Triton's kernels run on a CUDA device; tried once."""
+def kernels_run_on(device: torch.device) -> bool:
+    """Whether Triton's kernels run on a CUDA device; tried once, which compiles them."""
     return _GATE.opens(device, device, lambda: _try_kernels(device))
 
 

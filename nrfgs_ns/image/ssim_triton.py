@@ -2,10 +2,9 @@
 """Splatfacto's loss in two Triton kernels, one forward and one backward. Equations: `ssim.py`.
 
 An image [H, W, 3] is H rows of 3 W numbers; the neighbour in the same channel is 3 numbers away. A program takes a
-block of columns and walks down some rows. In each row it blurs along the row, and adds the result to the windows that
-are open there: a row belongs to 11 windows, of which the oldest closes. Nothing but the windows' sums is carried from
-row to row, so the moments never reach memory. Windows are named after their centre, and every pixel has one: those
-that reach out of the image count as zero.
+block of columns and walks down some rows. It blurs each row, and adds the result to the 11 windows that are open there,
+of which the oldest closes. Only the windows' sums are carried from row to row, so the moments never reach memory.
+Windows are named after their centre; those that reach out of the image count as zero.
 
 No atomics: each program writes its own partial sum, so the result is the same every time.
 """
@@ -84,7 +83,7 @@ def _no_windows(COLUMNS: tl.constexpr):
 def _next_row(windows, row):
     """Add a blurred row to the ten open windows, oldest first, and to a new one.
 
-    Returns the sum of the oldest, which is now complete, and the ten that stay open.
+    Returns the complete sum of the oldest, and the ten that stay open.
     """
     closed = windows[0] + row * W0
     still_open = (
@@ -194,11 +193,8 @@ launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_ke
 
 
 class WeightedSum(torch.autograd.Function):
-    """l1_weight mean |prediction - truth| + ssim_weight SSIM + constant.
-
-    Images are float32 [H, W, 3], both sides at least the window's. A training step is bound by the host, so this is
-    written for few launches: one kernel and one sum forward, one kernel backward.
-    """
+    """l1_weight mean |prediction - truth| + ssim_weight SSIM + constant, of float32 images [H, W, 3] at least as large
+    as the window. A training step is bound by the host: one kernel and one sum forward, one kernel backward."""
 
     @staticmethod
     def forward(ctx, prediction: Tensor, truth: Tensor, l1_weight: float, ssim_weight: float, constant: float):

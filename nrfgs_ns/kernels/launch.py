@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launching a Triton kernel again and again, with less work for the host.
 
-Each `kernel[grid](...)` looks at every argument to find out which of the kernel's compiled variants it asks for: its
-type, whether a pointer is aligned, whether an integer is 1 or a multiple of 16. For thirty arguments that takes the
-host longer than a small kernel takes the GPU. Kernels that are only ever given tensors of the same dtypes, and
-integers that Triton is told not to specialise (`do_not_specialize`), have one variant for each set of constants, as
-long as all pointers are aligned. So the first launch is Triton's own, and the variant it used is launched from then on.
+Each `kernel[grid](...)` looks at every argument to find the compiled variant: its type, whether a pointer is aligned,
+whether an integer is 1 or a multiple of 16. For thirty arguments that takes longer than a small kernel. Kernels that
+are only ever given tensors of the same dtypes, and integers that Triton is told not to specialise
+(`do_not_specialize`), have one variant for each set of constants, as long as all pointers are aligned. So the first
+launch is Triton's own, and the variant it used is launched from then on.
 """
 
 from typing import Any
@@ -14,19 +14,18 @@ import torch
 import triton
 
 ALIGNMENT = 16
-"""Bytes; what Triton tells pointers apart by. PyTorch's allocations are multiples of 512, parts of them may be not."""
+"""Bytes by which Triton tells pointers apart; parts of PyTorch's allocations may be unaligned."""
 MAX_INT = 2**31 - 1
-"""Beyond it an integer is of another type, and the kernel another variant."""
+"""Larger integers are of another type, and the kernel another variant."""
 KEEPS_CONSTANTS = tuple(int(part) for part in triton.__version__.split(".")[:2]) >= (3, 6)
-"""Whether a compiled kernel takes all of the function's arguments, constants too. Tried from 3.6 on."""
+"""Whether a compiled kernel takes all of the function's arguments, constants too."""
 
 
 class Launcher:
     """One kernel, for callers that always pass the same dtypes.
 
     Args:
-        kernel: under `triton.jit`; its plain arguments come before its constants, and integers among them are not
-            specialised.
+        kernel: under `triton.jit`; its plain arguments, with integers not specialised, come before its constants.
     """
 
     def __init__(self, kernel: Any):
@@ -34,13 +33,8 @@ class Launcher:
         self.variants: dict[tuple, tuple[Any, tuple]] = {}
 
     def __call__(self, grid: tuple[int, int, int], *arguments: torch.Tensor | int | float, **constants: Any) -> None:
-        """Launch it.
-
-        Args:
-            grid: numbers of programs.
-            arguments: the plain ones, the first of them a tensor.
-            constants: the kernel's, and options of the compiler (num_warps, ...).
-        """
+        """Launch a grid of programs with plain arguments, the first of them a tensor, and constants, including the
+        compiler's options (num_warps, ...)."""
         kinds: list[Any] = []
         plain: list[int | float] = []  # a tensor by its address: asked for it, Triton's launcher also asks the driver
         ordinary = True

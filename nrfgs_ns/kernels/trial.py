@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether Triton's kernels run here, found out by running them: Triton may be missing, or the C compiler that its
-launcher is built with, or the device may have less shared memory than a kernel takes.
-
-Nothing here imports Triton: it is missing on machines without CUDA. Trials do, once it is known to be there.
-"""
+"""Whether Triton's kernels run here, found out by running them: Triton or a C compiler may be missing, or the device
+may have too little shared memory. Nothing here imports Triton; trials do, once it is known to be there."""
 
 import importlib.util
 import logging
@@ -20,15 +17,14 @@ logger = logging.getLogger(__name__)
 
 
 def try_triton(trial: Callable[[], Outcome]) -> Outcome | str:
-    """What the trial returns, or why Triton's kernels do not run here, for after a colon.
+    """The trial's result, or why Triton's kernels do not run here, for after a colon.
 
     Args:
         trial: imports and runs kernels, with gradients if it likes, whatever mode the caller is in; raises what goes
-            wrong. Whatever it is, PyTorch computes the same.
+            wrong.
 
     Raises:
-        torch.OutOfMemoryError: memory ran out in the trial. That says nothing about Triton and is not to be remembered;
-            PyTorch's path would need more memory still.
+        torch.OutOfMemoryError: that says nothing about Triton and must not be remembered.
     """
     if importlib.util.find_spec("triton") is None:
         return "Triton is not installed"
@@ -44,12 +40,9 @@ def try_triton(trial: Callable[[], Outcome]) -> Outcome | str:
 
 @contextmanager
 def tried_meanwhile(trials: Sequence[Callable[[], object]], device: torch.device) -> Iterator[None]:
-    """Try kernels, which compiles them, on a thread of its own while the block runs; when it ends they have been tried.
+    """Try kernels, which compiles them, on a thread of its own while the block runs; joined at its end.
 
-    Args:
-        trials: what finds out whether some kernels run, and remembers it. What goes wrong is not said here: whoever
-            needs the kernels will meet it again.
-        device: that they are launched on.
+    Errors are not reported here: whoever needs the kernels will meet them again.
     """
 
     def run() -> None:
@@ -69,7 +62,7 @@ def tried_meanwhile(trials: Sequence[Callable[[], object]], device: torch.device
 
 
 class Gate(dict[Hashable, Any]):
-    """What has been found out about some kernels: each key is tried once, and said once where they do not run.
+    """Results of kernels' trials: each key is tried once, and a failure reported once.
 
     Args:
         what: they compute, the subject of the warning.
@@ -82,13 +75,13 @@ class Gate(dict[Hashable, Any]):
     def find(
         self, key: Hashable, device: torch.device, trial: Callable[[], Outcome], quiet: bool = False
     ) -> Outcome | str:
-        """What the trial returned, or why the kernels do not run on a device (`try_triton`).
+        """The trial's result, or why the kernels do not run on a device (`try_triton`).
 
         Args:
             key: what the answer holds for.
             device: for the warning.
             trial: as for `try_triton`; it may also return a reason.
-            quiet: somebody else says it.
+            quiet: do not warn.
         """
         if key not in self:
             self[key] = try_triton(trial)

@@ -35,7 +35,7 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
-from nrfgs_ns.appearance.spherical_harmonics import num_bases, sh_bases
+from nrfgs_ns.appearance.sh import num_bases, sh_bases
 from nrfgs_ns.model.renderer import View
 from nrfgs_ns.progress import progress
 from nrfgs_ns.rasterizer import contributions

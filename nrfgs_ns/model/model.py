@@ -20,8 +20,7 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.errors import InputError

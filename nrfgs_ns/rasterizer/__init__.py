@@ -45,7 +45,7 @@ def _backend(device: torch.device):
 
 
 def load_kernels(device: torch.device) -> None:
-    """Load the kernels of a CUDA device now. A gsplat without compiled kernels compiles them, once, for minutes."""
+    """Load a CUDA device's kernels now. A gsplat without compiled kernels compiles them, once, for minutes."""
     _backend(device).load_kernels(device)
 
 
@@ -75,7 +75,7 @@ def project(
     Raises:
         NotImplementedError: the device is neither CUDA nor CPU.
     """
-    return _backend(means.device).project(means, quats, scales, viewmats, Ks, width, height, options)
+    return _backend(means.device).project((means, quats, scales), (viewmats, Ks, width, height), options)
 
 
 def composite(
@@ -94,8 +94,8 @@ def composite(
         projection: the result of `project`, M rows.
         colors: any number of channels D per row. [M, D]
         opacities: opacity per row, before antialiasing compensation. [M]
-            Nothing is drawn of a row below 1/255, or whose colour or opacity is not finite. Colours and opacities are
-            converted to the projection's precision: under autocast a head computes in half precision.
+            Nothing is drawn of a row below 1/255, or whose colour or opacity is not finite. Both are converted to the
+            projection's precision: under autocast a head computes in half precision.
         backgrounds: colour behind the splats. [C, D]
         with_depth: append expected depth, sum(w z) / sum(w), to the colours: gsplat's mode "RGB+ED".
         absgrad: leave sum |dL/dmean2d| over pixels in `projection.means2d.absgrad` when going backward. [M, 2]
@@ -109,9 +109,10 @@ def composite(
     Raises:
         ValueError: a head's colours or opacities have the wrong shape.
     """
-    m, c = projection.gaussian_ids.shape[0], projection.n_cameras
-    _check_shape("opacities", opacities, m)
-    _check_shape("colors", colors, m, colors.shape[-1])
+    m = len(projection.gaussian_ids)
+    for name, tensor, shape in (("opacities", opacities, [m]), ("colors", colors, [m, colors.shape[-1]])):
+        if list(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {list(tensor.shape)}")
 
     colors, opacities = colors.to(projection.depths.dtype), opacities.to(projection.depths.dtype)
     backend = _backend(colors.device)
@@ -125,48 +126,26 @@ def composite(
     if with_depth:
         colors = torch.cat([colors, projection.depths[:, None]], dim=-1)
         if backgrounds is not None:
-            backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(c, 1)], dim=-1)
+            backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(len(backgrounds), 1)], dim=-1)
 
     render, alphas, lists = backend.composite(projection, colors, opacities, backgrounds, absgrad, leave_out)
     if with_depth:
         render = torch.cat([render[..., :-1], render[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
-    info = {
-        "camera_ids": projection.camera_ids,
-        "gaussian_ids": projection.gaussian_ids,
-        "radii": projection.radii,
-        "means2d": projection.means2d,
-        "depths": projection.depths,
-        "conics": projection.conics,
-        "opacities": opacities,
-        "tile_width": -(-projection.width // TILE_SIZE),
-        "tile_height": -(-projection.height // TILE_SIZE),
-        **lists,
-        "width": projection.width,
-        "height": projection.height,
-        "tile_size": TILE_SIZE,
-        "n_cameras": c,
-    }
-    return render, alphas, info
-
-
-def _check_shape(name: str, tensor: Tensor, *shape: int) -> None:
-    if tuple(tensor.shape) != shape:
-        raise ValueError(f"{name} must have shape {list(shape)}, got {list(tensor.shape)}")
+    kept = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "width", "height", "n_cameras"
+    info = {name: getattr(projection, name) for name in kept} | {"opacities": opacities, "tile_size": TILE_SIZE}
+    info |= {f"tile_{side}": -(-info[side] // TILE_SIZE) for side in ("width", "height")}
+    return render, alphas, info | lists
 
 
 def contributions(projection: Projection, opacities: Tensor) -> Tensor:
-    """Contribution of each projected splat to the image: the sum of w_i(p) over its pixels p.
+    """Contribution of each projected splat to the image: the sum of w_i(p) over its pixels p, [M], in pixels.
 
-    w_i(p) = alpha_i(p) T_i(p) is the share of the pixel's light that comes from splat i, the factor of its colour in
-    `composite`, and so the derivative of the image with respect to that colour. One forward and one backward pass
-    through the rasterizer. No gradient flows through it.
+    w_i(p) = alpha_i(p) T_i(p) is the share of the pixel's light that comes from splat i, and so the derivative of the
+    image with respect to its colour: one forward and one backward pass. No gradient flows through it.
 
     Args:
         projection: the result of `project`, M rows.
         opacities: per row, before antialiasing compensation, as for `composite`. [M]
-
-    Returns:
-        [M], in pixels.
     """
     with torch.enable_grad():
         # The image is linear in its colours: its derivative is the same for all.
@@ -187,12 +166,12 @@ def changes_without(
     passes: int = 1,
 ) -> Tensor:
     """Unbiased estimate of how much the images would change without each projected splat: the sum over pixels and
-    channels of the squared change.
+    channels of the squared change, [M], at least 0.
 
     An image I is linear in the opacity o_i of each row, so that without that row alone it changes by -o_i dI/do_i. With
-    random signs r for each pixel and channel, the mean of (o_i d(r I)/do_i)^2 is that sum (Hutchinson): one backward
-    pass estimates it for all rows. The variance is at most twice its square, divided by the number of passes. At pixels
-    where a row's alpha is capped or below 1/255, the change is taken as 0.
+    random signs r for each pixel and channel, the mean of (o_i d(r I)/do_i)^2 is that sum (Hutchinson), for all rows
+    from one backward pass. The variance is at most twice its square, divided by the number of passes. At pixels where a
+    row's alpha is capped or below 1/255, the change is taken as 0.
 
     Args:
         projection: the result of `project`, M rows.
@@ -200,9 +179,6 @@ def changes_without(
         counted: which pixels count, 0 or 1. [C, H, W, 1]
         generator: of the signs, on the device of the projection.
         passes: number of backward passes.
-
-    Returns:
-        [M], at least 0.
     """
     opacities = opacities.detach().requires_grad_()
     with torch.enable_grad():

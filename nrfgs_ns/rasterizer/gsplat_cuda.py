@@ -36,76 +36,52 @@ def load_kernels(device: torch.device) -> None:
     _kernels_run_on(device)
 
 
-def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    options: ProjectionOptions,
-) -> Projection:
-    """See `nrfgs_ns.rasterizer.project`.
+def project(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> Projection:
+    """See `nrfgs_ns.rasterizer.project`: means, quats, scales; viewmats, Ks, width, height.
 
-    gsplat lets NaN pass its tests for visibility: such a splat comes out as a row, which an appearance head would
-    turn into NaN gradients of its shared weights. Where that happens the projection is repeated without those splats;
-    to find out costs three sums and one wait, right after gsplat's own wait for the number of rows.
+    gsplat lets NaN pass its tests for visibility: a head would turn such a row into NaN gradients of shared weights.
+    Then the projection is repeated without those splats. The look costs three sums and one wait, right after gsplat's.
     """
-    geometry, cameras = (means, quats, scales), (viewmats, Ks, width, height)
     if options.every_row:
         return _every_row(geometry, cameras, options)
     rows = _visible_rows(geometry, cameras, options)
     if not (options.assume_finite or _finite(rows)):
-        camera_ids, gaussian_ids, _, means2d, depths, conics, _, _ = rows
+        _, gaussian_ids, _, means2d, depths, conics, _, _ = rows
         bad = ~torch.isfinite(torch.cat([means2d, depths[:, None], conics], dim=1)).all(dim=1)
-        keep = torch.ones(len(means), dtype=torch.bool, device=means.device)
+        keep = torch.ones(len(geometry[0]), dtype=torch.bool, device=gaussian_ids.device)
         keep[gaussian_ids[bad]] = False
         kept = keep.nonzero().squeeze(1)
         geometry = tuple(table.index_select(0, kept) for table in geometry)
-        camera_ids, gaussian_ids, *seen = _visible_rows(geometry, cameras, options)
-        rows = (camera_ids, kept.index_select(0, gaussian_ids), *seen)
+        camera_ids, gaussian_ids, *others = _visible_rows(geometry, cameras, options)
+        rows = (camera_ids, kept.index_select(0, gaussian_ids), *others)
     *columns, extents = rows
-    return Projection(*columns, width=width, height=height, n_cameras=viewmats.shape[0], extents=extents)
+    viewmats, _, width, height = cameras
+    return Projection(*columns, width=width, height=height, n_cameras=len(viewmats), extents=extents)
 
 
 def _kernel(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions, *, packed: bool) -> tuple:
-    """Gsplat's projection. Its dense kernel (not packed) has rows for all splats, and another radius formula."""
+    """Call gsplat. Its dense kernel (not packed) has rows for all splats, and another radius formula."""
     means, quats, scales = geometry
+    planes = {"near_plane": options.near_plane, "far_plane": options.far_plane}
+    antialiased = options.rasterize_mode == "antialiased"
     return fully_fused_projection(
-        means,
-        None,
-        quats,
-        scales,
-        *cameras,
-        eps2d=EPS2D,
-        near_plane=options.near_plane,
-        far_plane=options.far_plane,
-        calc_compensations=options.rasterize_mode == "antialiased",
-        packed=packed,
+        means, None, quats, scales, *cameras, eps2d=EPS2D, **planes, calc_compensations=antialiased, packed=packed
     )
 
 
 def _every_row(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> Projection:
     """One camera's rows of all splats. Invisible rows have radius 0, and meaningless numbers otherwise."""
     rows = _kernel(geometry, cameras, options, packed=False)
-    radii, means2d, depths, conics, compensations = (None if part is None else part.squeeze(0) for part in rows)
-    row = torch.arange(len(geometry[0]), device=geometry[0].device)
+    radii, *columns = (None if part is None else part.squeeze(0) for part in rows)
     extents = radii if HAS_BATCHES else None
-    if HAS_BATCHES:
-        radii = radii.amax(dim=-1)
-    else:
-        radii = _packed_radii(radii, conics.detach())
+    radii = radii.amax(dim=-1) if HAS_BATCHES else _packed_radii(radii, columns[2].detach())
+    row = torch.arange(len(radii), device=radii.device)
     _, _, width, height = cameras
-    return Projection(
-        torch.zeros_like(row), row, radii, means2d, depths, conics, compensations,
-        width=width, height=height, n_cameras=1, extents=extents,
-    )  # fmt: skip
+    return Projection(torch.zeros_like(row), row, radii, *columns, width, height, n_cameras=1, extents=extents)
 
 
 def _packed_radii(radii: Tensor, conics: Tensor) -> Tensor:
-    """The radii that gsplat 1.4's packed kernel would have found. Its floor under the difference of a round splat's
-    eigenvalues is another one than its dense kernel's."""
+    """Radii of gsplat 1.4's packed kernel, whose floor under a round splat's discriminant is not its dense kernel's."""
     a, b, c = conics.unbind(dim=1)
     det = a * c - b * b
     middle = 0.5 * (a + c) / det
@@ -121,7 +97,7 @@ def _finite(rows: tuple) -> bool:
 
 
 def _visible_rows(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> tuple:
-    """Gsplat's packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, and extents, which
+    """Packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, and extents, which
     gsplat 1.4 does not have."""
     means, _, scales = geometry
     if len(means) == 0:  # gsplat 1.5.3 divides by the number of splats, which ends the process
@@ -170,24 +146,12 @@ def _blend(
     lists: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     """Render and alphas from the tiles' lists, as for `composite`."""
-    isect_offsets, flatten_ids = lists
     behind = backgrounds
     if HAS_BATCHES and behind is not None:  # its check knows one image only, and sends that one no gradient
         behind = behind[0] if len(behind) == 1 and not behind.requires_grad else None
-    render, alphas = rasterize_to_pixels(
-        projection.means2d,
-        projection.conics,
-        colors,
-        opacities,
-        projection.width,
-        projection.height,
-        TILE_SIZE,
-        isect_offsets,
-        flatten_ids,
-        backgrounds=behind,
-        packed=True,
-        absgrad=absgrad,
-    )
+    shape = projection.width, projection.height, TILE_SIZE
+    tables = projection.means2d, projection.conics, colors, opacities
+    render, alphas = rasterize_to_pixels(*tables, *shape, *lists, backgrounds=behind, packed=True, absgrad=absgrad)
     if backgrounds is not None and behind is None:
         render = render + (1.0 - alphas) * backgrounds[:, None, None]
     return render, alphas
@@ -202,7 +166,7 @@ def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> boo
 def _lists(
     projection: Projection, opacities: Tensor, room: Room | None, finite: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Which splats each tile draws, as gsplat's kernels take it: offsets into a list of rows, and the list.
+    """Offsets into a list of rows, and the list: the splats that each tile draws, as gsplat's kernels take them.
 
     Args:
         room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
@@ -223,17 +187,9 @@ def _lists(
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
-    _, isect_ids, flatten_ids = isect_tiles(
-        means2d,
-        bounds,
-        depths,
-        TILE_SIZE,
-        tile_width,
-        tile_height,
-        packed=True,
-        gaussian_ids=projection.gaussian_ids,
-        **images,
-    )
+    tables, tiles = (means2d, bounds, depths), (TILE_SIZE, tile_width, tile_height)
+    rows = {"gaussian_ids": projection.gaussian_ids, **images}
+    _, isect_ids, flatten_ids = isect_tiles(*tables, *tiles, packed=True, **rows)
     return isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height), flatten_ids
 
 
@@ -243,12 +199,11 @@ _GATE = Gate("The list of each tile's splats")
 def _kernels_take(projection: Projection, opacities: Tensor) -> bool:
     """Whether the kernels of `tile_lists.py` make the lists."""
     tiles = -(-projection.width // TILE_SIZE) * (-(-projection.height // TILE_SIZE) + 1)
-    device = opacities.device
     return (
         projection.n_cameras == 1
         and tiles <= MOST_TILES
         and opacities.dtype == projection.means2d.dtype == torch.float32
-        and _kernels_run_on(device)
+        and _kernels_run_on(opacities.device)
     )
 
 

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which splats each tile of the image draws, front to back: gsplat's lists without what draws nothing.
+"""Lists of the splats that each tile draws, front to back: gsplat's lists without what draws nothing.
 
-gsplat lists a splat in every tile of the square of three standard deviations around it. Its kernels then look at each
-such pair pixel by pixel, and skip pixels where
+gsplat lists a splat in every tile of the square of three standard deviations around it; its kernels skip pixels where
 
     opacity exp(-sigma) < 1 / 255        sigma = 1/2 (a dx^2 + c dy^2) + b dx dy,  (a, b, c) the conic.
 
-That is outside of an ellipse, and of most of the square of a flat or transparent splat. Here a splat is listed in
-those tiles of its square that have a pixel's centre in the ellipse (Feng et al., FlashGS, and Hanson et al.,
-Speedy-Splat, 2024). What is left out draws nothing and has no gradient, so images and gradients are gsplat's.
+Here a splat is listed in those tiles of its square that have a pixel's centre in that ellipse (Feng et al., FlashGS,
+and Hanson et al., Speedy-Splat, 2024). What is left out draws nothing and has no gradient: images and gradients are
+gsplat's.
 
-An ellipse meets a row of tiles in one interval of columns. Its ends are at the ellipse's own leftmost and rightmost
+An ellipse meets a row of tiles in one interval of columns, which ends at the ellipse's own leftmost and rightmost
 points, or, where these lie outside the row's band, on the band's nearer edge.
 
-Splats are sorted by depth, then listed in that order, splat by splat; a stable sort by tile does the rest. The order is
-gsplat's to the last tie: 16-bit tile numbers take a quarter of the passes that its 64-bit keys take.
+Splats are sorted by depth, then listed in that order; a stable sort by tile does the rest, to gsplat's last tie. 16-bit
+tile numbers take a quarter of the passes of its 64-bit keys.
 """
 
 from __future__ import annotations
@@ -38,14 +37,14 @@ PAIRS = 256
 """Pairs of a splat and a tile that a program lists; a power of two."""
 
 SLACK = tl.constexpr(0.02)
-"""By how much sigma may exceed its bound: the drawing kernels' exponential and their sigma are rounded."""
+"""Excess of sigma over its bound that is allowed for: the drawing kernels' exponential and sigma are rounded."""
 MARGIN = tl.constexpr(1e-3)
-"""By which share the ellipse's half axes are lengthened, and pixels that are added to them, for the rounding here."""
+"""Share, and pixels, by which the ellipse's half axes are lengthened, for the rounding here."""
 
 
 @triton.jit
 def _ellipse(means2d, conics, opacities, rows, valid):
-    """What the tests of tiles need of the splats in `rows`: centre, conic, bound of 2 sigma, determinant."""
+    """Centre, conic, bound of 2 sigma and determinant of the splats in `rows`."""
     x = tl.load(means2d + rows * 2, mask=valid, other=0.0)
     y = tl.load(means2d + rows * 2 + 1, mask=valid, other=0.0)
     a = tl.load(conics + rows * 3, mask=valid, other=1.0)
@@ -106,8 +105,8 @@ def count_kernel(
     means2d, conics, opacities, radii, order, counts, colors, count, width, height,
     SPLATS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr, CHANNELS: tl.constexpr,
 ):  # fmt: skip
-    """How many tiles each splat is listed in, by its place in `order`. If there are CHANNELS, none where a number is
-    not finite."""
+    """Number of tiles that each splat is listed in, by its place in `order`; with CHANNELS, 0 where a number is not
+    finite."""
     at = tl.program_id(0) * SPLATS + tl.arange(0, SPLATS)
     valid = at < count
     rows = tl.load(order + at, mask=valid, other=0)
@@ -168,17 +167,16 @@ launch_count, launch_list = Launcher(count_kernel), Launcher(list_kernel)
 
 
 class Room:
-    """How many pairs of splats and tiles there is room for on a GPU.
+    """Number of pairs of splats and tiles that there is room for on a GPU.
 
-    How many there are the GPU alone knows. To ask it, the host would wait while there is nothing for the GPU to do. So
-    the host makes room for a little more than there were lately, goes on, and looks whether that was enough when the
-    image is on its way.
+    Only the GPU knows how many pairs an image has, and asking it first would leave it idle. So the host makes room for
+    a little more than lately, goes on, and looks whether that was enough when the image is on its way.
     """
 
     MORE: ClassVar[float] = 1.25
-    """Room for each pair that there was."""
+    """Room for each recent pair."""
     KEPT: ClassVar[float] = 0.99
-    """Share of the room that is there for the next image, if it needs as little."""
+    """Share of the room that remains for the next image, if it needs less."""
 
     def __init__(self):
         self.pairs = 0
@@ -192,7 +190,7 @@ class Room:
         self._arrived.record()
 
     def needed(self) -> int:
-        """The number that was sent, for which the host waits."""
+        """The number that was sent; the host waits for it."""
         self._arrived.synchronize()
         return int(self._counted[0])
 
@@ -207,17 +205,12 @@ _ROOMS = threading.local()
 
 
 class FixedRoom:
-    """Room that stays as it is, for a CUDA graph: it can be looked at when the graph has run.
-
-    Args:
-        pairs: how many there is room for.
-        device: the GPU.
-    """
+    """Constant room for `pairs` on a device, for a CUDA graph; looked at after the graph has run."""
 
     def __init__(self, pairs: int, device: torch.device):
         self.pairs = pairs
         self.counted = torch.full((2,), -1, dtype=torch.int64, device=device)
-        """of the last image, and the most of any; -1: none has been made"""
+        """of the last image, and the most of any; -1: none yet"""
 
     def send(self, total: Tensor) -> None:
         """Keep the number of pairs [1], on the GPU."""
@@ -232,15 +225,14 @@ class FixedRoom:
     def in_use(self) -> Iterator[None]:
         """Let this be the room for the images of this thread."""
         rooms, device = _ROOMS.__dict__, self.counted.device
-        before = rooms.get(device)
+        usual = rooms.get(device)
         rooms[device] = self
         try:
             yield
         finally:
-            if before is None:
-                del rooms[device]
-            else:
-                rooms[device] = before
+            rooms.pop(device)
+            if usual is not None:
+                rooms[device] = usual
 
 
 def room_on(device: torch.device) -> Room | FixedRoom:
@@ -272,11 +264,11 @@ def tile_lists(
         width, height: of the image, in tiles; with the row below it has at most 2^15.
         side: of a tile, in pixels.
         colors: leave out the splats of which one of these, [M, D], or another number is not finite.
-        room: make room for so many pairs, and send home how many there are; None: wait for their number.
+        room: make room for its number of pairs, and send home the actual one; None: wait for the number.
 
     Returns:
         Where each tile's splats begin, int32 [1, height + 1, width], the last row for tiles below the image; rows of
-        the splats, tile by tile, int32; without room for all pairs, some are missing.
+        the splats, tile by tile, int32. Without enough room some pairs are missing.
     """
     count, device, axes = len(depths), depths.device, 1 if radii.dim() == 1 else 2
     order = torch.sort(depths, stable=True).indices

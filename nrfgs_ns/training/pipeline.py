@@ -242,7 +242,7 @@ def _kernel_trials(model: NrfgsModel) -> list[Callable[[], object]]:
     """What loads or compiles the kernels that a first step would wait for; none on a CPU."""
     if model.device.type != "cuda":
         return []
-    trials = load_kernels, model.head.try_kernels, ssim.try_kernels, statistics.try_kernel, optimizers.try_kernel
+    trials = load_kernels, model.head.try_kernels, ssim.kernels_run_on, statistics.try_kernel, optimizers.try_kernel
     return [partial(trial, model.device) for trial in trials]
 
 

@@ -4,7 +4,7 @@
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.nrf import NrfConfig
 
 ULP = 2.0**-24
@@ -88,6 +88,10 @@ def assert_near(ours: dict[str, Tensor], exact: dict[str, Tensor], tolerance: fl
     limits = tolerance if isinstance(tolerance, dict) else dict.fromkeys(errors, tolerance)
     bad = {name: (error, limits[name]) for name, error in errors.items() if not error <= limits[name]}
     assert not bad, f"relative error, limit: {bad}"
+
+
+def compare(head, twin, case, tolerance: float | dict[str, float]) -> None:
+    assert_near(evaluate(head, *case), evaluate(twin, *case, dtype=torch.float64), tolerance)
 
 
 def float32_tolerance(num_bands: int = 3) -> float:

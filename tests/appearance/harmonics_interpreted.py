@@ -10,7 +10,7 @@ import torch
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.harmonics_triton import Harmonics
-from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases
+from nrfgs_ns.appearance.sh import eval_sh, num_bases
 
 
 @pytest.mark.parametrize("degree", range(4))

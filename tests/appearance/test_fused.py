@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from fused_cases import heads, scene
+from fused_cases import heads, scene, some_diffuse
 
 from nrfgs_ns.appearance.fused.packing import pack
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -31,12 +31,19 @@ def test_demanding_the_impossible_names_the_reason(no_interpreter):
         head(*scene(head, 20, 15))
 
 
-def test_float64_is_named(monkeypatch):
+@pytest.mark.parametrize(
+    "name, dtype, message",
+    [
+        ("latents", torch.float64, "latents is float64, and the kernels take float32"),
+        ("diffuse", torch.uint8, "diffuse is uint8, and the kernels take bool"),
+    ],
+)
+def test_other_types_are_named(name, dtype, message, monkeypatch):
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     head, _ = heads()
-    splats, visible, centers = scene(head, 20, 15)
-    with pytest.raises(InputError, match="latents is float64, and the kernels take float32"):
-        head({**splats, "latents": splats["latents"].double()}, visible, centers)
+    splats, visible, centers = some_diffuse(scene(head, 20, 15), 0.5, last=True)
+    with pytest.raises(InputError, match=message):
+        head({**splats, name: splats[name].to(dtype)}, visible, centers)
 
 
 @pytest.mark.parametrize("sizes", [{"latent_dim": 65}, {"hidden_width": 129}, {"hidden_width": 65, "num_bands": 5}])

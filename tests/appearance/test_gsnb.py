@@ -8,7 +8,6 @@ from head_cases import awake, numbers_per_splat, scene, shared_weights
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.gsnb import GsnbConfig
-from nrfgs_ns.appearance.sh import ShConfig
 
 
 def by_hand(head, splats, visible, centers, ramp):
@@ -45,24 +44,6 @@ def test_matches_the_formulas(step, ramp):
     colors, opacities = head(splats, visible, centers)
     assert_close(colors, by_hand(head, splats, visible, centers, ramp), rtol=0, atol=1e-12)
     assert_close(opacities, torch.sigmoid(splats["opacities"][visible, 0]))
-
-
-def test_the_basis_is_faded_in_from_nothing():
-    head, plain = awake(GsnbConfig()), ShConfig().setup()
-    splats, visible, centers = scene(head)
-    changes = []
-    for step in (0, 1250, 2500, 5000):
-        for each in (head, plain):
-            each.set_step(step)
-            each.active_degree = 3
-        assert head.ramp == step / 5000
-        changes.append((head(splats, visible, centers).colors - plain(splats, visible, centers).colors).abs().max())
-    # Directions are normalised once more on the way: a few units of float64.
-    assert changes[0] < 1e-14 < changes[1] < changes[2] < changes[3]
-
-
-def test_before_a_step_is_known_all_of_it_counts():
-    assert GsnbConfig().setup().ramp == 1.0
 
 
 def test_learnt_functions_use_the_coefficients_of_degrees_that_are_still_off():

@@ -13,15 +13,11 @@ from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
 
-CONFIGS = {
-    "nrf": NrfConfig(),
-    "sh": ShConfig(),
-    "vdgs": VdgsConfig(),
-    "gsnb": GsnbConfig(),
-    "sg": SgConfig(),
-}
+CONFIGS = {"nrf": NrfConfig(), "sh": ShConfig(), "vdgs": VdgsConfig(), "gsnb": GsnbConfig(), "sg": SgConfig()}
 SMALL = {
     "nrf": NrfConfig(latent_dim=3, hidden_width=5),
+    "nrf, logit": NrfConfig(latent_dim=3, hidden_width=5, num_bands=2, opacity_bound="logit"),
+    "nrf, one branch": NrfConfig(latent_dim=3, hidden_width=5, num_bands=2, split_bands=False, opacity_residual=False),
     "sh": ShConfig(degree=2),
     "vdgs": VdgsConfig(degree=1, hidden_width=4),
     "gsnb": GsnbConfig(degree=1, num_bands=2, hidden_width=4),
@@ -130,8 +126,3 @@ def test_one_camera_is_as_good_as_one_for_each_splat(config):
 def test_only_the_neural_residual_field_is_warmed_up(config):
     head = awake(config)
     assert (head.neutral_loss(*scene(head)) is not None) == isinstance(config, NrfConfig)
-
-
-def test_heads_are_told_apart_in_checkpoints():
-    names = ["nrf", "sh", "vdgs", "gsnb", "sg"]
-    assert [CONFIGS[name].setup().name for name in names] == names

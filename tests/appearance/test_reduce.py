@@ -6,8 +6,7 @@ import torch
 from head_cases import awake, scene
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import input_columns, latent_basis, with_diffuse, with_rank
 

@@ -44,31 +44,6 @@ def test_matches_the_formula(lobes):
     assert_close(opacities, torch.sigmoid(splats["opacities"][visible, 0]))
 
 
-def seen_along(direction, **changes):
-    """Colour of one splat with three lobes of white, as they start, looked at along `direction`."""
-    head = SgConfig().setup()
-    splats = {"means": torch.zeros(1, 3), "opacities": torch.zeros(1, 1), **head.splat_params(torch.zeros(1, 3))}
-    splats["sg_colors"][:] = torch.eye(3)  # lobe x is red, y green, z blue
-    splats |= changes
-    return head(splats, torch.tensor([0]), -torch.tensor(direction)).colors[0].tolist()
-
-
-def test_start():
-    """Axes x, y, z, at 1 on the axis, 56 % halfway to the next, 2 % opposite; looking along +x, from the camera."""
-    red, green, blue = seen_along([2.0, 0.0, 0.0])
-    assert red == pytest.approx(1.0) and green == blue == pytest.approx(math.exp(-2.0))
-    assert seen_along([1.0, 1.0, 0.0])[:2] == pytest.approx([0.557, 0.557], abs=1e-3)
-    assert seen_along([0.0, 0.0, -1.0])[2] == pytest.approx(0.018, abs=1e-3)
-
-
-def test_length_of_an_axis_and_sign_of_the_sharpness_do_not_matter():
-    direction = [1.0, 2.0, -0.5]
-    axes = torch.eye(3)[None] * torch.tensor([5.0, 0.1, 100.0])[:, None]
-    expected = pytest.approx(seen_along(direction), abs=1e-6)  # float32: ten units of 1
-    assert seen_along(direction, sg_axes=axes) == expected
-    assert seen_along(direction, sg_sharpness=torch.full((1, 3), -2.0)) == expected
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_an_axis_of_zero_is_finite_and_moves_on(dtype):
     head = awake(SgConfig(), dtype)
@@ -81,12 +56,6 @@ def test_an_axis_of_zero_is_finite_and_moves_on(dtype):
     assert (gradient != 0).any()
     # Three channels of at most 0.25 times a sharpness of at most 2.25, over the shortest axis.
     assert gradient.abs().max() <= 3 * 0.25 * 2.25 / 1e-3
-
-
-def test_no_two_lobes_start_alike():
-    axes = SgConfig(lobes=6).setup().splat_params(torch.zeros(1, 3))["sg_axes"][0]
-    assert len(axes.unique(dim=0)) == 6
-    assert torch.equal(axes[:3], torch.eye(3))
 
 
 def test_lobes_start_as_nothing_and_can_be_learnt():

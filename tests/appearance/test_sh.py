@@ -4,8 +4,7 @@ import torch
 from gsplat.cuda._torch_impl import _eval_sh_bases_fast, _spherical_harmonics
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.sh import ShConfig
-from nrfgs_ns.appearance.spherical_harmonics import eval_sh, num_bases, sh_bases
+from nrfgs_ns.appearance.sh import ShConfig, eval_sh, num_bases, sh_bases
 
 
 def unit(count):

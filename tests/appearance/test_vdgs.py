@@ -8,7 +8,6 @@ from head_cases import awake, numbers_per_splat, scene, shared_weights
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.hash_grid import HashGrid
-from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
 
 
@@ -73,16 +72,6 @@ def test_matches_the_formulas():
     assert_close(opacities, expected_opacities, rtol=0, atol=1e-12)
 
 
-def test_the_factor_leaves_colours_alone_and_only_turns_opacity_down():
-    head, plain = awake(VdgsConfig()), ShConfig().setup()
-    splats, visible, centers = scene(head)
-    ours, theirs = head(splats, visible, centers), plain(splats, visible, centers)
-    # Directions are normalised once more on the way: a few units of float64.
-    assert_close(ours.colors, theirs.colors, rtol=0, atol=1e-14)
-    assert (ours.opacities < theirs.opacities).all() and (ours.opacities > 0).all()
-    assert not torch.allclose(ours.opacities, head(splats, visible, -centers).opacities)
-
-
 def test_what_the_view_takes_from_opacity_can_be_shown():
     head = awake(VdgsConfig())
     splats, visible, centers = scene(head)
@@ -94,23 +83,11 @@ def test_what_the_view_takes_from_opacity_can_be_shown():
     assert torch.equal(parts["residual"].values, shown.colors - head.base_appearance(splats, visible).colors)
 
 
-def test_the_degree_grows_as_for_harmonics():
-    head = VdgsConfig(degree_interval=10).setup()
-    head.set_step(25)
-    assert head.active_degree == 2
-
-
 def grid(**options):
     torch.manual_seed(0)
     made = HashGrid(16, **options).double()
     made.table.data.normal_()
     return made
-
-
-def test_grid_starts_next_to_nothing():
-    torch.manual_seed(0)
-    table = VdgsConfig().setup().grid.table
-    assert 0.99e-4 < table.abs().max() <= 1e-4
 
 
 def test_numbered_level_has_one_row_for_each_lattice_point_of_the_cube():
@@ -130,12 +107,6 @@ def test_numbered_level_repeats_itself_beyond_the_cube_and_hashed_levels_do_not(
         # The shift rounds x by 2^-50, times 16 steps, times differences of a few between features.
         assert_close(here[:, :4], there[:, :4], rtol=0, atol=1e-12)
         assert ((here - there)[:, 4:].abs().amax(dim=1) > 0.1).all()
-
-
-def test_lattice_without_numbered_levels():
-    made = grid(log2_table_size=8)
-    assert len(made.sides) == 0
-    assert made(torch.rand(5, 3).double()).shape == (5, 16)
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -18,8 +18,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import command_line, set_up, trained
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_rank
 from nrfgs_ns.compact.decode import decode

@@ -17,8 +17,7 @@ from short_trainings import command_line
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0, SplatAppearance, base_colors
-from nrfgs_ns.appearance.sh import SphericalHarmonics
-from nrfgs_ns.appearance.spherical_harmonics import sh_bases
+from nrfgs_ns.appearance.sh import SphericalHarmonics, sh_bases
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError

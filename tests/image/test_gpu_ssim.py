@@ -17,7 +17,7 @@ pytestmark = [
 
 @pytest.fixture(autouse=True)
 def kernels_run():
-    assert module._kernels_run_on(torch.device("cuda", torch.cuda.current_device()))
+    assert module.kernels_run_on(torch.device("cuda", torch.cuda.current_device()))
 
 
 @pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])

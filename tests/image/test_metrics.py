@@ -49,9 +49,6 @@ def batch(image: torch.Tensor) -> torch.Tensor:
     return image.movedim(-1, 0)[None]
 
 
-# Without a mask.
-
-
 @pytest.mark.parametrize("height, width", [(11, 11), (40, 61), (161, 200), (230, 175)])
 @pytest.mark.parametrize("noise", [0.003, 0.1])
 def test_values_are_those_of_the_host(height, width, noise):
@@ -110,43 +107,10 @@ def test_small_images_give_a_number_or_none(height, width, masked):
     assert values["ms_ssim"] is None and values["lpips"] is None
 
 
-def test_multi_scale_needs_more_than_160_pixels():
-    assert ms_ssim(*pair(160, 300)) is None
-    assert ms_ssim(*pair(161, 300)) is not None
-
-
 def test_a_diverged_prediction_shows():
     pred, gt = pair(170, 170)
     pred[80, 80] = float("nan")
     assert all(math.isnan(metric(pred, gt)) for metric in SCALARS)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-def test_other_dtypes(dtype):
-    pred, gt = (image.to(dtype) for image in pair(165, 170))
-    for metric in SCALARS:
-        assert metric(pred, gt) == pytest.approx(metric(pred.double(), gt.double()), rel=1e-5)
-
-
-def test_no_gradient_is_recorded_and_inputs_stay():
-    pred, gt = pair(165, 170)
-    pred.requires_grad_()
-    mask = disc(165, 170, 40)
-    copies = pred.detach().clone(), gt.clone(), mask.clone()
-    values = image_metrics(pred, gt, mask)
-    assert all(isinstance(values[name], float) for name in ("psnr", "ssim", "ms_ssim", "l1"))
-    assert all(torch.equal(a, b) for a, b in zip((pred, gt, mask), copies, strict=True))
-    assert values == image_metrics(pred, gt, mask)
-
-
-# Under a mask.
-
-
-def test_a_full_mask_changes_nothing():
-    pred, gt = pair(173, 190)
-    mask = torch.ones(173, 190, 1, dtype=torch.bool)
-    for metric in SCALARS:  # the same numbers summed in another order: float32 rounding of 3e4 terms
-        assert metric(pred, gt, mask) == pytest.approx(metric(pred, gt), rel=1e-5)
 
 
 def test_an_empty_mask_gives_none():
@@ -196,19 +160,6 @@ def test_masked_ssim_is_the_mean_over_centres_inside():
     torch.testing.assert_close(raw[inner], kept[inner])
 
 
-def test_masked_multi_scale_ssim_is_blind_to_flawless_surroundings():
-    """With errors inside only, masked MS-SSIM is lower than unmasked, and a worse inside lowers it further."""
-    _, gt = pair(200, 220)
-    mask = disc(200, 220, 45)
-    values = []
-    for noise in (0.05, 0.2):
-        pred, _ = pair(200, 220, noise)
-        pred = torch.where(mask, pred, gt)
-        values.append(ms_ssim(pred, gt, mask))
-        assert values[-1] < ms_ssim(pred, gt) < 1
-    assert values[1] < values[0]
-
-
 def test_a_thin_mask_survives_the_coarse_scales():
     pred, gt = pair(200, 220)
     mask = torch.zeros(200, 220, 1, dtype=torch.bool)
@@ -224,9 +175,6 @@ def test_cuda_agrees_with_cpu(masked):
     on_cpu, on_cuda = image_metrics(pred, gt, mask), image_metrics(pred.cuda(), gt, mask)
     for name in ("psnr", "ssim", "ms_ssim", "l1"):
         assert on_cuda[name] == pytest.approx(on_cpu[name], rel=1e-5), name  # TF32 would be off by 1e-3
-
-
-# LPIPS.
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nrfgs_ns.image import overlap
-from nrfgs_ns.image.overlap import ENOUGH_STOPS, channels, compare, drawn, estimate, sight, slope, varies
+from nrfgs_ns.image.overlap import ENOUGH_STOPS, channels, compare, estimate, sight, slope, varies
 from nrfgs_ns.image.photograph import exposed
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 110.0
@@ -168,9 +168,3 @@ def test_bytes_and_large_pictures_are_the_same_as_small_ones_in_floats():
     assert common.sum() > 1000
     difference = one.light[common] - other.light[torch.isin(other.points, one.points)]
     assert difference.abs().median() < 0.02
-
-
-def test_many_points_are_thinned_alike_each_time():
-    many = torch.rand(50_000, 3)
-    assert len(drawn(many)) == 20_000 and torch.equal(drawn(many), drawn(many))
-    assert len(drawn(many[:10])) == 10

@@ -25,13 +25,6 @@ def test_trims_what_moved_and_keeps_the_rest():
     assert kept.mean() > 0.99
 
 
-def test_a_single_pixel_is_kept_by_its_neighbours():
-    trimming, truth = Trimming(0.05), torch.full((21, 21, 3), 0.5)
-    pred = truth.clone()
-    pred[10, 10] = 1.0
-    assert (trimming(pred, truth, END) == 1).all()
-
-
 def test_a_clean_photograph_among_dirty_ones_keeps_more_than_its_share():
     torch.manual_seed(0)
     trimming, truth = Trimming(0.3), torch.full((30, 30, 3), 0.5)

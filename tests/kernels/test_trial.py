@@ -7,9 +7,6 @@ import threading
 import pytest
 import torch
 
-from nrfgs_ns.appearance import hash_grid
-from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.image import ssim
 from nrfgs_ns.kernels import trial
 from nrfgs_ns.kernels.trial import Gate, tried_meanwhile, try_triton
 
@@ -57,23 +54,12 @@ def test_gradients_whatever_the_caller_does_without(mode):
         assert not torch.is_grad_enabled()
 
 
-@pytest.mark.parametrize("module, key", [(ssim, (CPU,)), (hash_grid, (CPU, 4))])
-def test_memory_that_is_out_is_not_remembered(module, key, monkeypatch, caplog):
-    monkeypatch.setattr(module, "_GATE", Gate("It"))
-    monkeypatch.setattr(module, "_try_kernels", raises(torch.OutOfMemoryError("CUDA out of memory")))
+def test_memory_that_is_out_is_not_remembered(caplog):
+    gate = Gate("It")
     with pytest.raises(torch.OutOfMemoryError):
-        module._kernels_run_on(*key)
-    assert module._GATE == {} and not caplog.records
-    monkeypatch.setattr(module, "_try_kernels", lambda *_: None)
-    assert module._kernels_run_on(*key)
-
-
-def test_nor_is_it_by_the_field(monkeypatch, caplog):
-    head = NrfConfig().setup()
-    monkeypatch.setattr(head.fused, "_launches", raises(torch.OutOfMemoryError("CUDA out of memory")))
-    with pytest.raises(torch.OutOfMemoryError):
-        head.fused._ready_on(CPU)
-    assert head.fused.ready == {} and not caplog.records
+        gate.opens("key", CPU, raises(torch.OutOfMemoryError("CUDA out of memory")))
+    assert gate == {} and not caplog.records
+    assert gate.opens("key", CPU, lambda: None)
 
 
 def test_kernels_are_tried_while_something_else_is_done():

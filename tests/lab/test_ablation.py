@@ -20,9 +20,8 @@ from nrfgs_lab.ablation import (
     without_low_branch,
     without_opacity_residual,
 )
-from nrfgs_ns.appearance.diffuse import DIFFUSE
 from nrfgs_ns.appearance.encoding import view_geometry
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import input_columns
 from nrfgs_ns.errors import InputError

@@ -7,7 +7,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from smoke_runs import METHODS, PLAIN, STEPS, bound
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.spherical_harmonics import eval_sh
+from nrfgs_ns.appearance.sh import eval_sh
 from nrfgs_ns.training.run import evaluate, parse, train
 
 pytestmark = [

@@ -28,15 +28,11 @@ def check(case: Case, dtype: torch.dtype = torch.float32, **limits) -> None:
     assert_agrees(judge(case, grads, unit, **limits), ours, unit)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", CASES)
-def test_hard_cases(name):
-    check(CASES[name]())
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_hard_cases_in_float64(name):
-    """The same formulas with 29 bits more: what still differs would be a wrong formula, not rounding."""
-    check(CASES[name](), torch.float64)
+def test_hard_cases(name, dtype):
+    """In float64 the same formulas with 29 bits more: what differs would be a wrong formula, not rounding."""
+    check(CASES[name](), dtype)
 
 
 @pytest.mark.parametrize("name", ["ordinary", "opaque_layers", "several_cameras"])
@@ -99,16 +95,11 @@ def scenes(draw) -> Case:
     )
 
 
-@settings(max_examples=40, derandomize=True)
-@given(scenes())
-def test_random_scenes(case):
-    check(case)
-
-
-@settings(max_examples=20, derandomize=True)
-@given(scenes())
-def test_random_scenes_in_float64(case):
-    check(case, torch.float64)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@settings(max_examples=30, derandomize=True)
+@given(case=scenes())
+def test_random_scenes(dtype, case):
+    check(case, dtype)
 
 
 @pytest.mark.slow

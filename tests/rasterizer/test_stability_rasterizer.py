@@ -221,14 +221,14 @@ def test_rows_that_gsplat_lets_through_as_nan_are_projected_away(monkeypatch):
 
     monkeypatch.setattr(gsplat_cuda, "fully_fused_projection", kernel)
     splats = cloud(means=math.nan)
-    p = gsplat_cuda.project(*(splats[name] for name in NAMES[:3]), *camera(), ProjectionOptions())
+    p = gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), ProjectionOptions())
     assert p.gaussian_ids.tolist() == [1, 2, 3, 4, 5] and calls == [6, 5]
     assert torch.isfinite(p.conics).all()
     sound = cloud()
-    gsplat_cuda.project(*(sound[name] for name in NAMES[:3]), *camera(), ProjectionOptions())
+    gsplat_cuda.project([sound[name] for name in NAMES[:3]], camera(), ProjectionOptions())
     assert calls == [6, 5, 6]  # no second look where nothing is wrong
     in_training = ProjectionOptions(assume_finite=True)  # a training's guard finds such splats
-    gsplat_cuda.project(*(splats[name] for name in NAMES[:3]), *camera(), in_training)
+    gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), in_training)
     assert calls == [6, 5, 6, 6]
 
 
@@ -250,7 +250,7 @@ def test_gsplats_projection_never_sees_an_empty_table(monkeypatch, mode, bad):
     splats = {name: value.detach()[:count].requires_grad_() for name, value in cloud().items()}
     if bad is not None:
         splats["means"] = torch.full((2, 3), bad, requires_grad=True)
-    p = gsplat_cuda.project(*(splats[name] for name in NAMES[:3]), *camera(), ProjectionOptions(mode))
+    p = gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), ProjectionOptions(mode))
     assert p.gaussian_ids.shape == (0,) and p.means2d.shape == (0, 2) and p.conics.shape == (0, 3)
     assert p.radii.shape == (0,) and p.radii.dtype == torch.int32
     assert (p.compensations is None) == (mode == "classic")

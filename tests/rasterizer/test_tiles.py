@@ -11,7 +11,7 @@ from make_gsplat_fixtures import CASES
 from nrfgs_ns.rasterizer import project
 from nrfgs_ns.rasterizer.contract import TILE_SIZE as TILE
 from nrfgs_ns.rasterizer.torch_cpu import compositing
-from nrfgs_ns.rasterizer.torch_cpu.tiles import MIN_ALPHA, SUB_TILE, Block, footprints, list_tiles, split_into_blocks
+from nrfgs_ns.rasterizer.torch_cpu.tiles import MIN_ALPHA, SUB_TILE, footprints, list_tiles
 
 
 def brute_force(projection, opacities):
@@ -70,52 +70,6 @@ def test_lists_are_complete_ordered_and_tight(name):
             (float(d), int(r)) for d, r in zip(depth[start : start + count], rows[start : start + count], strict=True)
         ]
         assert keys == sorted(keys)
-
-
-def test_slots_put_the_pairs_of_a_splat_side_by_side():
-    _, _, prints = setup("ordinary")
-    lists = list_tiles(prints, prints.whole)
-    by_slot = torch.empty_like(lists.splat)
-    by_slot[lists.slot] = lists.splat
-    counts = torch.diff(torch.cat([lists.splat_start, torch.tensor([lists.n_pairs])]))
-    assert torch.equal(by_slot[:-1], torch.arange(len(prints.rows)).repeat_interleave(counts))
-    assert by_slot[-1] == len(prints.rows), "the pair that pads has the splat that shows nothing"
-
-
-@pytest.mark.parametrize("name", ["ordinary", "larger_than_image", "several_cameras", "needles"])
-def test_blocks_partition_the_lists(name):
-    _, _, prints = setup(name)
-    whole = list_tiles(prints, prints.whole)
-    blocks = split_into_blocks(prints, 50)
-    assert len(blocks) > 1
-    parts = [list_tiles(prints, block) for block in blocks]
-    pairs = {
-        (int(t), int(s)) for p in parts for t, s in zip(p.tiles.repeat_interleave(p.count), p.splat[:-1], strict=True)
-    }
-    assert sum(p.n_pairs for p in parts) == whole.n_pairs == len(pairs)
-    expected = zip(whole.tiles.repeat_interleave(whole.count), whole.splat[:-1], strict=True)
-    assert pairs == {(int(t), int(s)) for t, s in expected}
-
-
-def test_blocks_respect_their_bound_down_to_single_tiles():
-    _, _, prints = setup("larger_than_image")
-    for block in split_into_blocks(prints, 100):
-        single = block.row1 - block.row0 == 1 and block.col1 - block.col0 == 1
-        assert single or list_tiles(prints, block).n_pairs <= 100
-
-
-def test_nothing_to_list():
-    _, _, prints = setup("nothing_visible")
-    assert prints.whole == Block(0, 0, 0, prints.tiles_x)
-    assert split_into_blocks(prints, 100) == []
-
-
-def test_faint_splats_are_not_listed():
-    """Below 1/255 nothing is drawn, whatever the pixel."""
-    projection, _, _ = setup("ordinary")
-    m = len(projection.radii)
-    assert len(footprints(projection, torch.full((m,), 0.0039)).rows) == 0
-    assert len(footprints(projection, torch.full((m,), 0.5)).rows) > 0.9 * m
 
 
 def test_blocks_without_a_pair(monkeypatch):

@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The field in two Triton kernels, one forward and one backward; PyTorch's twin is `nrf.py`.
 
-Splats that are diffuse (`diffuse.py`) are told to the kernels by the table's mask; they cost next to nothing where they
-are the table's last rows.
-
-`packing.py` says how weights and features lie, `kernels.py` computes with what `arithmetic.py` has, `launch.py` makes a
-differentiable function of it, and this file decides whether it can run. Triton is imported only when it is about to: it
-is missing on machines without CUDA. With TRITON_INTERPRET=1 set before Triton is imported, the same kernels run in
-Triton's interpreter on the CPU: slowly, for tests.
+`packing.py` lays out weights and features, `kernels.py` computes with the building blocks of `tiles.py`, `launch.py`
+makes a differentiable function of it, and this file decides whether it can run. Triton is imported only then: machines
+without CUDA lack it. With TRITON_INTERPRET=1 the same kernels run in Triton's interpreter on the CPU, for tests.
 """
 
 import math
@@ -18,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.diffuse import DIFFUSE
+from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.fused.packing import Packing, pack
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.kernels.trial import Gate
@@ -27,9 +23,9 @@ if TYPE_CHECKING:  # imports Triton
     from nrfgs_ns.appearance.fused.launch import FieldOptions, Launches
 
 MAX_WIDTH = 64
-"""Largest P (packing.py): latents, or features, rounded up to a power of two."""
+"""Largest P (packing.py)."""
 MAX_WEIGHTS = 128 * 128
-"""Most numbers in the first layer, padded. Their gradients are kept in registers, and the layer in shared memory."""
+"""Most numbers in the padded first layer: registers keep their gradients, shared memory the layer."""
 
 
 class FusedField:
@@ -37,8 +33,7 @@ class FusedField:
 
     Args:
         config: the field's NrfConfig.
-        low: its low branch, or only one.
-        high: its high branch, or None.
+        low, high: its branches; high is None if there is only one.
     """
 
     def __init__(self, config, low: nn.Sequential, high: nn.Sequential | None):
@@ -50,7 +45,7 @@ class FusedField:
         self.ready = Gate("The field")
 
     def takes(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> bool:
-        """Whether the kernels are to compute this call.
+        """Whether the kernels compute this call.
 
         Raises:
             InputError: the configuration demands them, and they cannot.
@@ -89,7 +84,7 @@ class FusedField:
         return FusedFunction.apply(*ready, options, *tables, diffuse, visible, camera_centers, *weights)
 
     def _why_not(self, splats: Mapping[str, Tensor], camera_centers: Tensor) -> str | None:
-        """What keeps the kernels from computing this call, or None."""
+        """Why the kernels cannot compute this call, or None."""
         device = splats["means"].device
         interpreted = os.environ.get("TRITON_INTERPRET") == "1"
         demanded = self.config.implementation == "fused"
@@ -99,39 +94,33 @@ class FusedField:
         for name, tensor in (*splats.items(), ("camera_centers", camera_centers), ("shared weights", weight)):
             taken = torch.bool if name == DIFFUSE else torch.float32
             if tensor.dtype != taken:
-                found, wanted = (str(dtype).removeprefix("torch.") for dtype in (tensor.dtype, taken))
-                return f"{name} is {found}, and the kernels take {wanted}"
+                own, needed = (str(dtype).removeprefix("torch.") for dtype in (tensor.dtype, taken))
+                return f"{name} is {own}, and the kernels take {needed}"
             if tensor.device != device:
                 return f"{name} is on {tensor.device}, and means on {device}"
         ready = self._ready_on(device, DIFFUSE in splats)
         return ready if isinstance(ready, str) else None
 
     def _ready_on(self, device: torch.device, some_diffuse: bool = False) -> "tuple[Packing, Launches] | str":
-        """What `_prepare` finds on `device`: found out once, and said once."""
+        """The result of `_prepare` on `device`: tried and reported once."""
         key = device, self.config.precision, some_diffuse
         quiet = self.config.implementation != "auto"
         return self.ready.find(key, device, lambda: self._prepare(device, some_diffuse), quiet)
 
     def _prepare(self, device: torch.device, some_diffuse: bool) -> "tuple[Packing, Launches] | str":
-        """The index maps on `device` and how the kernels are launched there, or why they cannot be; raise whatever goes
-        wrong."""
+        """Index maps and launches on `device`, or why there are none."""
         width, hidden = self.on_cpu.width, self.on_cpu.hidden
         if width > MAX_WIDTH or 2 * width * hidden > MAX_WEIGHTS:
             return (
                 f"its sizes are beyond the kernels': padded to powers of two, {width} latents or features (at most "
                 f"{MAX_WIDTH}) and {2 * width} x {hidden} weights of the first layer (at most {MAX_WEIGHTS})"
             )
-        packing = self.on_cpu.to(device)
-        return packing, self._launches(packing, some_diffuse)
-
-    def _launches(self, packing: Packing, some_diffuse: bool) -> "Launches":
-        """How the kernels are launched where the index maps are; raise whatever goes wrong."""
         from nrfgs_ns.appearance.fused.launch import first_that_runs
 
-        return first_that_runs(packing, self._options(), some_diffuse)
+        packing = self.on_cpu.to(device)
+        return packing, first_that_runs(packing, self._options(), some_diffuse)
 
     def _options(self, scene_unit: float = 1.0) -> "FieldOptions":
-        """The configuration as the launcher wants it."""
         from nrfgs_ns.appearance.fused.launch import FieldOptions
 
         config = self.config

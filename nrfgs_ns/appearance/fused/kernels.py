@@ -9,28 +9,20 @@ the rows of the table and computes
 Nothing of that is written to memory: the backward kernel computes it again, which costs less than reading it.
 
 What a splat has three or four of (direction, base colour and opacity, outputs, their gradients) is a tile [B, 4] whose
-columns are called lanes: three axes or colours, and in lane 3 the opacity or the gate. The features are R tiles.
+columns are called lanes: three axes or colours, and in lane 3 the opacity or the gate. The features are R tiles. A
+splat's lanes stay in the four threads in which tensor cores have its row, latents and features (`tiles.py`).
 
-The kernels are bound by the number of instructions and by threads that wait for each other. So
-
-- bands follow from one another by double angles, the slopes of the backward kernel are the waves of the forward, and
-  nothing is divided;
-- a splat's four lanes are held by the same four threads from the first load to the last store: the ones in which tensor
-  cores have the splat's row, and its latents and features as well (`tiles.py`);
-- loads of the next blocks are on their way while one is computed.
-
-Diffuse splats have zeros where the network has its inputs and outputs, and blocks of them have no network (`base.py`).
-
-Rows are gathered with 64-bit offsets: 2^26 splats with 32 latents each pass 2^31 numbers.
+The kernels are bound by instructions and by threads that wait for each other. So bands follow from one another by
+double angles, the backward kernel's slopes are the forward's waves, nothing is divided, and loads of the next blocks
+are on their way while one is computed. Rows have 64-bit offsets: 2^26 splats with 32 latents each pass 2^31 numbers.
 """
 
 import triton
 import triton.language as tl
 
-from nrfgs_ns.appearance.fused.arithmetic import dot, operand, sigmoid, sin_half_turns, tanh
-from nrfgs_ns.appearance.fused.base import backward_base, base_of, forward_base
 from nrfgs_ns.appearance.fused.tiles import (
     deal,
+    dot,
     give,
     give_latents,
     last,
@@ -38,9 +30,14 @@ from nrfgs_ns.appearance.fused.tiles import (
     load_four,
     load_latents,
     load_three,
+    operand,
+    read_four,
+    sigmoid,
+    sin_half_turns,
     stack,
+    tanh,
     unstack,
-)
+)  # fmt: skip
 
 OUTPUTS = tl.constexpr(8)  # columns of W2
 PI = tl.constexpr(3.141592653589793)
@@ -74,16 +71,13 @@ def _view(means, centers, rows, items, lanes, eps_squared, log_unit, B: tl.const
 def _waves(d, BANDS: tl.constexpr):
     """encoding.fourier_bands: tiles (sin(pi d), cos(pi d), sin(2 pi d), cos(2 pi d), ..), two for each band.
 
-    Band 0 within 2e-7: half turns make the reduction to [-1/2, 1/2] exact, which the library's sine pays for with a
-    slow path and local memory. Every other band by double angles from the one before,
+    Band 0 within 2e-7: half turns make the reduction to [-1/2, 1/2] exact. Every other band by double angles,
 
         sin 2a = 2 sin a cos a        cos 2a = cos^2 a - sin^2 a
 
-    An error (x, y) of (sin a, cos a) becomes 2 (x cos a + y sin a, y cos a - x sin a), which is twice as long. Rounding
-    adds 2^-25 to the sine, and 2^-25 + 2^-26 + 2^-25 to the cosine, of whose squares only one passes 1/2: together less
-    than 1e-7. So (x, y) of band k is no longer than 2^k (2^1/2 2e-7 + 1e-7) < 2^k 4e-7, 1.6e-6 in the third band; what
-    is found is 2^k 2.2e-7. Rounding d, which is there whatever computes the band, moves it by up to 2^k pi 2^-25, which
-    is 2^k 1e-7.
+    which doubles an error (x, y) of (sin a, cos a) and rounds by less than 1e-7 (2^-25 the sine; 2^-25 + 2^-26 + 2^-25
+    the cosine). So band k is within 2^k (2^1/2 2e-7 + 1e-7) < 2^k 4e-7; measured: 2^k 2.2e-7. Rounding d alone moves it
+    by up to 2^k pi 2^-25, which is 2^k 1e-7.
     """
     z = tl.abs(d)
     t = tl.minimum(z, 1.0 - z, propagate_nan=tl.PropagateNan.ALL)
@@ -166,6 +160,76 @@ def _silenced(X, is_diffuse, B: tl.constexpr, P: tl.constexpr):
     return tl.reshape(tl.where(is_diffuse[:, None, :, None], 0.0, lanes), (B, 2 * P))
 
 
+# Blocks of which all splats are diffuse: a program walks backwards over its last ones, as long as they need no network.
+# Diffuse splats come last in the table, so these are all blocks that have some, but one. A branch in the main loop
+# would serve a table in any order, but it keeps the compiler from loading the next blocks while one is computed.
+
+
+@triton.jit
+def base_of(stored, lanes, sh_c0):
+    """(c, alpha) from what is stored: features_dc, and the logit in lane 3."""
+    return tl.where(lanes < 3, 0.5 + sh_c0 * stored, sigmoid(stored))
+
+
+@triton.jit
+def _last_block(count, B: tl.constexpr):
+    """The last block that this program walks over."""
+    first = tl.program_id(0)
+    return first + (tl.cdiv(count, B) - 1 - first) // tl.num_programs(0) * tl.num_programs(0)
+
+
+@triton.jit
+def _all_diffuse(diffuse, visible, block, count, B: tl.constexpr):
+    """Whether every splat of a block is diffuse; no for negative blocks, which do not exist."""
+    items = tl.minimum(block * B + tl.arange(0, B), count - 1).to(tl.int64)
+    rows = tl.load(visible + items, mask=items >= 0, other=0)
+    return tl.min(tl.load(diffuse + rows, mask=items >= 0, other=0), axis=0) > 0
+
+
+@triton.jit
+def forward_base(
+    features_dc, opacities, diffuse, visible, colors_out, opacities_out, count, sh_c0, lanes, B: tl.constexpr
+):  # fmt: skip
+    """Do this program's last blocks that need no network; return the end of the others."""
+    block = _last_block(count, B)
+    done = _all_diffuse(diffuse, visible, block, count, B)
+    while done:
+        items = block * B + tl.arange(0, B)[:, None]
+        valid = items < count
+        items = tl.minimum(items, count - 1).to(tl.int64)
+        base = base_of(read_four(features_dc, opacities, tl.load(visible + items), valid, lanes), lanes, sh_c0)
+        out = tl.maximum(base, 0.0, propagate_nan=tl.PropagateNan.ALL)
+        tl.store(colors_out + items * 3 + lanes, out, mask=valid & (lanes < 3))
+        tl.store(opacities_out + items + (lanes - 3), out, mask=valid & (lanes == 3))
+        block -= tl.num_programs(0)
+        done = _all_diffuse(diffuse, visible, block, count, B)
+    return block + 1
+
+
+@triton.jit
+def backward_base(
+    features_dc, opacities, diffuse, visible, d_colors, d_opacities, d_features_dc, d_logits, count, sh_c0, lanes,
+    B: tl.constexpr, UNIQUE: tl.constexpr,
+):  # fmt: skip
+    """The same for gradients; those by latents, means and centres are 0 already."""
+    block = _last_block(count, B)
+    done = _all_diffuse(diffuse, visible, block, count, B)
+    while done:
+        items = block * B + tl.arange(0, B)[:, None]
+        valid = items < count
+        items = tl.minimum(items, count - 1).to(tl.int64)
+        rows = tl.load(visible + items)
+        base = base_of(read_four(features_dc, opacities, rows, valid, lanes), lanes, sh_c0)
+        d_out = read_four(d_colors, d_opacities, items, valid, lanes)
+        d_color = tl.where(base >= 0.0, d_out, 0.0)
+        d_stored = tl.where(lanes < 3, sh_c0 * d_color, d_out * (base * (1.0 - base)))
+        give(d_features_dc + rows * 3 + lanes, d_stored, valid & (lanes < 3), UNIQUE)
+        give(d_logits + rows + (lanes - 3), d_stored, valid & (lanes == 3), UNIQUE)
+        block -= tl.num_programs(0)
+        done = _all_diffuse(diffuse, visible, block, count, B)
+    return block + 1
+
+
 @triton.jit(do_not_specialize=["count"])
 def forward_kernel(
     means, latents, features_dc, opacities, diffuse, visible, centers, packed,
@@ -174,8 +238,7 @@ def forward_kernel(
     D: tl.constexpr, P: tl.constexpr, H: tl.constexpr, BANDS: tl.constexpr, B: tl.constexpr, COLUMNS: tl.constexpr,
     ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, KIND: tl.constexpr, DIFFUSE: tl.constexpr,
 ):  # fmt: skip
-    """Colours [count, 3] and opacities [count] of the splats in rows `visible`. Without DIFFUSE, `diffuse` is not
-    read."""
+    """Colours [count, 3] and opacities [count] of the splats in rows `visible`; `diffuse` is read if DIFFUSE."""
     lanes = tl.arange(0, 4)[None, :]
     outputs = tl.arange(0, COLUMNS)
     units = tl.arange(0, H)
@@ -233,11 +296,11 @@ def backward_kernel(
     SLOTS: tl.constexpr, ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, CENTER: tl.constexpr,
     KIND: tl.constexpr, GRADIENT_KIND: tl.constexpr, DIFFUSE: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of everything, from those of colours and opacities.
+    """Gradients of everything, from those of colours and opacities; d_x is the loss's derivative by x.
 
     Rows of the tables' gradients that no block visits are left as they are; with DIFFUSE, so may be what is 0. Each
     program writes its sum of the packed weights' gradients, and of one shared camera centre's, to its row of `partials`
-    [programs, SLOTS]: no atomics, so the result is the same every time. A d_x here is the loss's derivative by x.
+    [programs, SLOTS]: no atomics, so the result is the same every time.
     """
     lanes = tl.arange(0, 4)[None, :]
     outputs = tl.arange(0, COLUMNS)

@@ -3,10 +3,10 @@
 
 A training step of a small scene is bound by the host, so this is written for few launches: two to pack the weights,
 one forward, one to zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the
-weights' gradients. Where splats are diffuse, one more makes their mask 32-bit, and the tables' gradients are always
-zeroed.
+weights' gradients. Diffuse splats cost one more, for a 32-bit mask, and the tables' gradients are always zeroed.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.appearance.fused.arithmetic import INTERPRETED
 from nrfgs_ns.appearance.fused.kernels import backward_kernel, forward_kernel
 from nrfgs_ns.appearance.fused.packing import CENTER_SLOTS, Packing
+from nrfgs_ns.appearance.fused.tiles import INTERPRETED
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.kernels.launch import Launcher
 
@@ -43,11 +43,10 @@ class Launch:
     """most registers of a thread, for up to 128 hidden units; None leaves them to the compiler"""
 
     def options(self, hidden: int) -> dict[str, int]:
-        """What Triton's compiler is told, for H hidden units.
+        """Options of Triton's compiler, for H hidden units.
 
-        Four warps keep the activations of 64 splats in H / 2 registers of a thread: more units than 128 do not fit
-        where registers are few, and the compiler gives up. Multiplications are fused with additions, for which Triton
-        must be asked from 3.10 on.
+        Four warps keep the activations of 64 splats in H / 2 registers of a thread: more than 128 units do not fit
+        where registers are few. Triton must be asked for fused multiply-add from 3.10 on.
         """
         options = {"num_warps": self.warps, "num_stages": self.stages, "enable_fp_fusion": True}
         return options if self.registers is None or hidden > 128 else {**options, "maxnreg": self.registers}
@@ -67,18 +66,19 @@ KINDS = {
     "bf16": ("bf16", "bf16"),
     "fp16": ("fp16", "bf16"),
 }
-"""How products are taken, without and with gradients among the factors, for each NrfConfig.precision. float32 is three
-tf32 products on the tensor cores, which a float32 multiply-add is many times slower than. Gradients are never fp16: a
-loss that is a mean over pixels gives them any size down to 1e-10, below what fp16 holds, and scaling each tile by its
-largest number would cost a reduction over the tile and a multiplication after every product. bf16 has float32's
-range; its rounding is unbiased and averages out over the splats."""
+"""Kinds of products, without and with gradients among the factors, for each NrfConfig.precision.
 
-# From times on an H200 and the compiler's account of registers, spills and shared memory. A tensor core's tile has 64
-# rows. Forward, 128 registers let four programs of 4 warps run at once (65,536 a multiprocessor). Backward, the
-# weights' gradients and the activations fill all 255 that a thread can have, so that 8 warps run at once: two programs
-# of 64 splats took 0.25 ms for a million where one of 128 took 0.29. With tf32, the compiler has no layout for d_pre^T
-# X. float32's three products take 208 KB of shared memory at 32 splats, of 227 KB on an H100 or H200. The second way of
-# the half precisions takes 63 KB, of 99 KB on a GeForce.
+float32 is three tf32 products on the tensor cores, many times faster than float32 multiply-add. Gradients are never
+fp16: a loss that is a mean over pixels makes them as small as 1e-10, below what fp16 holds, and scaling each tile would
+cost a reduction. bf16 has float32's range; its rounding is unbiased and averages out over the splats.
+"""
+
+# From times on an H200 and the compiler's account of registers and shared memory. A tensor core's tile has 64 rows.
+# Forward, 128 registers let four programs of 4 warps run at once (65,536 a multiprocessor). Backward, the weights'
+# gradients and the activations fill all 255 that a thread can have, so that 8 warps run at once: two programs of 64
+# splats took 0.25 ms for a million, one of 128 took 0.29. With tf32 the compiler has no layout for d_pre^T X. float32's
+# products take 208 KB of shared memory at 32 splats, of 227 KB on an H200; the half precisions' second way 63 KB, of
+# 99 KB on a GeForce.
 HALF_PRECISION = (
     Launches(
         forward=Launch(block=64, warps=4, stages=3, programs_per_sm=4, columns=8, registers=128),
@@ -112,7 +112,7 @@ INTERPRETER_PROGRAMS = 2
 
 @dataclass(frozen=True)
 class FieldOptions:
-    """What of the field's configuration the kernels need."""
+    """The part of the field's configuration that the kernels need."""
 
     color_scale: float
     opacity_scale: float
@@ -128,8 +128,8 @@ class FieldOptions:
 class FusedFunction(torch.autograd.Function):
     """(tables, visible rows, camera centres, shared weights) -> colours [M, 3], opacities [M].
 
-    Camera centres [3] promise that no row of `visible` repeats. All tensors are float32 on one device; `visible` is
-    int64, and `diffuse` bool [N], or None where no splat is diffuse: those are other kernels, which do not ask.
+    Camera centres [3] promise that no row of `visible` repeats. All tensors are float32 on one device, `visible` int64,
+    `diffuse` bool [N], or None where no splat is diffuse: that compiles other kernels.
     """
 
     @staticmethod
@@ -156,7 +156,7 @@ class FusedFunction(torch.autograd.Function):
             d_centers.zero_()
         if count > 0:
             programs = _programs(how, count, device)
-            partials = tables[0].new_empty(programs, packing.size + CENTER_SLOTS)
+            partials = tables[0].new_empty(programs, len(packing.gather) + CENTER_SLOTS)
             kind, gradient_kind = KINDS[options.precision]
             launch_backward(
                 (programs, 1, 1), *tables, _or(flags, visible), visible, centers, packed,
@@ -170,9 +170,9 @@ class FusedFunction(torch.autograd.Function):
             )  # fmt: skip
             sums = partials.sum(dim=0)
         else:
-            sums = packed.new_zeros(packing.size + CENTER_SLOTS)
+            sums = packed.new_zeros(len(packing.gather) + CENTER_SLOTS)
         if wants_center and one_center:
-            d_centers = sums[packing.size : packing.size + 3]
+            d_centers = sums[len(packing.gather) : len(packing.gather) + 3]
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
         d_centers = d_centers if wants_center else None
@@ -190,7 +190,7 @@ def evaluate(packing: Packing, how: Launch, options: FieldOptions, tables: Seque
     """Colours [M, 3] and opacities [M] without gradients, and `diffuse` as the kernels read it.
 
     Args:
-        tables: means, latents, features_dc and opacities. These and the other tensors are dense and without gradient.
+        tables: means, latents, features_dc and opacities, dense and without gradient like all tensors here.
         packed: of `packed_weights`.
     """
     count, device = len(visible), visible.device
@@ -213,13 +213,10 @@ def evaluate(packing: Packing, how: Launch, options: FieldOptions, tables: Seque
 
 
 def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool) -> Launches:
-    """The fastest way to launch the kernels that this device can run at these sizes; else raise what goes wrong.
+    """The fastest launches that this device can run at these sizes; else raise what goes wrong.
 
-    Args:
-        some_diffuse: those for tables with diffuse splats.
-
-    What can go wrong shows only here: no C compiler for Triton's launcher, or less shared memory than the kernels take.
-    Memory of the device that ran out is none of it: a slower way would be taken for good.
+    A missing C compiler and a lack of shared memory show only here. Out-of-memory is re-raised: otherwise a slower
+    launch would be kept for good.
     """
     *more, last = LAUNCHES[options.precision]
     for launches in more:
@@ -227,7 +224,7 @@ def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool)
             probe(packing, launches, options, some_diffuse)
         except torch.OutOfMemoryError:
             raise
-        except Exception:  # whatever else it is: if the last way fails too, that one tells
+        except Exception:  # if the last one fails too, it says why
             continue
         return launches
     probe(packing, last, options, some_diffuse)
@@ -248,21 +245,15 @@ def probe(packing: Packing, launches: Launches, options: FieldOptions, some_diff
 
 def _programs(how: Launch, count: int, device: torch.device) -> int:
     """Programs to launch: all that run at once, unless there are fewer blocks."""
-    if INTERPRETED.value:
-        at_once = INTERPRETER_PROGRAMS
-    else:
-        at_once = how.programs_per_sm * _multiprocessors(device)
+    at_once = INTERPRETER_PROGRAMS if INTERPRETED.value else how.programs_per_sm * _multiprocessors(device)
     return min(at_once, math.ceil(count / how.block))
 
 
 def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> list[Tensor]:
     """Tables [N, 3], [N, D], [N, 3] and [N, 1], cut from one allocation so that one launch clears them.
 
-    Each begins at a multiple of 16 bytes whatever N is: Triton compiles another kernel for pointers that do not.
-
-    Args:
-        zero: make them zeros. Not needed if one camera sees every row: then the kernel writes each row, once, unless
-            splats are diffuse.
+    Each begins at a multiple of 16 bytes: Triton compiles another kernel for pointers that do not. Zeros are not needed
+    if one camera sees every row and none is diffuse: then the kernel writes each row, once.
     """
     padded = -(-rows // 4) * 4
     widths = (3, latent_dim, 3, 1)
@@ -274,28 +265,20 @@ def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> lis
 
 
 def _contiguous(x: Tensor) -> Tensor:
-    """X without gradient, dense."""
+    """A dense tensor without gradient."""
     return x.detach().contiguous()
 
 
 def _or(flags: Tensor | None, instead: Tensor) -> Tensor:
-    """Which splats are diffuse; where none is, any tensor for the kernels, which do not look at it then."""
+    """The mask of diffuse splats; without one, any tensor, which the kernels do not read then."""
     return instead if flags is None else flags
 
 
-_ZEROS: dict[torch.device, Tensor] = {}
-_MULTIPROCESSORS: dict[torch.device, int] = {}
-
-
+@functools.cache
 def _zero(device: torch.device) -> Tensor:
-    """A zero [1] on `device`, made once."""
-    if device not in _ZEROS:
-        _ZEROS[device] = torch.zeros(1, device=device)
-    return _ZEROS[device]
+    return torch.zeros(1, device=device)
 
 
+@functools.cache
 def _multiprocessors(device: torch.device) -> int:
-    """The device's multiprocessors, asked once."""
-    if device not in _MULTIPROCESSORS:
-        _MULTIPROCESSORS[device] = torch.cuda.get_device_properties(device).multi_processor_count
-    return _MULTIPROCESSORS[device]
+    return torch.cuda.get_device_properties(device).multi_processor_count

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the field's weights and features lie in the fused kernels: two index maps, built once.
+"""Where the field's weights and features lie in the fused kernels: two index maps, built once.
 
-Kernels' names: D numbers in a latent; R tiles of four features, P = 4 R columns of features and of latents, the same
-power of two for both; H hidden units of both branches side by side, rounded up to a power of two.
+D numbers in a latent; R tiles of four features, P = 4 R columns of features and of latents, the same power of two for
+both; H hidden units of both branches side by side, rounded up to a power of two.
 
 - Features, four lanes in a tile: tile 0 is the direction and the constant 1, whose row of W1 is the first layer's bias;
   tiles 1 + 2k and 2 + 2k are the sines and cosines of band k; tile R - 1 is (c, alpha). Lane 3 of tile 1 is log r. What
   is left over has no weights. Lane l of tile i is feature 4 i + l.
-- Latents, four tiles for every sixteen: latent 16 h + 4 l + t is in lane l of tile 4 h + t, that is, four neighbours of
-  the table, which are read at once, in one lane.
-- Inputs X [., 2P]: lane l of tile i of the latents in column 2 (4 i + l), of the features in the one behind. Of every
+- Latents, four tiles for every sixteen: latent 16 h + 4 l + t is in lane l of tile 4 h + t, so that four neighbours of
+  the table, which are read at once, are in one lane.
+- Inputs X [., 2P]: lane l of tile i of the latents in column 2 (4 i + l), of the features in the next one. Of every
   eight columns tensor cores keep two neighbours in a thread: a latent and a feature, of one lane and all tiles.
 - W1 [2P, H]: zero where a branch does not see an input.
 - W2 [H, 8] and b2 [8]: output j of the low branch in column 2j, of the high branch in column 2j + 1. So column 6 is
   d_alpha and column 7 the gate's logit w.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -28,7 +28,7 @@ CENTER_SLOTS = 4
 
 @dataclass(frozen=True)
 class Packing:
-    """Where everything lies. Tensors are on the CPU until `to`."""
+    """Index maps and sizes; on the CPU until `to`."""
 
     latent_dim: int
     width: int
@@ -44,15 +44,9 @@ class Packing:
     shapes: tuple[torch.Size, ...]
     """Shapes of the parameters, in the order in which they are laid in a row."""
 
-    @property
-    def size(self) -> int:
-        """Packed numbers."""
-        return len(self.gather)
-
     def to(self, device: torch.device) -> "Packing":
         """The same with its tensors on `device`."""
-        moved = {name: getattr(self, name).to(device) for name in ("gather", "scatter")}
-        return Packing(self.latent_dim, self.width, self.hidden, self.num_bands, shapes=self.shapes, **moved)
+        return replace(self, gather=self.gather.to(device), scatter=self.scatter.to(device))
 
 
 def pack(
@@ -61,11 +55,9 @@ def pack(
     """Lay out a field.
 
     Args:
-        latent_dim: D.
-        num_bands: K.
         use_distance: whether the log distance is among the inputs.
         low: the low branch or the only one, Linear - ReLU - Linear.
-        high: the high branch, or None if there is none.
+        high: the high branch, or None.
     """
     width = max(16, _power_of_two(latent_dim), 4 * _power_of_two(2 * num_bands + 2))
     columns = _feature_columns(num_bands, width // 4)
@@ -87,7 +79,8 @@ def pack(
     first = torch.full((2 * width, hidden), zero)
     second = torch.full((hidden, OUTPUT_COLUMNS), zero)
     bias = torch.full((OUTPUT_COLUMNS,), zero)
-    positions = [p.view(shape) for p, shape in zip(_ranges(shapes), shapes, strict=True)]
+    ranges = torch.arange(zero).split([shape.numel() for shape in shapes])
+    positions = [numbers.view(shape) for numbers, shape in zip(ranges, shapes, strict=True)]
     unit = 0
     branches = [(low_inputs, positions[:4], 0)]
     if high is not None:
@@ -128,12 +121,6 @@ def _latent_column(i: int) -> int:
 def _band(k: int) -> list[str]:
     """Names of band k's six features, in the encoding's order."""
     return [f"{wave}{k}{axis}" for wave in ("sin", "cos") for axis in "xyz"]
-
-
-def _ranges(shapes: tuple[torch.Size, ...]) -> list[Tensor]:
-    """Positions of each parameter's numbers when all are laid in a row."""
-    sizes = [shape.numel() for shape in shapes]
-    return list(torch.arange(sum(sizes)).split(sizes))
 
 
 def _power_of_two(n: int) -> int:

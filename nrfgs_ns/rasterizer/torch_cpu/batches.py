@@ -4,14 +4,12 @@
 Tiles advance together in *slabs* of 16 splats of depth. After each slab the tiles that have run out of splats or of
 light leave, so hidden splats cost nothing. A slab is cut into batches of tiles with similar counts, so little is
 padded, and the arrays [B, n, 64] of a batch stay within `BATCH_ELEMENTS` for each thread, the memory knob of the
-arithmetic.
+arithmetic. For the backward pass a batch keeps T in front of its slab and the numbers of its splats; all that is per
+pixel and splat is computed again.
 
-Slabs are shallow so that batches are wide. What one core has written is dear to read for another that shares no cache
-with it, and torch divides only operations on more than 32,768 numbers among its threads. In a wide batch even the slice
-[B, 64] of a single splat is divided, and at the same tile as the whole: each core keeps to its own.
-
-For the backward pass a batch keeps T in front of its slab and the numbers of its splats; all that is per pixel and
-splat is computed again.
+Slabs are shallow so that batches are wide: torch divides only operations on more than 32,768 numbers among its threads,
+and in a wide batch even the slice [B, 64] of a single splat is divided, at the same tile as the whole, so that each
+core reads what it has written itself.
 """
 
 from __future__ import annotations
@@ -35,15 +33,15 @@ NOTHING = -1e5  # exp2(NOTHING) = 0: the log-alpha of padding
 
 
 def batch_elements() -> int:
-    """Pixels x splats of a batch: `BATCH_ELEMENTS` for every thread of torch."""
+    """Pixels x splats of a batch."""
     return BATCH_ELEMENTS * min(torch.get_num_threads(), MAX_THREADS)
 
 
 class Sheet:
     """The constant part of the work: splats in depth order, the tile grid and its pixel basis.
 
-    Behind the last of the F splats the tables have one more that shows nothing: lists that are too short are padded
-    with it. A row of a table holds all that is read of a splat together, so that each pair fetches it once.
+    A row of a table holds all that is read of a splat, so that each pair fetches it once. Behind the last of the F
+    splats there is one more that shows nothing: lists that are too short are padded with it.
     """
 
     def __init__(self, prints: Footprints, colors: Tensor, n_cameras: int, width: int, height: int) -> None:
@@ -90,8 +88,8 @@ class Sheet:
 class Scratch:
     """Memory for the arrays of a batch, used by one batch after the other.
 
-    The allocator returns arrays of megabytes to the system, and getting them back costs more than a pass of
-    arithmetic; making n slices costs as much as a fifth of their arithmetic.
+    Getting megabytes from the system costs more than a pass of arithmetic, and making n slices a fifth of their
+    arithmetic.
     """
 
     def __init__(self, size: int, dtype: torch.dtype) -> None:

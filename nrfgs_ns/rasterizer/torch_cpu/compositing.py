@@ -65,8 +65,8 @@ BLOCK_PAIRS = 2**21  # (tile, splat) pairs listed at a time; about 200 bytes eac
 def full_precision() -> Iterator[None]:
     """Keep matrix products in the precision of their operands, whatever autocast or the matmul precision ask for.
 
-    log-alpha reaches tens and is then exponentiated: bfloat16 would be wrong by whole factors. Both settings reach CPU
-    products (the second through oneDNN), so both are suspended here.
+    log-alpha reaches tens and is then exponentiated: bfloat16 would be wrong by whole factors. The matmul precision
+    reaches CPU products through oneDNN.
     """
     enabled = torch.backends.mkldnn.enabled
     torch.backends.mkldnn.enabled = False
@@ -298,6 +298,22 @@ class _Composite(torch.autograd.Function):
         return total[:, :2].contiguous(), total[:, 2:5].contiguous(), grad_opacities, grad_colors, None, None
 
 
-def composite(projection: Projection, colors: Tensor, opacities: Tensor, absgrad: bool) -> tuple[Tensor, Tensor]:
-    """Blend colours front to back. Colours [M, D], opacities [M] -> render [C, H, W, D], transmittance [C, H, W, 1]."""
-    return _Composite.apply(projection.means2d, projection.conics, opacities, colors, projection, absgrad)
+def composite(
+    projection: Projection,
+    colors: Tensor,
+    opacities: Tensor,
+    backgrounds: Tensor | None,
+    absgrad: bool,
+    leave_out: bool,
+) -> tuple[Tensor, Tensor, dict]:
+    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and no lists to add to `info`."""
+    tables = projection.means2d, projection.conics, opacities, colors
+    render, transmittance = _Composite.apply(*tables, projection, absgrad)
+    if backgrounds is not None:
+        render = render + transmittance * backgrounds[:, None, None, :]
+    return render, 1 - transmittance, {}
+
+
+def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
+    """Whether `composite` can leave out rows that are not finite."""
+    return False

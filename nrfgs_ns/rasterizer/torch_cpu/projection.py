@@ -5,7 +5,7 @@ A splat with mean x, rotation R_q and scales s is seen by a camera with rotation
 
     p = W x + t,        mean2d = (f_x p_x / p_z + c_x,  f_y p_y / p_z + c_y).
 
-Its covariance is R_q diag(s^2) R_q^T. The camera flattens it with the Jacobian J of the perspective map, so that
+The camera flattens its covariance R_q diag(s^2) R_q^T with the Jacobian J of the perspective map, so that
 
     cov2d = A A^T,      A = J W R_q diag(s)  (2 x 3),      J = [ f_x / p_z    0            -f_x u / p_z ]
                                                                [ 0            f_y / p_z    -f_y v / p_z ]
@@ -67,7 +67,7 @@ class _Screen(NamedTuple):
 def directions(quats: Tensor) -> Tensor:
     """Quaternions (w, x, y, z) of length 1. [N, 4] -> [4, N]
 
-    NaN for a quaternion shorter than MIN_QUATERNION, or so long that its square overflows: it has no direction.
+    NaN for a quaternion shorter than MIN_QUATERNION, or so long that its square overflows.
     """
     squared = quats.square().sum(-1, keepdim=True)
     squared = squared.masked_fill((squared < MIN_QUATERNION**2) | squared.isinf(), math.nan)
@@ -184,12 +184,7 @@ class _Project(torch.autograd.Function):
 
 
 def _back_to_camera(
-    screen: _Screen,
-    K: Tensor,
-    by_means2d: Tensor,
-    by_depths: Tensor,
-    by_conics: Tensor,
-    by_compensations: Tensor,
+    screen: _Screen, K: Tensor, by_means2d: Tensor, by_depths: Tensor, by_conics: Tensor, by_compensations: Tensor
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Gradients of the camera-space position p, [n] each, and of the rows of W R_q diag(s), [3, n] each."""
     fx, fy = K[0, 0], K[1, 1]
@@ -241,20 +236,12 @@ def _back_to_quats(screen: _Screen, by_rotations: Tensor, quats: Tensor) -> Tens
     return tangent.t() / quats.norm(dim=-1, keepdim=True)
 
 
-def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    options: ProjectionOptions,
-) -> Projection:
-    """Find the visible splats of each camera and project them; see `nrfgs_ns.rasterizer.project`.
+def project(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> Projection:
+    """See `nrfgs_ns.rasterizer.project`: means, quats, scales; viewmats, Ks, width, height.
 
-    A projection that is not finite fails the comparisons below, so `assume_finite` saves no work and changes nothing.
+    A projection that is not finite fails the comparisons below, so `assume_finite` changes nothing.
     """
+    viewmats, Ks, width, height = cameras
 
     def visible(screen: _Screen) -> tuple[Tensor, Tensor]:
         radii = _radii(screen)
@@ -264,14 +251,10 @@ def project(
         seen &= (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
         return radii, seen.nonzero().squeeze(1)
 
-    cameras = [
-        _Project.apply(means, quats, scales, viewmat, K, (width, height), visible)
-        for viewmat, K in zip(viewmats, Ks, strict=True)
-    ]
-    ids, radii, means2d, depths, conics, compensations = (torch.cat(rows) for rows in zip(*cameras, strict=True))
-    camera_ids = torch.cat([torch.full_like(camera[0], index) for index, camera in enumerate(cameras)])
+    cameras = zip(viewmats, Ks, strict=True)
+    projected = [_Project.apply(*geometry, *camera, (width, height), visible) for camera in cameras]
+    ids, *columns, compensations = (torch.cat(rows) for rows in zip(*projected, strict=True))
+    camera_ids = torch.cat([torch.full_like(camera[0], index) for index, camera in enumerate(projected)])
     if options.rasterize_mode != "antialiased":
         compensations = None
-    return Projection(
-        *(camera_ids, ids, radii, means2d, depths, conics, compensations), width, height, n_cameras=len(viewmats)
-    )
+    return Projection(camera_ids, ids, *columns, compensations, width, height, n_cameras=len(viewmats))

@@ -13,11 +13,10 @@ and nowhere else. On the horizontal line dy the ellipse spans
 
 and its extreme points lie at dx = -+ sqrt(2 s c / (a c - b^2)), dy = +- (b / c) times that. Within a row of sub-tiles
 the leftmost point is therefore the one on the line nearest to the leftmost extreme, and likewise on the right: each
-(splat, row) yields one exact interval of columns, so a long diagonal needle is listed along its length and not over
-its bounding box.
+(splat, row) yields one exact interval of columns, so a long needle is listed along its length and not over its box.
 
-Sorting: splats are put in depth order once (stable, so equal depths keep their index order, as in gsplat), expanded
-    into pairs in that order, and the pairs are stably sorted by tile. Both sorts are radix sorts on integers.
+Splats are put in depth order once (stable, so equal depths keep their index order, as in gsplat), expanded into pairs
+in that order, and the pairs are stably sorted by tile. Both sorts are radix sorts on integers.
 """
 
 from __future__ import annotations
@@ -52,19 +51,14 @@ class Footprints:
     """The splats that can leave a mark, in depth order, and the sub-tiles around them; F of the M projected rows."""
 
     tiles_x: int
-    """Sub-tiles per image row."""
     tiles_y: int
-    """Sub-tiles per image column."""
+    """Sub-tiles per image row and column."""
     rows: Tensor
     """Row of the projection. [F], int64"""
     shape: Tensor
-    """Rows: centre x, centre y, conic a, b, c, ln(opacity). [6, F], float64
-
-    The images of all cameras are stacked, so y counts from the top of the first one."""
+    """Centre x, y (from the top of the first of the stacked images), conic a, b, c, ln(opacity). [6, F], float64"""
     spans: Tensor
-    """Bounding box in sub-tiles: first row, end row, first column, end column; rows of all cameras stacked. [4, F],
-    int64
-    """
+    """Bounding box in sub-tiles of the stacked images: first and end row, first and end column. [4, F], int64"""
 
     @property
     def whole(self) -> Block:
