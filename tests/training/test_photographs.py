@@ -106,10 +106,14 @@ def test_exif_comes_from_the_data_set_or_else_from_the_file(tmp_path):
 # Trainings.
 
 
+def linear(values):
+    """Light of sRGB values."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
 @pytest.fixture(scope="module")
 def exposed_scene(tmp_path_factory):
     """A procedural data set of 24 photographs, 128 x 96, with known stops, and those stops by name."""
-    from nrfgs_lab.exposure import exposed as exposed_bytes
     from nrfgs_lab.scenes import SceneConfig, write_scene
 
     config = SceneConfig(views=24, width=128, height=96, points=4000, samples=1)
@@ -121,7 +125,9 @@ def exposed_scene(tmp_path_factory):
         drawn = random.uniform(-1, 1) + 0.1 * random.standard_normal(3)
         with Image.open(path) as image:
             pixels = np.asarray(image.convert("RGB"))
-        Image.fromarray(exposed_bytes(pixels, drawn)).save(path)
+        light = np.clip(linear(pixels / 255.0) * 2.0**drawn, 0.0, 1.0)
+        values = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        Image.fromarray(np.rint(255.0 * values).astype(np.uint8)).save(path)
         stops[path.name] = drawn
     return scene, stops
 
