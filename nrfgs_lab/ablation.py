@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs inspect`: parts of a trained field left out, and what that costs and saves on held-out views.
+"""`nrfgs inspect`: loss and savings without parts of a trained field, on test views.
 
-Nothing is trained again: a number here is the trained model's loss without a part, which is at least the loss of a
-model trained without it.
+Nothing is retrained: the loss is at least that of a model trained without the part.
 """
 
 import json
@@ -41,7 +40,7 @@ from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.run import machine
 
 TIMED = 5
-"""Evaluations of a view's head; the fastest counts, because other work on the machine only ever adds."""
+"""Evaluations of a view's head; the fastest counts, because other work on the machine only adds."""
 
 
 @dataclass
@@ -89,8 +88,6 @@ class Inspect(NamesTraining):
             "splats": model.num_points,
             "views": len(images),
             "budget_db": self.budget,
-            "image_seconds": sum(fastest(lambda c=c: model.get_outputs_for_camera(c)) for c, _ in images) / len(images),
-            "latent_variances": basis.variances.tolist(),
             "rows": [asdict(entry) for entry in rows],
             "together": {**asdict(all_together), "left_out": left_out},
         }
@@ -105,23 +102,23 @@ class Row:
     """One field, measured."""
 
     part: str
-    """what was left out"""
+    """the part left out"""
     group: str
-    """full, part, input, rank, residual, together"""
+    """full, part, rank, residual, together"""
     psnr: float
     """mean over the views, dB"""
     loss_db: float
     """the full field's PSNR minus this one's"""
     bytes: int
-    """of the splats and the head, float32"""
+    """of splats and head, float32"""
     head_seconds: float
-    """for one view, mean over the views"""
+    """mean over the views"""
     diffuse: float = 0.0
     """share of the splats without residual"""
     rank: int | None = None
-    """numbers in a latent, where that is what was changed"""
+    """numbers in a latent, in group rank"""
     threshold: float | None = None
-    """8-bit steps, where residuals below it were dropped"""
+    """residuals below it were dropped, 8-bit steps"""
 
 
 Candidate = tuple[str, str, dict[str, Any], Callable[[Field], Field]]
@@ -129,7 +126,7 @@ Candidate = tuple[str, str, dict[str, Any], Callable[[Field], Field]]
 
 
 def changes(field: Field, seen: Residuals, basis: LatentBasis, distance: float) -> Iterator[Candidate]:
-    """Everything that can be left out of a field."""
+    """Parts that can be left out of a field."""
     config = field.head.config
     if field.head.high is not None:
         yield "high branch", "part", {}, without_high_branch
@@ -138,10 +135,6 @@ def changes(field: Field, seen: Residuals, basis: LatentBasis, distance: float) 
         yield "opacity residual", "part", {}, without_opacity_residual
     if config.use_distance:
         yield "distance", "part", {}, lambda field: with_constant_distance(field, distance)
-    inputs = {name for branch, _ in branches_of(field.head) for name in input_columns(config, branch)}
-    for name in sorted(inputs):
-        if name == "direction" or name.startswith("band"):
-            yield name, "input", {}, lambda field, name=name: without_input(field, name)
     for rank in range(1, config.latent_dim + 1):
         yield f"latent rank {rank}", "rank", {"rank": rank}, lambda field, rank=rank: with_rank(field, basis, rank)
     for threshold in THRESHOLDS:
@@ -151,7 +144,7 @@ def changes(field: Field, seen: Residuals, basis: LatentBasis, distance: float) 
 
 
 def row(part: str, group: str, field: Field, views: FieldViews, full: float | None, **extra: Any) -> Row:
-    """Measure one field; `full` is the full field's PSNR, None for itself."""
+    """Measure one field; `full` is the full field's PSNR, None for the full field."""
     score = views.psnr(field)
     loss = 0.0 if full is None else full - score
     share = diffuse_splats(field) / max(len(field.splats["means"]), 1)
@@ -166,13 +159,10 @@ def diffuse_splats(field: Field) -> int:
 def together(
     field: Field, rows: list[Row], candidates: list[Candidate], seen: Residuals, views: FieldViews, budget: float
 ) -> tuple[Row, list[str]]:
-    """All that can be left out at once within `budget` dB, found by trying the cheapest first.
+    """Smallest field within `budget` dB, by leaving out the cheapest parts first, and the names of what it lacks.
 
-    Parts may take half of the budget between them; residuals and the latents' rank the rest (`slim`). The low branch
-    stays, for opacity's sake: without its colours nothing is saved.
-
-    Returns:
-        the row of the smallest field, and the names of what it lacks.
+    Parts may take half of the budget; residuals and the latents' rank the rest (`slim`). The low branch stays: it has
+    the opacity, and without its colours nothing is saved.
     """
     full, whole = rows[0].psnr, field
     change_of = {name: change for name, _, _, change in candidates}
@@ -194,7 +184,7 @@ def together(
 
 @torch.no_grad()
 def head_seconds(views: FieldViews, field: Field) -> float:
-    """Mean over the views of the head's time for one; diffuse splats last, as in a training and in a file."""
+    """Mean of the head's time over the views; diffuse splats last, as in a training and in a file."""
     seconds = []
     for view, _, _ in views.views:
         rows = diffuse_last(field.splats, view.visible)
@@ -203,12 +193,12 @@ def head_seconds(views: FieldViews, field: Field) -> float:
 
 
 def diffuse_last(splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:
-    """The visible rows, those of diffuse splats behind the others."""
+    """Visible rows, those of diffuse splats last."""
     return visible[splats[DIFFUSE][visible].to(torch.uint8).argsort(stable=True)] if DIFFUSE in splats else visible
 
 
 def fastest(work: Callable[[], object]) -> float:
-    """Seconds of the fastest of some runs: wall-clock on a GPU, processor time on a CPU."""
+    """Seconds of the fastest run: wall-clock on a GPU, processor time on a CPU."""
     gpu = torch.cuda.is_available()
     clock, wait = (perf_counter, torch.cuda.synchronize) if gpu else (process_time, lambda: None)
     times = []
@@ -235,7 +225,7 @@ def mean_log_distance(model, cameras) -> float:
 
 
 def table(rows: list[Row]) -> Table:
-    """The rows, with ranks beyond eight at every eighth only."""
+    """Table of the rows; of ranks beyond eight every eighth."""
     full, printed = rows[0], Table()
     for column in ("left out", "PSNR (dB)", "loss (dB)", "MB", "head (ms)", "diffuse"):
         printed.add_column(column, justify="left" if column == "left out" else "right")
@@ -244,20 +234,19 @@ def table(rows: list[Row]) -> Table:
             continue
         if entry.group != previous.group:
             printed.add_section()
-        milliseconds = "" if entry.group == "input" else f"{1e3 * entry.head_seconds:.1f}"  # 0 costs as much as before
         diffuse = f"{100 * entry.diffuse:.0f} %" if entry.diffuse else ""
-        numbers = f"{entry.psnr:.2f}", f"{entry.loss_db:.3f}", f"{entry.bytes / 1e6:.2f}", milliseconds, diffuse
-        printed.add_row(entry.part, *numbers)
+        numbers = f"{entry.psnr:.2f}", f"{entry.loss_db:.3f}", f"{entry.bytes / 1e6:.2f}"
+        printed.add_row(entry.part, *numbers, f"{1e3 * entry.head_seconds:.1f}", diffuse)
     return printed
 
 
 def without_high_branch(field: Field) -> Field:
-    """Only the low branch; the same as a gate that is shut."""
+    """The low branch alone, as with a shut gate."""
     return Field(rebuilt(field.head, {"num_bands": 1}, layers(field.head.low), None), field.splats)
 
 
 def without_low_branch(field: Field) -> Field:
-    """The low branch answers 0 for colours; opacity's residual, which is its other answer, stays."""
+    """The low branch's colours are 0; its opacity residual stays."""
     w1, b1, w2, b2 = layers(field.head.low)
     w2, b2 = w2.clone(), b2.clone()
     w2[:3], b2[:3] = 0.0, 0.0
@@ -265,7 +254,7 @@ def without_low_branch(field: Field) -> Field:
 
 
 def without_opacity_residual(field: Field) -> Field:
-    """Opacities are the base's."""
+    """Base opacities."""
     w1, b1, w2, b2 = layers(field.head.low)
     return Field(
         rebuilt(field.head, {"opacity_residual": False}, (w1, b1, w2[:3], b2[:3]), _high(field.head)), field.splats
@@ -273,7 +262,7 @@ def without_opacity_residual(field: Field) -> Field:
 
 
 def with_constant_distance(field: Field, log_distance: float) -> Field:
-    """The log distance is the same number everywhere, and no input any more."""
+    """A constant log distance, folded into the biases."""
     changed = []
     for name, branch in branches_of(field.head):
         w1, b1, w2, b2 = layers(branch)
@@ -281,17 +270,6 @@ def with_constant_distance(field: Field, log_distance: float) -> Field:
         keep = [i for i in range(w1.shape[1]) if i != column]
         changed.append((w1[:, keep], b1 + log_distance * w1[:, column], w2, b2))
     return Field(rebuilt(field.head, {"use_distance": False}, *pair(changed)), field.splats)
-
-
-def without_input(field: Field, name: str) -> Field:
-    """An input of `input_columns` is 0 everywhere."""
-    changed = []
-    for branch_name, branch in branches_of(field.head):
-        w1, b1, w2, b2 = layers(branch)
-        w1 = w1.clone()
-        w1[:, input_columns(field.head.config, branch_name).get(name, [])] = 0.0
-        changed.append((w1, b1, w2, b2))
-    return Field(rebuilt(field.head, {}, *pair(changed)), field.splats)
 
 
 def _high(head: NeuralResidualField) -> Layers | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bytes against dB of one capture's files: results/compact.json.
+"""Bytes against dB of a capture's files: results/compact.json.
 
     python -m nrfgs_lab.compact SCENES/bonsai OUT         # the same for goldcape and fox; a GPU
     python -m nrfgs_lab.compact SCENES/fox OUT --rates --others ply                            # a PLY file alone
@@ -7,9 +7,9 @@
     python -m nrfgs_lab.results pack OUT results/compact.json
     python -m nrfgs_lab.pages.tables.files                # the figure
 
-It trains the capture, and writes it as compact files trained at each of --rates, and as --others. Records of OUT are
-not made again. PSNR is that of files that are read back, on test views. Settings are chosen on held-out training views:
-`held_out` of `nrfgs bench` makes HELD.
+It trains the capture, and exports compact files fine-tuned at each of --rates, and --others, unless OUT has their
+records. PSNR is of files read back, on test views. Settings are chosen on held-out views: `held_out` of `nrfgs bench`
+makes HELD.
 """
 
 import json
@@ -54,7 +54,7 @@ class Trade:
 
         for setting in self.settings:
             key, value = setting.split("=")
-            module = next((one for one in (finetune, harmonics_tune) if hasattr(one, key)), None)
+            module = next((module for module in (finetune, harmonics_tune) if hasattr(module, key)), None)
             if module is None:
                 raise InputError(f"--settings {setting}: the fine-tunes have no {key}.")
             setattr(module, key, json.loads(value))
@@ -77,7 +77,7 @@ class Trade:
             self.record("version-2", compact(CompactOptions()))
 
     def record(self, name: str, make: Callable[[Path], dict[str, Any] | None]) -> dict[str, Any]:
-        """The record of a name: what `make` returns, or writes to the path that it gets."""
+        """Record of a name; `make` returns it, or writes it to its argument."""
         path = self.out / f"{self.data.name}-{name}.json"
         if not path.exists() and (made := make(path)) is not None:
             write_whole(path, json.dumps(made, indent=1) + "\n")

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A study's records in one file, as the folder results/ of the repository keeps them.
+"""A study's records in one file of results/.
 
     python -m nrfgs_lab.results pack OUT results/NAME.json       # all records and tables of a study's folder
     python -m nrfgs_lab.results unpack results/NAME.json OUT     # the folder again: `nrfgs bench` reports from it
 
-{"study": NAME, "records": {path without .json: record}, "texts": {path: lines}}, a line for each record. Numbers are
-kept to seven significant digits, as many as float32 has. Figures and the tables of other formats are not kept: the
-commands draw them anew from the records. Nor are ns-eval's values of each image, where `bench/measure.py` has them,
-too; numbers of splats are kept every 500 steps.
+{"study": NAME, "records": {path without .json: record}, "texts": {path: lines}}, a line for each record. Numbers have
+seven significant digits, like float32, and numbers of splats are those of every 500 steps. Left out are figures, and
+ns-eval's values of each image where `bench/measure.py` has them.
 """
 
 import json
@@ -18,11 +17,11 @@ from typing import Any
 from nrfgs_ns.files import write_whole
 
 TEXTS = ".md", ".yaml"
-"""Endings of files that are kept as text."""
+"""Endings of text files."""
 
 
 def rounded(content: Any) -> Any:
-    """The content, its numbers with seven significant digits."""
+    """Content with numbers of seven significant digits."""
     if isinstance(content, dict):
         return {name: rounded(value) for name, value in content.items()}
     if isinstance(content, list):
@@ -31,7 +30,7 @@ def rounded(content: Any) -> Any:
 
 
 def slim(record: Any) -> Any:
-    """A run's record without the values of each image that it has twice, and with every fifth number of splats."""
+    """A run's record without duplicate values of each image, and with fewer numbers of splats."""
     if not (isinstance(record, dict) and isinstance(record.get("train"), dict)):
         return record
     train, record = record["train"], dict(record)
@@ -56,7 +55,7 @@ def pack(folder: Path, file: Path) -> None:
 
 
 def write(file: Path, records: dict[str, Any], texts: dict[str, list[str]] | None = None) -> None:
-    """Write a study's file; its name is the study's."""
+    """Write a study's file, named after the study."""
 
     def line(name: str) -> str:
         return f"  {json.dumps(name)}: {json.dumps(rounded(records[name]), separators=(',', ':'))}"
@@ -67,7 +66,7 @@ def write(file: Path, records: dict[str, Any], texts: dict[str, list[str]] | Non
 
 
 def unpack(file: Path, folder: Path) -> None:
-    """Write the folder that a file was made from."""
+    """Write the folder of a study's file."""
     content = json.loads(file.read_text(encoding="utf-8"))
     for name, record in content["records"].items():
         write_whole(folder / f"{name}.json", json.dumps(record, indent=1) + "\n")

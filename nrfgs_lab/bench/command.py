@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """`nrfgs bench`: methods x strategies x scenes x seeds, one table, one figure, one sheet of crops for each scene.
 
-Each training is a process of its own (`run.py`) that leaves OUT/runs/NAME.json when it is finished. Finished ones are
-not repeated, interrupted ones go on from their checkpoint, failed ones are tried again at the next call and listed as
-FAILED until then. A record that was made with other arguments is never mixed in: the benchmark stops and names it.
+Each training is a process of its own (`run.py`) that writes OUT/runs/NAME.json at its end. The next call skips finished
+runs, resumes interrupted ones and retries failed ones. A record with other arguments stops the benchmark.
 
-A file may be worked off in parts, by several commands, some of them at once. All of them report in the same folder, so
-a report has the trainings that its command chose, and whatever else of the file has left records there.
+Several commands may share a file and a folder, also at once: a report has the trainings that its command chose, and all
+others of the file with a record there.
 """
 
 import contextlib
@@ -18,33 +17,53 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal
+from typing import IO, Annotated, Literal
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from nrfgs_lab.bench.data import parser_options
 from nrfgs_lab.bench.executor import Queue, Submitted
+from nrfgs_lab.bench.report import FAILURE, report
+from nrfgs_lab.bench.spec import (
+    DEFAULT,
+    OWN,
+    Cell,
+    Job,
+    Scene,
+    Spec,
+    as_list,
+    cells_of,
+    command,
+    differences,
+    identity,
+    load_spec,
+    make_spec,
+    read_record,
+    scene_path,
+    steps_of,
+)
 from nrfgs_lab.lock import only_one
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, write_whole
 
 CHILD = (sys.executable, "-m", "nrfgs_lab.bench.run")
-"""The command that does a job; the file that describes the job is appended."""
+"""Command of a child; the file that describes its job is appended."""
 POLL_SECONDS = 0.2
 
 
 @dataclass
 class Running:
-    """A child at work."""
+    """A running child."""
 
     name: str
-    process: "subprocess.Popen | Submitted"
+    process: subprocess.Popen | Submitted
     log: IO
-    job: Any
+    job: Job
 
     def steps(self) -> int:
-        """Training steps so far, as noted by the child."""
+        """Training steps, as the child noted them."""
         try:
             return int(json.loads((Path(self.job.work) / "progress.json").read_text(encoding="utf-8"))["step"])
         except (OSError, ValueError, KeyError):
@@ -64,7 +83,7 @@ class Bench:
     work: Path = Path("outputs/bench")
     """folder for checkpoints, pictures and logs"""
     data: tuple[str, ...] = ()
-    """data sets: folders in --scenes; the file may say how to read them"""
+    """data sets: folders in --scenes"""
     runs: tuple[str, ...] = ()
     """runs or knobs of the file by name, or methods, each METHOD or "NAME=METHOD OPTIONS" """
     strategies: tuple[str, ...] = ()
@@ -95,9 +114,6 @@ class Bench:
     """rename records of other arguments to NAME.stale, and run them again"""
 
     def main(self) -> None:
-        from nrfgs_lab.bench.report import report  # matplotlib takes a second; `nrfgs --help` should not
-        from nrfgs_lab.bench.spec import steps_of
-
         plan, chosen = self.plan()
         check_writable(self.out / "table.md", "--out")
         parsers = None if self.report_only else self.parsers(chosen)
@@ -115,13 +131,9 @@ class Bench:
         jobs = self.jobs_of(plan, chosen, parsers) if parsers else {}
         pending = {name: job for name, job in jobs.items() if not self.record(name).exists()}
         if pending:
-            methods = {cell.run: steps_of(plan, cell.run, cell.scene) for cell in chosen}
-            for run in methods:
+            for run in dict.fromkeys(cell.run for cell in chosen):
                 if not is_method(run.method):
                     raise InputError(f"{self.spec}: runs: {run.name}: {run.method!r} is no method of ns-train.")
-            own = [f"{run.name} ({steps})" for run, steps in methods.items() if steps not in (self.steps, None)]
-            if own and self.steps is not None:
-                print(f"--steps does not change runs that have their own: {', '.join(own)}.")
             # A terminated benchmark must not leave its children behind; an exception reaches the `finally` below.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
             self.run_all(pending, plan)
@@ -133,10 +145,8 @@ class Bench:
         if failed and not self.report_only:
             sys.exit(f"nrfgs: {len(failed)} of the runs FAILED: {', '.join(failed)}. Logs: {self.work}/NAME.log")
 
-    def plan(self):
-        """The whole benchmark, `Spec`, and the trainings that this command asks for, list of `Cell`."""
-        from nrfgs_lab.bench.spec import DEFAULT, OWN, as_list, cells_of, load_spec, make_spec, scene_path
-
+    def plan(self) -> tuple[Spec, list[Cell]]:
+        """The whole benchmark, and the trainings that this command chooses."""
         where = str(self.spec or "nrfgs bench")
         content = load_spec(self.spec) if self.spec else {}
         given = {"steps": self.steps, "options": self.options, "train_views": self.train_views, "jobs": self.jobs}
@@ -157,7 +167,7 @@ class Bench:
         plan = make_spec(content, where)
         names = {*self.runs, *new, *([DEFAULT] if "knobs" in content else [])}
 
-        def is_chosen(cell) -> bool:
+        def is_chosen(cell: Cell) -> bool:
             follows = cell.run.strategies is None and cell.run.method.startswith("nrfgs")
             return (
                 (not self.runs or cell.run.name in names or cell.run.knob in names)
@@ -168,35 +178,30 @@ class Bench:
 
         return plan, [cell for cell in cells_of(plan) if is_chosen(cell)]
 
-    def shown(self, plan, chosen):
-        """The trainings of a report: the chosen ones, and all others of the file that have left something."""
-        from nrfgs_lab.bench.spec import cells_of
-
+    def shown(self, plan: Spec, chosen: list[Cell]) -> list[Cell]:
+        """The trainings of a report: the chosen ones, and all others of the file with a record or a failure."""
         every = cells_of(plan)
-        rows = list(dict.fromkeys((cell.scene, cell.strategy, cell.run) for cell in every))  # seeds stand together
-        there = [cell for cell in every if self.record(cell.name).exists() or self.has_failed(cell.name)]
-        cells = {*chosen, *there}
-        return sorted(cells, key=lambda cell: (rows.index((cell.scene, cell.strategy, cell.run)), cell.seed))
+        rows = list(dict.fromkeys((cell.scene, cell.strategy, cell.run) for cell in every))
+        others = [cell for cell in every if self.record(cell.name).exists() or self.has_failed(cell.name)]
+        return sorted(
+            {*chosen, *others}, key=lambda cell: (rows.index((cell.scene, cell.strategy, cell.run)), cell.seed)
+        )
 
     def record(self, name: str) -> Path:
-        """The file that a finished run leaves."""
+        """The record of a finished run."""
         return self.out / "runs" / f"{name}.json"
 
     def has_failed(self, name: str) -> bool:
         """Whether a run's last attempt failed."""
-        return failure(self.record(name)).exists() and not self.record(name).exists()
+        return self.record(name).with_suffix(FAILURE).exists() and not self.record(name).exists()
 
-    def parsers(self, cells) -> dict:
+    def parsers(self, cells: list[Cell]) -> dict[Scene, list[str]]:
         """Scene -> the data parser and its options. A data set that cannot be read fails now."""
-        from nrfgs_lab.bench.data import parser_options
-
         scenes = dict.fromkeys(cell.scene for cell in cells)
         return {scene: parser_options(self.scenes, scene, self.work / "scenes") for scene in scenes}
 
-    def jobs_of(self, plan, cells, parsers: dict) -> dict:
-        """Name -> `Job` of every training."""
-        from nrfgs_lab.bench.spec import Job, command, identity, steps_of
-
+    def jobs_of(self, plan: Spec, cells: list[Cell], parsers: dict[Scene, list[str]]) -> dict[str, Job]:
+        """Name -> job of every training."""
         return {
             cell.name: Job(
                 args=command(plan, cell, parsers[cell.scene], self.work / cell.name),
@@ -212,10 +217,8 @@ class Bench:
             for cell in cells
         }
 
-    def stale(self, plan, cells, parsers: dict | None) -> dict[str, str]:
-        """Name -> difference, of the records whose arguments are not those of the plan."""
-        from nrfgs_lab.bench.spec import differences, identity, read_record
-
+    def stale(self, plan: Spec, cells: list[Cell], parsers: dict[Scene, list[str]] | None) -> dict[str, str]:
+        """Records whose arguments are not those of the plan: name -> difference."""
         result = {}
         for cell in cells:
             if self.record(cell.name).exists():
@@ -225,7 +228,7 @@ class Bench:
                     result[cell.name] = difference
         return result
 
-    def run_all(self, pending: dict, plan) -> None:
+    def run_all(self, pending: dict[str, Job], plan: Spec) -> None:
         """Run the jobs, `plan.jobs` at once on each GPU, with the time that is left."""
         for folder in (self.out / "runs", self.work):
             folder.mkdir(parents=True, exist_ok=True)
@@ -260,7 +263,7 @@ class Bench:
                             say(f"{done.name}: {'done' if good else 'FAILED'}")
                             if not good:
                                 note = {"returncode": done.process.returncode, "identity": done.job.identity}
-                                write_whole(failure(record), json.dumps(note, indent=1) + "\n")
+                                write_whole(record.with_suffix(FAILURE), json.dumps(note, indent=1) + "\n")
                                 say(f"  see {done.log.name}")
                         if slot not in running and waiting:
                             running[slot] = self.start(*waiting.pop(0), gpu, threads, queue)
@@ -275,15 +278,16 @@ class Bench:
                     child.process.wait()
                     child.log.close()
 
-    def start(self, name: str, job, gpu: str, threads: int, queue: Queue | None) -> Running:
-        """Start one job on a GPU, with as many CPU threads unless OMP_NUM_THREADS says otherwise, or queue it."""
-        failure(self.record(name)).unlink(missing_ok=True)
+    def start(self, name: str, job: Job, gpu: str, threads: int, queue: Queue | None) -> Running:
+        """Start a job on a GPU, or queue it. OMP_NUM_THREADS goes before `threads`."""
+        self.record(name).with_suffix(FAILURE).unlink(missing_ok=True)
         file = self.work / f"{name}.job.json"
         write_whole(file, json.dumps(asdict(job), indent=1))
         log = (self.work / f"{name}.log").open("a")
         if queue is not None:
-            command, note = [*CHILD, str(file.resolve())], self.work / f"{name}.task.json"
-            return Running(name, queue.start(name, command, Path(log.name), gpu, note), log, job)
+            note = self.work / f"{name}.task.json"
+            task = queue.start(name, [*CHILD, str(file.resolve())], Path(log.name), gpu, note)
+            return Running(name, task, log, job)
         environment = {"OMP_NUM_THREADS": str(threads), **os.environ, "CUDA_VISIBLE_DEVICES": gpu}
         process = subprocess.Popen([*CHILD, str(file)], stdout=log, stderr=subprocess.STDOUT, env=environment)
         return Running(name, process, log, job)
@@ -317,11 +321,6 @@ def is_method(name: str) -> bool:
     from nerfstudio.configs.method_configs import all_methods  # takes seconds, and is only needed for others' methods
 
     return name in all_methods
-
-
-def failure(record: Path) -> Path:
-    """The note that a run's last attempt failed."""
-    return record.with_suffix(".failed")
 
 
 def gpu_names(count: int) -> list[str]:

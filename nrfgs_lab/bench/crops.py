@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Crops of test views side by side: the truth, each run's rendering, and below it its error.
-
-They are cut from the pictures that `ns-eval` wrote, truth and rendering side by side in each.
-"""
+"""Crops of test views, from `ns-eval`'s pictures: the truth, and each run's rendering above its error."""
 
 import re
 from pathlib import Path
@@ -14,49 +11,41 @@ from PIL import Image, ImageDraw
 from nrfgs_ns.files import whole
 
 VIEWS = 2
-"""Views in a sheet if nobody chose them."""
+"""Views in a sheet."""
 CROP_FRACTION = 0.3
 """Side of a crop, in shorter sides of the image."""
 CROP_PIXELS = 220
 """Side of a crop in the sheet."""
 ERROR_GAIN = 4.0
-"""How much the error maps are amplified."""
+"""Factor of the error maps."""
 TITLE, GAP = 16, 4
 ACROSS = 8
-"""Crops side by side, the truth's among them; more go below."""
+"""Crops side by side, with the truth; more go below."""
 PICTURE = re.compile(r"eval_img_(\d{4})")
 
 Images = npt.NDArray[np.float32]
 
 
-def crop_sheet(pictures: dict[str, Path], path: Path, views: list[int] | None = None) -> bool:
-    """Write a sheet: for each view lines of renderings and below them |error| x 4, the whole truth on the left.
+def crop_sheet(pictures: dict[str, Path], path: Path) -> bool:
+    """Write a PNG of the views where runs differ most: renderings above |error| x 4, the whole truth on the left.
 
     Args:
         pictures: label -> folder of ns-eval's pictures of a run.
         path: where the PNG goes.
-        views: numbers of test views; None: those where the runs differ most.
 
     Returns:
-        Whether there was something to show: a run without pictures is left out, or with pictures of another size than
-        the first run's, and a view that some run lacks.
+        Whether there is a view that all runs have. Runs without pictures, or with pictures of another size than the
+        first run's, are left out.
     """
-    files = {label: numbered(folder) for label, folder in pictures.items()}
-    files = {label: found for label, found in files.items() if found}
-    if not files:
-        return False
-    files = of_one_size(files)
-    shared = sorted(set.intersection(*(set(found) for found in files.values())))
-    chosen = [view for view in views if view in shared] if views is not None else shared
+    files = of_one_size({label: files for label, folder in pictures.items() if (files := numbered(folder))})
     places = []
-    for view in chosen:
+    for view in sorted(set.intersection(*map(set, files.values()))) if files else ():
         truth, renders = read(files, view)
         side = crop_side(truth.shape[0], truth.shape[1])
         places.append((*largest_disagreement(truth, list(renders.values()), side), view))
-    if views is None:
-        places = sorted(places, key=lambda place: -place[0])[:VIEWS]
     if not places:
         return False
+    places = sorted(places, key=lambda place: -place[0])[:VIEWS]
     parts = [_view(*read(files, view), top, left) for _, top, left, view in places]
     width, height = max(part.width for part in parts), sum(part.height + TITLE + GAP for part in parts)
     sheet = Image.new("RGB", (width, height), "white")
@@ -72,33 +61,31 @@ def crop_sheet(pictures: dict[str, Path], path: Path, views: list[int] | None = 
 
 def numbered(folder: Path) -> dict[int, Path]:
     """Number of the test view -> its picture."""
-    found = {}
-    for file in sorted(Path(folder).glob("eval_img_*.png")):
-        if match := PICTURE.match(file.name):
-            found[int(match.group(1))] = file
-    return found
+    return {
+        int(PICTURE.match(file.name)[1]): file for file in sorted(folder.glob("eval_img_[0-9][0-9][0-9][0-9]*.png"))
+    }
 
 
 def of_one_size(files: dict[str, dict[int, Path]]) -> dict[str, dict[int, Path]]:
-    """The runs whose pictures are as large as the first run's: another one may have had scaled photographs."""
+    """Runs with pictures of the first run's size: others may have had scaled photographs."""
 
     def size(file: Path) -> tuple[int, int]:
         with Image.open(file) as picture:
             return picture.size
 
-    first = {view: size(file) for view, file in next(iter(files.values())).items()}
+    first = {view: size(file) for view, file in next(iter(files.values()), {}).items()}
     return {
-        label: found
-        for label, found in files.items()
-        if all(size(file) == first[view] for view, file in found.items() if view in first)
+        label: views
+        for label, views in files.items()
+        if all(size(file) == first[view] for view, file in views.items() if view in first)
     }
 
 
 def read(files: dict[str, dict[int, Path]], view: int) -> tuple[Images, dict[str, Images]]:
     """The truth and each run's rendering of a view, [H, W, 3] in [0, 1]."""
     truth, renders = None, {}
-    for label, found in files.items():
-        with Image.open(found[view]) as picture:
+    for label, views in files.items():
+        with Image.open(views[view]) as picture:
             pair = np.asarray(picture.convert("RGB"), dtype=np.float32) / 255.0
         half = pair.shape[1] // 2
         truth = pair[:, :half] if truth is None else truth
@@ -112,9 +99,7 @@ def crop_side(height: int, width: int) -> int:
 
 
 def largest_disagreement(truth: Images, renders: list[Images], side: int) -> tuple[float, int, int]:
-    """The square where the runs' errors differ most, or where the error of a single run is largest: mean over it of the
-    deviation of the errors over the runs, and its top and left.
-    """
+    """Square where the runs' errors differ most, or a single run's error is largest: mean deviation, top and left."""
     errors = np.stack([np.abs(render - truth).mean(axis=-1) for render in renders])
     map_ = errors.std(axis=0) if len(errors) > 1 else errors[0]
     sums = np.zeros((map_.shape[0] + 1, map_.shape[1] + 1))
@@ -125,7 +110,7 @@ def largest_disagreement(truth: Images, renders: list[Images], side: int) -> tup
 
 
 def _view(truth: Images, renders: dict[str, Images], top: int, left: int) -> Image.Image:
-    """One view's lines: up to `ACROSS` crops, and below each its error."""
+    """One view: the whole truth, and lines of up to `ACROSS` crops above their errors."""
     side = crop_side(*truth.shape[:2])
     box = slice(top, top + side), slice(left, left + side)
     scale = (2 * CROP_PIXELS + GAP) / truth.shape[0]

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The data parser that reads a folder, so that every 8th image by name is a test image.
+"""Data parsers of a benchmark: every 8th image by name is a test image.
 
-- `transforms.json`: `nrfgs-data`. The data set's own split if it names one, else every 8th image.
-- `sparse/0` (or `colmap/sparse/0`, or `sparse`) with COLMAP's text or binary files: nerfstudio's `colmap`. That one
-  counts images in the order of COLMAP's numbers, which is not the order of names. So the folder is mirrored by links
-  into the work folder, with lists of the names of each split; the data set itself is not touched.
-- Held out: a data set of the training views alone, at half the size, some of which are its test views, for choosing
-  settings without looking at test views. It is written into the work folder.
+- `transforms.json`: `nrfgs-data`, with the data set's own split if it names one.
+- `sparse/0` (or `colmap/sparse/0`, or `sparse`): nerfstudio's `colmap`. It counts images in the order of COLMAP's
+  numbers, so the folder is mirrored by links into the work folder, beside lists of the names of each split.
+- Held out: a data set of the training views alone, at half the size, some of which are test views, in the work folder:
+  for choosing settings without looking at test views.
 """
 
 import json
@@ -26,13 +25,13 @@ TEST_EVERY = 8
 QUALITY = 92
 """Quality of the JPEGs of held-out data sets."""
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
-"""Where a COLMAP reconstruction may lie."""
+"""Places of a COLMAP reconstruction."""
 ROUNDINGS = {
     "floor": lambda side, factor: side // factor,
     "round": lambda side, factor: int(side / factor + 0.5),
     "ceil": lambda side, factor: -(-side // factor),
 }
-"""How a downscaled image's side may have come about; nerfstudio must be told."""
+"""nerfstudio's option -> side of a downscaled image."""
 
 
 def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
@@ -40,13 +39,12 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
 
     Args:
         root: folder of the scenes.
-        scene: which one.
         mirrors: folder for mirrored COLMAP data sets and held-out ones.
 
     Raises:
         InputError: the folder is in neither layout, or the downscaled images are missing or of an unknown size.
     """
-    folder, mirror = Path(root) / scene.path, mirrors / scene.name
+    folder, mirror = root / scene.path, mirrors / scene.name
     if scene.held_out is not None:
         with only_one(mirror.with_name(f"{mirror.name}.lock"), f"Another process makes {mirror}; waiting for it."):
             if not (mirror / "transforms.json").exists():
@@ -73,19 +71,19 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
 
 
 def held_out_views(names: list[str], first: int) -> list[str]:
-    """The training views to hold out: every 8th; every 6th of fewer than 30 if every 8th leaves fewer than three."""
+    """Views to hold out: every 8th; every 6th of fewer than 30 views if every 8th gives fewer than three."""
     chosen = names[first::TEST_EVERY]
     return names[first::6] if len(names) < 30 and len(chosen) < 3 else chosen
 
 
 def make_held_out(folder: Path, out: Path, first: int, views: int | None = None) -> None:
-    """Write the data set of a capture's training views at half the size.
+    """Write a data set of a capture's training views at half the size.
 
     Args:
-        folder: the capture, with a transforms.json that names its split.
+        folder: the capture.
         out: folder of the data set.
-        first: first of the held-out views among the training views in the order of their names.
-        views: number of the others that stay training views, evenly spaced; None: all.
+        first: first held-out view among the training views, by name.
+        views: number of training views to keep, evenly spaced; None: all.
 
     Raises:
         InputError: the capture names no training views.
@@ -117,7 +115,7 @@ def make_held_out(folder: Path, out: Path, first: int, views: int | None = None)
 
 
 def names_its_split(transforms: Path) -> bool:
-    """Whether a data set says which images are for testing. Files that cannot be read are left to the data parser."""
+    """Whether a data set names its split. The data parser refuses files that cannot be read."""
     try:
         return any(f"{split}_filenames" in json.loads(transforms.read_bytes()) for split in ("train", "val", "test"))
     except (OSError, ValueError, TypeError):
@@ -125,7 +123,7 @@ def names_its_split(transforms: Path) -> bool:
 
 
 def colmap_model(folder: Path) -> str | None:
-    """Path of the reconstruction inside a folder, or None."""
+    """Path of the reconstruction in a folder, or None."""
     for model in MODELS:
         if any((folder / model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return model
@@ -152,10 +150,7 @@ def image_names(model: Path) -> list[str]:
 
 
 def mirror_with_split(folder: Path, model: str, mirror: Path) -> None:
-    """Link everything in `folder` into `mirror`, and put lists of training and test images beside it.
-
-    Links that an earlier benchmark made to another place are replaced.
-    """
+    """Link the content of `folder` into `mirror`, beside lists of training and test images; replace links elsewhere."""
     names = image_names(folder / model)
     if len(names) < 2:
         raise InputError(f"{folder / model} has {len(names)} images; one to train on and one to test are needed.")
@@ -175,7 +170,7 @@ def mirror_with_split(folder: Path, model: str, mirror: Path) -> None:
 
 
 def rounding(folder: Path, factor: int, model: str) -> str:
-    """How the sides of the images in images_FACTOR were rounded, from the first image of the reconstruction."""
+    """Rounding of the sides of images_FACTOR, from the first image of the reconstruction."""
     originals, smaller = folder / "images", folder / f"images_{factor}"
     if not smaller.is_dir():
         raise InputError(

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs of a benchmark as tasks of submitit: on this machine, or in the queue of a Slurm cluster.
 
-A task runs the command that a child process of `nrfgs bench` would run; its record lies in a folder that all machines
-share. A task that the cluster interrupts (preemption, time limit) is queued again by submitit and goes on from the last
-checkpoint. Tasks in a queue outlive the benchmark. Their numbers are noted beside the jobs: the next call waits for
-those that are still there instead of queueing the runs twice.
+A task runs the command of a child process. All machines share the folders. submitit queues an interrupted task again
+(preemption, time limit), and it resumes from its last checkpoint. Tasks in a queue outlive the benchmark: the next call
+finds their numbers beside the jobs, and waits for them.
 """
 
 import json
@@ -17,27 +16,22 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
 
 GENERIC = ("timeout_min", "mem_gb", "cpus_per_task", "gpus_per_node")
-"""Parameters that submitit knows for every executor; others are Slurm's own."""
+"""Parameters of every executor; others are Slurm's."""
 LOCAL_TIMEOUT_MIN = 60 * 24 * 30
-"""Long enough for any run: by default submitit ends local tasks after minutes."""
+"""By default submitit ends local tasks after minutes."""
 
 
 @dataclass
 class Task:
-    """The command of one job, as submitit calls it on another machine."""
+    """Command of a job, called by submitit on another machine."""
 
     command: list[str]
-    """of one job"""
     log: str
-    """file that its output is appended to"""
+    """file for its output, appended"""
     child: subprocess.Popen | None = field(default=None, repr=False)
 
     def __call__(self) -> None:
-        """Run the command.
-
-        Raises:
-            RuntimeError: it failed.
-        """
+        """Run the command; RuntimeError if it fails."""
         with open(self.log, "a") as log:
             self.child = subprocess.Popen(self.command, stdout=log, stderr=subprocess.STDOUT)
             try:
@@ -48,13 +42,13 @@ class Task:
             raise RuntimeError(f"{' '.join(self.command)} ended with code {returncode}; see {self.log}")
 
     def end(self) -> None:
-        """End the command, if it still runs."""
+        """End the command if it runs."""
         if self.child is not None and self.child.poll() is None:
             self.child.terminate()
             self.child.wait()
 
     def checkpoint(self) -> Any:
-        """The same command, later: called by submitit before the cluster interrupts the task."""
+        """Queue the same command again; submitit calls this before the cluster interrupts the task."""
         from submitit.helpers import DelayedSubmission
 
         self.end()
@@ -62,12 +56,7 @@ class Task:
 
 
 class Submitted:
-    """A task of submitit with the interface of a child process.
-
-    Args:
-        job: submitit's.
-        lives_on: whether the task is to outlive this process.
-    """
+    """A task of submitit with the interface of a child process; `lives_on`: it outlives this process."""
 
     def __init__(self, job, lives_on: bool):
         self.job = job
@@ -75,18 +64,18 @@ class Submitted:
         self.returncode: int | None = None
 
     def poll(self) -> int | None:
-        """None while the task waits or runs, 0 when it has done its work, 1 when it has failed."""
+        """None while the task waits or runs, 0 after success, 1 after a failure."""
         if self.returncode is None and self.job.done():
             self.returncode = int(self.job.exception() is not None)
         return self.returncode
 
     def terminate(self) -> None:
-        """End the task, unless it is to live on."""
+        """End the task, unless it lives on."""
         if not self.lives_on and self.returncode is None:
             self.job.cancel()
 
     def wait(self) -> None:
-        """Wait for a task that was terminated."""
+        """Wait for a terminated task."""
         if not self.lives_on and self.returncode is None:
             self.job.wait()
 
@@ -96,11 +85,11 @@ class Queue:
 
     Args:
         name: "local" or "slurm".
-        folder: for submitit's files and logs; on a cluster, all machines must see it.
+        folder: folder for submitit's files and logs.
         parameters: KEY=VALUE for submitit, such as timeout_min=600 or partition=gpu.
 
     Raises:
-        InputError: submitit is not installed, or a parameter is not one of its.
+        InputError: submitit is not installed, or has no such parameter.
     """
 
     def __init__(self, name: str, folder: Path, parameters: tuple[str, ...] = ()):
@@ -123,14 +112,11 @@ class Queue:
             raise InputError(f"--slurm: {error}") from error
 
     def start(self, name: str, command: list[str], log: Path, gpu: str, note: Path) -> Submitted:
-        """Submit a task, or return the one that an earlier benchmark submitted and that is still there.
+        """Submit a run's command, or return its task if that is still queued or running.
 
         Args:
-            name: of the run.
-            command: that does it.
-            log: file for its output.
-            gpu: value of CUDA_VISIBLE_DEVICES; a cluster decides by itself.
-            note: file that remembers the task.
+            gpu: CUDA_VISIBLE_DEVICES of a local task.
+            note: file with the task's number.
         """
         if self.name == "slurm" and (earlier := self._earlier(note)) is not None:
             return Submitted(earlier, lives_on=True)
@@ -143,7 +129,7 @@ class Queue:
         return Submitted(job, lives_on=self.name == "slurm")
 
     def _earlier(self, note: Path):
-        """The task of a note, if it still waits or runs."""
+        """Task of a note, if it waits or runs."""
         import submitit
 
         if not note.exists():

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements of a trained model, the same for every method: on test views, on training views, in time and bytes.
+"""Measurements of a trained model, the same for every method: test views, training views, time and bytes.
 
-`ns-eval` reports what a method chooses to report; nerfstudio's own splatfacto has neither L1 nor MS-SSIM, ignores masks
-and takes its frames per second without waiting for the GPU. Here one piece of code looks at the renderings of all.
+`ns-eval` depends on the method: splatfacto's has neither L1 nor MS-SSIM, ignores masks, and does not wait for the GPU
+when it times frames.
 """
 
 from collections.abc import Callable, Iterable
@@ -17,15 +17,14 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
 
 from nrfgs_ns.data.views import evenly_spaced
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.metrics import METRIC_NAMES, image_metrics
 
 TIMED_CAMERAS = 20
-"""Test cameras, evenly spaced, whose rendering is timed."""
+"""Test cameras, evenly spaced, for frames per second."""
 TIMED_SECONDS = 1.0
-"""They are rendered in turn for at least this long."""
+"""Shortest time of rendering them in turn."""
 FULL_HD = 1920, 1080
-"""A screen's size, at which frames per second are taken beside the photographs' own."""
+"""Second size for frames per second."""
 
 
 @torch.no_grad()
@@ -34,15 +33,14 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
 
     Args:
         config_path: the config.yml that the training saved.
-        train_views: of how many training images, evenly spaced among all; 0 leaves them out.
-        timed: whether frames per second are taken; they say little on a GPU that others use, too.
+        train_views: number of training images, evenly spaced.
+        timed: measure frames per second; they need an idle GPU.
 
     Returns:
-        "test" and "train" (null without views), each with the means of psnr, ssim, ms_ssim, l1, lpips (null where it
-        cannot be had), of the same colour-corrected (cc_psnr, ...), and "per_image"; "test" has flip, too (null
-        without the package `flip-evaluator`). "fps" at the photographs' size and "fps_1080p" (null on a CPU), both null
-        if not timed; "splats", of which "diffuse" have no residual; "parameter_bytes" (what a renderer
-        needs); "checkpoint_bytes" (the file, with the optimisers' moments).
+        "test" and "train" (null without views), each with "per_image" and means of psnr, ssim, ms_ssim, l1, lpips (null
+        without weights), colour-corrected cc_psnr, ..., and for "test" flip (null without `flip-evaluator`); "fps" at
+        the photographs' size and "fps_1080p" (null on a CPU), null if not timed; "splats", of which "diffuse" have no
+        residual; "parameter_bytes" of a renderer; "checkpoint_bytes" with the optimisers' moments.
     """
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
     model, data = pipeline.model, pipeline.datamanager
@@ -78,7 +76,7 @@ def over_views(model, views: Iterable, flip: Callable | None = None) -> dict[str
     """Means and each image's values over (name, (camera, batch)).
 
     Args:
-        flip: prediction, truth and mask as arrays -> FLIP, if it is wanted; it takes a second for each view.
+        flip: prediction, truth and mask as arrays -> FLIP; a second for each view.
     """
     per_image = []
     for name, (camera, batch) in views:
@@ -97,24 +95,17 @@ def over_views(model, views: Iterable, flip: Callable | None = None) -> dict[str
 
 
 def flip(pred: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float | None:
-    """Mean FLIP (Andersson et al., PACMCGIT 3(2), 2020): how different two pictures look, lower is better.
-
-    The package `flip-evaluator` computes it, at its 67 pixels a degree.
+    """Mean FLIP (Andersson et al., PACMCGIT 3(2), 2020) in [0, 1], lower is better; needs the package `flip-evaluator`.
 
     Args:
         pred, truth: sRGB images [H, W, 3] in [0, 1].
-        mask: bool [H, W], True inside: outside, the prediction is replaced by the truth, and left out of the mean.
+        mask: bool [H, W], True inside; outside the prediction is replaced by the truth, and left out of the mean.
 
     Returns:
-        In [0, 1]; None if nothing is inside.
-
-    Raises:
-        InputError: `flip-evaluator` is missing.
+        None if the mask is empty. 67 pixels a degree are assumed.
     """
-    try:
-        import flip_evaluator
-    except ImportError as error:
-        raise InputError("FLIP needs the package flip-evaluator: pip install flip-evaluator") from error
+    import flip_evaluator
+
     if mask is not None:
         if not mask.any():
             return None
@@ -125,7 +116,7 @@ def flip(pred: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) ->
 
 
 def at_size(camera: Cameras, width: int, height: int) -> Cameras:
-    """The camera [1] with another image size: the same vertical angle, and a horizontal one that fits."""
+    """Camera [1] with another image size and the same vertical angle."""
     scale = height / camera.height
     size = {"width": torch.full_like(camera.width, width), "height": torch.full_like(camera.height, height)}
     return Cameras(camera.camera_to_worlds, camera.fx * scale, camera.fy * scale, width / 2, height / 2, **size).to(
@@ -134,7 +125,7 @@ def at_size(camera: Cameras, width: int, height: int) -> Cameras:
 
 
 def frames_per_second(model, cameras: list) -> float:
-    """Renderings per second of wall-clock, one after the other, after one of each that is not timed."""
+    """Renderings per second of wall-clock, after an untimed one of each."""
     chosen = [cameras[i].to(model.device) for i in evenly_spaced(len(cameras), TIMED_CAMERAS)]
     rendered, seconds = 0, 0.0
     for timed in (False, True):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a benchmark from its records: tables, numbers of splats over steps, crops, and a trade's figure."""
+"""Report of a benchmark: tables, numbers of splats over steps, crops, and a trade's figure."""
 
 import json
 from pathlib import Path
@@ -10,32 +10,22 @@ from rich.console import Console
 from nrfgs_lab.bench import trade
 from nrfgs_lab.bench.crops import crop_sheet, numbered
 from nrfgs_lab.bench.spec import OWN, Cell, Spec, read_record
-from nrfgs_lab.bench.table import (
-    COLUMNS,
-    FAILED,
-    MISSING,
-    STALE,
-    Row,
-    as_csv,
-    markdown,
-    plain_label,
-    views_as_csv,
-    with_averages,
-)
+from nrfgs_lab.bench.table import COLUMNS, FAILED, MISSING, STALE, Row, markdown, plain_label, with_averages
 from nrfgs_ns.files import whole, write_whole
+
+FAILURE = ".failed"
+"""Ending of the note that a run's last attempt failed, beside its record."""
 
 
 def report(spec: Spec, cells: list[Cell], out: Path, work: Path, stale: dict[str, str]) -> None:
-    """Write OUT/table.{md,csv}, views.csv, summary.json, splats.{png,svg}, crops/SCENE.png, and print the table.
-
-    A plan with knobs gets OUT/tradeoff.{md,json,png}, too.
+    """Print the table; write table.md, summary.json, splats.png, crops/, with knobs tradeoff.{md,json,png} into OUT.
 
     Args:
         spec: the benchmark.
         cells: the trainings to report.
         out: folder of the report; its runs/ holds the records.
         work: folder of the trainings, for their pictures; without them there are no crops.
-        stale: names of records that are not to be used, with the reason.
+        stale: records to leave out: name -> difference.
     """
     rows = rows_from_records(cells, out / "runs", stale)
     for name, difference in stale.items():
@@ -43,8 +33,6 @@ def report(spec: Spec, cells: list[Cell], out: Path, work: Path, stale: dict[str
     everything = with_averages(rows)
     table = markdown(everything)
     write_whole(out / "table.md", table)
-    write_whole(out / "table.csv", as_csv(everything))
-    write_whole(out / "views.csv", views_as_csv(rows))
     write_whole(out / "summary.json", json.dumps([summary(row) for row in everything], indent=1) + "\n")
     if any(row.records for row in rows):
         draw_splats(rows, out)
@@ -52,7 +40,7 @@ def report(spec: Spec, cells: list[Cell], out: Path, work: Path, stale: dict[str
         here = [cell for cell in cells if cell.scene.name == scene and cell.name not in stale]
         path = out / "crops" / f"{scene.replace('/', '_')}.png"
         try:
-            crop_sheet(pictures_of(here, out / "runs", work), path, spec.crops.get(scene))
+            crop_sheet(pictures_of(here, out / "runs", work), path)
         except OSError as error:
             print(f"No crops of {scene}: {error}")
     knobs = {run.name: run.knob for run in spec.runs if run.knob}
@@ -63,10 +51,7 @@ def report(spec: Spec, cells: list[Cell], out: Path, work: Path, stale: dict[str
 
 
 def pictures_of(cells: list[Cell], runs: Path, work: Path) -> dict[str, Path]:
-    """Label -> folder of ns-eval's pictures of each run on one scene, of its first seed that has some.
-
-    The labels name the seeds if the runs have not all the same one.
-    """
+    """Folder of ns-eval's pictures by run, of its first seed with pictures; labels name seeds if they differ."""
     first: dict[str, tuple[int, Path]] = {}
     for cell in cells:
         folder = work / cell.name / "pictures"
@@ -77,7 +62,7 @@ def pictures_of(cells: list[Cell], runs: Path, work: Path) -> dict[str, Path]:
 
 
 def rows_from_records(cells: list[Cell], runs: Path, stale: dict[str, str]) -> list[Row]:
-    """One row for each scene, strategy and run, whether or not it has records."""
+    """A row for each scene, strategy and run."""
     by_place: dict[tuple[str, str, str], Row] = {}
     for cell in cells:
         place = (cell.scene.name, cell.run.name, cell.strategy)
@@ -88,7 +73,7 @@ def rows_from_records(cells: list[Cell], runs: Path, stale: dict[str, str]) -> l
         elif file.exists():
             row.records[cell.seed] = read_record(file)
         else:
-            row.absent[cell.seed] = FAILED if file.with_suffix(".failed").exists() else MISSING
+            row.absent[cell.seed] = FAILED if file.with_suffix(FAILURE).exists() else MISSING
     return [row.fill() for row in by_place.values()]
 
 
@@ -111,10 +96,7 @@ def label(run: str, strategy: str) -> str:
 
 
 def draw_splats(rows: list[Row], out: Path) -> None:
-    """Number of splats over training steps: OUT/splats.png and .svg, one panel for each scene and strategy.
-
-    A line is the mean over seeds, on a band from the smallest to the largest.
-    """
+    """Write OUT/splats.png: mean and range over seeds by step, a panel for each scene and strategy."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -126,8 +108,7 @@ def draw_splats(rows: list[Row], out: Path) -> None:
     places = [(scene, strategy) for scene in scenes for strategy in strategies]
     across = min(3, len(scenes)) if len(strategies) == 1 else len(strategies)
     down = -(-len(places) // across)
-    # Text as text keeps the SVG small; a fixed salt gives the same file for the same numbers.
-    with pyplot.rc_context({"svg.fonttype": "none", "svg.hashsalt": "nrfgs", "font.size": 8}):
+    with pyplot.rc_context({"font.size": 8}):
         size = 3.6 * across, 2.6 * down + 0.3
         figure, panels = pyplot.subplots(down, across, figsize=size, squeeze=False, layout="constrained")
         for panel in panels.flat[len(places) :]:
@@ -143,17 +124,15 @@ def draw_splats(rows: list[Row], out: Path) -> None:
         figure.legend([lines[name] for name in ordered], ordered, loc="outside lower center", ncols=min(5, 2 * across))
         with whole(out / "splats.png") as aside:
             figure.savefig(aside, format="png", dpi=150, metadata={"Software": None})
-        with whole(out / "splats.svg") as aside:
-            figure.savefig(aside, format="svg", metadata={"Date": None})
         pyplot.close(figure)
 
 
 STYLES = "-", "--", ":", "-."
-"""Styles of lines: the next one when the ten colours are used up."""
+"""Line styles, each for ten colours."""
 
 
 def draw_counts(panel, row: Row, number: int) -> None:
-    """One row's numbers of splats over steps, in the colour and style of its run's number."""
+    """Draw one row's numbers of splats, in the colour and style of its run's number."""
     counts = [record["train"].get("splats") for record in row.records.values()]
     curves = [dict(map(tuple, pairs)) for pairs in counts if pairs]
     if not curves:

@@ -3,8 +3,8 @@
 
     python -m nrfgs_lab.bench.run JOB.json
 
-It may be killed at any time and started again. What is finished is not repeated; a training goes on from its last
-checkpoint if that was made with the same arguments. Two processes never work on the same training.
+It may be killed at any time and started again: finished parts are skipped, and a training resumes from its last
+checkpoint if the arguments are the same. Two processes never work on the same training.
 """
 
 import contextlib
@@ -31,10 +31,10 @@ PROGRESS_SECONDS = 1.0
 
 
 def run(job: Job) -> None:
-    """Do the job, or what is left of it."""
+    """Do a job, or the rest of it."""
     work, record_path = Path(job.work), Path(job.record)
     work.mkdir(parents=True, exist_ok=True)
-    # A benchmark that was killed may have left its children behind: the next one must not train into their folders.
+    # A killed benchmark may leave children behind, which train into this folder.
     with only_one(work / "lock", "Another process works on this run; waiting for it to end."):
         if record_path.exists():
             return
@@ -70,9 +70,8 @@ def run(job: Job) -> None:
 def host_without_downloads(method: str) -> Iterator[None]:
     """Let nerfstudio's own methods run offline, for comparisons.
 
-    They build LPIPS, and download its weights, with the model. For the time of a run it is replaced by one that gives
-    NaN, unless the weights are on disk. Their checkpoints need torch's leave to be read. This project's methods need no
-    such thing.
+    They build LPIPS with the model and download its weights: it is replaced by one that returns NaN, unless the weights
+    are on disk. torch must be allowed to read their checkpoints.
     """
     from torchvision.models import AlexNet_Weights
 
@@ -100,8 +99,8 @@ def host_without_downloads(method: str) -> Iterator[None]:
 def train_or_continue(job: Job, work: Path) -> TrainRecord:
     """Train from the last checkpoint, or from the start.
 
-    Only this project's methods with a given number of steps continue: nerfstudio's own splatfacto loses its optimisers'
-    hold of the parameters when it loads a checkpoint, and may leave a torn one.
+    Only this project's methods with a given number of steps resume: splatfacto's optimisers lose its parameters when it
+    loads a checkpoint, and the checkpoint may be torn.
     """
 
     def saved(record: TrainRecord) -> None:
@@ -112,7 +111,7 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
     def stepped(step: int) -> None:
         nonlocal noted
         if perf_counter() - noted >= PROGRESS_SECONDS:
-            with contextlib.suppress(OSError):  # a note that cannot be written is no reason to end a training
+            with contextlib.suppress(OSError):  # a full disk must not end a training here
                 write_whole(work / "progress.json", json.dumps({"step": step}))
             noted = perf_counter()
 
@@ -129,13 +128,13 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
 
 
 def last_checkpoint(work: Path) -> Path | None:
-    """The checkpoint of the latest step anywhere below a folder."""
+    """Checkpoint of the latest step below a folder."""
     files = work.rglob("nerfstudio_models/step-*.ckpt")
     return max(files, key=lambda path: (path.name, path.stat().st_mtime), default=None)
 
 
 def record_until(path: Path, checkpoint: Path) -> TrainRecord | None:
-    """The training's record as it was when a checkpoint was saved; None if it cannot be read or lacks the step."""
+    """Record of a training up to a checkpoint; None if it cannot be read or lacks the step."""
     try:
         record = TrainRecord(**json.loads(path.read_text(encoding="utf-8")))
     except (FileNotFoundError, ValueError):
@@ -152,7 +151,7 @@ def record_until(path: Path, checkpoint: Path) -> TrainRecord | None:
 
 
 def forget_other_arguments(work: Path, identity: dict[str, Any]) -> None:
-    """Clear a work folder that belongs to other arguments, so that nothing of theirs is continued."""
+    """Clear a work folder of other arguments."""
     note = work / "identity.json"
     with contextlib.suppress(FileNotFoundError, ValueError):
         if json.loads(note.read_text(encoding="utf-8")) == identity:

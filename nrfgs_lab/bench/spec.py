@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of a benchmark: runs x strategies x scenes x seeds from a YAML file, and the command of each training.
+"""Plan of a benchmark: runs x strategies x scenes x seeds from a YAML file, and the command of each training.
 
     runs:                                   # name -> method of ns-train, or method and options
       SH: nrfgs-sh
@@ -10,10 +10,10 @@
     seeds: [42, 43]
     steps: 30000
 
-All keys are fields of `Spec`; those of a run are fields of `Method`, those of a scene are fields of `Scene`.
+The keys are fields of `Spec`, `Method` (a run) and `Scene`.
 
-Instead of runs a plan may have a default and knobs. Each knob is turned away from the default alone, and the report
-says what each setting buys and what it costs (`trade.py`):
+A plan may have a default and knobs instead of runs. Each knob is varied alone, and the report compares every setting
+with the default (`trade.py`):
 
     default: nrfgs
     knobs:
@@ -24,8 +24,8 @@ says what each setting buys and what it costs (`trade.py`):
 
 A setting has the default's method and options, and its own after them; if it names a method, only its own.
 
-With `held_out: [4]` trainings see no test view: each scene is replaced by its training views at half the size, of which
-every eighth, from the fourth on, is a test view (`data.py`). Such scenes are called 4/bonsai.
+With `held_out: [4]` each scene is replaced by its training views at half the size; every eighth of them, from the
+fourth on, is a test view (`data.py`). Such a scene is called 4/bonsai.
 """
 
 import json
@@ -37,31 +37,28 @@ from typing import Any
 
 import yaml
 
-from nrfgs_ns.densification import strategy_from
 from nrfgs_ns.errors import InputError
 
 QUIET = (
     "--vis tensorboard --steps-per-eval-image 1000000 --steps-per-eval-all-images 1000000 "
     "--logging.local-writer.enable False --logging.profiler none"
 ).split()
-"""Options that keep evaluation, the viewer and the terminal table out of the timing."""
+"""Options without evaluation, viewer and terminal table during a training."""
 OWN = "own"
-"""As a strategy or a number of steps: the method's own, no option."""
+"""Strategy or number of steps that the method chooses: no option."""
 DEFAULT = "default"
 """The run that a plan with knobs compares all others with."""
-DENSIFICATION = "--pipeline.model.densification"
-"""The option that chooses a strategy."""
 AVERAGE = "average"
-"""Name in place of the scene's in rows of averages over scenes."""
+"""In the column of scenes: the average over scenes."""
 PRESET_STEPS = {"nrfgs-fast": 10_000}
-"""Method -> training steps, of presets that differ from their method by the number of steps."""
+"""Presets that differ from their method by the number of steps -> training steps."""
 SET_HERE = {
     **dict.fromkeys(("--output-dir", "--experiment-name", "--load-dir"), "leave it out"),
     **dict.fromkeys(("--max-num-iterations", "--time-budget"), "use steps, of the file or of a run"),
     "--steps-per-save": "use checkpoint_every",
     "--machine.seed": "use seeds",
 }
-"""Options of ns-train that the benchmark gives itself -> the key to use instead."""
+"""Options of ns-train that the benchmark sets -> what to use instead."""
 
 
 @dataclass(frozen=True)
@@ -74,37 +71,37 @@ class Method:
     options: tuple[str, ...] = ()
     """its options"""
     strategies: tuple[str, ...] | None = None
-    """instead of the benchmark's; a method of another project has `own` only, unless it says otherwise"""
+    """instead of the benchmark's; another project's methods have only `own` by default"""
     steps: int | str | None = None
-    """instead of the scene's, the preset's or the benchmark's; own: what the method chooses"""
+    """instead of the preset's, the scene's or the benchmark's; own: what the method chooses"""
     scenes: tuple[str, ...] | None = None
     """only these scenes"""
     knob: str = ""
-    """the knob that it turns"""
+    """the knob that is varied"""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A data set: a folder below the root, and how it is read."""
+    """A data set, and how it is read."""
 
     path: str
-    """the folder"""
+    """folder below --scenes"""
     downscale: int | None = None
-    """use the images of images_N; None: nerfstudio's layout decides by size, COLMAP's takes the full size"""
+    """read images_N; None: by size in nerfstudio's layout, full size in COLMAP's"""
     options: tuple[str, ...] = ()
     """options of the data parser"""
     steps: int | None = None
     """training steps, instead of the benchmark's"""
     views: int | None = None
-    """held out: number of the other training views to keep, evenly spaced"""
+    """number of training views to keep beside held-out ones, evenly spaced"""
     held_out: int | None = None
-    """first of the training views that are held out"""
+    """first held-out view"""
 
     @property
     def name(self) -> str:
         """Name in tables and records."""
-        parts = [self.held_out, self.views, self.path]
-        return self.path if self.held_out is None else "/".join(str(part) for part in parts if part is not None)
+        parts = [] if self.held_out is None else [self.held_out, self.views]
+        return "/".join(str(part) for part in [*parts, self.path] if part is not None)
 
 
 @dataclass
@@ -112,11 +109,11 @@ class Spec:
     """A benchmark."""
 
     runs: list[Method]
-    """methods with options, each under a name"""
+    """methods with options"""
     scenes: list[Scene]
     """data sets"""
     strategies: list[str] = field(default_factory=lambda: [OWN])
-    """values of --pipeline.model.densification; NAME@N for NAME,budget=N; or own for no option at all"""
+    """values of --pipeline.model.densification; NAME@N: NAME,budget=N; own: no option"""
     seeds: list[int] = field(default_factory=lambda: [42])
     """--machine.seed of each repetition"""
     steps: int = 30_000
@@ -124,19 +121,17 @@ class Spec:
     options: tuple[str, ...] = ()
     """options of ns-train for every run"""
     held_out: list[int] = field(default_factory=list)
-    """choose settings without test views: for each number, views held out of the training views from this one on"""
+    """first held-out view; each number makes one held-out version of each scene"""
     quick: bool = False
-    """quality alone: no ns-eval, no pictures, no frame rates; the training's files are removed"""
+    """quality alone: no ns-eval, pictures or frame rates; checkpoints are removed"""
     train_views: int = 16
-    """training images, evenly spaced, that are evaluated beside the test images"""
+    """training images to evaluate, evenly spaced"""
     checkpoint_every: int = 5_000
-    """steps between checkpoints, from which an interrupted run goes on"""
+    """steps between checkpoints"""
     jobs: int = 1
     """runs at once on each GPU, or on the CPU"""
     gpus: int = 1
     """GPUs to spread the runs over"""
-    crops: dict[str, list[int]] = field(default_factory=dict)
-    """scene -> numbers of the test views to compare in pictures, from 0; where methods differ most if left out"""
 
 
 @dataclass(frozen=True)
@@ -157,30 +152,30 @@ class Cell:
 
 @dataclass
 class Job:
-    """A training to make, and where its results go."""
+    """A training, and where its results go."""
 
     args: list[str]
     """command line of ns-train"""
     cell: dict[str, Any]
     """its run, strategy, scene and seed"""
     identity: dict[str, Any]
-    """what decides the result, without paths: a record is compared with it"""
+    """what decides the result, without paths"""
     steps: int | None
     """training steps in all; None: the method chooses them"""
     record: str
     """file to write"""
     work: str
-    """folder for everything else; pictures of the test views lie in its `pictures`"""
+    """folder for everything else"""
     train_views: int
     """training images to evaluate"""
     jobs: int
-    """runs that share the GPU: times mean something only if it is 1"""
+    """runs at once on the GPU; times are valid only with 1"""
     quick: bool = False
-    """no ns-eval, no pictures, no frame rates; the work folder is removed"""
+    """no ns-eval, pictures or frame rates; the work folder is removed"""
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML in which no key stands twice: the later one would silently replace the other."""
+    """YAML with unique keys: the later of two would silently replace the other."""
 
     def construct_mapping(self, node, deep=False):
         keys = [key.value for key, _ in node.value]
@@ -191,13 +186,13 @@ class _Loader(yaml.SafeLoader):
 
 
 def load_spec(path: Path) -> dict[str, Any]:
-    """The content of a YAML file: a mapping, as `make_spec` takes it.
+    """Content of a YAML file, for `make_spec`.
 
     Raises:
         InputError: the file cannot be read, or is no mapping.
     """
     try:
-        content = yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_Loader)
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
     _require(isinstance(content, dict), f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md.")
@@ -216,7 +211,7 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     """
     if "knobs" in content:
         content = _with_runs_of_knobs(content, where)
-    known = [one.name for one in fields(Spec)]
+    known = [key.name for key in fields(Spec)]
     for key in content:
         _require(key in known, f"{where}: unknown key {key!r}. Known are {', '.join(known)}.")
     for key in ("runs", "scenes"):
@@ -242,11 +237,6 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
             _whole(value, 0, f"{where}: {key}")
     if spec.held_out:
         spec.scenes = [replace(scene, held_out=first) for first in spec.held_out for scene in spec.scenes]
-    crops = spec.crops.values() if isinstance(spec.crops, dict) else [None]
-    views = all(isinstance(chosen, list) and all(isinstance(view, int) for view in chosen) for chosen in crops)
-    _require(views, f"{where}: crops must map scenes to lists of numbers of test views, such as {{bonsai: [0, 5]}}.")
-    for name in spec.crops:
-        _require(any(name == scene.name for scene in spec.scenes), f"{where}: crops: {name!r} is none of its scenes.")
     _require_free(spec.options, SET_HERE, f"{where}: options")
     for run in spec.runs:
         _check_run(run, spec, f"{where}: runs: {run.name}")
@@ -287,12 +277,12 @@ def cells_of(spec: Spec) -> list[Cell]:
 
 
 def strategies_of(run: Method, spec: Spec) -> tuple[str, ...]:
-    """The strategies of a run."""
+    """Strategies of a run."""
     return run.strategies or (tuple(spec.strategies) if run.method.startswith("nrfgs") else (OWN,))
 
 
 def steps_of(spec: Spec, run: Method, scene: Scene) -> int | None:
-    """Training steps: the run's, its preset's, the scene's, or the benchmark's; None if the method chooses them."""
+    """Training steps: the run's, else the preset's, the scene's or the benchmark's; None: the method chooses them."""
     steps = run.steps or PRESET_STEPS.get(run.method) or scene.steps or spec.steps
     return None if steps == OWN else steps
 
@@ -305,18 +295,20 @@ def strategy_options(strategy: str) -> list[str]:
     """
     if strategy == OWN:
         return []
-    return [DENSIFICATION, str(strategy_from(strategy.replace("@", ",budget=")))]
+    from nrfgs_ns.densification import strategy_from  # imports torch
+
+    return ["--pipeline.model.densification", str(strategy_from(strategy.replace("@", ",budget=")))]
 
 
 def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
-    """The command line of ns-train for one training.
+    """Command line of ns-train for one training.
 
     Args:
-        parser: the data parser and its options (see `data.py`).
+        parser: the data parser and its options (`data.py`).
         work: folder for checkpoints.
     """
     steps = steps_of(spec, cell.run, cell.scene)
-    # Only this project's methods go on from a checkpoint.
+    # Only this project's methods resume from a checkpoint.
     every = spec.checkpoint_every if cell.run.method.startswith("nrfgs") and steps else 10**9
     return [
         cell.run.method,
@@ -333,10 +325,10 @@ def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
 
 
 def identity(spec: Spec, cell: Cell, parser: list[str] | None) -> dict[str, Any]:
-    """A record's fingerprint: what decides the result, without paths, which differ between machines.
+    """What decides a run's result, without paths, which differ between machines.
 
     Args:
-        parser: as for `command`; None if the data are not there, and how they are read is not to be compared.
+        parser: as for `command`; None: how the data are read is not compared.
     """
     drop = ("--output-dir", "--steps-per-save")
     args = command(spec, cell, [], Path())
@@ -349,26 +341,26 @@ def identity(spec: Spec, cell: Cell, parser: list[str] | None) -> dict[str, Any]
 
 
 def differences(made_with: dict[str, Any], wanted: dict[str, Any]) -> str:
-    """Words in which a record's fingerprint differs from the wanted one; empty if it does not."""
+    """Words of a record's identity that the wanted one lacks; "" if they are equal."""
     words = []
     for key, value in wanted.items():
         had = made_with.get(key)
         if had == value:
             continue
         both = isinstance(had, list) and isinstance(value, list)
-        odd = [one for one in settings(had) if one not in settings(value)] if both else [str(had)]
+        odd = [pair for pair in settings(had) if pair not in settings(value)] if both else [str(had)]
         words.append(f"{key}: {' '.join(odd) or 'fewer words'}")
     return "; ".join(words)
 
 
 def settings(words: list[str]) -> list[str]:
-    """Words of a command line, each value with its option before it."""
+    """Options of a command line, each with its value."""
     pairs = zip(["", *words], words, strict=False)
     return [f"{before} {word}" if before.startswith("--") and word[:2] != "--" else word for before, word in pairs]
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """The record of a finished run.
+    """Record of a finished run.
 
     Raises:
         InputError: the file is not a record.
@@ -376,15 +368,15 @@ def read_record(path: Path) -> dict[str, Any]:
     kinds = {"identity": dict, "machine": dict, "jobs": int, "train": dict, "measured": dict}
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        lacks = [key for key, kind in kinds.items() if not isinstance(record[key], kind)]
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError(f"{path} is no record of a run ({error!r}). Remove it to have the run made anew.") from error
-    _require(not lacks, f"{path} is no record of a run: it lacks {', '.join(lacks)}. Remove it.")
-    return record
+        if all(isinstance(record[key], kind) for key, kind in kinds.items()):
+            return record
+    except (ValueError, TypeError, KeyError):
+        pass
+    raise InputError(f"{path} is no record of a run. Remove it to run it again.")
 
 
 def scene_path(value: Any) -> str:
-    """The folder of a scene as a file gives it."""
+    """Folder of a scene in a file."""
     return Path(str(value.get("path", value) if isinstance(value, dict) else value)).as_posix()
 
 
@@ -421,7 +413,7 @@ def _scene(value: Any, where: str) -> Scene:
 
 
 def _with_runs_of_knobs(content: dict[str, Any], where: str) -> dict[str, Any]:
-    """A plan of runs: the default, and each knob at each of its values."""
+    """The same plan with runs: the default, and each value of each knob."""
     _require("runs" not in content, f"{where}: runs are made from {DEFAULT} and knobs. Leave runs out.")
     several = len(as_list(content.get("strategies", []))) > 1
     _require(not several, f"{where}: strategies names several. Make the others values of a knob.")
@@ -438,13 +430,13 @@ def _with_runs_of_knobs(content: dict[str, Any], where: str) -> dict[str, Any]:
             changes = {"method": changes} if isinstance(changes, str) else changes
             _require(isinstance(changes, dict), f"{where}: {name} must be a method, or map keys of a run to values.")
             base = {} if "method" in changes else default
-            options = [words_of(one.get("options", ()), f"{where}: {name}: options") for one in (base, changes)]
+            options = [words_of(run.get("options", ()), f"{where}: {name}: options") for run in (base, changes)]
             runs[name] = {**base, **changes, "options": options[0] + options[1], "knob": str(knob)}
     return {**{key: value for key, value in content.items() if key not in (DEFAULT, "knobs")}, "runs": runs}
 
 
 def _values(description: Any, where: str) -> dict[str, Any]:
-    """Value of a knob -> the keys of a run that it changes."""
+    """Value of a knob -> changed keys of a run."""
     kinds = {"option": {"option", "values"}, "steps": {"steps"}, "strategies": {"strategies"}, "settings": {"settings"}}
     kind = next(
         (kind for kind, keys in kinds.items() if isinstance(description, dict) and set(description) == keys), ""
@@ -461,12 +453,12 @@ def _values(description: Any, where: str) -> dict[str, Any]:
 
 
 def as_list(value: Any) -> list[Any]:
-    """A single value is a list of one."""
+    """A list; of a single value, a list with that value."""
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
 def words_of(value: Any, where: str) -> tuple[str, ...]:
-    """Options given as one string, as in a shell, or as a list of words."""
+    """Words of options, from a string as in a shell, or a list."""
     _require(isinstance(value, (str, list, tuple)), f"{where} must be a string or a list of words.")
     try:
         return tuple(shlex.split(value)) if isinstance(value, str) else tuple(str(word) for word in value)
@@ -475,7 +467,7 @@ def words_of(value: Any, where: str) -> tuple[str, ...]:
 
 
 def _require_free(options: tuple[str, ...], given: dict[str, str], where: str) -> None:
-    """Refuse options that the benchmark gives itself: ns-train would take the later one."""
+    """Refuse options that the benchmark sets: ns-train takes the later of two."""
     for word in options:
         name = word.partition("=")[0].replace("_", "-")
         if name.startswith("--"):
@@ -483,7 +475,7 @@ def _require_free(options: tuple[str, ...], given: dict[str, str], where: str) -
 
 
 def _known(value: dict[str, Any], kind: type, where: str) -> None:
-    known = [one.name for one in fields(kind) if one.name not in ("name", "held_out")]
+    known = [key.name for key in fields(kind) if key.name not in ("name", "held_out")]
     unknown = sorted(set(value) - set(known))
     _require(not unknown, f"{where}: unknown key {unknown}. Known are {', '.join(known)}.")
 

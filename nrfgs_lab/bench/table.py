@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of a benchmark: means and deviations over seeds, per scene and over scenes, as Markdown and CSV."""
+"""The table of a benchmark: means and deviations over seeds, per scene and over scenes, as Markdown."""
 
-import csv
-import io
 import math
 import re
 import statistics
@@ -21,21 +19,21 @@ class Column:
 
     name: str
     value: Callable[[Record], float | None]
-    """its value in a run's record, None where there is none"""
+    """value in a run's record, or None"""
     form: str
-    """how it is written"""
+    """format"""
     better: int = 0
     """1: more is better, -1: less is better, 0: no ranking"""
     unit: float = 1.0
     """values are divided by this"""
     is_time: bool = False
-    """means something only for a run that had its GPU to itself, and beside others of the same machine"""
-    in_files_only: bool = False
-    """in the CSV and summary.json, not in the table that is read"""
+    """valid only for runs alone on their GPU, and comparable on one machine"""
+    in_summary_only: bool = False
+    """in summary.json, not in the table"""
 
 
 def _at(*keys: str) -> Callable[[Record], float | None]:
-    """The value of nested keys; None where one is missing or null."""
+    """Value of nested keys; None if one is missing or null."""
 
     def value(record: Record) -> float | None:
         for key in keys:
@@ -54,7 +52,7 @@ def _gap(record: Record) -> float | None:
 
 METRICS = {"PSNR": ("{:.2f}", 1), "SSIM": ("{:.4f}", 1), "MS-SSIM": ("{:.4f}", 1), "LPIPS": ("{:.4f}", -1)}
 METRICS |= {"FLIP": ("{:.4f}", -1), "L1": ("{:.4f}", -1)}
-"""Metric of an image -> form, and 1 where more is better."""
+"""Metric -> format, and 1 where more is better."""
 NAMES = *METRICS, *(f"cc {name}" for name in METRICS)
 KEYS = {name: name.lower().replace("-", "_").replace(" ", "_") for name in NAMES}
 """Metric, plain or colour-corrected -> its key in a record."""
@@ -75,24 +73,24 @@ COLUMNS = (
     Column("peak MB", _at("train", "peak_memory_bytes"), "{:.1f}", -1, 1e6),
     Column("train PSNR", _at("measured", "train", "psnr"), "{:.2f}"),
     Column("gap", _gap, "{:.2f}"),
-    *(_metric(name, in_files_only=True) for name in ("cc MS-SSIM", "cc LPIPS", "cc L1")),
+    *(_metric(name, in_summary_only=True) for name in ("cc MS-SSIM", "cc LPIPS", "cc L1")),
     *(
-        Column(f"train {name}", _at("measured", "train", key), "{:.4f}", in_files_only=True)
+        Column(f"train {name}", _at("measured", "train", key), "{:.4f}", in_summary_only=True)
         for name, key in KEYS.items()
         if name in ("SSIM", "MS-SSIM", "LPIPS", "L1", "cc PSNR")
     ),
 )
 BY_NAME = {column.name: column for column in COLUMNS}
-SHOWN = tuple(column for column in COLUMNS if not column.in_files_only)
-"""The columns of the table that is read."""
+SHOWN = tuple(column for column in COLUMNS if not column.in_summary_only)
+"""Columns of the table."""
 MISSING, STALE, FAILED = "missing", "stale", "FAILED"
 ABSENCES = (MISSING, STALE, FAILED)
-"""Why a seed has no record, the gravest last."""
+"""Reasons for a missing record, the gravest last."""
 
 
 @dataclass
 class Row:
-    """One run under one strategy on one scene, or on the average of all."""
+    """A run under a strategy on a scene, or on the average of all."""
 
     scene: str
     run: str
@@ -100,14 +98,14 @@ class Row:
     records: dict[int, Record] = field(default_factory=dict)
     """seed -> record"""
     absent: dict[int, str] = field(default_factory=dict)
-    """seed -> why there is no record, one of `ABSENCES`"""
+    """seed -> one of `ABSENCES`"""
     values: dict[str, dict[int, float]] = field(default_factory=dict)
     """column -> seed -> value"""
     devices: set[str] = field(default_factory=set)
     """machines of the records"""
 
     def fill(self) -> "Row":
-        """Read the columns' values from the records."""
+        """Set the columns' values from the records."""
         for column in COLUMNS:
             values = {}
             for seed, record in self.records.items():
@@ -130,7 +128,7 @@ class Row:
 
     @property
     def seeds(self) -> str:
-        """Number of seeds with a record, and why the others have none."""
+        """Number of seeds with a record, and reasons for the missing ones."""
         reasons = [f"{list(self.absent.values()).count(why)} {why}" for why in dict.fromkeys(self.absent.values())]
         return f"{len(self.records)}" + (f" ({', '.join(reasons)})" if reasons else "")
 
@@ -143,7 +141,7 @@ class Row:
 
 
 def average(rows: list[Row]) -> Row:
-    """The row of means over scenes: seed by seed, of the seeds and columns that every scene has."""
+    """Means over scenes, of seeds and columns that every scene has."""
     result = Row(AVERAGE, rows[0].run, rows[0].strategy)
     seeds = [seed for seed in rows[0].records if all(seed in row.records for row in rows)]
     result.records = {seed: {} for seed in seeds}
@@ -160,7 +158,7 @@ def average(rows: list[Row]) -> Row:
 
 
 def with_averages(rows: list[Row]) -> list[Row]:
-    """The rows, and behind them one average for each run and strategy if there is more than one scene."""
+    """Rows, followed by an average for each run and strategy if there are several scenes."""
     kinds = list(dict.fromkeys((row.strategy, row.run) for row in rows))
     if len({row.scene for row in rows}) < 2:
         return rows
@@ -168,10 +166,9 @@ def with_averages(rows: list[Row]) -> list[Row]:
 
 
 def ranks(rows: list[Row], column: Column) -> dict[int, int]:
-    """Row number -> 1 (best) or 2 (second) among rows that can be compared; equal as written is equal.
+    """Row number -> 1 (best) or 2 (second) within a scene and strategy; values are compared as printed.
 
-    Args:
-        rows: those of one scene and strategy. Times are ranked only if all are of one machine.
+    Times are ranked only if all were taken on one machine.
     """
     if column.better == 0:
         return {}
@@ -188,7 +185,7 @@ def ranks(rows: list[Row], column: Column) -> dict[int, int]:
 
 
 def has_run(row: Row) -> bool:
-    """Whether a row has a record, a failure, or a record that cannot be used."""
+    """Whether a row has a record, a failure or a stale record."""
     return bool(row.records) or any(why != MISSING for why in row.absent.values())
 
 
@@ -196,7 +193,7 @@ HEAD = ["scene", "run", "strategy", "seeds"]
 
 
 def notes(rows: list[Row]) -> list[str]:
-    """Sentences that must stand below the table."""
+    """Sentences below the table."""
     records = [record for row in rows if row.scene != AVERAGE for record in row.records.values()]
     result = []
     if any(record["jobs"] != 1 for record in records):
@@ -225,7 +222,7 @@ def notes(rows: list[Row]) -> list[str]:
 
 
 def not_run(rows: list[Row]) -> list[str]:
-    """A sentence that names the rows without any run, if there are any."""
+    """A sentence with the rows that were not run, or nothing."""
     places: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row.scene != AVERAGE and not has_run(row):
@@ -235,10 +232,7 @@ def not_run(rows: list[Row]) -> list[str]:
 
 
 def markdown(rows: list[Row]) -> str:
-    """The table in Markdown: best of each scene and strategy bold, second in italics.
-
-    Rows of which nothing was run are left out; `not_run` names them.
-    """
+    """Markdown table of the rows that were run: best of each scene and strategy bold, second in italics."""
     body = []
     present = [row for row in rows if has_run(row)]
     for place in dict.fromkeys((row.scene, row.strategy) for row in present):
@@ -254,40 +248,10 @@ def markdown(rows: list[Row]) -> str:
 
 
 def plain_markdown(text: str) -> str:
-    """A name escaped for a cell of a Markdown table. An underscore between letters needs no escape."""
+    """Text escaped for a cell of a Markdown table; an underscore between letters needs no escape."""
     return re.sub(r"[\\`*|<\[]|(?<!\w)_|_(?!\w)", r"\\\g<0>", " ".join(text.split()))
 
 
-def as_csv(rows: list[Row]) -> str:
-    """Means and deviations as plain numbers, empty where unknown; all rows, with counts of absent seeds."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    titles = [title for column in COLUMNS for title in (column.name, f"{column.name} deviation")]
-    writer.writerow([*HEAD, *ABSENCES, *titles])
-    for row in rows:
-        counts = [len(row.records), *(list(row.absent.values()).count(why) for why in ABSENCES)]
-        numbers = [number for column in COLUMNS for number in (row.mean(column), row.deviation(column))]
-        writer.writerow([row.scene, row.run, row.strategy, *counts, *("" if n is None else n for n in numbers)])
-    return file.getvalue()
-
-
-PER_VIEW = ("PSNR", "SSIM", "MS-SSIM", "LPIPS", "L1", "FLIP", "cc PSNR", "cc SSIM")
-
-
-def views_as_csv(rows: list[Row]) -> str:
-    """The metrics of every test view, a line for each run, seed and view: one bad view of a few moves a mean far."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow([*HEAD[:3], "seed", "image", *PER_VIEW])
-    for row in rows:
-        for seed, record in sorted(row.records.items()):
-            for view in (record["measured"].get("test") or {}).get("per_image", ()):
-                numbers = (view.get(KEYS[name]) for name in PER_VIEW)
-                place = (row.scene, row.run, row.strategy, seed, view["image"])
-                writer.writerow([*place, *("" if n is None else f"{n:.6g}" for n in numbers)])
-    return file.getvalue()
-
-
 def plain_label(text: str) -> str:
-    """A name escaped for matplotlib: `$` begins no formula, and a leading underscore keeps it in the legend."""
+    """Text escaped for matplotlib: `$` begins no formula, and a leading underscore hides no legend entry."""
     return ("\N{ZERO WIDTH SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")

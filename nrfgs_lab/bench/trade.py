@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trade of speed and size for accuracy: what each setting of a plan with knobs changes against the default.
+"""The trade of speed and size for accuracy: each setting of a plan with knobs against the default.
 
-**Noise.** Two or three seeds say little about the spread of one setting, so the spread is pooled over all settings of a
-scene: s^2 = sum (n_i - 1) s_i^2 / sum (n_i - 1). A difference of means over n and m seeds is noise unless it exceeds
+**Noise.** The spread over seeds is pooled over all settings of a scene, s^2 = sum (n_i - 1) s_i^2 / sum (n_i - 1). A
+difference of means over n and m seeds is noise unless it exceeds
 
     t s sqrt(1 / n + 1 / m),    t = the 97.5 % quantile of Student's t with sum (n_i - 1) degrees of freedom.
 
-Where nothing changed, one comparison in twenty is still called a difference. Costs (time, frames, bytes) are compared
-as ratios: all of this is done with their logarithms. Without a second seed anywhere, everything counts as noise.
+Costs (time, frames, bytes) are compared as ratios, by their logarithms. Without a second seed everything is noise.
 
-**Price.** What a setting buys is dB of PSNR for each doubling of a cost, (PSNR - PSNR_0) / log2(cost / cost_0). That
-has a meaning only for a trade, where both go up or both go down; the rest is better, worse, or within the noise.
+**Price.** dB of PSNR for each doubling of a cost, (PSNR - PSNR_0) / log2(cost / cost_0), where both go up or both go
+down; otherwise a setting is better, worse, or within the noise.
 """
 
 import json
@@ -30,7 +29,7 @@ from nrfgs_ns.files import whole, write_whole
 LEVEL = 0.975
 PSNR = BY_NAME["PSNR"]
 COSTS = {"training time": ("time s", 1), "time for a frame": ("FPS", -1), "bytes": ("MB", 1)}
-"""Cost -> a column, and the power of its values that is the cost: -1 where more is better."""
+"""Cost -> column, and the power of the column that is the cost."""
 RATIOS = ("time s", "FPS", "MB", "peak MB", "splats")
 SHOWN = ("PSNR", "SSIM", "LPIPS", *RATIOS)
 HEAD = ["", "seeds", "PSNR", "SSIM", "LPIPS", "training time", "FPS", "MB", "peak memory", "splats"]
@@ -58,7 +57,7 @@ class Change:
     value: float
     """difference, or ratio where `is_ratio`"""
     noise: float
-    """a difference up to this, or a ratio within [1 / noise, noise], is noise; infinite if the spread is unknown"""
+    """largest difference, or ratio, that is noise; infinite if the spread is unknown"""
     is_ratio: bool = False
 
     @property
@@ -69,7 +68,7 @@ class Change:
 
 
 def pooled_deviation(samples: Sequence[Sequence[float]]) -> tuple[float | None, int]:
-    """Deviation common to all samples, and its degrees of freedom; None and 0 if no sample has two values."""
+    """Pooled deviation of all samples, and its degrees of freedom; None and 0 if no sample has two values."""
     several = [sample for sample in samples if len(sample) > 1]
     freedom = sum(len(sample) - 1 for sample in several)
     if freedom == 0:
@@ -79,7 +78,7 @@ def pooled_deviation(samples: Sequence[Sequence[float]]) -> tuple[float | None, 
 
 
 def noise_bound(deviation: float | None, freedom: int, n: int, m: int) -> float:
-    """The largest difference of means over n and m values that counts as noise."""
+    """Largest difference of means over n and m values that is noise."""
     if deviation is None:
         return math.inf
     from scipy.stats import t
@@ -88,16 +87,13 @@ def noise_bound(deviation: float | None, freedom: int, n: int, m: int) -> float:
 
 
 def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> dict[str, Change]:
-    """Each row's change of one column against the default's, by name of the run.
+    """Change of a column against the default by run, for rows of one scene with values in it.
 
     Args:
-        rows: those of one scene, the default among them.
-        default: the row to compare with.
-        column: what is compared. Rows without a value, and a default without one, give no change.
-        ratio: compare as ratios, of those values that are positive.
+        ratio: compare positive values as ratios.
     """
     samples = {row.run: list(row.values[column.name].values()) for row in rows}
-    if ratio:  # a training that lost its last splat has no ratio
+    if ratio:
         samples = {run: [math.log(value) for value in values if value > 0] for run, values in samples.items()}
     deviation, freedom = pooled_deviation(list(samples.values()))
     base, result = samples[default.run], {}
@@ -111,7 +107,7 @@ def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> d
 
 
 def price(gain: Change, cost: Change, power: int = 1) -> tuple[str, float | None]:
-    """What a setting buys for its cost.
+    """Verdict on a setting.
 
     Args:
         gain: change of PSNR, dB.
@@ -119,9 +115,7 @@ def price(gain: Change, cost: Change, power: int = 1) -> tuple[str, float | None
         power: the cost is the column to this power.
 
     Returns:
-        "same" (both within the noise), "noise" (PSNR within it, the cost not), "gain" and "loss" (the cost within it,
-        PSNR not), "better" and "worse" (both changed, for the better or the worse), or "trade" with dB for each
-        doubling of the cost.
+        A key of `WORDS`, or "trade" with dB for each doubling of the cost.
     """
     if gain.is_noise:
         return ("same" if cost.is_noise else "noise"), None
@@ -134,11 +128,7 @@ def price(gain: Change, cost: Change, power: int = 1) -> tuple[str, float | None
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the points (cost, quality) that no other beats, by rising cost.
-
-    A point is beaten by one that costs no more and is worth no less, and differs in one of the two. Of equal points
-    none beats the other.
-    """
+    """Indices of the points (cost, quality) on the Pareto front, by rising cost; equal points are both on it."""
     order = sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1]))
     front: list[int] = []
     for i in order:
@@ -148,7 +138,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def front_of(rows: Sequence[Row], cost: str) -> list[str]:
-    """Names of the runs on the front of PSNR against a cost, by rising cost."""
+    """Runs on the front of PSNR against a cost, by rising cost."""
     column, power = COSTS[cost]
     points = {row.run: (row.mean(BY_NAME[column]), row.mean(PSNR)) for row in rows}
     known = {name: (paid**power, quality) for name, (paid, quality) in points.items() if None not in (paid, quality)}
@@ -180,11 +170,8 @@ def report(rows: list[Row], knobs: dict[str, str], out: Path) -> None:
 
 
 def compare(rows: list[Row], default: Row, knobs: dict[str, str]) -> dict[str, Any]:
-    """All settings of one scene against the default, as plain data.
-
-    Returns:
-        "fronts": cost -> names by rising cost; "settings": for each its knob, seeds, means with deviations, changes
-        with their noise (null if unknown), and prices by cost.
+    """Comparison of one scene's settings with the default, as plain data: fronts by cost, and each setting's means,
+    changes with their noise (null if unknown), and prices.
     """
     changed = {name: changes(rows, default, BY_NAME[name], name in RATIOS) for name in SHOWN}
 
@@ -217,7 +204,7 @@ def compare(rows: list[Row], default: Row, knobs: dict[str, str]) -> dict[str, A
 
 
 def table(rows: list[Row], default: Row, result: dict[str, Any]) -> str:
-    """One scene's table in Markdown: the default in absolute numbers, the settings as changes."""
+    """Markdown table of one scene: the default in absolute numbers, the settings as changes."""
     head = [*HEAD, *(f"dB per doubling of {cost}" for cost in COSTS)]
     lines = [head, ["---"] * 2 + ["---:"] * (len(head) - 2)]
     for row, plain in zip(rows, result["settings"], strict=True):

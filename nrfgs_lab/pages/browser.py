@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's viewer in a headless Chromium: for the viewer's tests, and for the pictures in the docs.
+"""Nerfstudio's viewer in a headless Chromium, for the viewer's tests and the pictures in the docs.
 
 pip install -e '.[browser]'; apt-get install chromium
 """
@@ -24,17 +24,12 @@ TRAIN = "nerfstudio.scripts.train:entrypoint"
 VIEWER = "nerfstudio.scripts.viewer.run_viewer:entrypoint"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 PATIENCE = 300
-"""Seconds in which anything must have happened, on a slow and busy machine."""
+"""Seconds to wait for anything on a slow, busy machine."""
 
 
 @contextlib.contextmanager
 def chromium() -> Iterator:
-    """A headless browser, without a GPU.
-
-    Raises:
-        ModuleNotFoundError: there is no playwright.
-        FileNotFoundError: there is no Chromium on the path.
-    """
+    """A headless browser, without a GPU; FileNotFoundError if there is no Chromium on the path."""
     from playwright.sync_api import sync_playwright
 
     if CHROMIUM is None:
@@ -48,13 +43,13 @@ def chromium() -> Iterator:
 
 
 class Served:
-    """A nerfstudio command that serves the viewer until the block ends, on a CPU, its pictures as PNG.
+    """A nerfstudio command on a CPU that serves the viewer, with PNG pictures, until the block ends.
 
     Args:
         entry: TRAIN or VIEWER.
-        log: file for what it says.
-        options: its words.
-        tail: words that come after the viewer's, such as the data set's.
+        log: file for its output.
+        options: words before the viewer's.
+        tail: words after the viewer's, such as the data set's.
     """
 
     def __init__(self, entry: str, log: Path, *options, tail: Sequence = ()):
@@ -88,7 +83,7 @@ class Served:
         self.stop()
 
     def stop(self) -> None:
-        """Ctrl-C."""
+        """Press Ctrl-C."""
         self.process.send_signal(signal.SIGINT)
         try:
             self.process.wait(20)
@@ -98,30 +93,24 @@ class Served:
 
 
 class Page:
-    """The viewer's page, in the words of somebody who uses it.
-
-    Args:
-        browser: what `chromium` yields.
-        port: where the viewer is served.
-        width, height: of the window, pixels.
-    """
+    """The viewer's page, in a window of `width` x `height` pixels."""
 
     def __init__(self, browser, port: int, width: int = 1000, height: int = 800):
         self.page = browser.new_page(viewport={"width": width, "height": height})
         self.page.set_default_timeout(1000 * PATIENCE)
-        # Fonts and logos of other sites: their absence is not ours to wait for.
+        # No fonts and logos of other sites: there may be no network.
         self.page.route(re.compile(r"^https?://(?!127\.0\.0\.1)"), lambda route: route.abort())
         self.page.goto(f"http://127.0.0.1:{port}", wait_until="domcontentloaded")
         self.page.get_by_text("Residual gain", exact=True).wait_for()
         self.scene = {"x": 0, "y": 80, "width": width - 360, "height": height - 100}
 
     def control(self, label: str):
-        """The input in the row of this label."""
+        """Input in the row of a label."""
         name = self.page.get_by_text(label, exact=True).first
         return name.locator("xpath=ancestor::*[.//input][1]").locator("input:not([type=hidden])").last
 
     def show(self, mode: str) -> None:
-        """Choose one of the panel's modes."""
+        """Choose a mode of the panel."""
         self.control("Show").click()
         self.page.get_by_role("option", name=mode, exact=True).click()
 
@@ -131,7 +120,7 @@ class Page:
         self.control("Residual gain").press("Enter")
 
     def hide_cameras(self) -> None:
-        """Take the photographs, which hang in the air where they were taken, out of the picture."""
+        """Hide the training cameras."""
         self.page.get_by_text("Hide Train Cams").click()
 
     def come_closer(self, amount: int = 400) -> None:
@@ -140,12 +129,12 @@ class Page:
         self.page.mouse.wheel(0, -amount)
 
     def set_resolution(self, pixels: int) -> None:
-        """The longer side of what is rendered."""
+        """Set the longer side of the picture."""
         self.control("Max res").fill(str(pixels))
         self.control("Max res").press("Enter")
 
     def step(self) -> int:
-        """The training step that the page tells."""
+        """Training step on the page."""
         return int(re.search(r"Step:\s*(\d+)", self.page.inner_text("body")).group(1))
 
     def turn(self) -> None:
@@ -156,15 +145,14 @@ class Page:
         self.page.mouse.up()
 
     def shot(self) -> np.ndarray:
-        """What the scene looks like now, [H, W, 3] in 0..255."""
+        """Picture of the scene now, [H, W, 3] in 0..255."""
         png = self.page.screenshot(clip=self.scene)
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(np.float32)
 
     def settled(self, unlike: np.ndarray | None = None) -> np.ndarray:
-        """The picture at its full size, as soon as it has not changed for two seconds and differs from the one given.
+        """Wait until the picture has full size, has not changed for two seconds, and differs from `unlike`; return it.
 
-        The viewer renders small first, and on a busy machine that stays for long: the page must tell the full size
-        before and after those seconds.
+        The viewer renders small first, which may last on a busy machine: the size is checked before and after.
         """
         deadline, since, last, was_full = time.time() + PATIENCE, time.time(), self.shot(), False
         while time.time() < deadline:
@@ -180,24 +168,24 @@ class Page:
         raise AssertionError("the picture did not change" if unlike is not None else "no picture came to rest")
 
     def is_full_size(self) -> bool:
-        """Whether the picture that was sent last is as large as it gets."""
+        """Whether the latest picture has full size."""
         sides = re.search(r"Resolution:\s*(\d+)x(\d+)px", self.page.inner_text("body"))
         return sides is not None and max(map(int, sides.groups())) == int(self.control("Max res").input_value())
 
     def returns_to(self, picture: np.ndarray) -> None:
-        """Wait until the scene looks like this."""
+        """Wait until the scene looks like a picture."""
         deadline = time.time() + PATIENCE
         while different(self.shot(), picture):
             assert time.time() < deadline, "the picture did not come back"
             time.sleep(0.3)
 
     def save(self, path: Path, quality: int = 85) -> None:
-        """Write the whole page as a JPEG, without the logo, which comes from another site."""
+        """Write the page as a JPEG, without the logo, which comes from another site."""
         self.page.add_style_tag(content="img { visibility: hidden }")
         path.parent.mkdir(parents=True, exist_ok=True)
         self.page.screenshot(path=path, type="jpeg", quality=quality)
 
 
-def different(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether somebody would see it: at least one pixel in a hundred differs by more than two levels of 256."""
-    return bool((np.abs(one - other).max(axis=-1) > 2).mean() > 0.01)
+def different(picture: np.ndarray, other: np.ndarray) -> bool:
+    """Whether the difference is visible: more than one pixel in a hundred by more than two levels of 256."""
+    return bool((np.abs(picture - other).max(axis=-1) > 2).mean() > 0.01)

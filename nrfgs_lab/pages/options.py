@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of all options: read from the configurations, so that it cannot say anything else than they do.
+"""The page of all options, from the configurations: those that this project adds, explains or presets in its own way.
 
-    python -m nrfgs_lab.pages.options            # writes docs/options.md
-
-Of what `ns-train` offers it has the options that this project adds, or that it explains or presets in its own way;
-nerfstudio's own are in `ns-train METHOD --help`, with these.
+python -m nrfgs_lab.pages.options            # writes docs/options.md
 """
 
 import ast
@@ -37,31 +34,31 @@ What this package adds to nerfstudio's options, or sets in its own way; `ns-trai
 `shrinkage`; they train for 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
 """
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
-"""Options of splatfacto's model, which is not explained here."""
+"""Options of splatfacto's model, not explained here."""
 LEFT_OUT = (
     *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
     *("pipeline.model.appearance.distance-eps", "load-3D-points"),
     *("viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact", "pipeline.sharding.schedules"),
 )
-"""Options that hardly anybody needs, or that a page of their own explains: `--help` has them."""
+"""Options that few need, or that another page explains: `--help` has them."""
 HOST = "`--data`, `--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
 
 
 class Option(NamedTuple):
-    """A line of the page."""
+    """A row of the page."""
 
     flag: str
     """with dots and hyphens, without leading hyphens"""
     default: Any
     text: str
-    """what it does"""
+    """explanation"""
 
 
 def own_options(config: Any, prefix: str = "") -> Iterator[Option]:
-    """The options of a configuration, and of those inside it, whose explanation stands in this project's code.
+    """Options of a configuration, and of those inside it, that this project's code explains.
 
     Args:
-        config: a dataclass's instance, which has the defaults.
+        config: a dataclass's instance with the defaults.
         prefix: dotted names down to it.
     """
     for field in dataclasses.fields(config):
@@ -79,7 +76,7 @@ def own_options(config: Any, prefix: str = "") -> Iterator[Option]:
 
 
 def explanation(config: type, name: str) -> str | None:
-    """What the nearest of this project's classes says of a field, or None if none of them has it."""
+    """Docstring of a field in the nearest of this project's classes, or None."""
     for base in config.__mro__:
         if base.__module__.split(".")[0] in PACKAGES and name in vars(base).get("__annotations__", {}):
             return _explanations(base)[name]
@@ -88,18 +85,18 @@ def explanation(config: type, name: str) -> str | None:
 
 @cache
 def _explanations(config: type) -> dict[str, str]:
-    """Field -> the string that follows it in the source, on one line."""
+    """Field -> its docstring, on one line."""
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
-    found = {}
+    texts = {}
     for node, following in zip(body.body, [*body.body[1:], None], strict=True):
         if isinstance(node, ast.AnnAssign):
             is_text = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
-            found[node.target.id] = " ".join(following.value.value.split()) if is_text else ""
-    return found
+            texts[node.target.id] = " ".join(following.value.value.split()) if is_text else ""
+    return texts
 
 
 def table(options: list[Option], prefix: str = "") -> str:
-    """A Markdown table, the flags without the prefix that they share."""
+    """A Markdown table, the flags without their common prefix."""
     lines = [f"| `--{prefix}` | default | |" if prefix else "| | default | |", "|---|---|---|"]
     for option in options:
         text = linked(option.text.replace("|", "\\|"))
@@ -108,7 +105,7 @@ def table(options: list[Option], prefix: str = "") -> str:
 
 
 def linked(text: str) -> str:
-    """A text whose pages of this folder are links."""
+    """Text with links to pages of this folder."""
     return re.sub(r"docs/([\w-]+\.md)", r"[\1](\1)", text)
 
 
@@ -130,11 +127,11 @@ def methods() -> list[MethodSpecification]:
 def page() -> str:
     """The whole page."""
     first, *others = methods()
-    options = [one for one in own_options(first.config) if one.flag not in LEFT_OUT]
+    options = [option for option in own_options(first.config) if option.flag not in LEFT_OUT]
     heads = [option for option in options if option.flag.startswith(APPEARANCE)]
     model = [option for option in options if option.flag.startswith(MODEL) and option not in heads]
     rest = [option._replace(flag=f"--{option.flag}") for option in options if not option.flag.startswith(MODEL)]
-    data = [one for one in own_options(NrfgsDataParserConfig()) if one.flag not in LEFT_OUT]
+    data = [option for option in own_options(NrfgsDataParserConfig()) if option.flag not in LEFT_OUT]
     data = [option._replace(flag=f"nrfgs-data --{option.flag}") for option in data]
     parts = [
         INTRODUCTION,
@@ -159,19 +156,19 @@ def page() -> str:
 
 
 def strategies() -> str:
-    """The options of each strategy of densification."""
+    """Options of each densification strategy."""
     parts = [
         "### Strategies\n\nOptions of a strategy follow its name: `--pipeline.model.densification "
         "mcmc,budget=150000,refine_every=50`. [What they do](bench.md#densification-strategies).\n"
     ]
     for name, config in STRATEGIES.items():
-        options = [one._replace(flag=one.flag.replace("-", "_")) for one in own_options(config())]
+        options = [option._replace(flag=option.flag.replace("-", "_")) for option in own_options(config())]
         parts.append(table(options).replace("| | default | |", f"| `{name}` | default | |"))
     return "\n".join(parts)
 
 
 def rates(method: MethodSpecification) -> str:
-    """The learning rates of a method's parameters, in a sentence."""
+    """A sentence with a method's learning rates."""
     parts = []
     for name, group in method.config.optimizers.items():
         scheduler = group["scheduler"]

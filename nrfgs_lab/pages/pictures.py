@@ -3,7 +3,6 @@
 
 python -m nrfgs_lab.pages.pictures viewer demo/outputs/*/nrfgs/*/config.yml    # docs/viewer.md
 python -m nrfgs_lab.pages.pictures newcomer SCENE                              # docs/own-data.md, from nrfgs prepare
-python -m nrfgs_lab.pages.pictures sheen                                       # README.md, from comparison-bonsai.jpg
 """
 
 import sys
@@ -12,16 +11,16 @@ import time
 from pathlib import Path
 
 from nerfstudio.utils.eval_utils import eval_setup
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
-from nrfgs_lab.bench.crops import CROP_PIXELS, GAP, TITLE, VIEWS
+from nrfgs_lab.bench.crops import GAP, TITLE
 from nrfgs_lab.pages.browser import TRAIN, VIEWER, Page, Served, chromium
 from nrfgs_ns.viewer.pictures import Shown, modes, picture
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 WINDOW = 1180, 680
 WIDTH, COLUMNS = 300, 3
-"""The sheet of modes: width of one in pixels, and how many side by side."""
+"""The sheet of modes: width of one in pixels, and number of columns."""
 STEPS, WATCHED = 800, 200
 """Training steps of a newcomer, and the step at which the page is photographed."""
 
@@ -80,35 +79,5 @@ def newcomer(scene: Path) -> None:
         page_of(next(folder.rglob("config.yml")), IMAGES / "first-scene-viewer.jpg")
 
 
-TITLES = {0: "photograph", 1: "3DGS", 2: "the field"}
-"""Columns of a sheet of crops, and what stands above them."""
-SIDE, HEAD = 230, 22
-"""Side of a crop and height of the titles, pixels."""
-
-
-def sheen() -> None:
-    """Write sheen.jpg: the first view of comparison-bonsai.jpg, and crops of three columns with their errors."""
-    sheet = Image.open(IMAGES / "comparison-bonsai.jpg").convert("RGB")
-    tall, top, step = 2 * CROP_PIXELS + GAP, 2 * TITLE, CROP_PIXELS + GAP
-    scale, across = sheet.height / (VIEWS * (top + tall + GAP)), int(tall * 799 / 532)
-
-    def cut(left: int, upper: int, width: int, height: int) -> Image.Image:
-        return sheet.crop([round(scale * edge) for edge in (left, upper, left + width, upper + height)])
-
-    view = cut(0, top, across, tall)
-    result = Image.new("RGB", (view.width + len(TITLES) * (SIDE + GAP), HEAD + 2 * SIDE + GAP), "white")
-    draw, font = ImageDraw.Draw(result), ImageFont.load_default(15)
-    result.paste(view, (0, HEAD))
-    draw.text((2, 2), "a test view", fill="black", font=font)
-    for column, title in TITLES.items():
-        x = view.width + GAP + column * (SIDE + GAP)
-        draw.text((x + 2, 2), title, fill="black", font=font)
-        for line in range(1 if column == 0 else 2):
-            crop = cut(across + GAP + column * step, top + line * step, CROP_PIXELS, CROP_PIXELS)
-            result.paste(crop.resize((SIDE, SIDE), Image.Resampling.LANCZOS), (x, HEAD + line * (SIDE + GAP)))
-    draw.text((view.width + GAP + 2, HEAD + SIDE + 100), "error, four times\namplified:", fill="black", font=font)
-    result.save(IMAGES / "sheen.jpg", quality=88)
-
-
 if __name__ == "__main__":
-    {"viewer": viewer, "newcomer": newcomer, "sheen": sheen}[sys.argv[1]](*map(Path, sys.argv[2:]))
+    {"viewer": viewer, "newcomer": newcomer}[sys.argv[1]](*map(Path, sys.argv[2:]))

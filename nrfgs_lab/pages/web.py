@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast a browser draws a page of `nrfgs export web`, and whether what it draws is what we draw.
+"""Speed of a page of `nrfgs export web` in a browser, and PSNR of its pictures against the model's.
 
     python -m nrfgs_lab.pages.web PAGE.html RECORD.json --browser "chromium --headless=new ..." --config CONFIG
 
-Any browser that can be started with an address will do. It is given a page of this program's own, from a server on this
-machine, which holds PAGE in a frame, waits for it, measures, and sends back what it found and three pictures. Without
---config it needs nothing but Python's own library.
+Any browser that takes an address will do. It opens a page from a local server that holds PAGE in a frame, measures, and
+sends back numbers and three pictures. Without --config only Python's own library is needed.
 """
 
 import argparse
@@ -25,7 +24,7 @@ SOFTWARE = "chromium --headless=new --no-sandbox --use-gl=angle --use-angle=swif
 PICTURES = 3
 
 OUTER = """<!DOCTYPE html><body style="margin:0"><script>
-const tell = (what) => fetch("done", { method: "POST", body: JSON.stringify(what) });
+const send = (answer) => fetch("done", { method: "POST", body: JSON.stringify(answer) });
 const frame = document.createElement("iframe"), start = performance.now();
 Object.assign(frame, { src: "page.html", width: WIDTH, height: HEIGHT, style: "border:0" });
 frame.onload = async () => {
@@ -40,10 +39,9 @@ frame.onload = async () => {
       await page.finished();
       pictures.push(page.picture());
     }
-    const found = await page.measure(COUNT);
-    await tell({ seconds_to_load: loaded, ...found, pictures });
+    await send({ seconds_to_load: loaded, ...(await page.measure(COUNT)), pictures });
   } catch (error) {
-    await tell({ failed: `${error} ${frame.contentDocument.getElementById("failed").textContent}` });
+    await send({ failed: `${error} ${frame.contentDocument.getElementById("failed").textContent}` });
   }
 };
 document.body.append(frame);
@@ -51,20 +49,20 @@ document.body.append(frame);
 
 
 def measured(page: Path, browser: list[str], size: tuple[int, int], count: int, patience: float) -> dict:
-    """What a browser says of a page.
+    """Measure a page in a browser.
 
     Args:
-        page: the .html file, or the folder of one whose scene lies apart.
+        page: the .html file, or the folder of a page with a separate scene.
         browser: command and options; a profile's folder and the address are added.
         size: of the frame, in CSS pixels.
         count: pictures over which seconds are averaged.
-        patience: seconds after which it is given up.
+        patience: seconds to wait.
 
     Returns:
-        `nrfgs.measure`'s answer, "seconds_to_load", and "pictures", PNG bytes of some photographs' places.
+        `nrfgs.measure`'s answer, "seconds_to_load", and "pictures": PNG bytes from some photographs' cameras.
 
     Raises:
-        RuntimeError: the page failed, or said nothing.
+        RuntimeError: the page failed, or did not answer.
     """
     folder, name = (page, "index.html") if page.is_dir() else (page.parent, page.name)
     outer = OUTER.replace("WIDTH", str(size[0])).replace("HEIGHT", str(size[1])).replace("COUNT", str(count))
@@ -109,7 +107,7 @@ def measured(page: Path, browser: list[str], size: tuple[int, int], count: int, 
         try:
             there.wait(patience)
         finally:
-            os.killpg(process.pid, signal.SIGTERM)  # whatever the command has started
+            os.killpg(process.pid, signal.SIGTERM)  # with the browser's children
             process.wait()
             server.shutdown()
     if not answers or "failed" in answers[0]:
@@ -120,12 +118,7 @@ def measured(page: Path, browser: list[str], size: tuple[int, int], count: int, 
 
 
 def alike(page: Path, config: Path, browser: list[str], patience: float) -> list[float]:
-    """PSNR, dB, of a page's pictures of some photographs' places against a model's.
-
-    Args:
-        config: config.yml of the model: the training's, or the one that `nrfgs export compact` writes for what is in
-            the page.
-    """
+    """PSNR, dB, of a page's pictures against a model's, the training's or the one from `nrfgs export compact`."""
     import io
 
     import numpy as np
@@ -151,7 +144,7 @@ def alike(page: Path, config: Path, browser: list[str], patience: float) -> list
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("page", type=Path, help="what nrfgs export web has written")
+    parser.add_argument("page", type=Path, help="page of nrfgs export web")
     parser.add_argument("record", type=Path, help="JSON to write; the pictures go beside it")
     parser.add_argument("--browser", default=SOFTWARE, help="command that opens an address")
     parser.add_argument("--config", type=Path, help="compare the page's pictures with those of this model")
@@ -160,16 +153,16 @@ def main() -> None:
     parser.add_argument("--patience", type=float, default=300, help="seconds")
     options = parser.parse_args()
     browser = shlex.split(options.browser)
-    found = measured(options.page, browser, options.size, options.count, options.patience)
+    record = measured(options.page, browser, options.size, options.count, options.patience)
     options.record.parent.mkdir(parents=True, exist_ok=True)
-    for k, picture in enumerate(found.pop("pictures")):
+    for k, picture in enumerate(record.pop("pictures")):
         options.record.with_name(f"{options.record.stem}-{k}.png").write_bytes(picture)
     files = [options.page] if options.page.is_file() else list(options.page.iterdir())
-    found["bytes"] = sum(file.stat().st_size for file in files)
+    record["bytes"] = sum(file.stat().st_size for file in files)
     if options.config:
-        found["psnr"] = alike(options.page, options.config, browser, options.patience)
-    options.record.write_text(json.dumps(found, indent=1) + "\n")
-    print(json.dumps(found, indent=1))
+        record["psnr"] = alike(options.page, options.config, browser, options.patience)
+    options.record.write_text(json.dumps(record, indent=1) + "\n")
+    print(json.dumps(record, indent=1))
 
 
 if __name__ == "__main__":

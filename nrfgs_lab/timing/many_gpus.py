@@ -21,18 +21,11 @@ import torch.multiprocessing as mp
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
+from nrfgs_lab.bench.spec import QUIET
 from nrfgs_ns.distributed.launch import free_port, join_group
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import initial_splats
 from nrfgs_ns.training.run import machine, parse
-
-QUIET = {
-    "--vis": "tensorboard",
-    "--logging.local-writer.enable": "False",
-    "--logging.profiler": "none",
-    "--steps-per-eval-image": "0",
-    "--steps-per-eval-all-images": "0",
-}
 
 
 @dataclass
@@ -50,7 +43,7 @@ class Load:
     options: str = ""
     """more options of ns-train"""
     device_type: Literal["cuda", "cpu"] = "cuda"
-    """cpu: to try it out"""
+    """cpu: to try the command"""
     splats: tuple[int, ...] = (4_000_000,)
     """numbers of splats"""
     extent: float = 2.0
@@ -67,14 +60,8 @@ class Load:
         for turn in range(self.rounds):
             for count in self.splats:
                 for world in self.devices:
-                    key = {
-                        "method": self.method,
-                        "options": self.options,
-                        "splats": count,
-                        "devices": world,
-                        "round": turn,
-                        "steps": self.steps,
-                    }
+                    key = {"method": self.method, "options": self.options, "splats": count}
+                    key |= {"devices": world, "round": turn, "steps": self.steps}
                     if any(all(run.get(name) == value for name, value in key.items()) for run in runs):
                         continue
                     with tempfile.TemporaryDirectory() as folder:
@@ -82,26 +69,19 @@ class Load:
                         mp.spawn(one_device, args=(self, count, world, url, folder), nprocs=world)
                         parts = [json.loads(Path(folder, f"{rank}.json").read_text()) for rank in range(world)]
                     seconds = max(part["seconds"] for part in parts)
-                    runs.append(
-                        {
-                            **key,
-                            "images_per_second": world * self.steps / seconds,
-                            "step_ms": 1000 * seconds / self.steps,
-                            "peak_memory_bytes": [part["peak_memory_bytes"] for part in parts],
-                            "peak_memory_setup_bytes": [part["peak_memory_setup_bytes"] for part in parts],
-                        }
-                    )
+                    speed = {"images_per_second": world * self.steps / seconds, "step_ms": 1000 * seconds / self.steps}
+                    peaks = ("peak_memory_bytes", "peak_memory_setup_bytes")
+                    runs.append({**key, **speed, **{peak: [part[peak] for part in parts] for peak in peaks}})
                     content = {"machine": machine(), "scene": self.scene.name, "runs": runs}
                     write_whole(self.out, json.dumps(content, indent=1) + "\n")
                     print(runs[-1], flush=True)
 
 
 def one_device(rank: int, load: Load, count: int, world: int, url: str, folder: str) -> None:
-    """One process of `Load`: trains, and leaves what it measured in FOLDER/RANK.json."""
+    """Train in one process of `Load`, and write FOLDER/RANK.json."""
     if world > 1:
         join_group(rank, world, url, load.device_type)
     options = {
-        **QUIET,
         "--data": load.scene,
         "--output-dir": folder,
         "--machine.device-type": load.device_type,
@@ -115,9 +95,9 @@ def one_device(rank: int, load: Load, count: int, world: int, url: str, folder: 
         "--pipeline.model.warmup-steps": 0,
     }
     words = [str(word) for option in options.items() for word in option]
-    config = parse([load.method, *words, *shlex.split(load.options)])
+    config = parse([load.method, *QUIET, *words, *shlex.split(load.options)])
     torch.manual_seed(config.machine.seed)
-    # Splats as wide as a grid of as many is fine: to look for the neighbours of millions takes longer than to measure.
+    # The spacing of a grid: the search for the neighbours of millions takes longer than the measurement.
     initial_splats.mean_distance = lambda means: means.new_full((len(means), 1), load.extent / count ** (1 / 3))
     trainer = config.setup(local_rank=rank, world_size=world)
     trainer.setup()
@@ -144,7 +124,7 @@ def one_device(rank: int, load: Load, count: int, world: int, url: str, folder: 
 
 
 def together(world: int) -> None:
-    """Wait until all devices have finished what they were asked."""
+    """Wait until all devices are idle."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
     if world > 1:
@@ -152,7 +132,7 @@ def together(world: int) -> None:
 
 
 def peak_memory() -> int:
-    """Most bytes in tensors on this GPU since the last reset; 0 on a CPU."""
+    """Largest number of bytes in tensors on this GPU since the last reset; 0 on a CPU."""
     return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
 
 

@@ -4,15 +4,11 @@
     python -m nrfgs_lab.timing.rasterizer_cpu --out rasterizer_cpu.json      # the standard cases, two threads
     python -m nrfgs_lab.timing.rasterizer_cpu --sizes 20000x256x256 --no-loop --out small.json
 
-The loop is the simplest correct rasterizer: gsplat's lists of 16-pixel tiles, then for each tile alpha, cumulative
-product and sum in plain torch, differentiated by autograd. Both compute the same image, which is checked first. Figures
-are medians in milliseconds over rounds of repeats, ours and the loop in turn; projection is included. Peak memory is
-measured in a process of its own. The file is written after each case, and a case in it is not repeated.
+The loop is the simplest correct rasterizer: gsplat's lists of 16-pixel tiles, and in each tile alpha, cumulative
+product and sum in plain torch, differentiated by autograd. That both render the same image is checked first. Times are
+medians in milliseconds over rounds, ours and the loop in turn, with projection. Peak memory is of a separate process.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 import math
 import os
@@ -26,12 +22,13 @@ from pathlib import Path
 os.environ["CUDA_VISIBLE_DEVICES"] = ""  # before torch looks for GPUs: this is about the CPU
 
 import torch  # noqa: E402
+import tyro  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 from nrfgs_ns.files import write_whole  # noqa: E402
 from nrfgs_ns.rasterizer import Projection, composite, project  # noqa: E402
 
-SIZES = ["20000x256x256", "50000x400x300", "50000x400x300 opaque", "200000x800x600", "200000x1600x1200"]
+SIZES = "20000x256x256", "50000x400x300", "50000x400x300 opaque", "200000x800x600", "200000x1600x1200"
 LOOP_TILE = 16
 
 
@@ -66,7 +63,7 @@ def cloud(n: int, width: int, height: int, opaque: bool = False) -> Scene:
 
 
 def cloud_of(size: str) -> Scene:
-    """The cloud of a name: splats x width x height, perhaps followed by "opaque"."""
+    """Cloud of a size of `RasterizerCpu`."""
     size, *opaque = size.split()
     return cloud(*map(int, size.split("x")), opaque=bool(opaque))
 
@@ -151,54 +148,58 @@ def memory_kib(field: str) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith(field))
 
 
-def measure(name: str, arguments: argparse.Namespace) -> dict:
-    """The record of one case, printed."""
-    scene = cloud_of(name)
-    row: dict = {"splats": len(scene.tensors[0]), "image": [scene.width, scene.height]}
-    if not arguments.no_loop:
-        row["mean_difference"] = agree(scene)  # also the loop's unmeasured run
-        if row["mean_difference"] > 1e-4:
-            sys.exit(f"{name}: the two images differ by {row['mean_difference']:.1e} on average")
-    rounds: list[dict[str, dict[str, float]]] = []
-    for _ in range(arguments.rounds):  # in turns: a machine that slows down for a while slows both
-        rounds.append({"ours": timed(ours, scene, arguments.repeats)})
-        if not arguments.no_loop:
-            rounds[-1]["loop"] = timed(plain_loop, scene, 1, warm=False)
-    for which in rounds[0]:
-        row[which] = {key: statistics.median(r[which][key] for r in rounds) for key in rounds[0][which]}
-    if not arguments.no_loop:
-        row["times_faster"] = statistics.median(sum(r["loop"].values()) / sum(r["ours"].values()) for r in rounds)
-    command = [sys.executable, "-m", "nrfgs_lab.timing.rasterizer_cpu", "--threads", str(arguments.threads)]
-    said = subprocess.run([*command, "--peak-memory", name], check=True, stdout=subprocess.PIPE, text=True).stdout
-    row |= {"rounds": rounds, "load": round(os.getloadavg()[0], 1), "peak_memory_mib": float(said)}
-    print(name, {key: value for key, value in row.items() if key != "rounds"}, flush=True)
-    return row
+@dataclass
+class RasterizerCpu:
+    """Time of the CPU rasterizer and of a plain loop."""
 
+    sizes: tuple[str, ...] = SIZES
+    """splats x width x height, perhaps followed by "opaque\""""
+    repeats: int = 3
+    """runs of ours in a round"""
+    rounds: int = 5
+    threads: int = 2
+    loop: bool = True
+    """time the loop, too"""
+    out: Path = Path("rasterizer_cpu.json")
+    """JSON file of the results"""
+    peak_memory: str | None = None
+    """print the peak memory of one size, MiB, and do nothing else"""
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", nargs="+", default=SIZES, help="splats x width x height, perhaps followed by opaque")
-    parser.add_argument("--repeats", type=int, default=3, help="runs of ours in a round")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--no-loop", action="store_true", help="skip the baseline")
-    parser.add_argument("--out", type=Path, default=Path("rasterizer_cpu.json"))
-    parser.add_argument("--peak-memory", metavar="SIZE", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    if arguments.peak_memory:
-        print(peak_memory(cloud_of(arguments.peak_memory)))
-        return
-    machine = {"name": f"{os.cpu_count()} CPU cores", "torch": torch.__version__}
-    record = {"machine": machine, "threads": arguments.threads, "repeats": arguments.repeats, "results": {}}
-    if arguments.out.exists():
-        earlier = json.loads(arguments.out.read_text())
-        record["results"] = earlier["results"] if {**earlier, "results": {}} == record else {}
-    for name in arguments.sizes:
-        if name not in record["results"]:
-            record["results"][name] = measure(name, arguments)
-            write_whole(arguments.out, json.dumps(record, indent=1) + "\n")
+    def main(self) -> None:
+        torch.set_num_threads(self.threads)
+        if self.peak_memory:
+            print(peak_memory(cloud_of(self.peak_memory)))
+            return
+        machine = {"name": f"{os.cpu_count()} CPU cores", "torch": torch.__version__}
+        results = {}
+        for name in self.sizes:
+            results[name] = self.measure(name)
+            record = {"machine": machine, "threads": self.threads, "repeats": self.repeats, "results": results}
+            write_whole(self.out, json.dumps(record, indent=1) + "\n")
+
+    def measure(self, name: str) -> dict:
+        """Measure one size, and print its record."""
+        scene = cloud_of(name)
+        row: dict = {"splats": len(scene.tensors[0]), "image": [scene.width, scene.height]}
+        if self.loop:
+            row["mean_difference"] = agree(scene)  # also the loop's unmeasured run
+            if row["mean_difference"] > 1e-4:
+                sys.exit(f"{name}: the two images differ by {row['mean_difference']:.1e} on average")
+        rounds: list[dict[str, dict[str, float]]] = []
+        for _ in range(self.rounds):  # in turns: a machine that slows down for a while slows both
+            rounds.append({"ours": timed(ours, scene, self.repeats)})
+            if self.loop:
+                rounds[-1]["loop"] = timed(plain_loop, scene, 1, warm=False)
+        for which in rounds[0]:
+            row[which] = {key: statistics.median(r[which][key] for r in rounds) for key in rounds[0][which]}
+        if self.loop:
+            row["times_faster"] = statistics.median(sum(r["loop"].values()) / sum(r["ours"].values()) for r in rounds)
+        command = [sys.executable, "-m", "nrfgs_lab.timing.rasterizer_cpu", "--threads", str(self.threads)]
+        output = subprocess.run([*command, "--peak-memory", name], check=True, stdout=subprocess.PIPE, text=True).stdout
+        row |= {"rounds": rounds, "load": round(os.getloadavg()[0], 1), "peak_memory_mib": float(output)}
+        print(name, {key: value for key, value in row.items() if key != "rounds"}, flush=True)
+        return row
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(RasterizerCpu).main()

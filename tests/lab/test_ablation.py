@@ -16,14 +16,12 @@ from nrfgs_lab.ablation import (
     diffuse_last,
     with_constant_distance,
     without_high_branch,
-    without_input,
     without_low_branch,
     without_opacity_residual,
 )
 from nrfgs_ns.appearance.encoding import view_geometry
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.appearance.reduce import input_columns
 from nrfgs_ns.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -47,7 +45,7 @@ def test_the_command(tiny_scene, tmp_path, capsys):
     tyro.cli(Inspect, args=["--load-config", str(config), "--views", "2"]).main()
     result = json.loads((config.parent / "inspect.json").read_text())
     rows = {row["part"]: row for row in result["rows"]}
-    assert {"high branch", "low branch", "opacity residual", "distance", "band 0", "band 2", "direction"} < set(rows)
+    assert {"high branch", "low branch", "opacity residual", "distance"} < set(rows)
     assert [row["rank"] for row in result["rows"] if row["group"] == "rank"] == [1, 2, 3, 4, 5, 6]
     assert rows["latent rank 6"]["loss_db"] == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
     assert rows["all residuals"]["diffuse"] == 1.0 and rows["all residuals"]["threshold"] is None
@@ -127,16 +125,3 @@ def test_a_constant_distance_is_what_the_field_sees(case):
     small = with_constant_distance(field, float(log_distance[0]))
     assert not small.head.config.use_distance
     assert_same(small, field, visible, centers, **FLOAT32)
-
-
-def test_an_input_that_is_0_no_longer_counts(case):
-    field, visible, _ = case
-    center = torch.tensor([5.0, 4.0, 3.0])
-    small = field
-    for name in input_columns(field.head.config, "low") | input_columns(field.head.config, "high"):
-        if name in ("direction", "distance") or name.startswith("band"):
-            small = without_input(small, name)
-    a, b = (small.head(small.splats, visible, c) for c in (center, -center))
-    assert (a.colors == b.colors).all() and (a.opacities == b.opacities).all()
-    a, b = (field.head(field.splats, visible, c) for c in (center, -center))
-    assert (a.colors != b.colors).any()

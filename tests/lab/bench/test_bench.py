@@ -94,7 +94,7 @@ def test_everything_is_run_once_and_reported(fake, capsys):
     table = (fake / "out" / "table.md").read_text()
     assert table in capsys.readouterr().out
     assert "| scene | NRF | own | 2 |" in table and "21.50 ± 0.71" in table
-    for file in ("table.csv", "summary.json", "splats.png", "splats.svg"):
+    for file in ("summary.json", "splats.png"):
         assert (fake / "out" / file).stat().st_size > 0
     bench_in(fake).main()
     assert len(ran(fake)) == 4, "a finished run was repeated"

@@ -2,7 +2,6 @@
 """One real run of a benchmark, in this process: interrupted while training and before its evaluation, then measured."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from nerfstudio.cameras.cameras import Cameras
 from nrfgs_lab.bench import run as bench_run
 from nrfgs_lab.bench.measure import at_size, flip, over_views
 from nrfgs_lab.bench.spec import Job, cells_of, command, identity, make_spec
-from nrfgs_ns.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -131,12 +129,6 @@ def test_at_size_keeps_the_pose_and_the_vertical_angle():
         rays = [one.generate_rays(0, coords=torch.tensor(at).float()) for one, at in ((camera, before), (wide, after))]
         torch.testing.assert_close(rays[0].directions, rays[1].directions)
         torch.testing.assert_close(rays[0].origins, rays[1].origins)
-
-
-def test_without_the_package_the_message_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    with pytest.raises(InputError, match="pip install flip-evaluator"):
-        flip(np.zeros((8, 8, 3)), np.zeros((8, 8, 3)))
 
 
 def test_equal_is_zero_different_is_more_and_outside_a_mask_nothing_counts():

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables, figure and crops from hand-made records."""
 
-import csv
-import io
 import json
 import re
 import shutil
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from nrfgs_lab.bench import crops
 from nrfgs_lab.bench.crops import crop_sheet, crop_side, largest_disagreement, numbered
 from nrfgs_lab.bench.report import draw_splats, pictures_of, report
 from nrfgs_lab.bench.spec import cells_of, identity, make_spec
@@ -18,10 +17,8 @@ from nrfgs_lab.bench.table import (
     COLUMNS,
     SHOWN,
     Row,
-    as_csv,
     markdown,
     ranks,
-    views_as_csv,
     with_averages,
 )
 
@@ -77,12 +74,6 @@ def test_markdown():
     assert body["s", "SH"][8] == "-", "LPIPS was not measured"
 
 
-def test_csv_has_plain_numbers():
-    lines = list(csv.DictReader(io.StringIO(as_csv(rows()))))
-    assert float(lines[1]["PSNR"]) == 33.0 and float(lines[1]["PSNR deviation"]) == pytest.approx(2**0.5)
-    assert float(lines[0]["MB"]) == 2.0 and lines[0]["LPIPS"] == "" and lines[3]["PSNR deviation"] == ""
-
-
 NAMES = {"a|b": r"a\|b", "_x_": r"\_x\_", "a*b*": r"a\*b\*", "two\nlines": "two lines", "$w^$": "$w^$"}
 """Name -> how a Markdown table writes it."""
 
@@ -93,16 +84,14 @@ def test_strange_names_break_no_table(tmp_path):
     lines = [line for line in markdown(strange).splitlines() if line.startswith("|")]
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4 + len(SHOWN) + 1}
     assert [re.split(r"(?<!\\)\|", line)[2].strip() for line in lines[2:]] == list(NAMES.values())
-    assert [line["run"] for line in csv.DictReader(io.StringIO(as_csv(strange)))] == list(NAMES)
     draw_splats([*strange, Row("$^$", "elsewhere", "own", {1: record(30.0)}).fill()], tmp_path)
-    svg = (tmp_path / "splats.svg").read_text()
-    assert "_x_</text>" in svg and ">$w^$</text>" in svg and ">$^$</text>" in svg and ">elsewhere</text>" in svg
+    assert (tmp_path / "splats.png").stat().st_size > 0
 
 
 def test_what_is_no_number_is_not_there():
     rows = [Row("s", "a", "own", {1: record(float("nan"))}).fill(), Row("s", "b", "own", {1: record(30.0)}).fill()]
     assert rows[0].text(PSNR) == "-" and ranks(rows, PSNR) == {}
-    assert "nan" not in as_csv(rows)
+    assert "nan" not in markdown(rows)
 
 
 def test_ranks_share_and_skip():
@@ -177,26 +166,6 @@ def test_what_failed_is_in_the_table_and_what_was_not_run_is_named_below():
     assert list(body) == [("s", "done", "own"), ("s", "broke", "own")]
     assert body["s", "broke", "own"]["seeds"] == "0 (1 FAILED)"
     assert below[0] == "Not run yet, and in no row: s, own: not_yet."
-    lines = list(csv.DictReader(io.StringIO(as_csv(rows))))
-    counts = [(line["run"], line["seeds"], line["FAILED"], line["missing"], line["stale"]) for line in lines]
-    assert counts == [("done", "1", "0", "0", "0"), ("broke", "0", "1", "0", "0"), ("not_yet", "0", "0", "1", "0")]
-
-
-def test_every_test_view_has_a_line():
-    """Seeds one below the other, in numbers' order; a record without views has no lines."""
-    views = [{"image": "a.jpg", "psnr": 31.0, "ssim": 0.9}, {"image": "b, c.jpg", "psnr": 20.123456789, "ssim": None}]
-    runs = {2: record(25.0), 1: record(25.0)}
-    for seed, record_of_seed in runs.items():
-        record_of_seed["measured"]["test"]["per_image"] = views if seed == 1 else views[::-1]
-    found = list(csv.DictReader(io.StringIO(views_as_csv([Row("s", "A", "own", runs), *rows()]))))
-    assert [(line["seed"], line["image"], line["PSNR"]) for line in found] == [
-        ("1", "a.jpg", "31"),
-        ("1", "b, c.jpg", "20.1235"),
-        ("2", "b, c.jpg", "20.1235"),
-        ("2", "a.jpg", "31"),
-    ]
-    assert {(line["scene"], line["run"], line["strategy"]) for line in found} == {("s", "A", "own")}
-    assert found[1]["SSIM"] == "" and found[1]["L1"] == ""
 
 
 def test_figure_has_a_panel_for_each_scene_and_strategy(tmp_path, monkeypatch):
@@ -224,15 +193,6 @@ def test_figure_has_a_panel_for_each_scene_and_strategy(tmp_path, monkeypatch):
     below = legend.get_window_extent()
     assert not any(below.overlaps(panel.get_window_extent()) for panel in figure.axes)
     pyplot.close(figure)
-
-
-def test_the_same_numbers_give_the_same_figure(tmp_path):
-    draw_splats(rows(), tmp_path)
-    svg = (tmp_path / "splats.svg").read_text()
-    assert ">SH<" in svg and ">NRF<" in svg and ">t_1 mcmc<" in svg
-    assert len(svg) < 100_000
-    draw_splats(rows(), tmp_path)
-    assert svg == (tmp_path / "splats.svg").read_text()
 
 
 # Crops.
@@ -274,10 +234,11 @@ def test_disagreement_is_found(pictures):
     assert top <= 40 and top + side >= 50
 
 
-def test_sheet_shows_the_views_where_runs_differ(pictures, tmp_path):
+def test_sheet_shows_the_views_where_runs_differ(pictures, tmp_path, monkeypatch):
     assert crop_sheet(pictures, tmp_path / "sheet.png")
     two = Image.open(tmp_path / "sheet.png")
-    assert crop_sheet(pictures, tmp_path / "chosen.png", [2])
+    monkeypatch.setattr(crops, "VIEWS", 1)
+    assert crop_sheet(pictures, tmp_path / "chosen.png")
     one = Image.open(tmp_path / "chosen.png")
     assert two.height == 2 * one.height and two.width == one.width
     # The best view comes first: the upper half of the automatic sheet is the sheet of view 2.
@@ -286,11 +247,12 @@ def test_sheet_shows_the_views_where_runs_differ(pictures, tmp_path):
     assert set(np.unique(below)) == {0, 200}
 
 
-def test_many_runs_go_below_one_another(pictures, tmp_path):
+def test_many_runs_go_below_one_another(pictures, tmp_path, monkeypatch):
     """Nine runs and the truth: eight crops in the first line, two in the second, and no wider than eight."""
     runs = {f"run {n}": pictures["AB"[n % 2]] for n in range(9)}
-    assert crop_sheet(runs, tmp_path / "many.png", [2])
-    assert crop_sheet(dict(list(runs.items())[:7]), tmp_path / "full.png", [2])
+    monkeypatch.setattr(crops, "VIEWS", 1)
+    assert crop_sheet(runs, tmp_path / "many.png")
+    assert crop_sheet(dict(list(runs.items())[:7]), tmp_path / "full.png")
     with Image.open(tmp_path / "many.png") as many, Image.open(tmp_path / "full.png") as full:
         assert many.width == full.width
         height = full.height - 16 - 4  # of the sheet's title and gap
@@ -347,7 +309,6 @@ def test_report_of_hand_made_records(tmp_path, pictures, capsys):
     assert (tmp_path / "out" / "crops" / "x_s.png").exists()
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [row["PSNR"] for row in summary] == [[30.0, None], [31.0, None]]
-    assert (tmp_path / "out" / "views.csv").read_text().startswith("scene,run,strategy,seed,image,PSNR")
     assert "**31.00**" in capsys.readouterr().out
     # Pictures of records that are not to be used are not shown beside the others.
     (tmp_path / "out" / "crops" / "x_s.png").unlink()
