@@ -17,16 +17,7 @@ SECONDS_BETWEEN_LINES = 30.0
 def progress(
     description: str, total: int | None = None, console: Console = CONSOLE, clock: Callable[[], float] = monotonic
 ) -> Iterator[Callable[..., None]]:
-    """Show how far the block is.
-
-    Args:
-        description: what is done.
-        total: number of pieces of work; None: unknown.
-        clock: seconds.
-
-    Yields:
-        advance(description=None), to be called after each piece.
-    """
+    """Show the progress of `total` pieces of work; yields advance(description=None), to be called after each."""
     if console.is_terminal:
         columns = TextColumn("{task.description:<40}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=console, transient=True) as bar:

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many CPU threads torch takes: one for small work, which several would not finish sooner.
-
-OpenMP's threads wait for each other in loops after each operation. Beside a busy process, small work then takes several
-times the processor time, and longer than with one thread.
-"""
+"""One CPU thread for small work: OpenMP's threads busily wait for each other after each operation, and beside another
+process several are slower than one."""
 
 import contextlib
 from collections.abc import Iterator

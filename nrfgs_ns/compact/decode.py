@@ -41,11 +41,7 @@ class Decoded(NamedTuple):
 
 
 def decode(path: Path) -> Decoded:
-    """Read a compact file.
-
-    Raises:
-        InputError: it cannot be read, is damaged, or does not hold what it should.
-    """
+    """Read a compact file; InputError if it cannot be read, is damaged, or describes no field."""
     header, streams = read_container(path)
     try:
         if header["format"] != FORMAT:
@@ -54,7 +50,6 @@ def decode(path: Path) -> Decoded:
         _check(header, config, weights, sum(stream.nbytes for stream in streams.values()))
         return Decoded(config, weights, _splats(header, streams, config.latent_dim), header)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RuntimeError) as error:
-        # The checksums hold: it was written like this.
         reason = " ".join(str(error).split())[:LONGEST]
         raise InputError(
             f"{path} does not describe a field ({type(error).__name__}: {reason}). Export it again with nrfgs export "
@@ -73,10 +68,9 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     for name in known:
         value, default = getattr(config, name), getattr(usual, name)
         right = isinstance(value, (int, float) if isinstance(default, float) else type(default))
-        if not right or isinstance(value, bool) != isinstance(default, bool):
+        right &= isinstance(value, bool) == isinstance(default, bool)
+        if not right or isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"the head's {name} is {ascii(value)}")
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"the head's {name} is {value}")
     if config.num_bands > MOST_BANDS:
         raise ValueError(f"the head has {config.num_bands} bands")
     config.validate()
@@ -84,26 +78,20 @@ def _config(head: dict[str, Any]) -> NrfConfig:
 
 
 def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor], unpacked: int) -> None:
-    """Raise ValueError where the header names sizes that the file does not have, or impossible grids."""
+    """Raise ValueError for sizes that the file does not have, and impossible grids."""
     unit = header["head"]["scene_unit"]
     if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < float(unit) < math.inf:
         raise ValueError(f"the head's scene_unit is {ascii(unit)}")
-    if config.latent_dim >= weights["low.0.weight"].shape[1]:  # it sees more than the latents
-        raise ValueError(
-            f"head.low.0.weight of shape {list(weights['low.0.weight'].shape)} with latents of {config.latent_dim}"
-        )
+    rows, inputs = weights["low.0.weight"].shape
+    if config.latent_dim >= inputs or config.hidden_width > rows:  # before a head of that size is built
+        sizes = f"latents of {config.latent_dim} and {config.hidden_width} hidden units"
+        raise ValueError(f"head.low.0.weight of shape {[rows, inputs]} with {sizes}")
     columns = {"means": 3, "turns": 3, "scales": 3, "opacities": 1, "colors": 3, "latents": config.latent_dim}
     for name, count in columns.items():
-        for part in ("low", "step"):
-            numbers = np.asarray(header["grids"][name][part])
-            if numbers.shape != (count,) or numbers.dtype.kind not in "if" or not np.isfinite(numbers).all():
-                raise ValueError(f"the {part} of the grid of {name} is not {count} numbers")
-        if not (np.asarray(header["grids"][name]["step"]) > 0).all():
-            raise ValueError(f"the step of the grid of {name} is not positive")
-    if config.hidden_width > weights["low.0.weight"].shape[0]:
-        raise ValueError(
-            f"head.low.0.weight of shape {list(weights['low.0.weight'].shape)} with {config.hidden_width} hidden units"
-        )
+        low, step = (np.asarray(header["grids"][name][part]) for part in ("low", "step"))
+        right = low.shape == step.shape == (count,) and {low.dtype.kind, step.dtype.kind} <= {"i", "f"}
+        if not right or not np.isfinite([low, step]).all() or not (step > 0).all():
+            raise ValueError(f"the grid of {name} is not {count} numbers with positive steps")
     with torch.random.fork_rng(devices=[]):  # whose numbers are not looked at
         shapes = {name: list(value.shape) for name, value in config.setup().state_dict().items()}
     for name in shapes.keys() | weights.keys():

@@ -54,16 +54,11 @@ GROUPS = ("view", DIFFUSE)
 def encode(
     field: Field, precision: Precision, render: dict[str, Any], steps: Mapping[str, np.ndarray] | None = None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray | Table]]:
-    """The header and streams of a compact file.
-
-    Splats that are not finite are left out: nothing draws them.
+    """The header and streams of a compact file, without the splats that are not finite.
 
     Args:
-        field: the head, and its splats.
-        precision: the steps of the grids, unless they are given.
-        render: what else decides a picture, for the header.
-        steps: of the grids, for each column of `tables.py`'s tables: those on which a field that was trained for the
-            file lies.
+        precision: the steps of the grids, unless `steps` of a fine-tuned field's tables are given.
+        render: the header's "render".
 
     Raises:
         InputError: no splat is finite.
@@ -109,7 +104,7 @@ def encode(
         "splats": {"view": len(of_view), DIFFUSE: len(order) - len(of_view)},
         "head": {"name": field.head.name, "config": config, "scene_unit": field.head.scene_unit},
         "render": render,
-        "grids": {name: grid.as_json() for name, grid in grids.items()},
+        "grids": {name: {"low": grid.low.tolist(), "step": grid.step.tolist()} for name, grid in grids.items()},
     }
     return header, streams
 

@@ -43,17 +43,13 @@ LAST = 0.03
 
 
 def prepared(field: Field, weight: Tensor) -> Field:
-    """A field as a fine-tune begins with it: with latents that are their own principal components, so that those that
-    matter little can go.
-
-    Args:
-        weight: what each splat contributes to the training views' pixels, >= 0. [N]
-    """
+    """The field at the start of a fine-tune: its latents are their own principal components, weighted by the splats'
+    contributions to the training views, weight [N] >= 0."""
     return with_rank(field, latent_basis(field, weight), field.head.config.latent_dim)
 
 
 class CodedSplats(nn.Module):
-    """The tables of a field (`tables.py`), each with steps that are learnt and begin with those of `precision`."""
+    """The tables of a field (`tables.py`), each with learnable steps that begin with those of `precision`."""
 
     def __init__(self, splats: Mapping[str, Tensor], precision: Precision):
         super().__init__()
@@ -79,7 +75,6 @@ class CodedSplats(nn.Module):
         return {name: table(rounded) for name, table in self.tables.items()}
 
     def splats(self, tables: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The field's table of the file's."""
         return splats_of(tables, self.diffuse)
 
     def bits(self, tables: Mapping[str, Tensor]) -> Tensor:
@@ -104,7 +99,6 @@ class CodedSplats(nn.Module):
 
     @staticmethod
     def _row(tables: Mapping[str, Tensor]) -> Tensor:
-        """The columns of all splats beside their means, in the file's order."""
         return torch.cat([tables[name] for name in COLUMNS], dim=-1)
 
 
@@ -132,8 +126,7 @@ def without_them(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]
     drawn at random (Hutchinson's estimator), one drawing for each view.
 
     Args:
-        model: an NrfgsModel in training mode.
-        field: what is drawn.
+        model: in training mode.
         views: training cameras and their photographs.
 
     Returns:
@@ -177,17 +170,16 @@ def fine_tune(
     precision: Precision,
     on_step: Callable[[int, float], None] = lambda *_: None,
 ) -> Tuned:
-    """Train a field on for what it costs in a file.
+    """Fine-tune a field for its size in a file.
 
     Args:
-        model: an NrfgsModel, which says how a field is drawn; its own splats are left alone.
+        model: renders the field; its own splats stay as they are.
         field: the field to begin with (`prepared`), with a neural residual field's head.
-        next_view: a training camera and its photograph for each step.
-        noise: on where the head is asked from.
+        next_view: step -> a training camera and its photograph.
+        noise: moves the head's camera centres.
         views: number of training views on which splats are weighed.
-        steps: number of steps.
         rate: loss for a byte of each splat.
-        precision: the steps of the grids to begin with.
+        precision: the first steps of the grids.
         on_step: called with the step and the bits, every REPORT_EVERY steps.
     """
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()

@@ -41,7 +41,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nrfgs_ns.compact.entropy import MOST_MODEL, BadStream, decode_table, encode_table
+from nrfgs_ns.compact.entropy import MOST_MODEL, decode_table, encode_table
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole
 
@@ -89,10 +89,8 @@ def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str,
     for name, stream in streams.items():
         if isinstance(stream, Table):
             array, body, coding = _coded(stream)
-        elif stream.dtype.name in DTYPES:
-            array, body, coding = stream, _pack(_planes(stream)), "xz"
         else:
-            raise ValueError(f"stream {name} is {stream.dtype.name}; use one of {', '.join(DTYPES)}")
+            array, body, coding = stream, _pack(_planes(stream)), "xz"
         sizes = {"dtype": array.dtype.name, "shape": list(array.shape), "bytes": len(body)}
         entries.append({"name": name, "coding": coding, **sizes, "crc32": zlib.crc32(body)})
         bodies.append(body)
@@ -105,21 +103,17 @@ def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str,
 
 
 def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read a file.
-
-    Returns:
-        the header, and the streams by name.
+    """The header and the streams, by name, of a file.
 
     Raises:
-        InputError: there is no such file, it is of another kind or version, it is cut short or longer than it says, or
-            a checksum does not hold.
+        InputError: there is no such file, it is of another kind or version, or damaged.
     """
     try:
         data = path.read_bytes() if path.is_file() else None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}). Export it again, or fix the path.") from error
+    except OSError:
+        data = None
     if data is None:
-        raise InputError(f"{path} cannot be read (there is no such file). Export it again, or fix the path.")
+        raise InputError(f"{path} cannot be read as a file. Export it again, or fix the path.")
     fix = "Copy it again, or export it again with nrfgs export compact."
     if data[: len(MAGIC)] != MAGIC[: len(data)] or not data:
         raise InputError(f"{path} is not a compact file of nrfgs: it begins with {data[:8]!r}. {fix}")
@@ -138,53 +132,45 @@ def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     header_end = first - CHECKSUM.size
     if zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
         raise InputError(f"{path} is damaged: the header's checksum does not hold. {fix}")
-    header = _header(path, data[PREAMBLE.size : header_end], max(LARGEST_RATIO * len(data), SMALL))
+    try:
+        header = _header(data[PREAMBLE.size : header_end], max(LARGEST_RATIO * len(data), SMALL))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: its header is none of a compact file ({error}). {fix}") from error
     streams = {}
     for entry in header["streams"]:
         body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
         if len(body) != entry["bytes"] or zlib.crc32(body) != entry["crc32"]:
             raise InputError(f"{path} is damaged: the checksum of its stream {entry['name']!r} does not hold. {fix}")
-        unpack = _uncoded if entry["coding"] == "rans" else _unpack
-        streams[entry["name"]] = unpack(path, entry, body)
+        try:
+            streams[entry["name"]] = (_uncoded if entry["coding"] == "rans" else _unpack)(entry, body)
+        except (ValueError, lzma.LZMAError, struct.error) as error:  # made to mislead: the checksum holds
+            raise InputError(f"{path}: its stream {entry['name']!r} cannot be decoded ({error}). {fix}") from error
     if first != len(data):
         raise InputError(f"{path} has {len(data) - first} bytes after its last stream. {fix}")
     return header, streams
 
 
-def _header(path: Path, text: bytes, most: int) -> dict[str, Any]:
-    """The header, whose checksum holds: its streams' entries are complete, and unpack to at most `most` bytes together.
-
-    Raises:
-        InputError: it is not so.
-    """
-    try:
-        header = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: its header is no JSON ({error}).") from error
+def _header(text: bytes, most: int) -> dict[str, Any]:
+    """The header; ValueError if a stream's entry is impossible, or all unpack to more than `most` bytes together."""
+    header = json.loads(text)
     entries = header.get("streams") if isinstance(header, dict) else None
     if not isinstance(entries, list):
-        raise InputError(f"{path}: its header has no list of streams.")
+        raise ValueError("no list of streams")
     total = 0
     for entry in entries:
+        named = f"the stream {ascii(entry)[:200]}"
         if not (isinstance(entry, dict) and all(_is(entry.get(key), kind) for key, kind in ENTRY.items())):
-            raise InputError(f"{path}: its header has a stream {ascii(entry)[:200]}, which cannot be.")
-        name, sizes, coding = ascii(entry["name"])[:80], entry["shape"], entry["coding"]
-        if coding not in CODINGS:
-            raise InputError(f"{path}: its stream {name} has the unknown coding {ascii(coding)[:80]}.")
-        possible = len(sizes) <= MOST_AXES and all(_is(size, int) and 0 <= size < 2**48 for size in sizes)
-        possible &= coding == "xz" or len(sizes) == 2
-        if entry["dtype"] not in CODINGS[coding] or not possible or entry["bytes"] < 0:
-            raise InputError(
-                f"{path}: its stream {name} is {ascii(entry['dtype'])[:80]} {ascii(sizes)[:80]}, which cannot be."
-            )
+            raise ValueError(named)
+        sizes, coding = entry["shape"], entry["coding"]
+        possible = entry["dtype"] in CODINGS.get(coding, ()) and entry["bytes"] >= 0
+        possible &= len(sizes) <= MOST_AXES and all(_is(size, int) and 0 <= size < 2**48 for size in sizes)
+        if not possible or coding == "rans" and len(sizes) != 2:
+            raise ValueError(named)
         total += math.prod(sizes) * np.dtype(entry["dtype"]).itemsize
         if total > most:
-            raise InputError(
-                f"{path}: its stream {name} would unpack to {ascii(sizes)} numbers, and a file of this size holds at "
-                f"most {most} bytes."
-            )
+            raise ValueError(f"{named} would unpack to more than {most} bytes")
     if len({entry["name"] for entry in entries}) < len(entries):
-        raise InputError(f"{path}: its header has two streams of one name.")
+        raise ValueError("two streams of one name")
     return header
 
 
@@ -194,22 +180,17 @@ def _is(value: Any, kind: type) -> bool:
 
 def _pack(raw: bytes) -> bytes:
     """Compressed without context: a quantised number's byte does not depend on the one beside it."""
-    dictionary = min(max(len(raw), 4096), LARGEST_DICTIONARY)
-    options = {"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0, "dict_size": dictionary}
+    options = {"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0}
+    options["dict_size"] = min(max(len(raw), 4096), LARGEST_DICTIONARY)
     return lzma.compress(raw, format=lzma.FORMAT_XZ, check=lzma.CHECK_NONE, filters=[options])
 
 
-def _unpack(path: Path, entry: Mapping[str, Any], body: bytes) -> np.ndarray:
-    """The numbers of one stream whose checksum holds; a file that was made to mislead is refused all the same."""
-    count = math.prod(entry["shape"])
-    size = np.dtype(entry["dtype"]).itemsize
+def _unpack(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
+    count, size = math.prod(entry["shape"]), np.dtype(entry["dtype"]).itemsize
     unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=LARGEST_MEMORY)
-    try:
-        raw = unpacker.decompress(body, max_length=count * size + 1) if body else b""
-    except lzma.LZMAError as error:
-        raise InputError(f"{path}: its stream {entry['name']!r} cannot be unpacked ({error}).") from error
+    raw = unpacker.decompress(body, max_length=count * size + 1) if body else b""
     if len(raw) != count * size:
-        raise InputError(f"{path}: its stream {entry['name']!r} does not hold {count} numbers of {size} bytes.")
+        raise ValueError(f"it does not hold {count} numbers of {size} bytes")
     planes = np.frombuffer(raw, dtype=np.uint8).reshape(size, count)
     return np.ascontiguousarray(planes.T).view(np.dtype(entry["dtype"]).newbyteorder("<")).reshape(entry["shape"])
 
@@ -218,28 +199,21 @@ def _coded(table: Table) -> tuple[np.ndarray, bytes, str]:
     """A table in its narrowest type, its bytes, and how they are coded."""
     low, high = int(table.numbers.min(initial=0)), int(table.numbers.max(initial=0))
     dtype = "uint32" if not table.signed else "int16" if -(2**15) <= low and high < 2**15 else "int32"
-    if not np.iinfo(dtype).min <= low <= high <= np.iinfo(dtype).max or len(table.numbers) > MOST_COLUMNS:
-        raise ValueError(f"a table of {len(table.numbers)} columns, from {low} to {high}, is no {dtype}")
     model, words = encode_table(table.numbers, table.signed)
     packed = _pack(_planes(model))
     return table.numbers.astype(dtype), MODEL.pack(len(model), len(packed)) + packed + words, "rans"
 
 
-def _uncoded(path: Path, entry: Mapping[str, Any], body: bytes) -> np.ndarray:
-    """The numbers of one table whose checksum holds; a file that was made to mislead is refused all the same."""
+def _uncoded(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     columns, rows = entry["shape"]
-    try:
-        count, size = MODEL.unpack_from(body)
-        if columns > MOST_COLUMNS or count > min(columns * MOST_MODEL, SMALL // 4):
-            raise BadStream(f"a model of {count} numbers for {columns} columns is too large")
-        packed = body[MODEL.size : MODEL.size + size]
-        model = _unpack(path, {"name": entry["name"], "shape": [count], "dtype": "int32"}, packed)
-        table = decode_table(model, body[MODEL.size + size :], columns, rows)
-        bounds = np.iinfo(entry["dtype"])
-        if table.size and not bounds.min <= table.min() <= table.max() <= bounds.max:
-            raise BadStream(f"it holds numbers that are no {entry['dtype']}")
-    except (BadStream, struct.error) as error:
-        raise InputError(f"{path}: its stream {entry['name']!r} cannot be decoded ({error}).") from error
+    count, size = MODEL.unpack_from(body)
+    if columns > MOST_COLUMNS or count > min(columns * MOST_MODEL, SMALL // 4):
+        raise ValueError(f"a model of {count} numbers for {columns} columns is too large")
+    model = _unpack({"shape": [count], "dtype": "int32"}, body[MODEL.size : MODEL.size + size])
+    table = decode_table(model, body[MODEL.size + size :], columns, rows)
+    bounds = np.iinfo(entry["dtype"])
+    if table.size and not bounds.min <= table.min() <= table.max() <= bounds.max:
+        raise ValueError(f"it holds numbers that are no {entry['dtype']}")
     return table.astype(entry["dtype"])
 
 

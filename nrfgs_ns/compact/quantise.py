@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of splats as whole numbers, and back. float64 throughout; every function says how far it may be off."""
+"""Tables of splats as whole numbers, and back, in float64."""
 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
 
@@ -27,9 +28,6 @@ class Grid(NamedTuple):
     def values(self, codes: Array) -> Array:
         """[N, C]"""
         return self.low + self.step * codes
-
-    def as_json(self) -> dict[str, list[float]]:
-        return {"low": self.low.tolist(), "step": self.step.tolist()}
 
 
 def morton(codes: Array) -> Array:
@@ -64,28 +62,17 @@ _SPREADS = (
 """Shifts and masks that pull 21 bits apart, two zeros between neighbours."""
 
 
-def _octahedral() -> Array:
-    """The rotations [24, 4] that take the axes to the axes."""
-    half, root = 0.5, 0.5**0.5
-    turns = [np.eye(4)[i] for i in range(4)]
-    for a in range(4):
-        for b in range(a + 1, 4):
-            for sign in (root, -root):
-                turn = np.zeros(4)
-                turn[a], turn[b] = root, sign
-                turns.append(turn)
-    turns += [np.array([half, x, y, z]) for x in (half, -half) for y in (half, -half) for z in (half, -half)]
-    return np.array(turns)
-
-
-OCTAHEDRAL = _octahedral()
+GROUP = Rotation.create_group("O")
+"""The 24 rotations that take the axes to the axes."""
+OCTAHEDRAL = np.roll(GROUP.as_quat(), 1, axis=1)
+"""The same as quaternions (w, x, y, z). [24, 4]"""
 NEAR = 0.8
 """A rotation by 74 degrees; the nearest of 24 turns by no more than 62.8, where w is 0.853."""
 
 
 def nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:
     """The same ellipsoids by the rotations that turn least: of the 24 ways to name an ellipsoid's axes, the one whose
-    rotation is nearest to none. A rotation with |w| > NEAR is left as it is.
+    rotation is nearest to the identity. A rotation with |w| > NEAR is left as it is.
 
     Args:
         quats: rotations (w, x, y, z) of any length but 0. [N, 4]
@@ -95,36 +82,9 @@ def nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:
         quats [N, 4] of unit length with w >= NEAR, and scales [N, 3], permuted.
     """
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    conjugate = OCTAHEDRAL * [1, -1, -1, -1]
-    best = np.abs(unit @ conjugate.T).argmax(axis=1)  # |w| of q g
-    best[np.abs(unit[:, 0]) > NEAR] = 0
-    turned = multiplied(unit, OCTAHEDRAL[best])
+    best = np.abs(unit @ (OCTAHEDRAL * [1, -1, -1, -1]).T).argmax(axis=1)  # |w| of q g
+    best[np.abs(unit[:, 0]) > NEAR] = OCTAHEDRAL[:, 0].argmax()  # the identity
+    turned = np.roll((Rotation.from_quat(np.roll(unit, -1, axis=1)) * GROUP[best]).as_quat(), 1, axis=1)
     turned *= np.where(turned[:, :1] < 0, -1.0, 1.0)
-    axes = np.array([np.abs(matrix(turn)).argmax(axis=0) for turn in OCTAHEDRAL])  # new axis j is old axis axes[j]
+    axes = np.abs(GROUP.as_matrix()).argmax(axis=1)  # new axis j is old axis axes[j]
     return turned, np.take_along_axis(scales, axes[best], axis=1)
-
-
-def multiplied(p: Array, q: Array) -> Array:
-    """Products of quaternions (w, x, y, z), [N, 4] each."""
-    (a, b, c, d), (e, f, g, h) = p.T, q.T
-    return np.stack(
-        [
-            a * e - b * f - c * g - d * h,
-            a * f + b * e + c * h - d * g,
-            a * g - b * h + c * e + d * f,
-            a * h + b * g - c * f + d * e,
-        ],
-        axis=1,
-    )
-
-
-def matrix(quat: Array) -> Array:
-    """The rotation matrix [3, 3] of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = quat
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What a table costs in a file, as a function that can be differentiated, and steps that are learnt with it.
+r"""The size of a table in a file as a differentiable function, and learnable steps.
 
 A column of a table lies on a uniform grid, value = step * whole number. While it is trained, rounding is imitated by
 noise that is uniform over a step (Balle et al., arXiv 1611.01704), or done, with the gradient of the identity. A number
@@ -27,12 +27,7 @@ NARROWEST = 0.05
 
 
 class Rounded(nn.Module):
-    """A table whose values, and whose steps, are learnt.
-
-    Args:
-        values: [N, C].
-        steps: to begin with, > 0. [C]
-    """
+    """A table with learnable values [N, C] and steps [C] > 0."""
 
     def __init__(self, values: Tensor, steps: Tensor):
         super().__init__()
@@ -57,11 +52,7 @@ class Rounded(nn.Module):
 
 
 class Density(nn.Module):
-    """How likely the numbers of a table are, column by column, beside their neighbours.
-
-    Args:
-        values: of the table, to begin with; a row lies next to the one before it. [N, C]
-    """
+    """The distribution of a table's columns given their neighbours; `values` [N, C] start it."""
 
     def __init__(self, values: Tensor):
         super().__init__()
@@ -79,7 +70,7 @@ class Density(nn.Module):
         self.growth = nn.Parameter(values.new_zeros(columns))
 
     def bits(self, values: Tensor, steps: Tensor) -> Tensor:
-        """What each row of values [N, C] costs where steps [C] tell them apart, [N]."""
+        """Bits of each row of values [N, C] rounded to steps [C], [N]."""
         before, before_2 = _earlier(values, 1), _earlier(values, 2)
         mean = values @ self.of_left.tril(-1).T + before @ self.of_left_before.tril(-1).T
         residuals = values - (mean + self.of_before[0] * before + self.of_before[1] * before_2)
@@ -108,8 +99,7 @@ def _earlier(values: Tensor, count: int) -> Tensor:
 
 
 def bits_of_places(means: Tensor, steps: Tensor) -> Tensor:
-    """What each of N means [N, 3] costs where steps [3] tell them apart, a scalar: their cells are told from all others
-    of their box, in any order. Halving a step costs a bit, wherever the means are."""
+    """Bits of each of N means [N, 3] in cells of steps [3], a scalar: its cell among all of their box, in any order."""
     extent = (means.detach().amax(dim=0) - means.detach().amin(dim=0)).clamp_min(1e-30)
     cells = (extent.log() - steps.log()).sum() / math.log(2.0)
     return cells - math.log2(max(len(means), 1)) + 1.0 / math.log(2.0)

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SH_C0, SplatAppearance
-from nrfgs_ns.appearance.reduce import LatentBasis, latent_basis, with_diffuse, with_rank
+from nrfgs_ns.appearance.reduce import latent_basis, with_diffuse, with_rank
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.harmonics_fit import OPAQUE, look_through
 
@@ -41,11 +41,11 @@ class Residuals(NamedTuple):
     """N splats' residuals over the training views."""
 
     weight: Tensor
-    """alpha T summed over pixels and views; 0 for a splat that no view sees. [N]"""
+    """alpha T summed over pixels and views; 0 for an unseen splat. [N]"""
     largest: Tensor
-    """largest change over the views, in 8-bit steps; 0 for a splat that no view sees. [N]"""
+    """largest change over the views, in 8-bit steps; 0 for an unseen splat. [N]"""
     features_dc: Tensor
-    """the mean colour y as the constant harmonic's coefficients; the base's for a splat that no view sees. [N, 3]"""
+    """the mean colour y as the constant harmonic's coefficients; the base's for an unseen splat. [N, 3]"""
     opacities: Tensor
     """the mean opacity a as a logit, likewise. [N, 1]"""
 
@@ -84,18 +84,16 @@ def _views_of(model, cameras: Cameras) -> Iterator[tuple[Tensor, Tensor, SplatAp
 
 
 class FieldViews:
-    """Views with their photographs, projected once: what is left out of a field does not move splats.
+    """Views with their photographs, projected once: slimming moves no splats.
 
     Args:
-        model: an NrfgsModel in evaluation mode.
+        model: in evaluation mode.
         views: pairs of a camera and its batch; at least one.
-        photographs: index of each view among the photographs that the model has learnt, so that its exposure does not
-            count as an error; None: the mean exposure.
+        photographs: index of each view among the photographs whose exposure the model has learnt; None: the mean.
     """
 
     def __init__(self, model, views: list, photographs: Sequence[int | None] | None = None):
-        self.model = model
-        self.views = []
+        self.model, self.views = model, []
         self.photographs = [None] * len(views) if photographs is None else list(photographs)
         for camera, batch in views:
             with torch.no_grad():
@@ -104,13 +102,13 @@ class FieldViews:
             self.views.append((view, truth, model.mask_of(batch)))
 
     def psnr(self, field: Field) -> float:
-        """Mean over the views, inside masks, dB."""
+        """Mean over the views, inside masks, dB; views whose mask is empty are left out."""
         scores = self.scores(field)
         return sum(scores) / max(len(scores), 1)
 
     @torch.no_grad()
     def scores(self, field: Field) -> list[float]:
-        """PSNR of each view inside its mask, dB; views whose mask is empty are left out."""
+        """The terms of `psnr`."""
         scores = []
         for (view, truth, mask), photograph in zip(self.views, self.photographs, strict=True):
             outputs, _ = self.model.composite(view, field.seen_from(view), photograph=photograph)
@@ -125,7 +123,7 @@ def dropped(field: Field, seen: Residuals, threshold: float) -> Field:
 
 
 class Slimmed(NamedTuple):
-    """A smaller field."""
+    """A field with fewer residuals and components."""
 
     field: Field
     threshold: float
@@ -139,8 +137,7 @@ def slim(
 ) -> Slimmed:
     """The smallest field that keeps a PSNR, of those that drop residuals and components of the latents.
 
-    First the largest of THRESHOLDS that costs no more than its share of the allowed loss, then the lowest rank for the
-    splats that are left.
+    First the largest of THRESHOLDS within its share of the allowed loss, then the lowest rank for the other splats.
 
     Args:
         lowest_psnr: on the views, dB.
@@ -155,19 +152,11 @@ def slim(
             field, threshold = smaller, candidate
             break
     basis = latent_basis(field, seen.weight)
-    rank = _smallest_rank(field, basis, views, lowest_psnr, on_trial)
-    whole = rank == field.head.config.latent_dim
-    return Slimmed(field if whole else with_rank(field, basis, rank), threshold, rank)
-
-
-def _smallest_rank(
-    field: Field, basis: LatentBasis, views: FieldViews, lowest_psnr: float, on_trial: Callable[[str], None]
-) -> int:
-    """Fewest principal components of the latents with which the views keep a PSNR (dB)."""
     low, rank = 1, field.head.config.latent_dim
     while low < rank:  # the loss falls with the rank, except for rounding: halve the interval
         middle = (low + rank) // 2
         on_trial(f"latent rank {middle}")
         enough = views.psnr(with_rank(field, basis, middle)) >= lowest_psnr
         low, rank = (low, middle) if enough else (middle + 1, rank)
-    return rank
+    whole = rank == field.head.config.latent_dim
+    return Slimmed(field if whole else with_rank(field, basis, rank), threshold, rank)

@@ -27,10 +27,10 @@ class _Format(NamesTraining):
     report: Path | None = None
     """also write the numbers to this file, as JSON"""
 
-    def checked(self) -> Path:
-        """The config.yml, with the paths checked that are written at the end."""
+    def checked(self, file: Path | None = None) -> Path:
+        """The config.yml; the paths that are written at the end are checked."""
         config = self.config()
-        for path, option in ((self.report, "--report"), (self.output, "--output")):
+        for path, option in ((self.report, "--report"), (file or self.output, "--output")):
             if path is not None:
                 check_writable(path, option)
         return config
@@ -43,11 +43,11 @@ class Ply(_Format):
     options: Annotated[PlyOptions, FLAT] = field(default_factory=PlyOptions)
 
     def main(self) -> None:
-        config = self.checked()
-        if self.options.largest is not None and not 0 < self.options.largest < float("inf"):
-            raise InputError(f"--largest is {self.options.largest}; it must be positive.")
-        if self.options.steps is not None and self.options.steps < 0:
-            raise InputError(f"--steps is {self.options.steps}; it must be at least 0.")
+        config, largest, steps = self.checked(), self.options.largest, self.options.steps
+        if largest is not None and not 0 < largest < float("inf"):
+            raise InputError(f"--largest is {largest}; it must be positive.")
+        if steps is not None and steps < 0:
+            raise InputError(f"--steps is {steps}; it must be at least 0.")
         from nrfgs_ns.export.ply import export_ply
 
         export_ply(config, self.output, self.options, self.measure, self.report)
@@ -74,21 +74,14 @@ class Web(_Format):
     options: Annotated[CompactOptions, FLAT] = field(default_factory=CompactOptions)
     page: Annotated[WebOptions, FLAT] = field(default_factory=WebOptions)
 
-    def checked(self) -> Path:
+    def main(self) -> None:
         alone = self.output.suffix.lower() in (".html", ".htm")
         if self.output.exists() and self.output.is_file() != alone:
             raise InputError(
                 f"--output {self.output} is a {'file' if self.output.is_file() else 'folder'}. Name a file that ends "
                 "in .html, or a folder that does not."
             )
-        config = self.config()
-        check_writable(self.output if alone else self.output / "index.html", "--output")
-        if self.report is not None:
-            check_writable(self.report, "--report")
-        return config
-
-    def main(self) -> None:
-        config = self.checked()
+        config = self.checked(self.output if alone else self.output / "index.html")
         check_compact(self.options)
         from nrfgs_ns.export.web.command import export_web
 
@@ -96,7 +89,6 @@ class Web(_Format):
 
 
 def check_compact(options: CompactOptions) -> None:
-    """Raise InputError, naming the option, if a value cannot work."""
     for name in ("finetune", "rate", "budget"):
         if not getattr(options, name) >= 0:
             raise InputError(f"--{name} is {getattr(options, name)}; it must be zero or positive.")

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`nrfgs export compact`: choose what is left out, write the file, and a config.yml with which nerfstudio reads it."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -10,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import yaml
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
@@ -28,7 +26,7 @@ from nrfgs_ns.files import write_whole
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.progress import progress
 from nrfgs_ns.threads import few_threads
-from nrfgs_ns.trained.loading import find_data, load_model, lost, measure_loss
+from nrfgs_ns.trained.loading import find_data, finish, load_model, lost, measure_loss
 from nrfgs_ns.training.config_file import read_config
 
 PLY_BYTES = 62 * 4
@@ -66,13 +64,9 @@ def export_compact(
         f"{numbers['rank']} numbers, {size / 1e6:.2f} MB, {size / count:.1f} bytes a splat: 3DGS's PLY of as many "
         f"splats has {numbers['ply_bytes'] / 1e6:.2f} MB, {numbers['ply_ratio']:.1f} times as much."
     ]
-    if measure:
-        lines.append(lost(numbers))
+    lines += [lost(numbers)] if measure else []
     lines += [f"Look at it with:  nrfgs view {output}", f"Evaluate it with:  ns-eval --load-config {config}"]
-    for line in lines:
-        CONSOLE.print(line, markup=False, soft_wrap=True)
-    if report is not None:
-        write_whole(report, json.dumps(numbers, indent=1) + "\n")
+    finish(lines, numbers, report)
 
 
 def packed(pipeline, load_config: Path, options: CompactOptions) -> tuple[dict, dict, dict[str, Any]]:
@@ -98,44 +92,36 @@ def packed(pipeline, load_config: Path, options: CompactOptions) -> tuple[dict, 
 
 
 class Chosen(NamedTuple):
-    """The part of a model that is written."""
+    """The part of a model that is written; `weight` [N] is each splat's contribution to the training views, pixels."""
 
     field: Field
     threshold: float
     """residuals below this many 8-bit steps are dropped; 0 for none"""
     weight: Tensor
-    """contribution of each splat to the training views, pixels. [N]"""
 
 
 def trained_for_the_file(
     pipeline, chosen: Chosen, options: CompactOptions
 ) -> tuple[Field, dict[str, np.ndarray] | None]:
-    """The chosen field after the fine-tune that the options ask for, and the steps on which it lies; without a
-    fine-tune, the field as it is."""
+    """The chosen field after the options' fine-tune, and its grids' steps; without one, the field and None."""
     if options.finetune == 0:
         return chosen.field, None
     model = pipeline.model
     centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
     noise = ViewNoise.as_long_as(model.noise_factor * camera_spacing(centers), torch.initial_seed())
     field, steps = prepared(chosen.field, chosen.weight), options.finetune
+    views, settings = pipeline.datamanager.next_train, (len(centers), steps, options.rate, Precision())
     with progress("Training for the file", -(-steps // REPORT_EVERY)) as advance:
-        tuned = fine_tune(
-            model,
-            field,
-            pipeline.datamanager.next_train,
-            noise,
-            len(centers),
-            steps,
-            options.rate,
-            Precision(),
-            lambda step, bits: advance(f"Training for the file ({bits / 8e6:.2f} MB)"),
-        )
+
+        def on_step(step: int, bits: float) -> None:
+            advance(f"Training for the file ({bits / 8e6:.2f} MB)")
+
+        tuned = fine_tune(model, field, views, noise, *settings, on_step)
     return tuned.field, tuned.steps
 
 
 def choose(pipeline, load_config: Path, options: CompactOptions) -> Chosen:
-    """The field to write. Without a fine-tune it is slimmed within the budget; a fine-tune finds out by itself what is
-    not worth its bytes."""
+    """The field to write, slimmed within the budget unless a fine-tune follows."""
     model, data = pipeline.model, pipeline.datamanager
     if not isinstance(model.head, NeuralResidualField):
         raise InputError(
@@ -160,19 +146,14 @@ def choose(pipeline, load_config: Path, options: CompactOptions) -> Chosen:
 
 
 def photographs_of(model, files: Sequence[Path], chosen: Sequence[int]) -> list[int | None]:
-    """Indices of the chosen training images among the photographs that a model has learnt; None: not learnt."""
+    """Indices of the chosen training images among a model's photographs; None: not among them."""
     known = [] if model.photograph is None else model.photograph.names
     return [i if i < len(known) and known[i] == Path(files[i]).name else None for i in chosen]
 
 
 def write_config(load_config: Path, output: Path) -> Path:
-    """Write what nerfstudio's commands need to find a compact file: a config.yml, whose path is returned, and an empty
-    checkpoint.
-
-    For FILE.nrf they are in FILE.nrf.nerfstudio/METHOD/compact: a folder named FILE may be somebody's data. Paths are
-    as they were given, so relative ones count from the folder in which the commands are run, as in every config.yml of
-    nerfstudio.
-    """
+    """Write what nerfstudio's commands need to read FILE.nrf, a config.yml, whose path is returned, and an empty
+    checkpoint, into FILE.nrf.nerfstudio/METHOD/compact. Relative paths stay relative, as nerfstudio's."""
     config = read_config(load_config)
     find_data(config, load_config)
     config.output_dir, config.experiment_name, config.timestamp = output.parent, f"{output.name}.nerfstudio", "compact"
@@ -180,7 +161,6 @@ def write_config(load_config: Path, output: Path) -> Path:
     config.load_dir = config.load_checkpoint = config.load_step = None
     config.pipeline.compact = output
     config.pipeline.model.appearance = decode(output).config
-    # What only the training had.
     config.pipeline.model.camera_optimizer.mode = "off"
     config.pipeline.model.use_bilateral_grid = False
     models = config.get_checkpoint_dir()

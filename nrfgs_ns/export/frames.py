@@ -3,7 +3,9 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from nrfgs_ns.appearance.sh import sh_bases
@@ -34,12 +36,12 @@ class Similarity:
         if self is NOWHERE:  # to the bit
             return splats
         rotation = self.rotation.to(splats.means.device)
+        quats = np.roll(splats.quats.double().cpu().numpy(), -1, axis=1)
+        turned = Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(quats)
         means = self.scale * splats.means.double() @ rotation.T + self.translation.to(rotation)
         return splats._replace(
             means=means.to(splats.means.dtype),
-            quats=torch.nn.functional.normalize(_product(_quaternion(rotation), splats.quats.double()), dim=-1).to(
-                splats.quats.dtype
-            ),
+            quats=torch.from_numpy(np.roll(turned.as_quat(), 1, axis=1)).to(splats.quats),
             scales=splats.scales + torch.tensor(self.scale).log().item(),
             features_rest=torch.einsum(
                 "ab,nbc->nac", _turned_harmonics(rotation).to(splats.features_rest), splats.features_rest
@@ -66,7 +68,7 @@ def to_capture(frame: CaptureFrame) -> Similarity:
 
 
 def _turned_harmonics(rotation: Tensor) -> Tensor:
-    """What a rotation makes of the 15 coefficients of degree 1 to 3, [15, 15] in float64.
+    """The matrix that turns the 15 coefficients of degree 1 to 3, float64 [15, 15].
 
     A turned function f'(d) = f(R^T d) has the coefficients k' with B(d) k' = B(R^T d) k for all d. Each degree stays
     among itself; 64 directions determine it, and the system has no error but rounding's.
@@ -76,25 +78,3 @@ def _turned_harmonics(rotation: Tensor) -> Tensor:
     directions = torch.nn.functional.normalize(directions, dim=-1)
     bases, turned = sh_bases(3, directions), sh_bases(3, directions @ rotation)  # rows d^T R are (R^T d)^T
     return torch.linalg.lstsq(bases, turned).solution[1:, 1:]
-
-
-def _quaternion(rotation: Tensor) -> Tensor:
-    """Unit quaternion (w, x, y, z) of a rotation matrix: the eigenvector of Bar-Itzhack's matrix (2000), [4]."""
-    r = rotation
-    k = torch.stack(
-        [
-            torch.stack([r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]),
-            torch.stack([r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]]),
-            torch.stack([r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]]),
-            torch.stack([r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1]]),
-        ]
-    )
-    return torch.linalg.eigh(k).eigenvectors[:, -1]
-
-
-def _product(one: Tensor, others: Tensor) -> Tensor:
-    """Hamilton products of a quaternion [4] with others [N, 4]."""
-    w, v = one[0], one[1:]
-    scalar = w * others[:, :1] - (others[:, 1:] * v).sum(-1, keepdim=True)
-    vector = w * others[:, 1:] + others[:, :1] * v + torch.linalg.cross(v.expand_as(others[:, 1:]), others[:, 1:])
-    return torch.cat([scalar, vector], dim=-1)

@@ -8,7 +8,6 @@ say how a head's colours and opacities become a file's; `ns-export gaussian-spla
 and writes the same numbers, in the training's world.
 """
 
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
@@ -27,12 +25,12 @@ from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.options import PlyOptions
-from nrfgs_ns.files import whole, write_whole
+from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 from nrfgs_ns.model.pinhole import pinhole
 from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
 from nrfgs_ns.threads import few_threads
-from nrfgs_ns.trained.loading import load_model, lost, measure_loss
+from nrfgs_ns.trained.loading import finish, load_model, lost, measure_loss
 
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz"),
@@ -45,10 +43,8 @@ PROPERTIES = (
 """The vertex properties of 3D Gaussian Splatting, in its order."""
 FAINTEST_LOGIT = -5.5373
 """Splats with a smaller opacity logit are left out, as by ns-export: logit(1/255), below which nothing is drawn."""
-
-
 SPARKS_EDGE = 1.4
-"""How far from a picture's middle, in halves of its size, a splat's centre may lie for Spark 2.2 to draw it: clipXY."""
+"""Largest distance of a splat's centre from the picture's middle, in halves of its size, in Spark 2.2: clipXY."""
 WORTH_A_WORD = 0.1
 """Loss in dB from which the command speaks of it."""
 
@@ -90,10 +86,7 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
         if measure:
             pipeline = load_model(load_config, "test")
             report |= measure_loss(pipeline, pictures_of_file(pipeline.model, output, placed))
-    for line in summary(output, report):
-        CONSOLE.print(line, markup=False, soft_wrap=True)
-    if report_file is not None:
-        write_whole(report_file, json.dumps(report, indent=1) + "\n")
+    finish(summary(output, report), report, report_file)
 
 
 def summary(output: Path, report: dict[str, Any]) -> Iterator[str]:
@@ -117,29 +110,16 @@ def summary(output: Path, report: dict[str, Any]) -> Iterator[str]:
 
 
 def write_splats(splats: PlainSplats, path: Path, comments: Sequence[str] = ()) -> int:
-    """Write a 3DGS PLY file, whole or not at all.
-
-    Splats that are not finite or too faint to be drawn are left out.
-
-    Returns:
-        How many were written.
+    """Write the splats that are finite and not too faint to a 3DGS PLY file; returns their number.
 
     Raises:
         InputError: none would be left.
     """
     count = len(splats.means)
-    columns = torch.cat(
-        [
-            splats.means,
-            splats.means.new_zeros(count, 3),
-            splats.features_dc,
-            splats.features_rest.transpose(1, 2).reshape(count, -1),  # channel-major
-            splats.opacities,
-            splats.scales,
-            splats.quats,
-        ],
-        dim=1,
-    )
+    rest = splats.features_rest.transpose(1, 2).reshape(count, -1)  # channel-major
+    normals = splats.means.new_zeros(count, 3)
+    columns = (splats.means, normals, splats.features_dc, rest, splats.opacities, splats.scales, splats.quats)
+    columns = torch.cat(columns, dim=1)
     keep = torch.isfinite(columns).all(dim=1) & (splats.opacities[:, 0] >= FAINTEST_LOGIT)
     if not keep.any():
         raise InputError(f"{path} is not written: none of the {count} splats is finite and opaque enough to be drawn.")
@@ -151,11 +131,7 @@ def write_splats(splats: PlainSplats, path: Path, comments: Sequence[str] = ()) 
 
 
 def read_splats(path: Path) -> PlainSplats:
-    """Read a 3DGS PLY file of any degree up to 3; lower ones are filled up with zeros.
-
-    Raises:
-        InputError: the file is not there, or has not the properties of one.
-    """
+    """Read a 3DGS PLY file of any degree up to 3, missing ones as zeros; InputError if it is none."""
     try:
         vertices = PlyData.read(str(path))["vertex"].data
     except (OSError, KeyError, ValueError, PlyParseError) as error:
@@ -191,16 +167,7 @@ def read_splats(path: Path) -> PlainSplats:
 def render_splats(
     splats: PlainSplats, camera, background: Tensor, rasterize_mode: str = "classic", scene_unit: float = 1.0
 ) -> Tensor:
-    """Render a file's splats as any viewer would, with this project's rasterizer.
-
-    Args:
-        splats: on one device, which picks the rasterizer's back end.
-        background: a colour [3].
-        rasterize_mode: as the model was trained.
-
-    Returns:
-        [H, W, 3] in [0, 1].
-    """
+    """Render a file's splats over a background [3] with this project's rasterizer, [H, W, 3] in [0, 1]."""
     device = splats.means.device
     pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
     field = Field(ShConfig(degree=3).setup(), splats._asdict())
@@ -210,7 +177,7 @@ def render_splats(
 
 
 def on_screen(means: Tensor, camera) -> Tensor:
-    """Which splats' centres [N, 3] lie no farther from the picture's middle than SPARKS_EDGE, bool [N]."""
+    """Whether splats' centres [N, 3] lie within SPARKS_EDGE, bool [N]."""
     pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
     seen_from = pinhole(camera, pose.to(means.device), 1)
     viewmat, intrinsics = seen_from.viewmat.reshape(4, 4), seen_from.K.reshape(3, 3)
@@ -220,16 +187,8 @@ def on_screen(means: Tensor, camera) -> Tensor:
 
 
 def pictures_of_file(model, path: Path, placed: Similarity) -> Callable[[Any], dict[str, Tensor]]:
-    """What a file shows beside the model that it was written from.
-
-    Args:
-        model: an NrfgsModel in evaluation mode.
-        placed: from the training's world to the file's.
-
-    Returns:
-        camera -> "file"; "on_screen", of the file's splats whose centres lie within SPARKS_EDGE; "base", the model's
-        base colours and opacities.
-    """
+    """A function from a camera to the pictures "file", "on_screen" (of the splats within SPARKS_EDGE) and "base" (the
+    model's base colours and opacities); `placed` leads from the training's world to the file's."""
     file = placed.inverse.moved(read_splats(path))
     file = type(file)(*(value.to(model.device) for value in file))
     how = model.background_color, model.config.rasterize_mode, model.scene_unit

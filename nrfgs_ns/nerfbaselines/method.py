@@ -85,7 +85,6 @@ class Nrfgs:
         self.loaded_step = None if self.checkpoint is None else self.step
 
     def _set_up_training(self, dataset: dict[str, Any]) -> None:
-        """Build the trainer, which loads the checkpoint if there is one."""
         config = copy.deepcopy(self.config)  # its classes are replaced, which a file should not say
         hold_in_memory(config.pipeline.datamanager, dataset, self.world)
         self.folder = tempfile.TemporaryDirectory(prefix="nrfgs-")
@@ -118,7 +117,7 @@ class Nrfgs:
         }
 
     def get_info(self) -> dict[str, Any]:
-        """What this training is: steps, checkpoint, and every option that is a number, a string or a truth value."""
+        """Steps, checkpoint, and every option that is a number, a string or a truth value."""
         return {
             **self.get_method_info(),
             "num_iterations": self.config.max_num_iterations,
@@ -136,8 +135,7 @@ class Nrfgs:
             step: from 0, or from the loaded step.
 
         Returns:
-            loss, its terms and metrics, every `logging.steps_per_log` steps; between these nothing, so that nothing
-            waits for a GPU.
+            loss, its terms and metrics, every `logging.steps_per_log` steps; {} between: no step waits for a GPU.
 
         Raises:
             TrainingStopped: a number is not finite.
@@ -184,15 +182,11 @@ class Nrfgs:
         """There are no appearance embeddings."""
 
     def optimize_embedding(self, dataset: dict[str, Any], *, embedding: np.ndarray | None = None) -> dict[str, Any]:
-        """There are no appearance embeddings.
-
-        Raises:
-            NotImplementedError: always, which is how nerfbaselines learns it.
-        """
+        """Raise NotImplementedError: there are no appearance embeddings."""
         raise NotImplementedError
 
     def save(self, path: str) -> None:
-        """Write a checkpoint into a folder, which is made if it is not there."""
+        """Write a checkpoint into a folder."""
         folder = Path(path)
         models = folder / MODELS
         models.mkdir(parents=True, exist_ok=True)
@@ -221,14 +215,13 @@ NrfgsVdgs, NrfgsGsnb, NrfgsSg = map(_method, ("vdgs", "gsnb", "sg"))
 
 
 def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) -> NrfgsTrainerConfig:
-    """The configuration of a training, read as `ns-train` reads its options.
+    """The configuration of a training, parsed as by `ns-train`.
 
     Args:
-        overrides: options and their values; a list is several words.
-        metadata: the data set's; its background is taken, unless the overrides name one.
+        overrides: options and their values, which win over the data set's background in `metadata`.
 
     Raises:
-        InputError: an option is not one, or belongs to a loop that nerfbaselines does not run.
+        InputError: an option is unknown, or belongs to a loop that nerfbaselines does not run.
     """
     background = background_of(metadata)
     if background is not None:
@@ -263,7 +256,6 @@ def _read_config(checkpoint: Path) -> NrfgsTrainerConfig:
 
 
 def _read_record(file: Path) -> dict[str, Any]:
-    """What `save` wrote beside the configuration."""
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         return {name: record[name] for name in ("transform", "scale", "scene_unit", "training_images")}
@@ -272,7 +264,6 @@ def _read_record(file: Path) -> dict[str, Any]:
 
 
 def _checkpoint_file(checkpoint: Path) -> Path:
-    """The file of parameters in a checkpoint's folder."""
     files = list((checkpoint / MODELS).glob("*.ckpt"))
     if len(files) != 1:
         raise InputError(f"{checkpoint / MODELS} holds {len(files)} checkpoints; it must hold one.")

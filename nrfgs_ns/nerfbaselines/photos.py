@@ -2,8 +2,7 @@
 """Nerfbaselines' cameras and data sets as nerfstudio's, in memory.
 
 Nerfbaselines' poses are camera-to-world with y down and z forwards (OpenCV), in the data set's own world; nerfstudio's
-have y up and z backwards, in a world that is turned upright, centred and scaled to the cameras. `World` is the way from
-one to the other. Pixels are the same: the centre of the first is (0.5, 0.5).
+have y up and z backwards, in a world that is turned upright, centred and scaled to the cameras.
 """
 
 import math
@@ -35,12 +34,7 @@ class World(NamedTuple):
 
     @classmethod
     def around(cls, poses: np.ndarray, options: NrfgsDataParserConfig) -> "World":
-        """The world that nerfstudio's parser would make of these cameras.
-
-        Args:
-            poses: as nerfbaselines has them, [V, 3 or 4, 4].
-            options: the parser's orientation_method, center_method, auto_scale_poses and scale_factor.
-        """
+        """The world that nerfstudio's parser, with these options, makes of nerfbaselines' poses [V, 3 or 4, 4]."""
         rows = np.tile(np.eye(4), (len(poses), 1, 1))
         rows[:, :3] = _opengl(poses).numpy()
         method = options.orientation_method
@@ -59,11 +53,7 @@ class World(NamedTuple):
         return self.scale * (xyz @ self.transform[:, :3].T + self.transform[:, 3])
 
     def cameras(self, given: Any) -> Cameras:
-        """Nerfbaselines' pinhole cameras [V] as nerfstudio's.
-
-        Raises:
-            InputError: a camera is not a pinhole.
-        """
+        """Nerfbaselines' cameras [V] as nerfstudio's; InputError if one is not a pinhole."""
         if (np.asarray(given.camera_models) != PINHOLE).any():
             raise InputError("A camera has distortion. Let nerfbaselines undistort: these methods take pinholes only.")
         poses = _opengl(given.poses)
@@ -73,12 +63,8 @@ class World(NamedTuple):
         sizes = torch.from_numpy(np.array(given.image_sizes, dtype=np.int64))
         return Cameras(
             camera_to_worlds=torch.cat([rotation, center[..., None]], dim=-1).float(),
-            fx=intrinsics[:, 0].contiguous(),
-            fy=intrinsics[:, 1].contiguous(),
-            cx=intrinsics[:, 2].contiguous(),
-            cy=intrinsics[:, 3].contiguous(),
-            width=sizes[:, 0].contiguous(),
-            height=sizes[:, 1].contiguous(),
+            **{name: intrinsics[:, i].contiguous() for i, name in enumerate(("fx", "fy", "cx", "cy"))},
+            **{name: sizes[:, i].contiguous() for i, name in enumerate(("width", "height"))},
             camera_type=CameraType.PERSPECTIVE,
         )
 
@@ -90,11 +76,7 @@ def _opengl(poses: np.ndarray) -> Tensor:
 
 
 def background_of(metadata: dict[str, Any]) -> str | None:
-    """The model's background for a data set: that on which it is evaluated, or None if it names none.
-
-    Raises:
-        InputError: neither black nor white.
-    """
+    """The model's background for a data set, None if it names none; InputError if it is neither black nor white."""
     color = metadata.get("background_color")
     if color is None:
         return None
@@ -105,15 +87,11 @@ def background_of(metadata: dict[str, Any]) -> str | None:
 
 
 def hold_in_memory(config: NrfgsDatamanagerConfig, dataset: dict[str, Any], world: World) -> None:
-    """Let a datamanager's configuration build one that holds nerfbaselines' training set instead of reading files.
-
-    What it holds is in classes, not in the configuration, because nerfstudio copies configurations.
-
-    Args:
-        config: changed in place: its classes are replaced.
+    """Let a datamanager's configuration hold nerfbaselines' training set in memory: its classes are replaced, because
+    nerfstudio copies configurations.
 
     Raises:
-        InputError: a camera is not a pinhole, or an option asks for what nerfbaselines has done already.
+        InputError: a camera is not a pinhole, or an option sizes the images.
     """
     if config.camera_res_scale_factor != 1.0:
         raise InputError("pipeline.datamanager.camera_res_scale_factor: nerfbaselines sizes the images itself.")

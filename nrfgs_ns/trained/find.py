@@ -22,34 +22,15 @@ class NamesTraining:
     """the same, as ns-eval and ns-viewer call it"""
 
     def config(self) -> Path:
-        """The config.yml that is meant.
-
-        Raises:
-            InputError: there is none.
-        """
-        return config_of(self.named())
-
-    def named(self) -> Path | None:
-        """What the command line names.
-
-        Raises:
-            InputError: it names two.
-        """
+        """The named config.yml (`config_of`); InputError if there is none, or two are named."""
         if self.model is not None and self.load_config is not None:
             raise InputError(f"{self.model} and --load-config {self.load_config} both name a training. Give one.")
-        return self.model if self.load_config is None else self.load_config
+        return config_of(self.model if self.load_config is None else self.load_config)
 
 
 def config_of(path: Path | None) -> Path:
-    """The config.yml at a path, or the newest one in a folder and the three folders below it.
-
-    Args:
-        path: a config.yml, or a folder: a run's, outputs/EXPERIMENT/METHOD, ...; None: outputs. Where a folder decides,
-            the choice is printed.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The file at a path; in a folder (None: outputs) or up to three levels below, the newest config.yml, which is
+    printed. InputError if there is none."""
     if path is not None and path.is_file():
         return path
     folder = OUTPUTS if path is None else path

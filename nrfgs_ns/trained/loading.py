@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trained models, loaded for evaluation, viewing and export, and the loss of a file made from one."""
 
+import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import write_whole
 
 if TYPE_CHECKING:  # nerfstudio takes seconds to import: `nrfgs --help` answers at once
     from nerfstudio.engine.trainer import TrainerConfig
@@ -60,12 +62,8 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
 
 
 def find_data(config: "TrainerConfig", path: Path) -> None:
-    """Let a configuration name its data set where that is now: as it is stored, else in the same place as seen from
-    config.yml, so that outputs and data can be moved together.
-
-    Raises:
-        InputError: it is in neither.
-    """
+    """Set the data set's present place: as stored, or the same as seen from config.yml, since outputs and data may be
+    moved together; InputError if it is in neither."""
     manager = config.pipeline.datamanager
     stored = manager.data or manager.dataparser.data
     if stored is None or stored.exists():
@@ -83,11 +81,7 @@ def find_data(config: "TrainerConfig", path: Path) -> None:
 
 
 def load_model(path: Path, mode: Literal["test", "inference"]) -> "NrfgsPipeline":
-    """The pipeline of `load_training`.
-
-    Raises:
-        InputError: as `load_training`; or there is nothing to look at.
-    """
+    """The pipeline of `load_training`; InputError also if it has no splats."""
     pipeline = load_training(path, mode).pipeline
     if pipeline.model.num_points == 0:
         raise InputError(f"{path}: this training has lost all splats. Train again with other options or data.")
@@ -95,11 +89,7 @@ def load_model(path: Path, mode: Literal["test", "inference"]) -> "NrfgsPipeline
 
 
 def load_file(path: Path) -> "NrfgsModel":
-    """The model in a compact file, in evaluation mode; it needs no config.yml and no data set.
-
-    Raises:
-        InputError: as `decode`.
-    """
+    """The model in a compact file, in evaluation mode, without config.yml and data set; InputError as `decode`."""
     from nerfstudio.data.scene_box import SceneBox
 
     from nrfgs_ns.compact.decode import decode, model_state
@@ -135,12 +125,10 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
     """Compare pictures with the photographs, on the test views.
 
     Args:
-        pipeline: of the model, with its test images.
-        pictures: renders a camera, a batch of one: name -> image [H, W, 3]. One of them is "file".
+        pictures: camera -> images [H, W, 3] by name, one of them "file".
 
     Returns:
-        Means over the images, dB, inside their masks: psnr_model, and psnr_NAME of each picture. loss_db: model minus
-        file. per_image: each image's values.
+        means over the images, dB, inside their masks: psnr_model, psnr_NAME; loss_db: model minus file; and per_image.
 
     Raises:
         InputError: no test image has pixels inside its mask.
@@ -164,6 +152,16 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
         raise InputError("No test image has pixels inside its mask: there is nothing to measure on. Use --no-measure.")
     means = {key: sum(image[key] for image in per_image) / len(per_image) for key in scores}
     return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}
+
+
+def finish(lines: Iterable[str], numbers: dict[str, Any], report: Path | None) -> None:
+    """Print an export's result, and write its numbers as JSON if there is a path for them."""
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    for line in lines:
+        CONSOLE.print(line, markup=False, soft_wrap=True)
+    if report is not None:
+        write_whole(report, json.dumps(numbers, indent=1) + "\n")
 
 
 def lost(numbers: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ from time import sleep
 from types import SimpleNamespace
 
 from nrfgs_ns.compact.format import MAGIC
-from nrfgs_ns.trained.find import NamesTraining, config_of
+from nrfgs_ns.trained.find import NamesTraining
 
 
 @dataclass
@@ -21,7 +21,7 @@ class View(NamesTraining):
     """port to listen on. None: 7007, or the next that is free"""
 
     def main(self) -> None:
-        path = config_of(self.named())
+        path = self.config()
         with path.open("rb") as file:
             compact = file.read(len(MAGIC)) == MAGIC
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder in nerfstudio's viewer whose controls say which picture of the appearance head is shown.
+"""Controls of the appearance head's pictures in nerfstudio's viewer.
 
-A model that was handed a panel (`show_by`) renders by it only where the panel says that a browser is asking: what a
-browser sets cannot reach a training, an evaluation or ns-render.
+A model with a panel (`show_by`) follows it only in the viewer's render threads (`is_asking`): what a browser sets
+cannot reach a training, an evaluation or ns-render.
 """
 
 import contextlib
@@ -36,11 +36,8 @@ MARKER_COLOR = (255, 211, 105)
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let what a rendering sends to browsers be sent whole.
-
-    Nerfstudio interrupts a rendering that nobody waits for by an exception at any line (a trace function raises it).
-    Where that is one of viser's, viser 0.2.7 keeps its lock, and the viewer stands still.
-    """
+    """Suspend nerfstudio's trace function, which interrupts a rendering by an exception at any line: in viser's code it
+    would leave a lock taken."""
     trace = sys.gettrace()
     sys.settrace(None)
     try:
@@ -50,57 +47,40 @@ def uninterrupted() -> Iterator[None]:
 
 
 class ViewerPanel(ViewerControl):
-    """The folder "Appearance" at the top of nerfstudio's viewer.
-
-    Nerfstudio finds it because it is an attribute of the model. A control rather than elements: nerfstudio would put
-    elements at the foot of a tab, two folders deep.
-    """
+    """The folder "Appearance" at the top of nerfstudio's viewer, which finds it as an attribute of the model."""
 
     def __init__(self, model: "NrfgsModel"):
         protect()
         open_sooner()
         self.model = model
         self.background: Tensor | None = None
-        """the viewer's background colour, [3]"""
+        """the viewer's background colour [3]"""
         self.frozen_center: Tensor | None = None
-        """camera centre at the moment when the view was frozen, in world units, [3]"""
+        """camera centre [3] where the view was frozen"""
         self.installed = False
 
     def _setup(self, viewer) -> None:
-        """Nerfstudio calls this when the viewer has its own controls."""
+        """Add the controls; nerfstudio calls this after its own."""
         super()._setup(viewer)
         self.legends = self._legends()
         gui = viewer.viser_server.gui
         with gui.add_folder("Appearance", order=viewer.stats_markdown.order + 0.5):
             self.mode = gui.add_dropdown("Show", list(self.legends), initial_value=FULL, hint="What is drawn")
             self.legend = gui.add_markdown(self.legends[FULL])
-            self.gain = gui.add_slider(
-                "Residual gain",
-                min=0.0,
-                max=2.0,
-                step=0.05,
-                initial_value=1.0,
-                hint="How much of what depends on the view is added: 0 nothing, 1 as trained",
-            )
-            self.stops = gui.add_slider(
-                "Exposure", min=-3.0, max=3.0, step=0.1, initial_value=0.0, hint="Stops by which the image is brighter"
-            )
+            hint = "How much of what depends on the view is added: 0 nothing, 1 as trained"
+            self.gain = gui.add_slider("Residual gain", 0.0, 2.0, 0.05, 1.0, hint=hint)
+            hint = "Stops by which the image is brighter"
+            self.stops = gui.add_slider("Exposure", -3.0, 3.0, 0.1, 0.0, hint=hint)
             self.look = None
             if self.model.photograph is not None:
-                names = [MEAN_LOOK, *self.model.photograph.names]
-                self.look = gui.add_dropdown(
-                    "Look", names, initial_value=MEAN_LOOK, hint="The photograph whose exposure and colour are shown"
-                )
-            self.freeze = gui.add_checkbox(
-                "Freeze view",
-                initial_value=False,
-                hint="Keep the looks that the splats have from here, and walk around them",
-            )
+                names, hint = [MEAN_LOOK, *self.model.photograph.names], "The photograph whose exposure is shown"
+                self.look = gui.add_dropdown("Look", names, MEAN_LOOK, hint=hint)
+            hint = "Keep the looks that the splats have from here, and walk around them"
+            self.freeze = gui.add_checkbox("Freeze view", initial_value=False, hint=hint)
             self.count = gui.add_text("Splats", initial_value=f"{self.model.num_points:,}", disabled=True)
         # One callback each: viser runs a control's callbacks in no particular order.
         self.mode.on_update(lambda _: self._change_mode())
-        self.gain.on_update(lambda _: viewer._trigger_rerender())
-        for control in filter(None, (self.stops, self.look)):
+        for control in filter(None, (self.gain, self.stops, self.look)):
             control.on_update(lambda _: viewer._trigger_rerender())
         self.freeze.on_update(lambda event: self._freeze(event.client))
         self.marker = None
@@ -110,7 +90,7 @@ class ViewerPanel(ViewerControl):
 
     @staticmethod
     def is_asking() -> bool:
-        """Whether this code runs for a browser: nerfstudio's viewer renders in a thread of its own for each."""
+        """Whether this code runs in a render thread of nerfstudio's viewer."""
         return isinstance(threading.current_thread(), RenderStateMachine)
 
     def set_background(self, background: Tensor) -> None:
@@ -118,11 +98,9 @@ class ViewerPanel(ViewerControl):
         self.background = background
 
     def _welcome(self, client) -> None:
-        """Let a browser begin where the first of the training photographs was taken: nerfstudio's own first view may
-        see nothing at all. A little in front of it, so that the photograph, which hangs there, hides nothing.
-        """
+        """Let a browser begin a little in front of the first training photograph: nerfstudio's view may see nothing."""
         taken = list(getattr(self.viewer, "camera_handles", {}).values())
-        if not taken:  # the scene is not there yet: the first picture that is asked for is early enough
+        if not taken:  # until the first picture
             self.waiting.append(client)
             return
         first = taken[0]
@@ -132,20 +110,18 @@ class ViewerPanel(ViewerControl):
             client.camera.wxyz = first.wxyz
 
     def _welcome_waiting(self) -> None:
-        """Try again with those who came too early."""
         waiting, self.waiting = self.waiting, []
         for client in waiting:
             self._welcome(client)
 
     def _legends(self) -> dict[str, str]:
-        """What the line under the dropdown says in each mode."""
-        field = self.model.field
-        kinds = offered_components(field)
-        return {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(field)}
+        """The line under the dropdown in each mode."""
+        kinds = offered_components(self.model.field)
+        return {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(self.model.field)}
 
     @property
     def shown(self) -> Shown:
-        """What the controls say now; the image as trained if there is no viewer."""
+        """The picture that the controls name; the image as trained without a viewer."""
         if not self.installed:
             return Shown()
         center = self.frozen_center if self.freeze.value else None
@@ -171,8 +147,7 @@ class ViewerPanel(ViewerControl):
 
     @property
     def is_slow(self) -> bool:
-        """Whether pictures take so long that they may be interrupted. On a GPU, where a first one tries kernels, a
-        trial that is interrupted would count as failed."""
+        """Whether pictures may be interrupted. On a GPU an interrupted trial of a kernel would count as failed."""
         return self.model.device.type == "cpu"
 
     def _change_mode(self) -> None:
@@ -180,24 +155,15 @@ class ViewerPanel(ViewerControl):
         self.viewer._trigger_rerender()
 
     def _freeze(self, client) -> None:
-        """Remember where the client's camera is, and mark the place; or forget it.
-
-        Args:
-            client: who has clicked; None if a program did, which sets `frozen_center` itself.
-        """
+        """Store and mark the place of the client's camera; None: a program sets `frozen_center` itself."""
         if self.marker is not None:
             self.marker.remove()
             self.marker = None
         if self.freeze.value and client is not None:
-            camera = client.camera
+            camera, size = client.camera, self.viewer.config.camera_frustum_scale
             self.frozen_center = torch.tensor(camera.position / VISER_NERFSTUDIO_SCALE_RATIO, dtype=torch.float32)
+            place = {"wxyz": camera.wxyz, "position": camera.position}
             self.marker = self.viser_server.scene.add_camera_frustum(
-                "/frozen_view",
-                fov=camera.fov,
-                aspect=camera.aspect,
-                scale=self.viewer.config.camera_frustum_scale,
-                color=MARKER_COLOR,
-                wxyz=camera.wxyz,
-                position=camera.position,
+                "/frozen_view", camera.fov, camera.aspect, size, MARKER_COLOR, **place
             )
         self.viewer._trigger_rerender()

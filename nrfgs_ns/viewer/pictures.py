@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be shown of an appearance head: one camera rendered in one of several modes.
-
-`picture` needs no viewer: `training/tracking.py` logs the same pictures.
+"""Pictures of an appearance head: one camera rendered in one of several modes. No viewer is needed.
 
 Modes, beside those that the head itself offers (`AppearanceHead.components`):
 
@@ -36,15 +34,13 @@ FULL, BASE, VIEW_DEPENDENCE, DEPTH = "full", "base colour", "view dependence", "
 GREY = 0.5
 """Where a change is drawn that is none."""
 AMPLIFICATION = 4.0
-"""How much larger than life a change is drawn: the whole range of colours is used up by a change of 1/8 of white, a
-little over half of the field's bound of 0.2."""
+"""Factor of a change as drawn: a change of 1/8 of white uses up the whole range of colours."""
 OPACITY_AXIS = (1.0, 0.0, -1.0)
 """The colour of a change of opacity: orange where the splat is more opaque than its base, blue where it is less."""
 FULL_DEVIATION = 0.1
-"""The standard deviation of colour that is drawn brightest: a residual of +0.1 from half of all directions and -0.1
-from the others."""
+"""The standard deviation of colour that is drawn brightest."""
 FAR_QUANTILE = 0.98
-"""Share of the drawn pixels that set the range of depths, so that one floater does not flatten all else."""
+"""Share of the drawn pixels that set the range of depths: one floater must not flatten all else."""
 
 LEGENDS = {
     FULL: "The image as trained, with the residual times the gain.",
@@ -55,31 +51,30 @@ LEGENDS = {
     "opacity": f"Grey: no change. Orange: more opaque, blue: less; times the gain, times {AMPLIFICATION:g}.",
     "weight": "Dark 0, bright 1.",
 }
-"""What a mode, or a component's kind, shows: the line under the panel's dropdown."""
+"""The line under the panel's dropdown, by mode or kind of component."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a picture shows."""
+    """Options of a picture."""
 
     mode: str = FULL
     """one of `modes(head)`"""
     gain: float = 1.0
     """factor of the residuals, >= 0; 1 is as trained."""
     frozen_center: Tensor | None = None
-    """where splats are seen from [3], in world units, if that is not where the camera is"""
+    """point [3] from which splats are seen, in world units; None: the camera's"""
     stops: float = 0.0
-    """by how much the image is exposed more"""
+    """additional exposure of the image"""
     photograph: int | None = None
     """the training photograph whose exposure and colour the image has; None: the mean look"""
 
 
 def offered_components(field: Field) -> dict[str, str]:
-    """What a head can show of itself: name -> kind, asked with no splats."""
+    """Components that a head can show: name -> kind."""
     means = field.splats["means"]
-    none = torch.zeros(0, dtype=torch.int64, device=means.device)
     with torch.no_grad():
-        components = field.head.components(field.splats, none, means.new_zeros(3))
+        components = field.head.components(field.splats, means.new_zeros(0, dtype=torch.int64), means.new_zeros(3))
     return {name: component.kind for name, component in components.items()}
 
 
@@ -98,11 +93,8 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
         background: a colour [3] behind the splats instead of the configuration's.
 
     Returns:
-        What the model's `get_outputs` returns, with "rgb" [H, W, 3] in [0, 1] showing what was asked for. Accumulation
-        and depth are those of the image with its gain, or of the base for the base colour.
-
-    Raises:
-        ValueError: the head does not offer the mode.
+        the model's `get_outputs`, with "rgb" [H, W, 3] in [0, 1] in this mode. Accumulation and depth belong to the
+        image with its gain, or to the base for the base colour.
     """
     field = model.field
     view = model.project(camera, field.splats)
@@ -121,13 +113,7 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
         deviation = view_dependence(field, view)
         share = _blend(view, deviation / FULL_DEVIATION, appearance.opacities, outputs["accumulation"])
     else:
-        components = field.components_of(view)
-        if shown.mode not in components:
-            raise ValueError(
-                f"The {model.head.name!r} head does not show {shown.mode!r}; it offers "
-                f"{', '.join(map(repr, modes(field)))}."
-            )
-        component = components[shown.mode]
+        component = field.components_of(view)[shown.mode]
         if component.kind != "weight":
             drawn = GREY + AMPLIFICATION * shown.gain * _as_colors(component)
             outputs["rgb"] = _over_grey(view, drawn, appearance.opacities, outputs["accumulation"])
@@ -139,10 +125,8 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
 
 
 def with_gain(field: Field, view: "View", gain: float) -> SplatAppearance:
-    """The appearance of the visible splats with `gain` times what the head adds to their base appearance.
-
-    At gain 1 this is the head's own answer, to the bit; at 0 the base appearance.
-    """
+    """The appearance of the visible splats with `gain` times their residual: at 1 the head's own, to the bit; at 0 the
+    base appearance."""
     if gain == 1.0:
         return field.seen_from(view)
     base = field.base_of(view)
@@ -156,11 +140,8 @@ def with_gain(field: Field, view: "View", gain: float) -> SplatAppearance:
 
 
 def icosahedron() -> Tensor:
-    """Unit vectors to the 12 corners of an icosahedron, [12, 3].
-
-    They are a spherical 5-design: the mean over them is the mean over the sphere for polynomials up to degree 5, so
-    that mean and variance of a colour in harmonics up to degree 2 are exact.
-    """
+    """Unit vectors to the 12 corners of an icosahedron, [12, 3]: a spherical 5-design, so that mean and variance of a
+    colour in harmonics up to degree 2 are exact."""
     golden = (1 + 5**0.5) / 2
     corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
     turned = [corner[i:] + corner[:i] for i in range(3) for corner in corners]
@@ -168,15 +149,8 @@ def icosahedron() -> Tensor:
 
 
 def view_dependence(field: Field, view: "View") -> Tensor:
-    """How much the colours of the visible splats vary with the direction from which they are seen.
-
-    Each splat is seen from 12 places around it, as far away as the camera is, whatever is in between and whether or
-    not the training had a photograph from there.
-
-    Returns:
-        Standard deviation of the colour over the directions, root mean square over the three channels, in units of
-        white. [M, 1]
-    """
+    """Standard deviation of the visible splats' colours over 12 directions, as far away as the camera is: root mean
+    square over the channels, in units of white. [M, 1]"""
     means = field.splats["means"].index_select(0, view.visible)
     distance = (view.center - means).norm(dim=-1, keepdim=True)
     around = [view._replace(center=means + distance * direction) for direction in icosahedron().to(means)]

@@ -1,20 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the viewer is served: to this machine alone, its own files alone, to its own page alone.
-
-Nerfstudio 1.1.5 serves its viewer through viser 0.2.7, which listens on all interfaces, hands out any file that a raw
-path leads to (`GET /../../etc/passwd`), lets every web page that is open in the user's browser steer it, and takes any
-number for the size of a picture. `protect` changes that for the viewers that are opened from then on in this process:
-
-    host      127.0.0.1 unless another one is chosen. `ns-viewer` cannot tell nerfstudio's default of 0.0.0.0 from a
-              choice, so that there it counts as none; `ns-train` and `nrfgs view` take it at its word.
-    requests  refused where the Host header is neither an address nor a name of this machine (another name may have been
-              made to point here), or where the page that asks is of another origin.
-    files     refused outside the folder of viser's page.
-    messages  dropped where a browser's page would not send them; numbers are held within the bounds of their control.
-
-It also gives back a lock that viser keeps (`GuardedServer.atomic`).
-
-Read in: nerfstudio 1.1.5, viser 0.2.7 (`viser/infra/_infra.py`, `viser/_messages.py`), which nerfstudio pins.
+"""A guard for nerfstudio's viewer, which viser 0.2.7 serves to all interfaces, with any file that a raw path leads to
+(`GET /../../etc/passwd`), to every web page that is open in the user's browser. From `protect` on, viewers listen on
+127.0.0.1 unless another host is chosen (`ns-viewer` cannot tell nerfstudio's default of 0.0.0.0 from a choice: there it
+counts as none), serve viser's page alone, to itself alone, and drop messages that this page would not send.
 """
 
 import contextlib
@@ -44,11 +32,10 @@ LOCAL, ALL_INTERFACES = "127.0.0.1", "0.0.0.0"
 
 WIDEST = 8.0
 """Largest ratio of a picture's sides."""
-FARTHEST = 1e6
-"""Largest number in a message: beyond it float32 has no room for a scene."""
+FARTHEST, LONGEST_TEXT = 1e6, 200
+"""Largest number and text in a message: beyond it float32 has no room for a scene."""
 LARGEST = 1e4
-"""Largest value of a control that has bounds of its own, if those are wider: pixels, seconds."""
-LONGEST_TEXT = 200
+"""Largest value of a control with bounds: pixels, seconds."""
 
 SENT_BY_PAGES = (
     _messages.ViewerCameraMessage,
@@ -57,8 +44,7 @@ SENT_BY_PAGES = (
     _messages.ScenePointerMessage,
     _messages.TransformControlsUpdateMessage,
 )
-"""What the viewer's page sends of its own accord. Not among them: uploads, which nothing here takes, and the wish for a
-public link, which is the user's to make (`--viewer.make-share-url`)."""
+"""Not among them: uploads, and the wish for a public link, which is the user's (`--viewer.make-share-url`)."""
 
 
 @dataclass
@@ -71,18 +57,14 @@ class LocalViewerConfig(ViewerConfig):
 
 
 def protect() -> None:
-    """Serve all viewers of this process from now on as this module says.
-
-    Raises:
-        InputError: viser is another version than the one whose server is known here.
-    """
+    """Guard all viewers of this process from now on; InputError if viser is of an unknown version."""
     if infra.WebsockServer is GuardedServer:
         return
     version = importlib.metadata.version("viser")
     if version != VISER_READ:
         raise InputError(
-            f"viser {version} is installed, and the viewer is guarded in {VISER_READ} alone, which nerfstudio 1.1.5 "
-            f"pins. Run: pip install viser=={VISER_READ}."
+            f"viser {version} is installed, and the viewer is guarded in {VISER_READ} alone. Run: pip install "
+            f"viser=={VISER_READ}."
         )
     infra.WebsockServer = GuardedServer
     # The page is built. To ask, viser looks through all processes of the machine, and fails if one of them ends then.
@@ -93,7 +75,7 @@ def protect() -> None:
 
 
 def _guarded(open_viewer):
-    """Nerfstudio's `Viewer.__init__` with the host that was chosen, and a line on how to look from elsewhere."""
+    """Nerfstudio's `Viewer.__init__` on the chosen host, with a line on how to look from elsewhere."""
 
     @functools.wraps(open_viewer)
     def open_guarded(self, config, *args, **options) -> None:
@@ -118,7 +100,7 @@ def _guarded(open_viewer):
 
 
 def _check_address(host: str, port: int | None) -> None:
-    """Raise InputError where nothing can listen: viser would take each port for a busy one, or stand still."""
+    """Raise InputError where nothing can listen: viser would stand still."""
     if port is not None and not 0 < port < 2**16:
         raise InputError(f"The viewer's port is {port}; give one from 1 to {2**16 - 1}.")
     try:
@@ -131,12 +113,12 @@ def _check_address(host: str, port: int | None) -> None:
         ) from error
 
 
-def _refused(*_, **__) -> None:
+def _refused(*_, **__):
     raise InputError("The legacy viewer is steered by a page of another site. Use --vis viewer.")
 
 
 class GuardedServer(infra.WebsockServer):
-    """Viser's server, which looks at what comes in."""
+    """Viser's server, with checked requests and messages."""
 
     def __init__(self, host: str, *args, message_class=infra.Message, **options):
         super().__init__(host, *args, message_class=_Admission(message_class, self), **options)
@@ -146,12 +128,12 @@ class GuardedServer(infra.WebsockServer):
             machine = socket.gethostname().lower()
             self.names |= {host.lower(), machine, f"{machine}.local"}
         self.bounds: dict[str, tuple[Any, Any]] = {}
-        """smallest and largest value of the controls that have such, by id"""
+        """smallest and largest value of controls, by id; None: no bound"""
         self.file_names: set[str] = set()
-        """the ids of text fields that become the name of a file"""
+        """ids of text fields that become the name of a file"""
 
     def queue_message(self, message) -> None:
-        """Remember the bounds of the controls that are put up."""
+        """Send a message, and remember the bounds of controls."""
         if getattr(message, "min", None) is not None or getattr(message, "max", None) is not None:
             self.bounds[message.id] = (message.min, message.max)
         elif isinstance(message, _messages.GuiAddTextMessage) and message.label == "Render name":
@@ -162,10 +144,7 @@ class GuardedServer(infra.WebsockServer):
 
     @contextlib.contextmanager
     def atomic(self) -> Iterator[None]:
-        """As viser's, but an exception inside gives the lock back: viser 0.2.7 keeps it, and the viewer stands still.
-
-        Nerfstudio raises one when a browser leaves while its camera moves.
-        """
+        """As viser's, except that an exception inside, as when a browser leaves, frees the lock."""
         messages = super().atomic()
         messages.__enter__()
         try:
@@ -181,8 +160,7 @@ class GuardedServer(infra.WebsockServer):
         """The answer to a request that is not served, None for the others."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._known(hosts[0]):
-            sentence = "Not served under this name. Open the viewer as http://localhost:PORT or by the address."
-            return HTTPStatus.FORBIDDEN, {}, sentence.encode()
+            return HTTPStatus.FORBIDDEN, {}, b"Not served under this name. Open the viewer by http://localhost:PORT."
         if any(origin.partition("://")[2] != hosts[0] for origin in origins):
             return HTTPStatus.FORBIDDEN, {}, b"Not served to pages of other sites."
         if headers.get_all("Upgrade") == ["websocket"]:
@@ -197,28 +175,23 @@ class GuardedServer(infra.WebsockServer):
         return None if found else (HTTPStatus.NOT_FOUND, {}, b"404")
 
     def _known(self, host: str) -> bool:
-        """Whether a Host header names this server. An address does: what points it elsewhere is not a name server."""
+        """Whether a Host header names this server. Every address does: no name server points it elsewhere."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:
             return False
-        try:
-            ipaddress.ip_address(name)
-        except ValueError:
-            return name in self.names
-        return True
+        with contextlib.suppress(ValueError):
+            return bool(ipaddress.ip_address(name))
+        return name in self.names
 
 
 class _Admission:
-    """What stands in for viser's message class: its `deserialize` lets pass what a page would send.
-
-    What it does not becomes a message that nobody listens to. An exception would leave the client's render thread
-    running for ever.
+    """Viser's message class, with a `deserialize` that turns what no page would send into a message without listeners:
+    an exception would leave the client's render thread running for ever.
     """
 
     def __init__(self, message_class: type, server: GuardedServer):
-        self.message_class = message_class
-        self.server = server
+        self.message_class, self.server = message_class, server
 
     def deserialize(self, raw: bytes):
         try:
@@ -229,15 +202,11 @@ class _Admission:
         return message
 
     def _check(self, message) -> None:
-        """Hold a message within bounds.
-
-        Raises:
-            ValueError: it is not one that a page would send.
-        """
+        """Clamp a message's numbers to their bounds; ValueError if no page would send it."""
         if not isinstance(message, SENT_BY_PAGES):
             raise ValueError(type(message).__name__)
         for number in _numbers([getattr(message, field.name) for field in fields(message)]):
-            if not abs(number) <= FARTHEST:
+            if not abs(number) <= FARTHEST:  # NaN, too
                 raise ValueError(number)
         if isinstance(message, _messages.ViewerCameraMessage):
             lengths = [len(getattr(message, name)) for name in ("wxyz", "position", "look_at", "up_direction")]
@@ -260,15 +229,11 @@ class _Admission:
 
 def _numbers(value: Any) -> Iterator[float]:
     """All numbers in nested tuples, lists and dictionaries."""
-    if isinstance(value, dict):
-        value = value.values()
-    elif isinstance(value, (int, float)):
+    if isinstance(value, (int, float)):
         yield value
-        return
-    elif not isinstance(value, (list, tuple)):
-        return
-    for part in value:
-        yield from _numbers(part)
+    elif isinstance(value, (dict, list, tuple)):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _numbers(part)
 
 
 def _held(value: Any, low: Any, high: Any) -> Any:
@@ -285,7 +250,7 @@ _serving = threading.local()
 
 
 class _Websockets:
-    """The module `websockets` as viser's server sees it: with a `serve` that asks the guard."""
+    """The module `websockets` for viser's server, with a `serve` that asks the guard."""
 
     def __getattr__(self, name: str):
         return getattr(websockets, name)
@@ -309,11 +274,10 @@ class _Websockets:
 
 
 class _BytesAlone:
-    """A connection that skips messages of text: viser would fall over them."""
+    """A connection that skips messages of text, on which viser fails."""
 
     def __init__(self, websocket):
-        self.websocket = websocket
-        self.send = websocket.send
+        self.websocket, self.send = websocket, websocket.send
 
     async def recv(self) -> bytes:
         while not isinstance(message := await self.websocket.recv(), bytes):

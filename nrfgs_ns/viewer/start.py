@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makes nerfstudio's viewer open sooner; a training waits for it before its first step.
-
-Nerfstudio decodes all photographs once more, at full size as float32, to show each 100 pixels high where it was taken.
-Viser reads its archive of icons through for every button.
-"""
+"""A faster start of nerfstudio's viewer, which decodes all photographs once more, at full size, to show each 100 pixels
+high, and whose viser reads its archive of icons through for every button."""
 
 import functools
 import tarfile
@@ -40,19 +37,14 @@ def icon(name: str) -> str:
 
 
 _ARCHIVE_LOCK = threading.Lock()
-
-
-@functools.cache
-def _archive() -> tarfile.TarFile:
-    return tarfile.open(_icons.ICONS_DIR / "tabler-icons.tar")
+_archive = functools.cache(lambda: tarfile.open(_icons.ICONS_DIR / "tabler-icons.tar"))
 
 
 class SmallPhotographs:
-    """Of a data set what the viewer needs: cameras and small photographs.
+    """The cameras and small photographs of a data set.
 
     Args:
-        dataset: nerfstudio's.
-        read: photographs that have been read, with "image" [H, W, 3 or 4]; None: the files give small ones.
+        read: photographs in memory, with "image" [H, W, 3 or 4]; None: they are read from their files.
     """
 
     def __init__(self, dataset: InputDataset, read: Sequence[Mapping[str, Any]] | None):
@@ -80,7 +72,7 @@ def _with_small_photographs(init_scene):
 
     @functools.wraps(init_scene)
     def init_small_scene(self, train_dataset, *args, **options) -> None:
-        read = vars(self.pipeline.datamanager).get("cached_train")  # read by now, or not at all
+        read = vars(self.pipeline.datamanager).get("cached_train")
         with few_threads():
             init_scene(self, SmallPhotographs(train_dataset, read), *args, **options)
 

@@ -15,7 +15,6 @@ from nrfgs_ns.compact.format import (
     DTYPES,
     MAGIC,
     MODEL,
-    MOST_COLUMNS,
     PREAMBLE,
     SMALL,
     Table,
@@ -85,61 +84,6 @@ def test_tables_are_coded(arrays, coded):
     assert (streams["half"] == arrays["half"]).all()
 
 
-@pytest.mark.parametrize(
-    "table",
-    [
-        Table(np.array([[-1]]), signed=False),
-        Table(np.array([[2**31]])),
-        Table(np.array([[2**32]]), signed=False),
-        Table(np.zeros((MOST_COLUMNS + 1, 1), dtype=np.int64)),
-    ],
-)
-def test_a_table_that_no_reader_would_take_is_not_written(table, tmp_path):
-    with pytest.raises(ValueError, match="a table of"):
-        write_container(tmp_path / "x.nrf", {}, {"a": table})
-
-
-@pytest.mark.parametrize(
-    "change, says",
-    [
-        (lambda entry: entry.update(coding="zip"), "coding 'zip'"),
-        (lambda entry: entry.pop("coding") and None, "has a stream"),
-        (lambda entry: entry.update(coding="xz", dtype="uint16"), "cannot be unpacked"),
-        (lambda entry: entry.update(dtype="float16"), "which cannot be"),
-        (lambda entry: entry.update(dtype="uint32"), "no uint32"),
-        (lambda entry: entry.update(shape=[900]), "which cannot be"),
-        (lambda entry: entry.update(shape=[3, 301]), "cannot be decoded"),
-        (lambda entry: entry.update(shape=[900, 1]), "cannot be decoded"),
-        (lambda entry: entry.update(shape=[10**6, 0]), "too large"),
-        (lambda entry: entry.update(shape=[3, 10**9]), "would unpack to"),
-    ],
-)
-def test_a_misleading_entry_of_a_table_is_refused(change, says, coded, tmp_path):
-    path = tmp_path / "made.nrf"
-    path.write_bytes(coded.read_bytes())
-    rewritten(path, lambda header: change(header["streams"][0]) and None)
-    with pytest.raises(InputError, match=says):
-        read_container(path)
-
-
-@pytest.mark.parametrize("count, size", [(2**32 - 1, 10), (SMALL // 4 + 1, 10), (5, 2**32 - 1), (0, 0), (5, 3)])
-def test_a_misleading_model_of_a_table_is_refused(count, size, coded, tmp_path):
-    path = tmp_path / "made.nrf"
-    path.write_bytes(coded.read_bytes())
-
-    def change(header):
-        data = bytearray(path.read_bytes())
-        _, _, length, _ = PREAMBLE.unpack_from(data)
-        first, entry = PREAMBLE.size + length + CHECKSUM.size, header["streams"][0]
-        MODEL.pack_into(data, first, count, size)
-        entry["crc32"] = zlib.crc32(data[first : first + entry["bytes"]])
-        path.write_bytes(data)
-
-    rewritten(path, change)
-    with pytest.raises(InputError, match="made.nrf: its stream 'signed' (cannot be|does not hold)"):
-        read_container(path)
-
-
 @settings(max_examples=150)
 @given(data=st.data())
 def test_a_changed_byte_is_noticed(data, written, tmp_path_factory):
@@ -168,71 +112,61 @@ def test_a_cut_or_longer_file_is_noticed(data, written):
 
 
 def rewritten(path, change) -> None:
-    """Change a file's header and fix its checksum and length: a file that was made wrong, not one that was damaged."""
+    """Change a file's header, or the version that `change` returns, and fix its checksum and length."""
     data = path.read_bytes()
     _, version, length, _ = PREAMBLE.unpack_from(data)
     header = json.loads(data[PREAMBLE.size : PREAMBLE.size + length])
     version = change(header) or version
-    write_with(path, json.dumps(header).encode(), version)
-
-
-def write_with(path, text: bytes, version: int = 2) -> None:
-    """Give a file another header."""
-    data = path.read_bytes()
-    _, _, length, _ = PREAMBLE.unpack_from(data)
-    body = data[PREAMBLE.size + length + CHECKSUM.size :]
+    text, body = json.dumps(header).encode(), path.read_bytes()[PREAMBLE.size + length + CHECKSUM.size :]
     start = PREAMBLE.pack(MAGIC, version, len(text), PREAMBLE.size + len(text) + CHECKSUM.size + len(body)) + text
     path.write_bytes(start + CHECKSUM.pack(zlib.crc32(start)) + body)
 
 
 @pytest.mark.parametrize(
-    "change, says",
+    "file, change, says",
     [
-        (lambda header: 3, "version 3.*Install a newer"),
-        (lambda header: 1, "version 1.*export it again"),
-        (lambda header: header["streams"][0].update(shape=[3, 18]), "does not hold 54 numbers"),
-        (lambda header: header["streams"][0].update(shape=[3, 16]), "does not hold 48 numbers"),
-        (lambda header: header["streams"][0].update(shape=[2**40]), "would unpack to"),
-        (lambda header: header["streams"][0].update(dtype="object"), "which cannot be"),
-        (lambda header: header["streams"][0].update(shape=[True, 51]), "which cannot be"),
-        (lambda header: header["streams"][0].update(bytes=True), "has a stream"),
-        (lambda header: header["streams"][0].update(crc32=1), "checksum of its stream"),
-        (lambda header: header["streams"].pop() and None, "after its last stream"),
+        ("written", lambda header: 3, "version 3.*Install a newer"),
+        ("written", lambda header: 1, "version 1.*export it again"),
+        ("written", lambda header: header["streams"][0].update(shape=[3, 18]), "does not hold 54 numbers"),
+        ("written", lambda header: header["streams"][0].update(shape=[2**40]), "would unpack to"),
+        ("written", lambda header: header["streams"][0].update(shape=[True, 51]), "the stream"),
+        ("written", lambda header: header["streams"][0].update(bytes=True), "the stream"),
+        ("written", lambda header: header["streams"][0].update(crc32=1), "checksum of its stream"),
+        ("written", lambda header: header["streams"].pop() and None, "after its last stream"),
+        ("written", lambda header: header.update(streams=3), "no list of streams"),
+        ("coded", lambda header: header["streams"][0].update(coding="zip"), "the stream .*'zip'"),
+        ("coded", lambda header: header["streams"][0].update(coding="xz", dtype="uint16"), "cannot be decoded"),
+        ("coded", lambda header: header["streams"][0].update(dtype="float16"), "the stream .*'float16'"),
+        ("coded", lambda header: header["streams"][0].update(dtype="uint32"), "no uint32"),
+        ("coded", lambda header: header["streams"][0].update(shape=[900]), "the stream"),
+        ("coded", lambda header: header["streams"][0].update(shape=[3, 301]), "cannot be decoded"),
+        ("coded", lambda header: header["streams"][0].update(shape=[10**6, 0]), "too large"),
+        ("coded", lambda header: header["streams"][0].update(shape=[3, 10**9]), "would unpack to"),
     ],
 )
-def test_a_misleading_header_is_refused(change, says, written, tmp_path):
+def test_a_misleading_header_is_refused(file, change, says, request, tmp_path):
     path = tmp_path / "made.nrf"
-    path.write_bytes(written.read_bytes())
+    path.write_bytes(request.getfixturevalue(file).read_bytes())
     rewritten(path, change)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=f"made.nrf.*{says}"):
         read_container(path)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [b"", b"\xff\xfe", b"{", b"[" * 100_000, b"[]", b"null", b"{}", b'{"streams": 3}', b'{"streams": [3]}'],
-)
-def test_a_header_that_is_none_is_refused(text, written, tmp_path):
+@pytest.mark.parametrize("count, size", [(2**32 - 1, 10), (SMALL // 4 + 1, 10), (5, 2**32 - 1), (0, 0), (5, 3)])
+def test_a_misleading_model_of_a_table_is_refused(count, size, coded, tmp_path):
     path = tmp_path / "made.nrf"
-    path.write_bytes(written.read_bytes())
-    write_with(path, text)
-    with pytest.raises(InputError, match="made.nrf"):
-        read_container(path)
+    path.write_bytes(coded.read_bytes())
 
+    def change(header):
+        data = bytearray(path.read_bytes())
+        _, _, length, _ = PREAMBLE.unpack_from(data)
+        first, entry = PREAMBLE.size + length + CHECKSUM.size, header["streams"][0]
+        MODEL.pack_into(data, first, count, size)
+        entry["crc32"] = zlib.crc32(data[first : first + entry["bytes"]])
+        path.write_bytes(data)
 
-@pytest.mark.parametrize("key", ["name", "coding", "dtype", "shape", "bytes", "crc32"])
-def test_a_stream_with_an_impossible_entry_is_refused(key, written, tmp_path):
-    path = tmp_path / "made.nrf"
-    for value in (None, -1, 2.5, float("nan"), "x", [], {}, [1.5], [None], [-3, -17], [True], 10**30):
-        if (key, value) == ("name", "x"):  # a name like any other
-            continue
-        path.write_bytes(written.read_bytes())
-        rewritten(path, lambda header, value=value: header["streams"][0].update({key: value}))
-        with pytest.raises(InputError, match="made.nrf"):
-            read_container(path)
-    path.write_bytes(written.read_bytes())
-    rewritten(path, lambda header: header["streams"][0].pop(key) and None)
-    with pytest.raises(InputError, match="made.nrf"):
+    rewritten(path, change)
+    with pytest.raises(InputError, match="made.nrf: its stream 'signed' cannot be decoded"):
         read_container(path)
 
 
@@ -242,18 +176,3 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / "text.nrf").write_text("ply\nformat binary_little_endian 1.0\n" * 9)
     with pytest.raises(InputError, match="not a compact file"):
         read_container(tmp_path / "text.nrf")
-    with pytest.raises(ValueError, match="float64"):
-        write_container(tmp_path / "x.nrf", {}, {"a": np.zeros(3)})
-
-
-def test_a_write_that_is_cut_short_leaves_the_older_file(written, monkeypatch):
-    before = written.read_bytes()
-
-    def torn(*_):
-        raise OSError("disk full")
-
-    monkeypatch.setattr("nrfgs_ns.files.os.replace", torn)
-    with pytest.raises(OSError, match="disk full"):
-        write_container(written, {}, {})
-    assert written.read_bytes() == before
-    assert [file.name for file in written.parent.iterdir()] == [written.name]

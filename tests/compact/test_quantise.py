@@ -4,30 +4,20 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from nrfgs_ns.compact.quantise import (
-    NEAR,
-    OCTAHEDRAL,
-    Grid,
-    from_morton,
-    matrix,
-    morton,
-    nearest_turn,
-)
+from nrfgs_ns.compact.quantise import NEAR, OCTAHEDRAL, Grid, from_morton, morton, nearest_turn
 
 
 @given(seed=st.integers(0, 99), count=st.integers(0, 40))
 def test_morton_interleaves_and_back(seed, count):
     codes = np.random.default_rng(seed).integers(0, 2**21, (count, 3))
+    codes[:1] = 2**21 - 1
     interleaved = morton(codes)
     assert (from_morton(interleaved) == codes).all()
     for row, number in zip(codes[:3], interleaved, strict=False):  # by hand, bit for bit
         by_hand = sum(((int(row[axis]) >> k) & 1) << (3 * k + axis) for k in range(21) for axis in range(3))
         assert by_hand == int(number)
-
-
-def test_morton_takes_the_largest_codes():
-    assert morton(np.full((1, 3), 2**21 - 1)).tolist() == [2**63 - 1]
 
 
 @given(seed=st.integers(0, 99))
@@ -41,15 +31,8 @@ def test_grids_are_half_a_step_off_at_most(seed):
 
 def ellipsoids(quats, scales):
     """R S R^T, [N, 3, 3]."""
-    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    turns = np.stack([matrix(quat) for quat in unit])
+    turns = Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix()
     return turns * scales[:, None, :] @ turns.transpose(0, 2, 1)
-
-
-def test_the_axes_turns_are_24():
-    turns = np.stack([matrix(turn) for turn in OCTAHEDRAL])
-    assert np.allclose(np.abs(turns).sum(axis=1), 1.0) and np.allclose(np.linalg.det(turns), 1.0)
-    assert len({tuple(np.rint(turn).astype(int).ravel()) for turn in turns}) == 24
 
 
 @given(seed=st.integers(0, 99))

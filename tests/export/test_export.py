@@ -16,7 +16,7 @@ from plyfile import PlyData
 from short_trainings import command_line
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.head import SH_C0, SplatAppearance, base_colors
+from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.appearance.sh import SphericalHarmonics, sh_bases
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.data.world import CaptureFrame
@@ -389,20 +389,6 @@ def test_ns_export_writes_the_same_splats(method, trained, tmp_path, export_gaus
     assert all((a[name] == b[name]).all() for name in LAYOUT)
 
 
-def test_options_of_nerfstudios_exporter_work(trained, tmp_path, export_gaussian_splat):
-    export = {"load_config": trained("nrfgs"), "output_dir": tmp_path}
-    export_gaussian_splat(**export, output_filename="all.ply").main()
-    whole = PlyData.read(tmp_path / "all.ply")["vertex"].data
-    middle = tuple(float(np.median(whole[axis])) for axis in "xyz")
-    box = {"obb_center": middle, "obb_rotation": (0.0, 0.0, 0.5), "obb_scale": (0.7, 0.7, 0.7)}
-    export_gaussian_splat(**export, output_filename="box.ply", **box).main()
-    export_gaussian_splat(**export, output_filename="rgb.ply", ply_color_mode="rgb").main()
-    cut, rgb = (PlyData.read(tmp_path / f"{name}.ply")["vertex"].data for name in ("box", "rgb"))
-    assert 0 < len(cut) < len(whole) and set(cut.tolist()) < set(whole.tolist())
-    expected = np.clip(0.5 + SH_C0 * whole["f_dc_1"], 0, 1) * 255
-    assert np.abs(rgb["green"] - expected).max() < 1 + 1e-3  # truncated to a byte
-
-
 def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
     """plyfile's numbers, gsplat's own harmonics, and the model's picture."""
     from gsplat.cuda._torch_impl import _spherical_harmonics
@@ -460,6 +446,8 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
         for name, report in (("file/s.html", None), ("s.html", tmp_path / "file" / "report.json")):
             with pytest.raises(InputError, match="cannot be written"):
                 kind(trained("nrfgs"), output=tmp_path / name, report=report).main()
+    with pytest.raises(InputError, match="the 'sh' head.*nrfgs export ply"):
+        Web(trained("nrfgs-sh"), output=tmp_path / "page.html").main()
     lost = tmp_path / "config.yml"
     text = trained("nrfgs").read_text()
     lost.write_text(text.replace("timestamp: ", "timestamp: no-"))
@@ -509,9 +497,3 @@ def test_a_page_apart_from_its_scene(trained, tmp_path):
     for name, kind in (("taken", "file"), ("taken.html", "folder")):
         with pytest.raises(InputError, match=f"is a {kind}. Name a file that ends in .html"):
             Web(trained("nrfgs"), output=tmp_path / name).main()
-
-
-def test_a_page_of_another_head_is_refused(trained, tmp_path):
-    with pytest.raises(InputError, match="the 'sh' head.*nrfgs export ply"):
-        Web(trained("nrfgs-sh"), output=tmp_path / "page.html").main()
-    assert not (tmp_path / "page.html").exists()

@@ -8,11 +8,9 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-import torch
-from torch.testing import assert_close
 
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.export.web.command import _rounded, weight_vectors
+from nrfgs_ns.export.web.command import weight_vectors
 from nrfgs_ns.export.web.page import READER, VIEWER, page
 
 REPOSITORY = Path(__file__).parents[2]
@@ -77,12 +75,6 @@ def test_the_style_and_the_scripts_are_installed_with_the_package():
 )
 def test_how_many_weights_a_view_needs(options, vectors):
     assert weight_vectors(NrfConfig(**options)) == vectors
-
-
-@pytest.mark.parametrize("unit", [1e-5, 1.0, 1e5])
-def test_places_keep_their_digits_in_any_unit(unit):
-    places = unit * torch.randn(12, generator=torch.Generator().manual_seed(0))
-    assert_close(torch.tensor(_rounded(places)), places, rtol=1e-6, atol=0)
 
 
 def test_nothing_in_the_scripts_is_fetched_from_elsewhere():

@@ -141,15 +141,8 @@ def random_scene(folder: Path, mode: str, options: dict) -> tuple[Path, list[dic
         right = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back)
         right = right / right.norm()
         pose = torch.stack([right, torch.linalg.cross(back, right), back, eye], dim=1)
-        photographs.append(
-            {
-                "name": f"{k}.png",
-                "pose": pose.flatten().tolist(),
-                "lens": [260.0, 250.0, 150.0, 130.0],
-                "size": list(SIZE),
-                "distance": float(eye.norm()),
-            }
-        )
+        place = {"name": f"{k}.png", "pose": pose.flatten().tolist(), "distance": float(eye.norm())}
+        photographs.append({**place, "lens": [260.0, 250.0, 150.0, 130.0], "size": list(SIZE)})
     return folder / "scene.nrf", photographs
 
 
@@ -269,43 +262,6 @@ def assert_like_the_renderer(browser, config: Path, path: Path, folder: Path) ->
 
 def test_a_demo_scene_is_drawn_as_by_the_renderer(demo, browser, tmp_path):
     assert_like_the_renderer(browser, *demo, tmp_path)
-
-
-def reduced(capture: Path, folder: Path, views: int, share: int, points: int) -> Path:
-    """A data set of evenly spaced views of a capture, at 1 / share of its size, with some of its points."""
-    from plyfile import PlyData, PlyElement
-
-    meta = json.loads((capture / "transforms.json").read_text())
-    meta["frames"] = sorted(meta["frames"], key=lambda frame: frame["file_path"])
-    meta["frames"] = meta["frames"][:: len(meta["frames"]) // views][:views]
-    for name in ("train_filenames", "val_filenames", "test_filenames"):
-        meta.pop(name, None)
-    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
-        for part in (meta, *meta["frames"]):
-            if key in part:
-                part[key] = part[key] // share if key in "wh" else part[key] / share
-    for frame in meta["frames"]:
-        image = Image.open(capture / frame["file_path"])
-        frame["file_path"] = f"{Path(frame['file_path']).stem}.png"
-        image.resize((image.width // share, image.height // share), Image.Resampling.BOX).save(
-            folder / frame["file_path"]
-        )
-    vertices = PlyData.read(str(capture / meta["ply_file_path"]))["vertex"].data
-    vertices = vertices[:: -(-len(vertices) // points)].copy()
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(folder / "points.ply"))
-    meta["ply_file_path"] = "points.ply"
-    (folder / "transforms.json").write_text(json.dumps(meta))
-    return folder
-
-
-def test_a_capture_is_drawn_as_by_the_renderer(captures, browser, tmp_path):
-    data = tmp_path / "bonsai"
-    data.mkdir()
-    reduced(captures / "bonsai", data, views=24, share=4, points=12_000)
-    options = {"--pipeline.model.num-downscales": 0, "--optimizers.field.optimizer.lr": 0.02}
-    config = trained(command_line("nrfgs", data, tmp_path, 150, options))
-    Web(config, output=tmp_path / "page.html", options=ALL).main()
-    assert_like_the_renderer(browser, config, tmp_path / "page.html", tmp_path)
 
 
 def test_every_control_changes_the_picture(demo, browser):
@@ -543,11 +499,8 @@ def test_a_folder_on_a_web_server(browser, tmp_path):
     with web_server(folder) as address:
         page = Page(browser, f"{address}/").begun()
         assert psnr(page.picture(), rendered(scene, photographs[0])) >= ALIKE
-        assert {url.rsplit("/", 1)[1] for url in page.requests if url.startswith("http")} <= {
-            "",
-            "scene.nrf",
-            "favicon.ico",
-        }
+        asked = {url.rsplit("/", 1)[1] for url in page.requests if url.startswith("http")}
+        assert asked <= {"", "scene.nrf", "favicon.ico"}
         page.page.close()
         scene.unlink()
         page = Page(browser, f"{address}/")

@@ -34,6 +34,7 @@ needs_nerfbaselines = pytest.mark.skipif(
 SPEC = Path(package.__file__).parent / "spec.py"
 STEPS = 6
 OPTIONS = {"max_num_iterations": 50, "pipeline.model.num_downscales": 0, "logging.steps_per_log": 2}
+FAST = {name: value for name, value in OPTIONS.items() if name != "max_num_iterations"}
 
 
 @dataclass
@@ -147,18 +148,28 @@ def test_a_checkpoint_renders_without_the_images(trained, tiny_scene, tmp_path):
     assert one.read_bytes() == other.read_bytes()
 
 
-def test_a_training_goes_on_as_if_it_had_not_stopped(trained, tiny_scene):
-    method, dataset, folder, _ = trained
-    continued = Nrfgs(checkpoint=str(folder), train_dataset=dataset)
-    assert continued.get_info()["loaded_step"] == STEPS
-    train(continued, STEPS, STEPS + 4)
-    unbroken = Nrfgs(train_dataset=dataset, config_overrides=OPTIONS)
-    train(unbroken, 0, STEPS + 4)
+@pytest.mark.parametrize("kind, options", [(Nrfgs, OPTIONS), (NrfgsFast, FAST)])
+def test_a_training_goes_on_as_if_it_had_not_stopped(kind, options, tiny_scene, tmp_path):
+    """Also `nrfgs-fast`, whose place in its schedules, three steps for each one, is part of the checkpoint."""
+    dataset = read(tiny_scene, "train")
+    unbroken = kind(train_dataset=dataset, config_overrides=options)
+    train(unbroken, 0, 3)
+    unbroken.save(str(tmp_path / "checkpoint"))
+    if kind is NrfgsFast:
+        assert unbroken.trainer.pace.position == pytest.approx(9.0, abs=1e-9)
     camera = read(tiny_scene, "test")["cameras"][0]
+    before = unbroken.render(camera)["color"]
+    train(unbroken, 3, 6)
+    continued = kind(checkpoint=str(tmp_path / "checkpoint"), train_dataset=dataset)
+    assert continued.get_info()["loaded_step"] == 3
+    assert continued.get_info()["num_iterations"] == unbroken.get_info()["num_iterations"]
+    train(continued, 3, 6)
     np.testing.assert_array_equal(continued.render(camera)["color"], unbroken.render(camera)["color"])
-    assert not np.array_equal(continued.render(camera)["color"], method.render(camera)["color"])
-    for one in (continued, unbroken):
-        one.close()
+    assert not np.array_equal(continued.render(camera)["color"], before)
+    rates = [one.trainer.optimizers.optimizers["means"].param_groups[0]["lr"] for one in (unbroken, continued)]
+    assert rates[0] == rates[1]
+    for method in (continued, unbroken):
+        method.close()
 
 
 def test_depth_is_in_the_unit_of_the_data(trained, tiny_scene):
@@ -240,27 +251,6 @@ def test_presets_are_those_of_ns_train(method, steps, schedule, densification):
     assert config.pipeline.model.densification.name == densification and config.method_name == method
     assert one.get_method_info()["method_id"] == method
     assert configure(one.method, {"max_num_iterations": 50}, {}).schedule_steps == schedule
-
-
-def test_a_preset_with_a_schedule_goes_on_as_if_it_had_not_stopped(tiny_scene, tmp_path):
-    """`nrfgs-fast`, whose walk through the schedules is part of the checkpoint: three steps for each one of 30,000."""
-    dataset = read(tiny_scene, "train")
-    options = {key: value for key, value in OPTIONS.items() if key != "max_num_iterations"}
-    unbroken = NrfgsFast(train_dataset=dataset, config_overrides=options)
-    assert unbroken.get_info()["num_iterations"] == 10_000
-    train(unbroken, 0, 3)
-    unbroken.save(str(tmp_path / "checkpoint"))
-    assert unbroken.trainer.pace.position == pytest.approx(9.0, abs=1e-9)
-    train(unbroken, 3, 6)
-    continued = NrfgsFast(checkpoint=str(tmp_path / "checkpoint"), train_dataset=dataset)
-    assert continued.get_info()["num_iterations"] == 10_000 and continued.get_info()["loaded_step"] == 3
-    train(continued, 3, 6)
-    camera = read(tiny_scene, "test")["cameras"][0]
-    np.testing.assert_array_equal(continued.render(camera)["color"], unbroken.render(camera)["color"])
-    rates = [one.trainer.optimizers.optimizers["means"].param_groups[0]["lr"] for one in (unbroken, continued)]
-    assert rates[0] == rates[1]
-    for one in (continued, unbroken):
-        one.close()
 
 
 def test_the_last_steps_are_averaged(tiny_scene, tmp_path, monkeypatch):

@@ -20,17 +20,8 @@ from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, VIEW_DEPENDENCE
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 
 pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e '.[browser]'")
-MODES = [
-    FULL,
-    BASE,
-    "residual",
-    "low branch",
-    "high branch",
-    "gate weight",
-    "opacity residual",
-    VIEW_DEPENDENCE,
-    DEPTH,
-]
+FIELD = ["residual", "low branch", "high branch", "gate weight", "opacity residual"]
+MODES = [FULL, BASE, *FIELD, VIEW_DEPENDENCE, DEPTH]
 
 
 @pytest.fixture(scope="module")

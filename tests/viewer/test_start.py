@@ -47,10 +47,16 @@ def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_p
         viewer.viser_server.stop()
 
 
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """Photographs of 640 x 400."""
+    config = SceneConfig(views=3, width=640, height=400, points=50, samples=1)
+    scene = write_scene(config, tmp_path_factory.mktemp("large"))
+    return NrfgsInputDataset(NrfgsDataParserConfig(data=scene).setup().get_dataparser_outputs("train"))
+
+
 @pytest.mark.parametrize("read", [True, False], ids=["read", "in files"])
-def test_large_photographs_come_small(tmp_path, read):
-    scene = write_scene(SceneConfig(views=3, width=640, height=400, points=50, samples=1), tmp_path)
-    dataset = NrfgsInputDataset(NrfgsDataParserConfig(data=scene).setup().get_dataparser_outputs("train"))
+def test_large_photographs_come_small(dataset, read):
     images = [dataset.get_data(index, image_type="uint8") for index in range(len(dataset))] if read else None
     small = start.SmallPhotographs(dataset, images)
     assert len(small) == len(dataset) and small.cameras is dataset.cameras

@@ -2,14 +2,12 @@
 """`nrfgs export web`: what the page holds, and where it begins."""
 
 import io
-import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
@@ -24,7 +22,7 @@ from nrfgs_ns.files import whole
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.pinhole import pinhole
 from nrfgs_ns.threads import few_threads
-from nrfgs_ns.trained.loading import load_model, lost
+from nrfgs_ns.trained.loading import finish, load_model, lost
 
 SCENE = "scene.nrf"
 """Name of the scene's file in a folder."""
@@ -33,22 +31,13 @@ POSTER_SIDE = 960
 MOST_WEIGHTS = 1024
 """Vectors of four that a uniform block holds on every device with WebGL 2 (16 KiB)."""
 MOST_POINTS = 20_000
-"""Splats that are asked how far away a photograph's subject is."""
+"""Splats that tell a photograph's distance to its subject."""
 
 
 def export_web(
-    load_config: Path,
-    output: Path,
-    options: CompactOptions,
-    web: WebOptions,
-    measure: bool,
-    report: Path | None,
+    load_config: Path, output: Path, options: CompactOptions, web: WebOptions, measure: bool, report: Path | None
 ) -> None:
-    """Write a page; see `nrfgs export --help`.
-
-    Args:
-        output: an .html file; any other name is that of a folder, in which the page and its scene lie apart.
-    """
+    """Write a page, or into a folder a page beside its scene; see `nrfgs export web --help`."""
     alone = output.suffix.lower() in (".html", ".htm")
     with few_threads() as threads:
         pipeline = load_model(load_config, "test")
@@ -65,7 +54,8 @@ def export_web(
     text = page(about, poster, scene if alone else SCENE, title, web.author)
     contents = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
     for path, content in contents.items():
-        write(path, content)
+        with whole(path) as aside:
+            aside.write_bytes(content)
 
     size = sum(map(len, contents.values()))
     name = about["photographs"][about["start"]]["name"]
@@ -74,14 +64,9 @@ def export_web(
         f"{size / 1e6:.2f} MB; 3DGS's PLY of as many splats has {numbers['ply_bytes'] / 1e6:.2f} MB. It begins where "
         f"{name} was taken."
     ]
-    if measure:
-        lines.append(lost(losses))
+    lines += [lost(losses)] if measure else []
     lines.append("Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md.")
-    for line in lines:
-        CONSOLE.print(line, markup=False, soft_wrap=True)
-    if report is not None:
-        numbers |= {"bytes": size, "scene_bytes": scene_bytes, "start": name, **losses}
-        write(report, (json.dumps(numbers, indent=1) + "\n").encode())
+    finish(lines, numbers | {"bytes": size, "scene_bytes": scene_bytes, "start": name, **losses}, report)
 
 
 def check_model(model, load_config: Path) -> None:
@@ -113,15 +98,12 @@ def weight_vectors(config: NrfConfig) -> int:
 
 @torch.no_grad()
 def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
-    """What the page's scripts must know besides the scene, and its poster.
+    """The scripts' values besides the scene, and a JPEG of the training view at which the page begins: of at most eight,
+    evenly spaced, the one that the model draws best (PSNR).
 
-    It begins at the training view that the model draws best (PSNR) of at most eight, evenly spaced; the poster is the
-    model's picture of it.
-
-    Returns:
-        "photographs": name, pose [12] (camera to world, x right, y up, z backwards, row by row), lens (focal lengths,
-        principal point) and size in pixels, and "distance", to the subject; "start", one of them; "up", a direction;
-        "nearest", the shortest distance to what is turned around; "speed", units a second. And a JPEG.
+    The values: "photographs", each with its name, pose [12] (camera to world, x right, y up, z backwards, row by row),
+    lens (focal lengths, principal point) and size in pixels, and "distance" to the subject; "start", an index; "up", a
+    direction; "nearest", the shortest distance to the point that is orbited; "speed", units a second.
     """
     model, data = pipeline.model, pipeline.datamanager
     images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
@@ -138,7 +120,8 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
     poses = cameras.camera_to_worlds.cpu()
     up = poses[:, :3, 1].mean(dim=0)
     up = up / up.norm() if up.norm() > 1e-3 else up.new_tensor([0.0, 0.0, 1.0])
-    means = subject(model)
+    opaque = model.gauss_params["means"][model.gauss_params["opacities"][:, 0] > 0]
+    means = opaque[:: max(1, -(-len(opaque) // MOST_POINTS))].cpu()
     photographs = [
         {
             "name": Path(name).name,
@@ -149,24 +132,12 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
         }
         for i, name in enumerate(data.train_dataset.image_filenames)
     ]
-    known = sorted(one["distance"] for one in photographs if one["distance"] is not None)
+    known = sorted(view["distance"] for view in photographs if view["distance"] is not None)
     typical = known[len(known) // 2] if known else model.scene_unit
-    for one in photographs:
-        one["distance"] = typical if one["distance"] is None else one["distance"]
-    about = {
-        "photographs": photographs,
-        "start": start,
-        "up": _rounded(up),
-        "nearest": typical / 50,
-        "speed": typical / 2,
-    }
-    return about, _jpeg(poster)
-
-
-def subject(model) -> torch.Tensor:
-    """Means of splats that are rather opaque than not, at most MOST_POINTS of them. [P, 3]"""
-    opaque = model.gauss_params["means"][model.gauss_params["opacities"][:, 0] > 0]
-    return opaque[:: max(1, -(-len(opaque) // MOST_POINTS))].cpu()
+    for view in photographs:
+        view["distance"] = typical if view["distance"] is None else view["distance"]
+    places = {"photographs": photographs, "start": start, "up": _rounded(up)}
+    return places | {"nearest": typical / 50, "speed": typical / 2}, _jpeg(poster)
 
 
 def distance(camera: Cameras, means: torch.Tensor) -> float | None:
@@ -178,12 +149,6 @@ def distance(camera: Cameras, means: torch.Tensor) -> float | None:
     size = pixels.new_tensor([seen.width, seen.height])
     middle = ((pixels / size - 0.5).abs() < 0.25).all(dim=1) & (points[:, 2] > 0)
     return float(points[middle, 2].median()) if middle.any() else None
-
-
-def write(path: Path, content: bytes) -> None:
-    """Write a file, whole or not at all; folders are made."""
-    with whole(path) as aside:
-        aside.write_bytes(content)
 
 
 def _rounded(values: torch.Tensor) -> list[float]:

@@ -16,17 +16,16 @@ def page(about: dict[str, Any], poster: bytes, scene: bytes | str, title: str, a
     """The HTML of a page that shows a scene.
 
     Args:
-        about: what the scripts read besides the scene: "photographs", "start", "focus", "up", "nearest", "speed".
-        poster: a JPEG to look at while the scene is loaded.
-        scene: a compact file's bytes; or the name of one that lies beside the page.
+        about: the scripts' values (`command.surroundings`).
+        poster: a JPEG for the time of loading.
+        scene: a compact file's bytes, or the name of one beside the page.
         title, author: plain text.
     """
     beside = isinstance(scene, str)
-    byline = f"<p>{html.escape(author)}</p>" if author else ""
     parts = {
         "connect": "'self'" if beside else "'none'",
         "title": html.escape(title),
-        "byline": byline,
+        "byline": f"<p>{html.escape(author)}</p>" if author else "",
         "poster": "data:image/jpeg;base64," + base64.b64encode(poster).decode(),
         "style": _asset("page.css"),
         "reader": "".join(map(_asset, READER)),
