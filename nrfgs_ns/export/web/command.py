@@ -98,8 +98,8 @@ def weight_vectors(config: NrfConfig) -> int:
 
 @torch.no_grad()
 def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
-    """The scripts' values besides the scene, and a JPEG of the training view at which the page begins: of at most eight,
-    evenly spaced, the one that the model draws best (PSNR).
+    """The scripts' values besides the scene, and a JPEG of the training view at which the page begins: the one that the
+    model draws best (PSNR) of at most eight, evenly spaced.
 
     The values: "photographs", each with its name, pose [12] (camera to world, x right, y up, z backwards, row by row),
     lens (focal lengths, principal point) and size in pixels, and "distance" to the subject; "start", an index; "up", a
