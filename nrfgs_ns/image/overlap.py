@@ -157,8 +157,7 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
                 done.add(pair)
                 compared.append((*pair, *shift))
     if not compared:
-        none = torch.zeros(0, dtype=torch.int64)
-        return Pairs(none, none, torch.zeros(0, 3), torch.zeros(0, 3))
+        return Pairs(*torch.zeros(2, 0, dtype=torch.int64), *torch.zeros(2, 0, 3))
     first, second, shift, spread = zip(*compared, strict=True)
     return Pairs(torch.tensor(first), torch.tensor(second), torch.stack(shift), torch.stack(spread))
 

@@ -31,12 +31,7 @@ REACH = tl.constexpr(metrics.REACH)
 C1 = tl.constexpr(metrics.SSIM_C1)
 C2 = tl.constexpr(metrics.SSIM_C2)
 # The window is symmetric: W0 is the weight of its ends, W5 of its centre.
-W0 = tl.constexpr(metrics.WEIGHTS[0])
-W1 = tl.constexpr(metrics.WEIGHTS[1])
-W2 = tl.constexpr(metrics.WEIGHTS[2])
-W3 = tl.constexpr(metrics.WEIGHTS[3])
-W4 = tl.constexpr(metrics.WEIGHTS[4])
-W5 = tl.constexpr(metrics.WEIGHTS[5])
+W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight) for weight in metrics.WEIGHTS[:6])
 
 
 @triton.jit
@@ -114,8 +109,7 @@ def forward_kernel(
 
     of_x, of_y = _no_windows(COLUMNS), _no_windows(COLUMNS)
     of_xx, of_yy, of_xy = _no_windows(COLUMNS), _no_windows(COLUMNS), _no_windows(COLUMNS)
-    l1_sum = tl.zeros((COLUMNS,), tl.float32)
-    ssim_sum = tl.zeros((COLUMNS,), tl.float32)
+    l1_sum, ssim_sum = tl.zeros((COLUMNS,), tl.float32), tl.zeros((COLUMNS,), tl.float32)
     for step in range(ROWS + SIZE - 1):
         row = first - REACH + step
         row_width = tl.where((row >= 0) & (row < height), width, 0)  # nothing above and below the image

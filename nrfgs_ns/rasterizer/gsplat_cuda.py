@@ -31,7 +31,7 @@ MOST_TILES = 2**15  # those beyond have no 16-bit number, as `tile_lists.py` wan
 
 
 def load_kernels(device: torch.device) -> None:
-    """See `nrfgs_ns.rasterizer.load_kernels`: any of gsplat's kernels loads all."""
+    """Load all of gsplat's kernels, by calling one, and try ours."""
     spherical_harmonics(0, torch.ones(1, 3, device=device), torch.ones(1, 1, 3, device=device))
     _kernels_run_on(device)
 

@@ -81,11 +81,17 @@ def test_distances_from_1e_30_to_1e30(head, exponent, seed):
 
 
 @pytest.mark.parametrize("head", HEADS)
-@pytest.mark.parametrize("coordinate", [1e-6, 1e6])
-@pytest.mark.parametrize("distance", [1e-6, 1.0, 1e6])
-def test_coordinates_of_1e_6_and_1e6(head, coordinate, distance):
+@pytest.mark.parametrize(
+    "extreme",
+    [
+        *(Extreme(coordinate=at, distance=distance) for at in (1e-6, 1e6) for distance in (1e-6, 1.0, 1e6)),
+        *(Extreme(latent=size) for size in (1e4, 1e10, 1e20)),
+        *(Extreme(color=color) for color in (-1e18, 1e4, 1e18)),
+    ],
+)
+def test_coordinates_latents_and_base_colours(head, extreme):
     """At 1e6, float32 sees positions on a grid of 1/16: splats closer than that are on the camera, and no harm done."""
-    assert_healthy(*build(head, Extreme(coordinate=coordinate, distance=distance)))
+    assert_healthy(*build(head, extreme))
 
 
 @pytest.mark.parametrize("head", HEADS)
@@ -101,12 +107,6 @@ def test_opacity_logits_to_both_ends(head, logit):
         assert (base == 1).all()
 
 
-@pytest.mark.parametrize("head", HEADS)
-@pytest.mark.parametrize("size", [1e4, 1e10, 1e20])
-def test_latents_of_1e4_to_1e20(head, size):
-    assert_healthy(*build(head, Extreme(latent=size)))
-
-
 @pytest.mark.parametrize("head", [head for head in HEADS if head.startswith("nrf")])
 @settings(max_examples=12, derandomize=True)
 @given(latent=st.floats(-3, 4), weight=st.floats(-3, 4), distance=st.floats(-18, 18), seed=st.integers(0, 99))
@@ -114,12 +114,6 @@ def test_latents_and_weights_together(head, latent, weight, distance, seed):
     """To 1e4 each, the largest sum is some 1e4 * 64 * (1e4 * 48 * 1e4) = 3e17, and gradients are 1e13 at most."""
     extreme = Extreme(latent=10.0**latent, weight=10.0**weight, distance=10.0**distance)
     assert_healthy(*build(head, extreme, seed=seed))
-
-
-@pytest.mark.parametrize("head", HEADS)
-@pytest.mark.parametrize("color", [-1e18, 1e4, 1e18])
-def test_base_colours(head, color):
-    assert_healthy(*build(head, Extreme(color=color)))
 
 
 @pytest.mark.parametrize("head", HEADS)
@@ -215,14 +209,8 @@ def test_the_field_agrees_with_float64(latent, weight, distance, logit, color, s
     e_low + e_high + |dc_high| (e_w / 4 + 2 u) + 2 u of its value. tanh's slope is at most 1; s_c scales; and sum and
     result round once each, with 4 u of the base for its own error.
     """
-    extreme = Extreme(
-        latent=10.0**latent,
-        weight=10.0**weight,
-        distance=10.0**distance,
-        logit=logit,
-        color=10.0**color,
-        coordinate=0.0,
-    )
+    sizes = {"latent": latent, "weight": weight, "distance": distance, "color": color}
+    extreme = Extreme(**{name: 10.0**size for name, size in sizes.items()}, logit=logit, coordinate=0.0)
     head, splats, center = build("nrf", extreme, seed=seed)
     rows = torch.arange(6)
     with torch.no_grad():

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What people touch, on a CUDA device: the viewer's pictures and the exported files. `pytest -m gpu`.
-
-Each check is a function of a device, and runs on the CPU too, in the default suite.
-"""
+"""The viewer's pictures and the exported files on a CUDA device. `pytest -m gpu`. On a CPU their rooms test them."""
 
 import json
 from itertools import combinations
@@ -11,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 from short_trainings import command_line, trained
-from torch.testing import assert_close
 
 from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.options import CompactOptions, PlyOptions
@@ -20,7 +16,10 @@ from nrfgs_ns.rasterizer import composite
 from nrfgs_ns.training.run import evaluate, parse
 from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture
 
-NO_GPU = "needs a CUDA device and gsplat's kernels"
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels"),
+]
 FROZEN = "full, as seen from another camera"
 STEPS = 60
 
@@ -63,9 +62,9 @@ def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tens
     return {name: value.cpu() for name, value in pictures.items()}
 
 
-def negative_colors(device: str, scene: Path, out: Path) -> None:
+def test_negative_colors(tiny_scene, tmp_path):
     """The compositor takes signed colours as they are: those of the residual's picture are."""
-    model, cameras = model_with_something_to_show(device, scene, out)
+    model, cameras = model_with_something_to_show("cuda", tiny_scene, tmp_path)
     with torch.no_grad():
         view = model.project(cameras[0:1])
         residual = model.field.components_of(view)["residual"].values
@@ -78,28 +77,16 @@ def negative_colors(device: str, scene: Path, out: Path) -> None:
     assert torch.equal(mirrored, -render)
 
 
-def per_splat_centers(device: str, scene: Path, out: Path) -> None:
-    """A head that is told each splat's own centre answers as for one camera, if they are all the same."""
-    model, cameras = model_with_something_to_show(device, scene, out)
-    with torch.no_grad():
-        view = model.project(cameras[0:1])
-        center = cameras[4:5].camera_to_worlds[0, :3, 3]  # not the camera that looks: a frozen view
-        one = model.field.seen_from(view._replace(center=center))
-        each = model.field.seen_from(view._replace(center=center.expand(len(view.visible), 3).contiguous()))
-    for name in ("colors", "opacities"):
-        # The same operations on the same numbers; a kernel may take another order of sums for another stride.
-        assert_close(getattr(each, name), getattr(one, name), rtol=0, atol=1e-6)
-
-
-def exported_files(device: str, scene: Path, out: Path) -> dict[str, dict]:
-    """Train, write both files, read them back; the reports of `nrfgs export`."""
+def test_exported_files(tiny_scene, tmp_path):
+    """Train, write both files, read them back: each is as good as the model, to a third of what the residual adds."""
+    out = tmp_path
     options = {
-        "--machine.device-type": device,
+        "--machine.device-type": "cuda",
         "--pipeline.model.few-views": "off",
         "--pipeline.model.num-downscales": 0,
         "--optimizers.field.optimizer.lr": 0.05,  # a residual that matters after a few steps
     }
-    config = trained(command_line("nrfgs", scene, out, STEPS, options))
+    config = trained(command_line("nrfgs", tiny_scene, out, STEPS, options))
     scores = evaluate(config, out / "eval.json")
     reports = {}
     Ply(config, output=out / "splats.ply", report=out / "ply.json", options=PlyOptions(steps=8)).main()
@@ -112,11 +99,6 @@ def exported_files(device: str, scene: Path, out: Path) -> dict[str, dict]:
     assert len(read_splats(out / "splats.ply").means) == reports["ply"]["written"] > 100
     small = evaluate(out / "field.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml", out / "small.json")
     assert small["psnr"] == pytest.approx(reports["compact"]["psnr_file"], abs=1e-3)
-    return reports
-
-
-def close_to_the_model(reports: dict[str, dict]) -> None:
-    """Each file is as good as the model, to a third of what the residual is worth."""
     ply, compact = reports["ply"], reports["compact"]
     worth = ply["psnr_model"] - ply["psnr_base"]
     assert worth > 0.5
@@ -124,28 +106,7 @@ def close_to_the_model(reports: dict[str, dict]) -> None:
     assert compact["view_dependent"] > 0 and compact["ply_ratio"] > 3
 
 
-CHECKS = [negative_colors, per_splat_centers]
-
-
-@pytest.mark.parametrize("check", CHECKS)
-def test_splats_for_the_viewer(check, no_cuda, tiny_scene, tmp_path):
-    check("cpu", tiny_scene, tmp_path)
-
-
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: f"cuda-{check.__name__}")
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason=NO_GPU)
-def test_splats_for_the_viewer_on_the_gpu(check, tiny_scene, tmp_path):
-    check("cuda", tiny_scene, tmp_path)
-
-
-def test_every_mode(no_cuda, tiny_scene, tmp_path):
-    viewer_pictures("cpu", tiny_scene, tmp_path)
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason=NO_GPU)
-def test_every_mode_on_the_gpu(tiny_scene, tmp_path):
+def test_every_mode(tiny_scene, tmp_path):
     """The pictures are the CPU's."""
     gpu = viewer_pictures("cuda", tiny_scene, tmp_path)
     cpu = viewer_pictures("cpu", tiny_scene, tmp_path)
@@ -157,13 +118,3 @@ def test_every_mode_on_the_gpu(tiny_scene, tmp_path):
         # rounding in float32. Few pixels have such a contribution.
         assert (error > 2 * AMPLIFICATION / 255).float().mean() < 0.01, name
         assert error.mean() < 1e-3, name
-
-
-def test_exported_files(no_cuda, tiny_scene, tmp_path):
-    close_to_the_model(exported_files("cpu", tiny_scene, tmp_path))
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason=NO_GPU)
-def test_exported_files_on_the_gpu(tiny_scene, tmp_path):
-    close_to_the_model(exported_files("cuda", tiny_scene, tmp_path))

@@ -14,8 +14,10 @@ W, H = 40, 28
 ANTIALIASED = ProjectionOptions("antialiased")
 
 
-def one(z=2.0, x=0.0, y=0.0, scale=0.1, **options):
-    splat = [torch.tensor([[x, y, z]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), scale)]
+def one(z=2.0, x=0.0, y=0.0, scale=0.1, quat=(1.0, 0.0, 0.0, 0.0), **options):
+    """The projection of one splat; `scale` is a number or a tensor [1, 3]."""
+    scales = scale if isinstance(scale, torch.Tensor) else torch.full((1, 3), scale)
+    splat = torch.tensor([[x, y, z]]), torch.tensor([quat]), scales
     return project(*splat, torch.eye(4)[None], _camera(W, H)[None], W, H, ProjectionOptions(**options))
 
 
@@ -42,9 +44,7 @@ def test_radius_of_a_point_comes_from_the_blur():
 @pytest.mark.parametrize("field", ["means", "quats", "scales"])
 def test_invisible_and_invalid_splats_send_no_nan_back(field):
     """Centres at and behind the camera, zero quaternions, infinite and NaN scales: invisible, gradient exactly 0."""
-    means = torch.tensor(
-        [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 2.0], [0.0, 0.0, 2.0]]
-    )
+    means = torch.tensor([[0.0, 0.0, z] for z in (2.0, 0.0, -1.0, 2.0, 2.0, 2.0)])
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(6, 1)
     scales = torch.full((6, 3), 0.1)
     quats[3], scales[4], scales[5] = 0.0, float("inf"), float("nan")
@@ -59,16 +59,7 @@ def test_invisible_and_invalid_splats_send_no_nan_back(field):
 def test_flat_splat_has_finite_gradients():
     """Seen edge on, a disc of thickness 0 has det = 0 and compensation 0: sqrt would send an infinity back."""
     scales = torch.tensor([[0.0, 0.1, 0.1]], requires_grad=True)
-    p = project(
-        torch.tensor([[0.0, 0.0, 2.0]]),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        scales,
-        torch.eye(4)[None],
-        _camera(W, H)[None],
-        W,
-        H,
-        ANTIALIASED,
-    )
+    p = one(scale=scales, rasterize_mode="antialiased")
     p.compensations.sum().backward()
     assert p.compensations.item() == 0 and torch.isfinite(scales.grad).all()
 
@@ -97,15 +88,7 @@ def test_gradients_of_compensations_near_the_camera(near):
 
 def test_long_needles_keep_a_definite_conic():
     """Ten thousand pixels long, a third of a pixel wide: the covariance's determinant is 1e-9 of its products."""
-    needle = project(
-        torch.tensor([[0.0, 0.0, 1.0]]),
-        torch.tensor([[0.924, 0.0, 0.0, 0.383]]),
-        torch.tensor([[300.0, 1e-3, 1e-3]]),
-        torch.eye(4)[None],
-        _camera(W, H)[None],
-        W,
-        H,
-    )
+    needle = one(z=1.0, scale=torch.tensor([[300.0, 1e-3, 1e-3]]), quat=(0.924, 0.0, 0.0, 0.383))
     a, b, c = needle.conics[0].double()
     # Across the needle only the blur is left: the conic's trace is 1 / 0.3 up to float32's 1e-7.
     assert abs(float(a + c) * (0.3 + (34.64e-3) ** 2) - 1) < 1e-4
@@ -127,13 +110,9 @@ def test_agrees_with_gsplats_torch_projection():
         tensors[0], covars, *tensors[3:], *size, calc_compensations=True
     )
     p = project(*tensors, *size, ANTIALIASED)
-    for ours, theirs in (
-        (p.means2d, means2d),
-        (p.depths, depths),
-        (p.conics, conics),
-        (p.compensations, compensations),
-    ):
-        torch.testing.assert_close(ours, theirs[0, p.gaussian_ids], rtol=1e-9, atol=1e-12)
+    theirs = {"means2d": means2d, "depths": depths, "conics": conics, "compensations": compensations}
+    for name, table in theirs.items():
+        torch.testing.assert_close(getattr(p, name), table[0, p.gaussian_ids], rtol=1e-9, atol=1e-12)
 
 
 def test_rows_are_ordered_by_camera_then_splat():

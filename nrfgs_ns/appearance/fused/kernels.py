@@ -322,8 +322,7 @@ def backward_kernel(
     else:
         d_W1 = tl.zeros((2 * P, H), tl.float32)
     d_W2 = tl.zeros((H, COLUMNS), tl.float32)
-    d_b2_low = tl.zeros((B, 4), tl.float32)
-    d_b2_high = tl.zeros((B, 4), tl.float32)
+    d_b2_low, d_b2_high = tl.zeros((B, 4), tl.float32), tl.zeros((B, 4), tl.float32)
     d_center = tl.zeros((B, 4), tl.float32)
     blocks = tl.cdiv(count, B)
     if DIFFUSE:
