@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks of a data set before any training time is spent.
 
-Every check raises InputError with the file or field, what it holds, and the fix. `source` is the transforms.json that
-the messages name. What only deserves attention goes through `warn`.
+Every check raises InputError with the file or field, its content, and the fix. `source` is the file that messages name.
 """
-
-from __future__ import annotations
 
 import json
 import math
@@ -22,28 +19,22 @@ from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.errors import InputError
 
 ROTATION_TOLERANCE = 1e-2
-"""Largest entry of |R^T R - 1| that is still a rotation. Rounding a pose to three decimals leaves 3e-3; a scale of 1 %
-inside the rotation gives 2e-2, and would distort what the camera sees."""
+"""Largest entry of |R^T R - 1| of a rotation: rounding to three decimals leaves 3e-3, a scale of 1 % gives 2e-2."""
 LAST_ROW_TOLERANCE = 1e-6
 POSITION_TOLERANCE = 1e-8
-"""Camera positions that agree to this fraction of their size are one place. In UTM coordinates it is 5 cm."""
-FAR_OUTSIDE = 100.0
-"""A camera this many times as far from the middle as three in four are has a wrong pose."""
-RATHER_FAR = 20.0
-"""A camera this many times as far away deserves a look."""
+"""Camera positions that agree to this share of their size are one place; in UTM coordinates it is 5 cm."""
+FAR_OUTSIDE, RATHER_FAR = 100.0, 20.0
+"""A camera this many times as far from the middle as three in four has a wrong pose, or deserves a warning."""
 LONGEST_JSON = 2**26
-"""Size limit of a transforms.json: 64 MB, a hundred thousand frames."""
+"""Bytes of a transforms.json, at most: a hundred thousand frames."""
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".dng")
 """Suffixes of a camera's files."""
-FILES_OF_A_FRAME = ("file_path", "mask_path", "depth_file_path")
-SHOWN = 3
-"""Offenders that a message lists before it counts the rest."""
-LONGEST = 160
-"""Characters of a value in a message."""
+SHOWN, LONGEST = 3, 160
+"""Items that a message lists before it counts the rest, and characters of each."""
 
 
 def warn(message: str) -> None:
-    """Print one warning as plain text: a file name may hold brackets, which the console would take for markup."""
+    """Print one warning as plain text: brackets in a file name are not markup."""
     CONSOLE.print(f"Warning: {message}", style="bold yellow", markup=False, soft_wrap=True)
 
 
@@ -54,13 +45,13 @@ def some(items: Sequence[Any]) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value from a file for a message: one line, of bounded length, that every terminal can print."""
+    """A value from a file for a message: one printable line of bounded length."""
     text = value if isinstance(value, str) and value.isprintable() else ascii(value)
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}...{text[-LONGEST // 2 :]}"
 
 
 def number(value: Any) -> float:
-    """The value as nerfstudio would convert it, NaN if it would not."""
+    """The value as a float, NaN if it is no number."""
     try:
         return math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
@@ -76,11 +67,8 @@ def matrix(value: Any) -> np.ndarray:
 
 
 def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
-    """Read the transforms.json of `data`, a folder or the file itself.
-
-    Returns:
-        Its content, with `frames` a non-empty list of objects, and its path.
-    """
+    """The content of the transforms.json of `data`, a folder or the file itself, whose `frames` are a non-empty list of
+    objects; and its path."""
     if not os.path.exists(data):
         raise InputError(f"{shown(str(data))}: no such file or folder. Check the path that --data names.")
     source = data if data.suffix == ".json" else data / "transforms.json"
@@ -101,12 +89,11 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
 
 
 def _advice_without_transforms(folder: Path) -> str:
-    """Next step for a path without a transforms.json, by what is there instead."""
+    """Next step for a path without a transforms.json, by its content."""
     if not folder.is_dir():
         return "Point --data at a folder that holds a transforms.json, or at the file."
-    for model in ("colmap/sparse/0", "sparse/0", "sparse"):
-        if any((folder / model / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
-            return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
+    if model := find_colmap(folder):
+        return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
     if (folder / "transforms_train.json").is_file():
         return "There is a data set of Blender's: put `blender-data` at the end of the command."
     places = [folder, folder / "images"]
@@ -120,8 +107,16 @@ def _advice_without_transforms(folder: Path) -> str:
     )
 
 
+def find_colmap(folder: Path) -> str | None:
+    """Place of a COLMAP model in the folder of a data set."""
+    for place in ("colmap/sparse/0", "sparse/0", "sparse", "."):
+        if any((folder / place / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
+            return place
+    return None
+
+
 def check_options(config: Any) -> None:
-    """The parser's numbers, whatever the data set."""
+    """The parser's numbers are in their ranges."""
     for name, least, fix in (
         ("scale_factor", 0, "a positive number"),
         ("scene_scale", 0, "a positive number"),
@@ -134,7 +129,7 @@ def check_options(config: Any) -> None:
 
 
 def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
-    """Every frame names an image, each another one; an auxiliary image is named by all frames or by none."""
+    """Every frame names an image of its own; masks and depths are named by all frames or by none."""
     nameless = [f"frames[{i}]" for i, frame in enumerate(frames) if not _is_name(frame.get("file_path"))]
     if nameless:
         raise InputError(f"{source}: {some(nameless)} without a file_path. Name the image, or remove the frame.")
@@ -153,11 +148,7 @@ def _is_name(value: Any) -> bool:
 
 
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
-    """Poses are rigid 4 x 4 camera-to-world matrices; with `need_spread`, the cameras stand at more than one place.
-
-    Returns:
-        The poses, float64 [V, 4, 4].
-    """
+    """The poses, float64 [V, 4, 4]: rigid camera-to-world matrices; with `need_spread`, of more than one place."""
     names = np.array([frame["file_path"] for frame in frames])
     matrices = [matrix(frame.get("transform_matrix")) for frame in frames]
 
@@ -194,7 +185,7 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
 
 
 def _check_spread(positions: np.ndarray, names: Sequence[str], source: Path) -> None:
-    """No camera is far outside the others' spread: all lengths are measured by the farthest one."""
+    """No camera is far outside the others' spread: the farthest one scales the scene."""
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     usual = np.quantile(distance, 0.75)
     far = distance > RATHER_FAR * usual
@@ -208,7 +199,7 @@ def _check_spread(positions: np.ndarray, names: Sequence[str], source: Path) -> 
 
 
 def check_applied(meta: dict[str, Any], source: Path) -> None:
-    """applied_transform and applied_scale, if given, are a 3 x 4 matrix and a positive number."""
+    """applied_transform is a 3 x 4 matrix and applied_scale a positive number, if there."""
     if "applied_transform" in meta:
         applied = matrix(meta["applied_transform"])
         if applied.shape != (3, 4) or not np.isfinite(applied).all():
@@ -227,7 +218,7 @@ def check_unique(names: Iterable[Any], where: str) -> None:
 
 
 def check_exist(paths: Sequence[Path], source: Path, what: str) -> None:
-    """Every file is there; `what` says what the files are."""
+    """Every file is there; `what` is their kind."""
     missing = [path for path in paths if not os.path.isfile(path)]  # False, too, for a name that cannot be
     if missing:
         raise InputError(
@@ -237,10 +228,7 @@ def check_exist(paths: Sequence[Path], source: Path, what: str) -> None:
 
 
 def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what: str, fix: str) -> None:
-    """Every file is an image of the size (width, height) that its camera has; only headers are read.
-
-    `what` says what the files are, and `fix` what to do if their size is another.
-    """
+    """Every file is an image of the given size (width, height), by its header; `what` is their kind."""
     headers = [(path, read_size(path), tuple(size)) for path, size in zip(paths, sizes, strict=True)]
     wrong = [f"{path} is {w} x {h}, not {size[0]} x {size[1]}" for path, (w, h), size in headers if (w, h) != size]
     if wrong:

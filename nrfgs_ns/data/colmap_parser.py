@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""nerfstudio's `colmap` parser, with the checks of `nrfgs-data`; and which parsers stand in for nerfstudio's."""
+"""nerfstudio's `colmap` parser with the checks of `nrfgs-data`, and which parsers stand in for nerfstudio's."""
 
 import os
 from dataclasses import replace
@@ -15,7 +15,6 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nrfgs_ns.data.checks import check_frames, shown
 from nrfgs_ns.data.colmap import read_model
 from nrfgs_ns.data.dataparser import NrfgsDataParser, Scene
-from nrfgs_ns.data.layout import ColmapLayout, Layout
 from nrfgs_ns.data.points import read_colmap
 from nrfgs_ns.data.splits import Named
 from nrfgs_ns.data.world import after
@@ -35,13 +34,13 @@ class NrfgsColmapDataParser(NrfgsDataParser):
     """
 
     config: ColmapDataParserConfig
+    _resizes = True
 
-    def _read(self) -> tuple[dict[str, Any], Path, Layout]:
+    def _read(self) -> tuple[dict[str, Any], Path]:
         config = self.config
         if not os.path.exists(config.data):
             raise InputError(f"{shown(str(config.data))}: no such folder. Check the path that --data names.")
-        layout = ColmapLayout(config)
-        cameras, views, source = read_model(layout.colmap)
+        cameras, views, source = read_model(self._colmap)
         kinds = {cameras[view.camera]["camera_model"] for view in views}
         if len(kinds) > 1:
             raise InputError(f"{source}: some cameras are fisheyes and some are not. Undistort the photographs.")
@@ -60,18 +59,38 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         if config.assume_colmap_world_coordinate_convention:
             meta["applied_transform"] = UPRIGHT[:3].tolist()
         check_frames(frames, source)
-        return meta, source, layout
+        return meta, source
 
-    def _order(self, frames: list[dict[str, Any]], layout: Layout) -> list[int]:
+    @property
+    def _colmap(self) -> Path:
+        return self._folder / self.config.colmap_path
+
+    def _root(self, key: str) -> Path:
+        config = self.config
+        folders = {
+            "file_path": config.images_path,
+            "mask_path": config.masks_path,
+            "depth_file_path": config.depths_path,
+        }
+        return self._folder / folders[key]
+
+    def _file(self, name: str, key: str = "file_path") -> Path:
+        path = self._root(key) / name
+        return path if key == "file_path" else path.with_suffix(".png")
+
+    def _copy(self, name: str, key: str, factor: int) -> Path:
+        return self._copies(key, factor) / self._file(name, key).relative_to(self._root(key))
+
+    def _order(self, frames: list[dict[str, Any]]) -> list[int]:
         return list(range(len(frames)))  # by COLMAP's numbers
 
-    def _to_frames(self, meta: dict[str, Any], layout: Layout) -> torch.Tensor | None:
+    def _to_frames(self, meta: dict[str, Any]) -> torch.Tensor | None:
         return torch.tensor(meta["applied_transform"]) if "applied_transform" in meta else None
 
-    def _named_splits(self, meta: dict[str, Any], layout: Layout) -> Named:
+    def _named_splits(self, meta: dict[str, Any]) -> Named:
         named = {}
         for split, file in LISTS:
-            path = layout.folder / f"{file}_list.txt"
+            path = self._folder / f"{file}_list.txt"
             if path.is_file():
                 try:
                     lines = path.read_text(encoding="utf-8").splitlines()
@@ -81,10 +100,10 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         return named
 
     def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        return *read_colmap(scene.layout.colmap), after(scene.transform, scene.to_frames)
+        return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
 
 
 def checked(config: DataParserConfig) -> DataParserConfig:
-    """The configuration of a parser that checks what it reads, for nerfstudio's own two, and any other as it is."""
+    """The configuration of a parser that checks what it reads, for nerfstudio's own two, and any other unchanged."""
     parsers = {NerfstudioDataParserConfig: NrfgsDataParser, ColmapDataParserConfig: NrfgsColmapDataParser}
     return replace(config, _target=parsers[type(config)]) if type(config) in parsers else config

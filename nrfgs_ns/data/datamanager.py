@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images in memory, and the order in which training sees them: nerfstudio's datamanager made to fail early and clearly,
-to run without an accelerator, and to continue where it stopped."""
+"""Images in memory and their order in training: nerfstudio's datamanager, made to fail early and clearly, to run
+without an accelerator, and to continue after an interruption."""
 
 import math
 import random
@@ -30,15 +30,14 @@ from nrfgs_ns.data.views import different_views, scene_unit
 from nrfgs_ns.errors import InputError
 
 LARGEST_SCALE = 16.0
-"""By which images may be enlarged."""
+"""Largest enlargement of images."""
 
 
 class NrfgsInputDataset(InputDataset):
     """nerfstudio's dataset, whose errors name the file and the fix.
 
-    Grey, palette, bilevel, CMYK and YCbCr images are converted to RGB, grey or palette with transparency to RGBA;
-    nerfstudio takes most of these for something else without a word (a palette's indices for grey, CMYK for RGBA).
-    Images of more than 8 bits are refused: their range is unknown, and nerfstudio would keep the low byte.
+    Images of any mode are converted to RGB or RGBA, where nerfstudio takes a palette's indices for grey and CMYK for
+    RGBA. Images of more than 8 bits are refused: their range is unknown.
     """
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
@@ -56,15 +55,15 @@ class NrfgsInputDataset(InputDataset):
         if lost.any():  # nerfstudio's own parsers do not look
             names = [str(path) for path, is_lost in zip(self.image_filenames, lost.tolist(), strict=True) if is_lost]
             raise InputError(f"The pose of {some(names)} holds NaN or Inf. Recompute it, or remove the frame.")
-        # A copy: the datamanager removes entries in place, and the original is shared by all datasets of the process.
+        # A copy: the datamanager removes entries from the list, which all datasets share.
         self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
         self.metadata["scene_unit"] = scene_unit(self.cameras.camera_to_worlds[:, :3, 3])
         self.metadata["different_views"] = different_views(self.cameras.camera_to_worlds)
-        # A copy too: undistortion crops the cameras while it loads the images.
+        # Undistortion crops the cameras while it loads the images.
         self._sizes = torch.cat([self.cameras.width, self.cameras.height], dim=-1).tolist()
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
-        """Decodes an image, uint8 [H, W, 3 or 4], scaled by scale_factor."""
+        """A decoded image, uint8 [H, W, 3 or 4], scaled by scale_factor."""
         path = self.image_filenames[image_idx]
         pixels = read_picture(path)
         if self.scale_factor != 1.0:
@@ -79,7 +78,7 @@ class NrfgsInputDataset(InputDataset):
         return np.array(pixels)
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """The image with its mask and index; InputError if either file cannot be used."""
+        """The image, its mask and its index; InputError if a file cannot be used."""
         image = self.get_image_float32(image_idx) if image_type == "float32" else self.get_image_uint8(image_idx)
         data = {"image_idx": image_idx, "image": image}
         if (masks := self._dataparser_outputs.mask_filenames) is not None:
@@ -101,7 +100,7 @@ class NrfgsInputDataset(InputDataset):
 
 @dataclass
 class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's full-image datamanager, keeping images as uint8: a quarter of the memory and no other pixel."""
+    """nerfstudio's full-image datamanager, keeping images as uint8, in a quarter of the memory."""
 
     _target: type = field(default_factory=lambda: NrfgsDatamanager)
     """target class to instantiate"""
@@ -115,7 +114,7 @@ class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
 
 
 class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
-    """nerfstudio's datamanager that can load everything at once, run on a CPU, and tell and restore its place."""
+    """nerfstudio's datamanager, which can load everything at once, run on a CPU, and save and restore its order."""
 
     config: NrfgsDatamanagerConfig
 
@@ -137,10 +136,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             ) from error
 
     def load_all_images(self) -> tuple[int, int]:
-        """Decodes all images now, so that a broken one is found before the first step.
-
-        Returns:
-            The numbers of training and evaluation images.
+        """Decode all images, and return the numbers of training and evaluation images.
 
         Raises:
             InputError: an image or a mask cannot be used, or nothing is visible in any training image.
@@ -159,22 +155,16 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return count, len(self.cached_eval)
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        """The next camera in turn, and its image.
-
-        The camera is the same object each time its turn comes: cutting it out of all the others and moving it to a GPU
-        takes longer than some training steps.
-
-        Returns:
-            camera [1] on the device, with "cam_idx" in its metadata, and "image" [H, W, 3 or 4], "image_idx", "mask".
-        """
+        """The next camera in turn, [1] on the device with "cam_idx" in its metadata, and its "image" [H, W, 3 or 4],
+        "image_idx" and "mask". The camera is the same object each time: moving it to a GPU takes as long as a step."""
         return self.train_view(self._next_index())
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """One training camera and its image, as `next_train` gives them, out of turn."""
+        """A training camera and its image, as by `next_train`, out of turn."""
         return self._view(index), self._image(index)
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
-        """The next `count` cameras in turn, one by one as `next_train` gives them, and the image of number `own`."""
+        """The next `count` cameras in turn, as by `next_train`, and the image of number `own`."""
         indices = [self._next_index() for _ in range(count)]
         return [self._view(index) for index in indices], self._image(indices[own])
 
@@ -201,7 +191,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     @cached_property
     def _views(self) -> dict[int, Cameras]:
-        """Training cameras by index, as far as they have had their turn."""
+        """Training cameras by index, from their first turn on."""
         return {}
 
     @cached_property
@@ -211,8 +201,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     @cached_property
     def _place(self) -> Literal["device", "memory", "files"]:
-        """Where decoded images are kept: on the device if they take at most half of what is free there, else on the
-        host, else in files."""
+        """Where decoded images are kept: on the device if they take at most half of its free memory, else on the host,
+        else in files."""
         device, each = torch.device(self.device), 1 if self.config.cache_images_type == "uint8" else 4
         size = 0
         for dataset in (self.train_dataset, self.eval_dataset):
@@ -239,12 +229,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, Tensor]]:
-        """All images of a split, decoded and undistorted on all processors, each put in its place as it comes.
-
-        Args:
-            split: which.
-            cache_images_device: nerfstudio's choice; `_place` decides.
-        """
+        """All images of a split, decoded and undistorted; `_place` decides where, not `cache_images_device`."""
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         on_gpu = torch.device(self.device).type != "cpu"
         place, kind = self._place, self.config.cache_images_type
@@ -260,16 +245,14 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         workers = self.config.max_thread_workers
         pictures = in_parallel(lambda index: read(dataset, index, kind), sizes, f"Reading {split} images", workers)
         images = [placed(data) for data in pictures]
-        # What is in memory is a pinhole's, whatever the lens; the camera's type is still the photograph's.
+        # Undistorted images are a pinhole's, whatever the lens.
         dataset.cameras.camera_type[:] = CameraType.PERSPECTIVE.value
         self.train_cameras = self.train_dataset.cameras.to(self.device if place == "device" else "cpu")
         return images
 
     def sampling_state(self) -> dict[str, Any]:
-        """Everything that decides which training camera comes next, as plain numbers, strings, lists and tuples.
-
-        Under the strategy `fps` that includes numpy's global generator, from which nerfstudio draws.
-        """
+        """State of the order of training cameras, in plain numbers, strings, lists and tuples; for the strategy `fps`
+        with numpy's global generator, from which nerfstudio draws."""
         state = {
             "strategy": self.config.train_cameras_sampling_strategy,
             "num_images": len(self.train_dataset),
@@ -285,11 +268,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         }
 
     def load_sampling_state(self, state: dict[str, Any]) -> None:
-        """Continues the order of cameras from `sampling_state()`.
-
-        Raises:
-            InputError: the state is that of another number of images or of another strategy.
-        """
+        """Continue the order of cameras from `sampling_state()`; InputError if images or strategy are others."""
         if state["num_images"] != len(self.train_dataset):
             raise InputError(
                 f"{self.get_datapath()}: the checkpoint was trained on {state['num_images']} images, but there are "

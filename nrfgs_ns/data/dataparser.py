@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`nrfgs-data`: nerfstudio's own data sets, checked up front, every 8th image for testing, points read by plyfile.
 
-COLMAP's layout (`colmap_parser.py`) becomes the same dictionary, that of transforms.json, so that there is one way from
-it to cameras, and the same checks on it.
+COLMAP models (`colmap_parser.py`) become the dictionary of a transforms.json, so that checks and cameras are the same.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +13,7 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION, NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
@@ -33,9 +31,8 @@ from nrfgs_ns.data.checks import (
     some,
     warn,
 )
-from nrfgs_ns.data.layout import FOLDERS, Layout
 from nrfgs_ns.data.lenses import SMALLEST, cameras_of, read_lenses
-from nrfgs_ns.data.pictures import smaller_copies, stored_exif
+from nrfgs_ns.data.pictures import read_size, smaller_copies, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
@@ -49,6 +46,8 @@ with_data_parsers()
 MIN_POINTS = 4
 """Fewer points cannot start a training: a splat's first size is its distance to its three nearest neighbours."""
 ORIENTATIONS = ("pca", "up", "vertical", "none")
+FOLDERS = {"file_path": "images", "mask_path": "masks", "depth_file_path": "depths"}
+"""A frame's files -> folder of their smaller copies, followed by _ and the factor."""
 COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """The applied_transform of data sets from before nerfstudio wrote it down."""
 
@@ -71,19 +70,17 @@ class Scene(NamedTuple):
     """A whole data set, before it is split."""
 
     meta: dict[str, Any]
-    """what transforms.json says, or would say"""
+    """the content of transforms.json, or its equivalent"""
     source: Path
     """the file that messages name"""
-    layout: Layout
-    """where its files are"""
     splits: Rows
     """rows of each split"""
     factor: int
-    """by which images are smaller than the intrinsics say"""
+    """size by the intrinsics / size of the images"""
     lenses: np.ndarray
     """`lenses.read_lenses`, float64 [V, 12]"""
     cameras: Cameras
-    """all of them, placed and of the size of the images"""
+    """placed, of the size of the images"""
     transform: torch.Tensor
     """[3, 4], from the frames' world to the cameras', before `scale`"""
     to_frames: torch.Tensor | None
@@ -94,35 +91,34 @@ class Scene(NamedTuple):
 class NrfgsDataParser(DataParser):
     """nerfstudio's parser, with these differences.
 
-    - The data set is checked before it is parsed (see `checks`); what cannot be used raises InputError.
+    - The data set is checked before it is parsed; what cannot be used raises InputError.
     - If val or test has no images, the other stands in; if both have none, the training images are evaluated, with a
       warning.
     - A data set of one image loads. It keeps its own scale, having no extent to normalise by.
-    - Points are read by plyfile instead of open3d, or straight from colmap/sparse/0, where nerfstudio asks a question
-      at the terminal and then writes into the data set.
+    - Points are read by plyfile, or straight from colmap/sparse/0 without a question at the terminal.
     - Cameras far from the origin are moved there in float64 (see `world`).
     - With a downscale_factor of which there is no folder, images are resized into a cache.
-    - To render from a checkpoint, nerfstudio announces that it needs no images (it presets `downscale_factor`). Then
-      neither images nor points need be there.
+    - To render from a checkpoint, nerfstudio presets `downscale_factor`: neither images nor points need be there.
     """
 
     config: NerfstudioDataParserConfig
     downscale_factor: int | None = None
     """set by nerfstudio, before the parsing, if no image is needed"""
+    _resizes = False
+    """Whether images are made smaller without being asked for."""
 
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
-        """Parses one split; the first call checks the whole data set."""
+        """Parse one split; the first call checks the whole data set."""
         scene = self._scene
         chosen = next((name for name in STAND_INS.get(split, ()) if len(scene.splits[name])), split)
         if chosen == "train" != split:
             warn(f"{scene.source}: no image is kept for {split}. The training images are evaluated instead.")
         rows = scene.splits[chosen]
         frames = [scene.meta["frames"][row] for row in rows]
-        files = {key: scene.layout.files(frames, key, scene.factor) for key in FOLDERS}
+        files = {key: self._files(frames, key, scene.factor) for key in FOLDERS}
         cameras = scene.cameras[torch.from_numpy(rows)]
         if self._images_needed:
-            sizes = list(zip(cameras.width.flatten().tolist(), cameras.height.flatten().tolist(), strict=True))
-            files |= _checked_files(scene, rows, files, sizes)
+            files |= self._checked_files(scene, rows, files, cameras)
         box = self.config.scene_scale * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         outputs = PlacedOutputs(
             image_filenames=files["file_path"],
@@ -138,13 +134,12 @@ class NrfgsDataParser(DataParser):
                 "mask_color": getattr(self.config, "mask_color", None),
             },
         )
-        if self.config.load_3D_points and self._images_needed:  # rendering from a checkpoint needs no points
+        if self.config.load_3D_points and self._images_needed:
             outputs.metadata |= self._placed_points
         return outputs
 
-    @cached_property
+    @property
     def _images_needed(self) -> bool:
-        """Whether nerfstudio asks for images."""
         return self.downscale_factor is None
 
     @cached_property
@@ -152,7 +147,7 @@ class NrfgsDataParser(DataParser):
         """The whole data set, checked as far as can be done without opening all images."""
         config = self.config
         check_options(config)
-        meta, source, layout = self._read()
+        meta, source = self._read()
         frames = meta["frames"]
         lenses = read_lenses(meta, source)
         check_applied(meta, source)
@@ -161,11 +156,11 @@ class NrfgsDataParser(DataParser):
             raise InputError(
                 f"{source}: --mask-color is set, but no frame has a mask_path. Add masks or drop the option."
             )
-        factor = self._factor(frames, layout, source) if self._images_needed else self.downscale_factor
-        order = self._order(frames, layout)
+        factor = self._factor(frames, source) if self._images_needed else self.downscale_factor
+        order = self._order(frames)
         frames = meta["frames"] = [frames[row] for row in order]
         lenses, poses = lenses[order], poses[order]
-        splits = self._splits(meta, layout, source)
+        splits = self._splits(meta, source)
         placed, transform, scale = self._placed(poses, meta, source)
         cameras = cameras_of(meta, lenses, placed, source)
         rounding = getattr(config, "downscale_rounding_mode", "floor")
@@ -175,27 +170,30 @@ class NrfgsDataParser(DataParser):
                 f"{source}: --downscale-factor {factor} leaves images of {cameras.width.min()} x "
                 f"{cameras.height.min()} pixels. Give a smaller one."
             )
-        self._warn_of_repeated(cameras.camera_to_worlds, splits, frames, source)
-        to_frames = self._to_frames(meta, layout)
-        return Scene(meta, source, layout, splits, factor, lenses, cameras, transform, to_frames, scale)
+        _warn_of_repeated(cameras.camera_to_worlds, splits, frames, source)
+        return Scene(meta, source, splits, factor, lenses, cameras, transform, self._to_frames(meta), scale)
 
-    def _factor(self, frames: list[dict[str, Any]], layout: Layout, source: Path) -> int:
-        """The downscale factor, for which all files are there."""
+    def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
+        """The downscale factor; every file is there at it."""
         factor = self.config.downscale_factor
-        if factor is None:  # the first image in its full size decides
-            check_exist([layout.file(frame["file_path"]) for frame in frames], source, "images")
-            factor = layout.factor_of(frames[0]["file_path"])
+        if factor is None:
+            check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
+            first, factor = frames[0]["file_path"], 1
+            size = max(read_size(self._file(first)))
+            while size / factor > MAX_AUTO_RESOLUTION and (
+                self._resizes or self._copy(first, "file_path", 2 * factor).exists()
+            ):
+                factor *= 2
         for key in FOLDERS:
-            what = "images" if key == "file_path" else f"files of {key}"
-            check_exist(layout.files(frames, key, factor), source, what)
+            check_exist(self._files(frames, key, factor), source, "images" if key == "file_path" else f"files of {key}")
         return factor
 
-    def _splits(self, meta: dict[str, Any], layout: Layout, source: Path) -> Rows:
-        """Rows of the training and the evaluation images, as the data set names them or by rule."""
-        paths = [layout.file(frame["file_path"]) for frame in meta["frames"]]
-        named = self._named_splits(meta, layout)
+    def _splits(self, meta: dict[str, Any], source: Path) -> Rows:
+        """Rows of the training and the evaluation images, by the data set's own lists or by rule."""
+        paths = [self._file(frame["file_path"]) for frame in meta["frames"]]
+        named = self._named_splits(meta)
         splits = (
-            split_by_names(named, paths, layout.file, source) if named else split_by_rule(self.config, paths, source)
+            split_by_names(named, paths, self._file, source) if named else split_by_rule(self.config, paths, source)
         )
         if named and "train" not in named:
             there = next(iter(named.values()))[0]  # test_filenames, test_list.txt
@@ -209,22 +207,10 @@ class NrfgsDataParser(DataParser):
             )
         return splits
 
-    def _warn_of_repeated(self, poses: torch.Tensor, splits: Rows, frames: list[dict[str, Any]], source: Path) -> None:
-        """Warn of images for evaluation alone that were taken from where a training image was."""
-        train = splits["train"]
-        evaluated = np.setdiff1d(np.union1d(splits["val"], splits["test"]), train)
-        repeated = repeated_views(poses, evaluated, train)
-        if repeated:
-            warn(
-                f"{source}: {some([Path(frames[row]['file_path']).name for row in repeated])}, for evaluation, show "
-                "what training images show from the same place, which flatters the results. Remove copies, and frames "
-                "of a camera that stands still."
-            )
-
     def _placed(
         self, poses: np.ndarray, meta: dict[str, Any], source: Path
     ) -> tuple[torch.Tensor, torch.Tensor, float]:
-        """Poses in the world that is trained in, and the way there (`world.place`)."""
+        """Poses in the training world, and the way there (`world.place`)."""
         config = self.config
         orientation = meta.get("orientation_override", config.orientation_method)
         if orientation not in ORIENTATIONS:
@@ -247,54 +233,60 @@ class NrfgsDataParser(DataParser):
             )
         return placed
 
-    # Different in COLMAP's layout.
+    def _files(self, frames: list[dict[str, Any]], key: str, factor: int) -> list[Path]:
+        """Files of some frames, in full size or the data set's own smaller copies."""
+        names = [frame[key] for frame in frames if key in frame]
+        if names and self._has_copies(key, factor):
+            return [self._copy(name, key, factor) for name in names]
+        return [self._file(name, key) for name in names]
 
-    def _read(self) -> tuple[dict[str, Any], Path, Layout]:
-        """What the data set says, the file that it says so in, and where its files are."""
-        meta, source = read_transforms(self.config.data)
-        check_frames(meta["frames"], source)
-        return meta, source, Layout(source.parent)
+    def _has_copies(self, key: str, factor: int) -> bool:
+        return factor > 1 and self._copies(key, factor).is_dir()
 
-    def _order(self, frames: list[dict[str, Any]], layout: Layout) -> list[int]:
-        """The order in which frames are split: by name, as in nerfstudio."""
-        parts = [layout.file(frame["file_path"]).parts for frame in frames]
-        return sorted(range(len(frames)), key=parts.__getitem__)
+    def _copies(self, key: str, factor: int) -> Path:
+        """Folder of the copies at 1 / factor of the size, which need not be there."""
+        root = self._root(key)
+        return root.with_name(f"{root.name}_{factor}")
 
-    def _to_frames(self, meta: dict[str, Any], layout: Layout) -> torch.Tensor | None:
-        """The transform [3, 4] that has already been applied to the frames' poses, if one has."""
-        if "applied_transform" in meta:
-            return torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
-        return COLMAP_TO_FRAMES if layout.colmap.exists() else None
-
-    def _named_splits(self, meta: dict[str, Any], layout: Layout) -> Named:
-        """The splits that the data set names itself; empty if it names none."""
-        fields = {split: f"{split}_filenames" for split in SPLITS}
-        return {split: (name, meta[name]) for split, name in fields.items() if name in meta}
-
-    def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor] | None:
-        """Positions [N, 3] and colours [N, 3] as stored, and the transform [3, 4] from their world to the cameras'
-        before scaling; None without."""
-        if "ply_file_path" in scene.meta:
-            name = scene.meta["ply_file_path"]
-            if not isinstance(name, str):
-                raise InputError(f"{scene.source}: ply_file_path is {shown(repr(name))}. Name a file, or remove it.")
-            return *read_ply(scene.layout.file(name)), scene.transform
-        if scene.layout.colmap.is_dir():
-            return *read_colmap(scene.layout.colmap), after(scene.transform, scene.to_frames)
-        return None
+    def _checked_files(
+        self, scene: Scene, rows: np.ndarray, files: dict[str, list[Path]], cameras: Cameras
+    ) -> dict[str, list[Path]]:
+        """Images and masks, checked to have their cameras' sizes, and resized where the data set has no copies."""
+        sizes = list(zip(cameras.width.flatten().tolist(), cameras.height.flatten().tolist(), strict=True))
+        full = [(int(width), int(height)) for width, height in scene.lenses[rows, 4:6]]
+        result = {}
+        for key, what, fix in (
+            ("file_path", "images", "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy alike."),
+            ("mask_path", "masks", "Make them as large as the images."),
+        ):
+            paths = files[key]
+            if not paths:
+                continue
+            if scene.factor > 1 and not self._has_copies(key, scene.factor):
+                check_headers(paths, full, what, fix)
+                result[key] = smaller_copies(paths, sizes, what)
+                continue
+            check_unique(paths, f"{scene.source}: frames")
+            if scene.factor > 1:
+                fix = (
+                    f"Remove {paths[0].parent}, so that copies are made, or with `colmap` give "
+                    "--downscale-rounding-mode round or ceil."
+                )
+            check_headers(paths, sizes, what, fix)
+        return result
 
     @cached_property
     def _placed_points(self) -> dict[str, torch.Tensor]:
-        """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the world of the cameras, which see enough of
-        them; nothing (and a warning) without."""
+        """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; empty, with a warning,
+        without points."""
         scene = self._scene
         points = self._points(scene)
         count = 0 if points is None else len(points[0])
         if count < MIN_POINTS:
-            found = "the data set has no point cloud (no ply_file_path, no colmap/sparse/0)"
+            finding = "the data set has no point cloud (no ply_file_path, no colmap/sparse/0)"
             if points is not None:
-                found = f"the point cloud holds {count} usable points, fewer than {MIN_POINTS}"
-            warn(f"{scene.source}: {found}. Training starts from random points, which costs quality.")
+                finding = f"the point cloud holds {count} usable points, fewer than {MIN_POINTS}"
+            warn(f"{scene.source}: {finding}. Training starts from random points, which costs quality.")
             return {}
         xyz, rgb, transform = (torch.as_tensor(table) for table in points)
         transform = transform.double()
@@ -307,33 +299,78 @@ class NrfgsDataParser(DataParser):
         check_sight(xyz, scene.cameras[torch.from_numpy(rows)], names, scene.source)
         return {"points3D_xyz": xyz, "points3D_rgb": rgb}
 
+    # Different for COLMAP models.
 
-def _checked_files(
-    scene: Scene, rows: np.ndarray, files: dict[str, list[Path]], sizes: Sequence[tuple[int, int]]
-) -> dict[str, list[Path]]:
-    """Images and masks, found to have the sizes that their cameras have; those that are larger, resized."""
-    checked = {}
-    fixes = {
-        "images": "Use the images that the poses were computed from, or scale w, h, fl_x, fl_y, cx and cy alike.",
-        "masks": "Make them as large as the images.",
-    }
-    for key, what in (("file_path", "images"), ("mask_path", "masks")):
-        paths = files[key]
-        if not paths:
-            continue
-        shrink = scene.factor > 1 and not scene.layout.has_copies(key, scene.factor)
-        if not shrink:
-            check_unique(paths, f"{scene.source}: frames")
-        full = [(int(width), int(height)) for width, height in scene.lenses[rows, 4:6]]
-        fix = fixes[what]
-        if scene.factor > 1 and not shrink:
-            fix = (
-                f"Remove {paths[0].parent}, so that copies are made, or with `colmap` give "
-                "--downscale-rounding-mode round or ceil."
-            )
-        check_headers(paths, full if shrink else sizes, what, fix)
-        checked[key] = smaller_copies(paths, sizes, what) if shrink else paths
-    return checked
+    def _read(self) -> tuple[dict[str, Any], Path]:
+        """The data set as a transforms.json, checked by `check_frames`, and the file that messages name."""
+        meta, source = read_transforms(self.config.data)
+        check_frames(meta["frames"], source)
+        return meta, source
+
+    @property
+    def _folder(self) -> Path:
+        data = self.config.data
+        return data.parent if data.is_file() else data
+
+    @property
+    def _colmap(self) -> Path:
+        """The COLMAP model that the poses come from; it need not be there."""
+        return self._folder / "colmap" / "sparse" / "0"
+
+    def _root(self, key: str) -> Path:
+        """Folder of one kind of files in full size, beside which smaller copies are."""
+        return self._folder / FOLDERS[key]
+
+    def _file(self, name: str, key: str = "file_path") -> Path:
+        """A file of a frame, in full size."""
+        return self._folder / name
+
+    def _copy(self, name: str, key: str, factor: int) -> Path:
+        """Its copy at 1 / factor of the size, which need not be there."""
+        return self._copies(key, factor) / Path(name).name
+
+    def _order(self, frames: list[dict[str, Any]]) -> list[int]:
+        """Rows in the order of splitting: by name, as in nerfstudio."""
+        parts = [self._file(frame["file_path"]).parts for frame in frames]
+        return sorted(range(len(frames)), key=parts.__getitem__)
+
+    def _to_frames(self, meta: dict[str, Any]) -> torch.Tensor | None:
+        """The transform [3, 4] already applied to the frames' poses, if there is one."""
+        if "applied_transform" in meta:
+            return torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
+        return COLMAP_TO_FRAMES if self._colmap.exists() else None
+
+    def _named_splits(self, meta: dict[str, Any]) -> Named:
+        """Splits listed by the data set itself."""
+        return {
+            split: (f"{split}_filenames", meta[f"{split}_filenames"])
+            for split in SPLITS
+            if f"{split}_filenames" in meta
+        }
+
+    def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor] | None:
+        """Positions [N, 3] and colours [N, 3] as stored, and the transform [3, 4] from their world to the cameras'
+        before scaling; None without."""
+        if "ply_file_path" in scene.meta:
+            name = scene.meta["ply_file_path"]
+            if not isinstance(name, str):
+                raise InputError(f"{scene.source}: ply_file_path is {shown(repr(name))}. Name a file, or remove it.")
+            return *read_ply(self._file(name)), scene.transform
+        if self._colmap.is_dir():
+            return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
+        return None
+
+
+def _warn_of_repeated(poses: torch.Tensor, splits: Rows, frames: list[dict[str, Any]], source: Path) -> None:
+    """Warn of evaluation images taken from where a training image was."""
+    evaluated = np.setdiff1d(np.union1d(splits["val"], splits["test"]), splits["train"])
+    repeated = repeated_views(poses, evaluated, splits["train"])
+    if repeated:
+        warn(
+            f"{source}: {some([Path(frames[row]['file_path']).name for row in repeated])}, for evaluation, show what "
+            "training images show from the same place, which flatters the results. Remove copies, and frames of a "
+            "camera that stands still."
+        )
 
 
 nrfgs_dataparser = DataParserSpecification(

@@ -20,15 +20,15 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 UNKNOWN = ("k5", "k6", "s1", "s2", "s3", "s4")
 """Parameters of OpenCV's larger models, which neither nerfstudio nor we undistort."""
 DRAWN = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
-"""Cameras that are drawn: pinholes, and those whose photographs are undistorted to a pinhole's."""
+"""Pinholes, and cameras whose photographs are undistorted to a pinhole's."""
 SMALLEST, LARGEST = 4, 2**16
-"""Pixels that an image has along each side."""
+"""Pixels of an image along each side."""
 WIDEST, NARROWEST = 0.1, 1e3
 """Focal lengths of lenses, in image sizes: fields of view of 157 degrees and of 3.4 minutes."""
 FARTHEST_CENTER = 10.0
 """Largest distance of the principal point from the image's middle, in image sizes."""
 FISHEYE_AT_LEAST = 1e-12
-"""A distortion without effect, so that nerfstudio undistorts: it does only where some parameter is not 0."""
+"""A distortion without effect, because nerfstudio undistorts only where some parameter is not 0."""
 LEFT_OF_IMAGE = 0.25
 """Share of an image's pixels that undistortion must leave."""
 LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
@@ -39,10 +39,10 @@ def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
     """Intrinsics of every frame, by nerfstudio's rule: the top level's where it has them.
 
     Returns:
-        float64 [V, 12]: `PIXELS` in the order above, then `DISTORTION`.
+        float64 [V, 12]: `PIXELS`, then `DISTORTION`.
 
     Raises:
-        InputError: a number is missing, makes no sense, or is given twice with two values.
+        InputError: a number is missing or out of range, or given twice with two values.
     """
     frames = meta["frames"]
     _check_model(meta, source)
@@ -55,7 +55,7 @@ def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
             )
     table = np.empty((len(frames), len(PIXELS) + len(DISTORTION)))
     for index, key in enumerate(PIXELS):
-        table[:, index] = _column(meta, key, source, positive=key not in ("cx", "cy"))
+        table[:, index] = [_pixels(holder, name, key, source) for holder, name in _holders(meta, key in meta)]
     shared = any(key in meta for key in (*DISTORTION, "distortion_params"))
     table[:, len(PIXELS) :] = [_distortion(holder, name, source) for holder, name in _holders(meta, shared)]
     focal, center, sides = table[:, 0:2], table[:, 2:4], table[:, 4:6]
@@ -80,32 +80,25 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
     model = meta.get("camera_model", "OPENCV")
     drawn = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in DRAWN]
     if not isinstance(model, str) or model not in drawn:
-        known = isinstance(model, str) and model in CAMERA_MODEL_TO_TYPE
         raise InputError(
-            f"{source}: camera_model {shown(repr(model))} is {'not drawn here' if known else 'unknown'}. Use one of "
-            f"{', '.join(drawn)}{'; undistort the photographs to one of them' if known else ''}."
+            f"{source}: camera_model {shown(repr(model))} is not drawn here. Use one of {', '.join(drawn)}, or "
+            "undistort the photographs to one of them."
         )
-    other = [
-        frame["file_path"]
-        for frame in meta["frames"]
-        if CAMERA_MODEL_TO_TYPE.get(str(frame.get("camera_model", model))) != CAMERA_MODEL_TO_TYPE[model]
-    ]
-    if other:
-        raise InputError(
-            f"{source}: camera_model of {some(other)} is not {model}, the top level's, which is used for all frames. "
-            "Undistort the photographs, or correct it."
-        )
-    holders = [(meta, "the top level"), *((frame, frame["file_path"]) for frame in meta["frames"])]
-    for holder, name in holders:
-        if holder.get("is_fisheye") and CAMERA_MODEL_TO_TYPE[model] != CameraType.FISHEYE:
+    kind = CAMERA_MODEL_TO_TYPE[model]
+    for holder, name in [(meta, "the top level"), *_holders(meta, False)]:
+        where = f"of {shown(name)} is"
+        if CAMERA_MODEL_TO_TYPE.get(str(holder.get("camera_model", model))) != kind:
             raise InputError(
-                f"{source}: is_fisheye of {shown(name)} is not read by nerfstudio. Set camera_model to OPENCV_FISHEYE."
+                f"{source}: camera_model {where} not {model}, the top level's, which is used for all frames. "
+                "Undistort the photographs, or correct it."
             )
+        if holder.get("is_fisheye") and kind != CameraType.FISHEYE:
+            raise InputError(f"{source}: is_fisheye {where} not read. Set camera_model to OPENCV_FISHEYE.")
         for key in UNKNOWN:
             if holder.get(key, 0.0) != 0.0:
                 raise InputError(
-                    f"{source}: {key} of {shown(name)} is {shown(repr(holder[key]))}, a distortion that cannot be "
-                    f"undone here. Undistort the photographs, or fit a model of {', '.join(DISTORTION)}."
+                    f"{source}: {key} {where} {shown(repr(holder[key]))}, a distortion that cannot be undone here. "
+                    f"Undistort the photographs, or fit a model of {', '.join(DISTORTION)}."
                 )
 
 
@@ -114,48 +107,36 @@ def _holders(meta: dict[str, Any], shared: bool) -> list[tuple[dict[str, Any], s
     return [(meta, "the top level")] if shared else [(frame, frame["file_path"]) for frame in meta["frames"]]
 
 
-def _column(meta: dict[str, Any], key: str, source: Path, positive: bool) -> list[float]:
-    """One parameter of the top level, or of every frame."""
-    values = []
-    for holder, name in _holders(meta, key in meta):
-        if key not in holder:
-            hint = " (from a field of view: w / (2 tan(camera_angle_x / 2)))" if key in ("fl_x", "fl_y") else ""
-            raise InputError(f"{source}: {key} is missing, at the top and in {shown(name)}. Add it, in pixels{hint}.")
-        value = number(holder[key])
-        if not np.isfinite(value) or positive and value <= 0 or key in ("w", "h") and value < 1:
-            raise InputError(
-                f"{source}: {key} of {shown(name)} is {shown(repr(holder[key]))}. Give a number of pixels, above 0."
-            )
-        values.append(value)
-    return values
+def _pixels(holder: dict[str, Any], name: str, key: str, source: Path) -> float:
+    if key not in holder:
+        hint = " (from a field of view: w / (2 tan(camera_angle_x / 2)))" if key in ("fl_x", "fl_y") else ""
+        raise InputError(f"{source}: {key} is missing, at the top and in {shown(name)}. Add it, in pixels{hint}.")
+    value = number(holder[key])
+    least = {"w": 1.0, "h": 1.0, "cx": -np.inf, "cy": -np.inf}.get(key, 1e-300)
+    if not (np.isfinite(value) and value >= least):
+        raise InputError(
+            f"{source}: {key} of {shown(name)} is {shown(repr(holder[key]))}. Give a number of pixels, above 0."
+        )
+    return value
 
 
 def _distortion(holder: dict[str, Any], name: str, source: Path) -> list[float]:
     """Six parameters in nerfstudio's order, of the top level or of a frame."""
-    if "distortion_params" in holder:
-        values = holder["distortion_params"]
-        numbers = [number(value) for value in values] if isinstance(values, list) else []
-        if len(numbers) != len(DISTORTION) or not np.isfinite(numbers).all():
-            raise InputError(
-                f"{source}: distortion_params of {shown(name)} is {shown(repr(values))}. Give six numbers: "
-                f"{', '.join(DISTORTION)}."
-            )
-        return numbers
-    numbers = [number(holder.get(key, 0.0)) for key in DISTORTION]
-    for key, value in zip(DISTORTION, numbers, strict=True):
-        if not np.isfinite(value):
-            raise InputError(
-                f"{source}: {key} of {shown(name)} is {shown(repr(holder[key]))}. Give a number, 0 for none."
-            )
+    values = holder.get("distortion_params", [holder.get(key, 0.0) for key in DISTORTION])
+    numbers = [number(value) for value in values] if isinstance(values, list) else []
+    if len(numbers) != len(DISTORTION) or not np.isfinite(numbers).all():
+        raise InputError(
+            f"{source}: the distortion of {shown(name)} is {shown(repr(values))}. Give six numbers, 0 for none: "
+            f"{', '.join(DISTORTION)}."
+        )
     return numbers
 
 
 def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: torch.Tensor, source: Path) -> Cameras:
-    """The cameras in full size.
+    """The cameras in full size, with intrinsics by `read_lenses` and poses [V, 3, 4].
 
-    Args:
-        lenses: of `read_lenses`.
-        poses: [V, 3, 4].
+    Raises:
+        InputError: undistorting would leave next to nothing of an image.
     """
     kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
     table = torch.from_numpy(lenses)
@@ -165,41 +146,39 @@ def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: torch.Tensor, so
     if kind == CameraType.FISHEYE:
         distortion[(distortion == 0).all(dim=1), 0] = FISHEYE_AT_LEAST
     full = np.column_stack([lenses[:, :4], width, height, distortion])
-    _check_distortion(full, kind, meta["frames"], source)
+    for lens, index in zip(*np.unique(full, axis=0, return_index=True), strict=True):
+        if lens[6:].any():
+            name = shown(meta["frames"][index]["file_path"])
+            _check_distortion(lens, kind, f"{source}: the distortion of {name}")
     return Cameras(poses, fx, fy, cx, cy, width, height, distortion, kind, metadata={})
 
 
-def _check_distortion(lenses: np.ndarray, kind: CameraType, frames: list[dict[str, Any]], source: Path) -> None:
-    """Undistorting leaves enough of every image."""
-    different, first = np.unique(lenses, axis=0, return_index=True)
-    for lens, index in zip(different, first, strict=True):
-        if not lens[6:].any():
-            continue
-        where = f"{source}: the distortion of {shown(frames[index]['file_path'])}"
-        fx, fy, cx, cy, w, h, k1, k2, k3, k4, p1, p2 = lens
-        K, size = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]), (int(w), int(h))
-        if kind == CameraType.FISHEYE:
-            flat = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-                K, np.array([k1, k2, k3, k4]), size, np.eye(3), balance=0
-            )
-            enough = True
-        elif k4 != 0:
-            raise InputError(f"{where} has k4 = {k4:g}, which is for fisheyes. Set it to 0, or undistort the images.")
-        else:
-            parameters = np.array([k1, k2, p1, p2, k3])
-            flat, part = cv2.getOptimalNewCameraMatrix(K, parameters, size, 0)
-            enough = part[2] * part[3] >= LEFT_OF_IMAGE * w * h and not _folds(K, parameters, size, flat, part)
-        change = flat[[0, 1], [0, 1]] / (fx, fy)
-        if not (enough and ((LEAST_FOCAL < change) & (change < MOST_FOCAL)).all()):
-            raise InputError(
-                f"{where} is so strong that undistorting leaves next to nothing of the image. Correct the parameters, "
-                "or undistort the photographs yourself."
-            )
+def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
+    """Undistorting leaves enough of the image."""
+    fx, fy, cx, cy, w, h, k1, k2, k3, k4, p1, p2 = lens
+    K, size = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]), (int(w), int(h))
+    if kind == CameraType.FISHEYE:
+        flat = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+            K, np.array([k1, k2, k3, k4]), size, np.eye(3), balance=0
+        )
+        enough = True
+    elif k4 != 0:
+        raise InputError(f"{where} has k4 = {k4:g}, which is for fisheyes. Set it to 0, or undistort the images.")
+    else:
+        parameters = np.array([k1, k2, p1, p2, k3])
+        flat, part = cv2.getOptimalNewCameraMatrix(K, parameters, size, 0)
+        enough = part[2] * part[3] >= LEFT_OF_IMAGE * w * h and not _folds(K, parameters, size, flat, part)
+    change = flat[[0, 1], [0, 1]] / (fx, fy)
+    if not (enough and ((LEAST_FOCAL < change) & (change < MOST_FOCAL)).all()):
+        raise InputError(
+            f"{where} is so strong that undistorting leaves next to nothing of the image. Correct the parameters, or "
+            "undistort the photographs yourself."
+        )
 
 
 def _folds(K: np.ndarray, distortion: np.ndarray, size: tuple[int, int], flat: np.ndarray, part: Sequence[int]) -> bool:
-    """Whether undistortion takes pixels of its image, `part` (x, y, width, height) of that of the pinhole `flat`, in
-    another order than they have in the photograph, or from beside it: the polynomial turns around before the edge."""
+    """Whether undistortion takes pixels of `part` (x, y, width, height) of the pinhole `flat`'s image in another order
+    than in the photograph, or from beside it: the polynomial turns around before the edge."""
     left, top, columns, rows = part
     u, v = np.meshgrid(np.linspace(left, left + columns, 17), np.linspace(top, top + rows, 17))
     rays = np.stack([(u - flat[0, 2]) / flat[0, 0], (v - flat[1, 2]) / flat[1, 1], np.ones_like(u)], axis=-1)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs and masks as files: formats, EXIF, and smaller copies, made once and kept in a cache."""
+"""Files of photographs and masks: formats, EXIF, and smaller copies in a cache."""
 
+import contextlib
 import hashlib
 import math
 import os
@@ -18,30 +19,36 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole
 
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "PPM")
-"""PIL's names of photographs' formats. PIL knows others by their first bytes, whatever a file is called, and starts
-Ghostscript for one of them."""
+"""Formats that PIL may open. It goes by a file's first bytes, and starts Ghostscript for one of the others."""
 MASK_MODES = ("1", "L", "I", "I;16")
-"""PIL modes with one value per pixel that means something by itself (a palette index does not)."""
+"""PIL modes of masks: one value for each pixel, no palette index."""
 HALF = 127
-"""A JPEG mask is inside above this: its edges ring, so that values near 0 are outside."""
+"""A JPEG mask is inside above this, since its edges ring."""
 BYTES_PER_PIXEL = 16
-"""Memory for decoding a picture: as PIL has it, converted, resized or undistorted, and as a tensor."""
+"""Memory for decoding a picture: decoded, converted, resized or undistorted, and a tensor."""
 
 Result = TypeVar("Result")
 
 
 def open_picture(path: Path, formats: Sequence[str] = FORMATS) -> Image.Image:
-    """PIL's `Image.open` for photographs alone: the header is read, the pixels are not.
+    """An image whose header is read and whose pixels are not.
 
     Raises:
         InputError: it is not an image of these formats.
     """
-    try:
+    with _named(path, "is not a readable image"):
         return Image.open(path, formats=formats)
-    except Exception as error:  # PIL lets out whatever its many readers meet in a broken file
+
+
+@contextlib.contextmanager
+def _named(path: Path, finding: str) -> Iterator[None]:
+    """PIL lets out whatever its readers meet in a broken file: make it InputError."""
+    try:
+        yield
+    except Exception as error:
         raise InputError(
-            f"{path} is not a readable image ({_reason(error)}). Restore the file, or remove its frame from the data "
-            "set."
+            f"{path} {finding} ({str(error) or type(error).__name__}). Restore the file, or remove its frame from the "
+            "data set."
         ) from error
 
 
@@ -52,7 +59,7 @@ def read_size(path: Path) -> tuple[int, int]:
 
 
 def check_depth(image: Image.Image, path: Path) -> None:
-    """8 bits per channel. Of more, the range is unknown: PIL keeps the high byte, which is black for 12 bits in 16."""
+    """Refuse more than 8 bits per channel, whose range is unknown: 12 bits in 16 would be black."""
     if image.mode[0] in "IF" or any(";16" in str(tile[3]) for tile in image.tile):
         raise InputError(
             f"{path} has more than 8 bits per channel (mode {image.mode}). Convert it to an 8-bit PNG or JPEG."
@@ -60,19 +67,12 @@ def check_depth(image: Image.Image, path: Path) -> None:
 
 
 def read_picture(path: Path) -> Image.Image:
-    """A decoded photograph of 8 bits, RGB, or RGBA where it has transparency.
-
-    Grey, palette, bilevel, CMYK and YCbCr images are converted.
-    """
+    """A photograph of any mode with 8 bits, decoded to RGB, or to RGBA if it has transparency."""
     with open_picture(path) as image:
         check_depth(image, path)
         transparent = image.mode.endswith(("A", "a")) or (image.mode == "P" and "transparency" in image.info)
-        try:
+        with _named(path, "cannot be decoded"):
             return image.convert("RGBA" if transparent else "RGB")
-        except Exception as error:  # as above
-            raise InputError(
-                f"{path} cannot be decoded ({_reason(error)}). Restore the file, or remove its frame from the data set."
-            ) from error
 
 
 def read_mask(path: Path) -> Image.Image:
@@ -83,15 +83,13 @@ def read_mask(path: Path) -> Image.Image:
                 f"{path}: a mask must have one grey channel (0 outside, anything else inside), not colours or a "
                 "palette. Save it as 8-bit grey."
             )
-        try:
+        with _named(path, "cannot be decoded"):
             inside = np.array(image) > (HALF if image.format == "JPEG" else 0)
-        except Exception as error:  # as above
-            raise InputError(f"{path} cannot be decoded ({_reason(error)}). Restore the mask.") from error
     return Image.fromarray(inside.astype(np.uint8) * 255)
 
 
 def free_memory() -> int | None:
-    """Bytes that programs can still have without anything being swapped out; None where the system does not tell."""
+    """Bytes of available memory; None where the system does not say."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
@@ -102,19 +100,15 @@ def free_memory() -> int | None:
 def in_parallel(
     read: Callable[[int], Result], sizes: Sequence[tuple[int, int]], what: str, workers: int | None = None
 ) -> Iterator[Result]:
-    """Results of `read(0)`, `read(1)`, ..., which decode pictures of these sizes, on several threads.
+    """Results of `read(0)`, `read(1)`, ..., which decode pictures of these sizes (width, height), on `workers` threads.
 
-    Half of the free memory bounds the number of threads. Where one fails, those that have not begun are left out.
-
-    Args:
-        sizes: (width, height) in full size.
-        what: text of the progress bar.
-        workers: None: one for each processor.
+    By default there is a thread for each processor; half of the free memory bounds their number. The first failure ends
+    the reading. `what` names the progress bar.
 
     Raises:
         InputError: there is no memory for decoding the largest picture.
     """
-    from nerfstudio.utils.rich_utils import CONSOLE  # 20 seconds, which `nrfgs prepare` need not spend
+    from nerfstudio.utils.rich_utils import CONSOLE  # slow to import, and not needed by `nrfgs prepare`
 
     width, height = max(sizes, key=math.prod, default=(1, 1))
     each, free = BYTES_PER_PIXEL * width * height, free_memory()
@@ -136,20 +130,17 @@ def in_parallel(
 
 
 def cache_folder(kind: str = "images") -> Path:
-    """Folder of a kind of files in nrfgs-ns in XDG_CACHE_HOME, or else in .cache of the home folder."""
+    """Folder of a kind of cached files, in XDG_CACHE_HOME or ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nrfgs-ns" / kind
 
 
 def smaller_copies(
     paths: Sequence[Path], sizes: Sequence[tuple[int, int]], kind: Literal["images", "masks"]
 ) -> list[Path]:
-    """Copies of pictures at smaller sizes, from the cache; those that are not in it are made.
+    """Cached copies of pictures at smaller sizes (width, height), made where missing or older than their originals.
 
-    A copy is made anew where its original has changed. Copies have the names of their originals. Photographs are
-    filtered (Lanczos; JPEG stays JPEG, of quality 95, the rest is kept without loss), masks are sampled.
-
-    Args:
-        sizes: (width, height) of the copies.
+    They keep their names. Photographs are filtered (Lanczos; JPEG stays JPEG, of quality 95, the rest is kept without
+    loss), masks are sampled.
     """
     copies = [_copy_of(path, size, kind) for path, size in zip(paths, sizes, strict=True)]
     missing = [job for job in zip(paths, sizes, copies, strict=True) if not job[2].is_file()]
@@ -163,7 +154,7 @@ def smaller_copies(
 
 
 def _copy_of(path: Path, size: tuple[int, int], kind: str) -> Path:
-    """Path of a copy, in a folder named after all that decides its pixels."""
+    """Path of a copy, in a folder named after everything that decides its pixels."""
     stat = path.stat()
     identity = f"{path.resolve()} {stat.st_size} {stat.st_mtime_ns} {size} {kind}"
     return cache_folder() / hashlib.sha256(identity.encode("utf-8", "surrogateescape")).hexdigest()[:24] / path.name
@@ -185,10 +176,6 @@ def _resize(path: Path, size: tuple[int, int], copy: Path, kind: str) -> None:
         ) from error
 
 
-def _reason(error: Exception) -> str:
-    return str(error) or type(error).__name__
-
-
 NUMBERS = {
     "exposure_time": ExifTags.Base.ExposureTime,
     "f_number": ExifTags.Base.FNumber,
@@ -197,26 +184,18 @@ NUMBERS = {
 }
 NAMES = {"make": ExifTags.Base.Make, "model": ExifTags.Base.Model}
 KEPT = (*NAMES.values(), ExifTags.Base.DateTime)
-"""Tags of the main directory that hold for copies of a photograph in another size, too."""
 KEPT_EXIF = (*NUMBERS.values(), ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DateTimeOriginal)
-"""The same of the photographic directory."""
+"""Tags of the main and the photographic directory that hold for copies in another size, too."""
 
 
 def read_exif(path: Path) -> dict[str, float | str]:
-    """EXIF about the taking of a photograph; empty for a file without EXIF, or one that is no image.
-
-    Returns:
-        Some of exposure_time (seconds), f_number, iso, focal_length (mm), each finite and above 0, and make, model.
-    """
+    """A photograph's EXIF, as far as known: exposure_time (seconds), f_number, iso, focal_length (mm), each finite and
+    above 0, make, model. Empty for a file that is no image."""
     return known(_exif_at(path)[0])
 
 
 def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, float | str]:
-    """The same from a frame of transforms.json, as `nrfgs prepare` writes it; empty where there is no "exif".
-
-    Raises:
-        InputError: it is not a dictionary of positive numbers and text.
-    """
+    """The same from a frame's "exif" in transforms.json, as `nrfgs prepare` writes it; InputError for another type."""
     stored = frame.get("exif", {})
     good = isinstance(stored, dict) and all(
         isinstance(value, str) if name in NAMES else isinstance(value, int | float) and 0 < value < math.inf
@@ -232,7 +211,7 @@ def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, float | str]:
 
 
 def exif_of(image: Image.Image) -> Image.Exif:
-    """An image's EXIF; empty where it is damaged, which is no reason to refuse the image."""
+    """An image's EXIF; empty if it is damaged."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # PIL's "corrupt EXIF data"
@@ -240,12 +219,12 @@ def exif_of(image: Image.Image) -> Image.Exif:
             for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
                 exif.get_ifd(part)
         return exif
-    except Exception:  # PIL lets out whatever it meets in damaged bytes
+    except Exception:  # whatever damaged bytes lead to
         return Image.Exif()
 
 
 def _exif_at(path: Path) -> tuple[Image.Exif, tuple[int, int]]:
-    """EXIF and size of a file; empty for one that is no image."""
+    """EXIF and size of a file; empty if it is no image."""
     try:
         with open_picture(path) as image:
             return exif_of(image), image.size
@@ -254,7 +233,7 @@ def _exif_at(path: Path) -> tuple[Image.Exif, tuple[int, int]]:
 
 
 def known(exif: Image.Exif) -> dict[str, float | str]:
-    """What `read_exif` returns, from PIL's EXIF."""
+    """The result of `read_exif`, from PIL's EXIF."""
     details = exif.get_ifd(ExifTags.IFD.Exif)
     numbers = {name: _number(details.get(tag)) for name, tag in NUMBERS.items()}
     names = {name: str(exif.get(tag) or "").strip(" \0") for name, tag in NAMES.items()}
@@ -262,7 +241,7 @@ def known(exif: Image.Exif) -> dict[str, float | str]:
 
 
 def _number(value: Any) -> float | None:
-    """A tag's value, or the first of several, if it is a finite number above 0."""
+    """A tag's (first) value, if it is a finite number above 0."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, IndexError, ZeroDivisionError):
@@ -271,30 +250,22 @@ def _number(value: Any) -> float | None:
 
 
 def exif_of_copy(exif: Image.Exif) -> bytes:
-    """EXIF, for PIL's `exif` option, of a copy that was turned, undistorted or made smaller.
-
-    Camera, lens, exposure, date and position are kept; orientation, sizes, thumbnails and makers' notes are not.
-    """
-    copy = Image.Exif()
-    details, position = exif.get_ifd(ExifTags.IFD.Exif), exif.get_ifd(ExifTags.IFD.GPSInfo)
-    main = {tag: exif[tag] for tag in KEPT if tag in exif}
-    kept = {tag: details[tag] for tag in KEPT_EXIF if tag in details}
-    if not (main or kept or position):
-        return b""
-    copy.update(main)
-    if kept:
-        copy.get_ifd(ExifTags.IFD.Exif).update(kept)
-    if position:
-        copy.get_ifd(ExifTags.IFD.GPSInfo).update(position)
-    return copy.tobytes()
+    """EXIF, for PIL's `exif` option, of a turned, undistorted or smaller copy: camera, exposure, date, position."""
+    copy, details = Image.Exif(), exif.get_ifd(ExifTags.IFD.Exif)
+    copy.update({tag: exif[tag] for tag in KEPT if tag in exif})
+    parts = {
+        ExifTags.IFD.Exif: {tag: details[tag] for tag in KEPT_EXIF if tag in details},
+        ExifTags.IFD.GPSInfo: exif.get_ifd(ExifTags.IFD.GPSInfo),
+    }
+    for part, kept in parts.items():
+        if kept:
+            copy.get_ifd(part).update(kept)
+    return copy.tobytes() if len(copy) or any(parts.values()) else b""
 
 
 def share_of_size(path: Path) -> float:
-    """Width of an image as a share of the one in its EXIF: below 1 where it was made smaller and EXIF was kept as it
-    was; 1 where nothing is known.
-
-    A focal length in millimetres comes with the sensor's resolution, in pixels of the size in EXIF, except where it is
-    also given for 35 mm film (then 1, too)."""
+    """Width of an image over its width in EXIF, which the sensor's resolution refers to; 1 if that is unknown, or not
+    needed because EXIF has the focal length for 35 mm film."""
     exif, size = _exif_at(path)
     details = exif.get_ifd(ExifTags.IFD.Exif)
     sides = [_number(details.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
@@ -304,7 +275,7 @@ def share_of_size(path: Path) -> float:
 
 
 def read_position(path: Path) -> tuple[float, float] | None:
-    """Latitude and longitude in degrees where a photograph was taken, or None."""
+    """Latitude and longitude of a photograph in degrees, or None."""
     gps = _exif_at(path)[0].get_ifd(ExifTags.IFD.GPSInfo)
     angles = []
     for tag, side, negative, bound in (
@@ -319,4 +290,4 @@ def read_position(path: Path) -> tuple[float, float] | None:
         if not abs(angle) <= bound:
             return None
         angles.append(-angle if str(gps.get(side, "")).strip(" \0").upper() == negative else angle)
-    return (angles[0], angles[1]) if any(angles) else None  # 0, 0 is what devices without a fix write
+    return (angles[0], angles[1]) if any(angles) else None  # devices without a fix write 0, 0

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs as training reads them, decoded and undistorted; files of those for which there is no memory.
+"""Decoded and undistorted photographs, and files of their pixels where there is not enough memory.
 
-A file holds a photograph's bytes unchanged and is mapped into memory: only what is read takes memory, and the system
-may drop it again. Files are made once, and anew where the photograph, its mask or its camera has changed.
+Files are mapped: the system may drop what was read. They are made once, and anew where the photograph, its mask or its
+camera has changed.
 """
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,19 +24,16 @@ from nrfgs_ns.files import whole, write_whole
 LENS = ("fx", "fy", "cx", "cy", "width", "height")
 """Fields of a camera that undistortion changes."""
 MAPPED = ("image", "mask")
-"""Contents of a photograph's files."""
 PAGE = 4096
 """Bytes."""
 
 
 def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
-    """A photograph as a pinhole would have taken it; its camera in the data set becomes that pinhole.
-
-    Args:
-        image_type: "uint8" or "float32".
+    """A photograph, undistorted; its camera in the data set becomes the pinhole that would have taken it.
 
     Returns:
-        "image" [H, W, 3 or 4], "image_idx", and "mask" bool [H, W, 1] if there are masks.
+        "image" [H, W, 3 or 4] of `image_type` (uint8 or float32), "image_idx", and "mask" bool [H, W, 1] if there are
+        masks.
     """
     data = dataset.get_data(index, image_type=image_type)
     camera = dataset.cameras[index].reshape(())
@@ -78,7 +76,7 @@ def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
 
 
 def look_through(image: torch.Tensor) -> None:
-    """Have a mapped image's bytes in memory when they are needed: read one of each page."""
+    """Read one byte of each page of a mapped image, so that it is in memory."""
     image.view(torch.uint8).flatten()[::PAGE].sum()
 
 
@@ -94,28 +92,24 @@ def _write(folder: Path, data: dict[str, Any], lens: list[float]) -> None:
 
 
 def _about(folder: Path) -> dict[str, Any] | None:
-    """Contents of a folder's files; None where they are not there or not whole, as those who clean a cache leave
-    them."""
+    """The description of a folder's files; None where one is missing or cut, as cleaners of caches leave them."""
     try:
         about = json.loads((folder / "about.json").read_text(encoding="utf-8"))
         sizes = {name: (folder / f"{name}.bin").stat().st_size for name in MAPPED if name in about}
-        return about if all(size == _bytes(*about[name]) for name, size in sizes.items()) else None
+        announced = {name: np.dtype(about[name][0]).itemsize * math.prod(about[name][1:]) for name in sizes}
+        return about if sizes == announced else None
     except (OSError, ValueError):
         return None
 
 
-def _bytes(kind: str, *shape: int) -> int:
-    return getattr(torch, kind).itemsize * torch.Size(shape).numel()
-
-
 def _mapped(folder: Path, name: str, form: list) -> torch.Tensor:
-    """A tensor that is a file; what is written into it stays in memory."""
+    """A mapped file; writing into the tensor leaves the file alone."""
     kind, *shape = form  # not torch.from_file, which takes only names that are UTF-8
     return torch.from_numpy(np.memmap(folder / f"{name}.bin", dtype=kind, mode="c", shape=tuple(shape)))
 
 
 def _folder(dataset: Any, index: int, image_type: str) -> Path:
-    """Folder of a photograph's files, named after all that decides its pixels."""
+    """Folder of a photograph's files, named after everything that decides its pixels."""
     outputs = dataset._dataparser_outputs
     paths = [outputs.image_filenames[index]]
     if outputs.mask_filenames is not None:

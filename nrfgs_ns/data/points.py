@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The point clouds that training starts from, read without open3d: .ply files and COLMAP's points3D.
+"""Initial point clouds, without open3d: .ply files and COLMAP's points3D.
 
-Both readers return positions, float64 [N, 3] in the world of the file, and colours, uint8 [N, 3]. Points with a
-non-finite position or colour are dropped, and a warning counts them. A file that cannot be read raises InputError:
-points that are there but damaged must not turn into a random start unnoticed.
+Both readers return positions, float64 [N, 3] in the world of the file, and colours, uint8 [N, 3], without points that
+are not finite, which a warning counts. A damaged file raises InputError, so that no training starts from random points
+unnoticed.
 """
-
-from __future__ import annotations
 
 import os
 from pathlib import Path
@@ -51,16 +49,19 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         rgb = np.full(stored.shape, float(GREY))
     xyz, rgb = _finite(stored.astype(np.float64), rgb, path)
     if stored.dtype.kind == "f" and len(xyz):
-        size = np.median(np.abs(xyz), axis=0).max()
-        step = np.spacing(size.astype(stored.dtype))
-        extent = np.ptp(np.quantile(xyz, (0.1, 0.9), axis=0), axis=0).max()
-        if step > COARSE * extent > 0:
-            warn(
-                f"{path}: coordinates of {size:,.0f} in {8 * stored.itemsize} bits are rounded to {step:g}"
-                f", where the points extend over {extent:.3g}. Store them as double, or nearer to the origin (with the "
-                "poses)."
-            )
+        _warn_of_rounding(xyz, stored.dtype, path)
     return xyz, rgb
+
+
+def _warn_of_rounding(xyz: np.ndarray, stored: np.dtype, path: Path) -> None:
+    size = np.median(np.abs(xyz), axis=0).max()
+    step = np.spacing(size.astype(stored))
+    extent = np.ptp(np.quantile(xyz, (0.1, 0.9), axis=0), axis=0).max()
+    if step > COARSE * extent > 0:
+        warn(
+            f"{path}: coordinates of {size:,.0f} in {8 * stored.itemsize} bits are rounded to {step:g}, where the "
+            f"points extend over {extent:.3g}. Store them as double, or nearer to the origin (with the poses)."
+        )
 
 
 def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
@@ -73,7 +74,7 @@ def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
 
 
 def _check_counts(path: Path) -> None:
-    """No element announces more entries than the file has bytes: room is made for them before they are read."""
+    """No element announces more entries than the file has bytes, for which plyfile would reserve memory."""
     with path.open("rb") as file:
         header, end, _ = file.read(LONGEST_HEADER).partition(b"end_header")
     if not end:
@@ -90,7 +91,7 @@ def read_colmap(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _finite(xyz: np.ndarray, rgb: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points without those that are not finite, which a warning counts, with colours as uint8."""
+    """Finite points, with colours as uint8; a warning counts the others."""
     good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
     finding = f"{path}: {np.count_nonzero(~good)} of {len(good)} points have a NaN or infinite value"
     if np.count_nonzero(good) < len(good) / 2:

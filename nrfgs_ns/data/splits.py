@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which images are for training, and which for evaluation."""
+"""Division of a data set's images into training and evaluation."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nerfstudio.data.utils.dataparsers_utils import (
-    get_train_eval_split_all,
-    get_train_eval_split_filename,
-    get_train_eval_split_fraction,
-    get_train_eval_split_interval,
-)
+from nerfstudio.data.utils import dataparsers_utils as nerfstudio_splits
 
 from nrfgs_ns.data.checks import check_unique, some, warn
 from nrfgs_ns.data.views import interior_test_images
@@ -23,21 +18,16 @@ STAND_INS = {"val": ("val", "test", "train"), "test": ("test", "val", "train")}
 """Which part is evaluated: the first of these that has images."""
 
 Named = Mapping[str, tuple[str, Any]]
-"""Part -> what names it (a field, a file), and the names of its images."""
+"""Part -> the field or file that lists it, and the names of its images."""
 Rows = dict[str, np.ndarray]
 """Part -> rows of the data set, int64."""
 
 
 def split_by_names(named: Named, images: list[Path], path_of: Callable[[str], Path], source: Path) -> Rows:
-    """The rows of parts that are named.
-
-    Args:
-        images: of the whole data set.
-        path_of: from a name to the image's path.
-        source: for messages.
+    """Rows of listed parts; `path_of` leads from a listed name to one of `images`.
 
     Raises:
-        InputError: a name is none, stands twice in a part, or belongs to no image.
+        InputError: a list is not one of names, repeats one, or names an image that the data set lacks.
     """
     members = dict.fromkeys(SPLITS, frozenset())
     for split, (where, names) in named.items():
@@ -60,14 +50,10 @@ def split_by_names(named: Named, images: list[Path], path_of: Callable[[str], Pa
 
 
 def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
-    """The rows of the parts by the parser's `eval_mode`. A single image is for training.
-
-    Args:
-        config: the parser's, with eval_mode and what belongs to it.
-        images, source: as for `split_by_names`.
+    """Rows of the parts by the parser's `eval_mode`. A single image is for training.
 
     Raises:
-        InputError: these images cannot be split so.
+        InputError: the mode cannot split these images.
     """
     count, mode, every = len(images), config.eval_mode, config.eval_interval
     if count == 1:
@@ -78,13 +64,9 @@ def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
         evaluated = interior_test_images(count, every)
         train = np.setdiff1d(np.arange(count), evaluated)
     else:
+        option = {"fraction": [config.train_split_fraction], "interval": [every]}.get(mode, [])
         try:
-            train, evaluated = {
-                "fraction": lambda: get_train_eval_split_fraction(images, config.train_split_fraction),
-                "filename": lambda: get_train_eval_split_filename(images),
-                "interval": lambda: get_train_eval_split_interval(images, every),
-                "all": lambda: get_train_eval_split_all(images),
-            }[mode]()
+            train, evaluated = getattr(nerfstudio_splits, f"get_train_eval_split_{mode}")(images, *option)
         except (AssertionError, ValueError, KeyError) as error:
             raise InputError(
                 f"{source}: --eval-mode {mode} cannot split these images ({error}). Choose another."

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the capture's world to the one that is trained in, and back.
+"""From the capture's world to the training world, and back.
 
-Training is in float32, whose numbers of ten million are a metre apart. So cameras that are far from the origin, as
-georeferenced ones are, are moved there in float64 before anything else is done, and the way back is float64 too.
+Numbers of ten million are a metre apart in float32. So cameras far from the origin, as georeferenced ones are, are
+moved there in float64 before anything else, and the way back is float64, too.
 """
 
 from dataclasses import dataclass, replace
@@ -14,17 +14,13 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs, trans
 from torch import Tensor
 
 FAR = 100.0
-"""Cameras whose mean is farther from the origin than so many times their extent are moved there in float64. Nearer ones
+"""Distance of the cameras' mean from the origin, in their extents, above which they are moved in float64. Nearer ones
 lose less than a hundredth of a pixel to float32, and stay to the bit where nerfstudio puts them."""
 
 
 @dataclass(frozen=True)
 class CaptureFrame:
-    """Where the capture's own world lies in the one that is trained in: x_training = scale (R x_capture + t).
-
-    The capture's own world is that of the original reconstruction, before an `applied_transform` in transforms.json:
-    the one that dataparser_transforms.json leads back to.
-    """
+    """The world of the original reconstruction, before an `applied_transform`: x_training = scale (R x_capture + t)."""
 
     rotation: np.ndarray
     """R, float64 [3, 3]"""
@@ -32,14 +28,13 @@ class CaptureFrame:
     """t, float64 [3]"""
     scale: float
     """> 0"""
-
     origin: np.ndarray
-    """a point of the capture's world amid the cameras, float64 [3], to be subtracted from coordinates that are to fit
-    into float32; 0 where they do as they are"""
+    """a point of the capture's world amid the cameras, float64 [3], to subtract before rounding to float32; 0 where
+    float32 is enough"""
 
     @classmethod
     def of(cls, outputs: DataparserOutputs) -> "CaptureFrame":
-        """That of a data set, such as `pipeline.datamanager.train_dataparser_outputs`."""
+        """The frame of a data set, such as `pipeline.datamanager.train_dataparser_outputs`."""
         transform, scale = outputs.dataparser_transform.double().numpy(), float(outputs.dataparser_scale)
         frame = cls(transform[:, :3], transform[:, 3], scale, np.zeros(3))
         if outputs.dataparser_transform.dtype != torch.float64:
@@ -47,12 +42,12 @@ class CaptureFrame:
         return replace(frame, origin=_rounded(frame.to_capture(np.zeros((1, 3)))[0], 1 / scale))
 
     def to_capture(self, points: np.ndarray) -> np.ndarray:
-        """Points [N, 3] of the training's world in the capture's, float64 [N, 3]."""
+        """Points [N, 3] of the training world in the capture's, float64 [N, 3]."""
         return (np.asarray(points, dtype=np.float64) / self.scale - self.translation) @ self.rotation
 
 
 class PlacedOutputs(DataparserOutputs):
-    """Nerfstudio's outputs, whose way back may be in float64."""
+    """nerfstudio's outputs, whose way back may be in float64."""
 
     def transform_poses_to_original_space(self, poses: Tensor, camera_convention="opencv") -> Tensor:
         way_back = self.dataparser_transform
@@ -64,17 +59,11 @@ class PlacedOutputs(DataparserOutputs):
 def place(
     poses: np.ndarray, orientation: str, centering: str, auto_scale: bool, factor: float
 ) -> tuple[Tensor, Tensor, float]:
-    """Orient, centre and scale cameras as nerfstudio does.
-
-    Args:
-        poses: camera-to-world, float64 [V, 4, 4].
-        orientation: nerfstudio's orientation_method.
-        centering: nerfstudio's center_method.
-        auto_scale: whether the largest coordinate of a camera becomes 1.
+    """Orient, centre and scale camera-to-world poses, float64 [V, 4, 4], as nerfstudio does.
 
     Returns:
-        The poses, float32 [V, 3, 4]; the transform [3, 4] that they were moved by, float64 if they were far from the
-        origin and otherwise float32; and the scale that came after it.
+        The poses, float32 [V, 3, 4]; the transform [3, 4] before scaling, float64 if they were far from the origin and
+        otherwise float32; and the scale.
     """
     positions = poses[:, :3, 3]
     center, extent = positions.mean(axis=0), np.ptp(positions, axis=0).max()
@@ -97,13 +86,13 @@ def place(
 
 
 def _rounded(place: np.ndarray, extent: float) -> np.ndarray:
-    """A place in whole units, or in parts of one if the extent of what is there is less."""
+    """A place rounded to units, or to a power of two of the extent if that is less."""
     step = min(1.0, 2.0 ** np.floor(np.log2(extent)))
     return np.round(place / step) * step
 
 
 def after(transform: Tensor, earlier: Tensor | None) -> Tensor:
-    """One transform [3, 4] after an earlier one, in the first one's precision."""
+    """The product [3, 4] of two transforms, in the first one's precision."""
     if earlier is None:
         return transform
     return transform @ torch.cat([earlier.to(transform), torch.tensor([[0, 0, 0, 1]]).to(transform)], 0)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs prepare PHOTOS OUT`: the stages in order, what each depends on, and the verdict.
+"""`nrfgs prepare PHOTOS OUT`: the stages in order, their dependencies, and the verdict.
 
-A stage is done when state.json in OUT's folder `work` says so under the stage's key: a digest of the input's bytes, of
-the options that the stage depends on, and of the stage before it. A stage whose key is known is skipped; one that was
-begun under the same key goes on from what it left; else what it left is removed. Running a stage forgets the ones after
-it.
+OUT/work/state.json has the key of each stage that was begun: a digest of the input's bytes, the stage's options and
+the previous stage. A finished stage with the same key is skipped, an unfinished one continues; files of another key are
+removed. Running a stage forgets the later ones.
 """
 
 import contextlib
@@ -26,18 +25,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from nrfgs_ns.data.pictures import read_position
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
-from nrfgs_ns.prepare import forecast, pairs, structure
+from nrfgs_ns.prepare import pairs, structure
 from nrfgs_ns.prepare import photos as files
 from nrfgs_ns.prepare.structure import CameraModel
 
 STAGES = ("import", "features", "pairs", "match", "map", "undistort", "write")
-"""In the order of work; each builds on the one before it."""
 GOOD_SHARE = 0.9
-"""Share of the photographs that find their place in a capture that went well."""
+"""Share of the photographs that a good reconstruction places."""
 FOCAL_TOLERANCE = 0.15
-"""EXIF's focal lengths, in whole millimetres of a 35 mm camera, are right to about this share."""
+"""Relative error of EXIF's focal lengths, in whole millimetres of a 35 mm camera."""
 GOOD_ERROR = 1.5
-"""Mean reprojection error of a reconstruction that went well, pixels."""
+"""Mean reprojection error of a good reconstruction, pixels."""
 
 
 @dataclass
@@ -64,16 +62,8 @@ class Prepare:
 
     def main(self) -> None:
         try:
-            run = Run(self)
-            run.import_input()
-            run.find_features()
-            run.choose_pairs()
-            run.match()
-            run.map()
-            run.undistort()
-            run.write()
-            run.verdict()
-        except OSError as error:  # no permission, no space, ...
+            Run(self).all()
+        except OSError as error:
             raise InputError(f"{error.filename or self.out}: {error.strerror or error}.") from error
         except RuntimeError as error:  # COLMAP's
             work = self.out / "work"
@@ -83,7 +73,7 @@ class Prepare:
 
 
 class Run:
-    """One call of the command: where things are, and what is done already."""
+    """One call of the command: its paths, and the state of the stages."""
 
     def __init__(self, options: Prepare, screen: Console | None = None):
         for name in ("feature_size", "features", "frames"):
@@ -98,9 +88,9 @@ class Run:
         self.out, self.work = options.out, options.out / "work"
         self.stored, self.database, self.model = self.work / "photos", self.work / "database.db", self.work / "model"
         self.undistorted, self.pairs_file = self.work / "undistorted", self.work / "likely_pairs.json"
-        self.repeated = 0  # stages that were done already
-        self.speed: float | None = None  # seconds for the features of a million pixels
         self.state_file = self.work / "state.json"
+        self.repeated = 0  # finished stages
+        self.speed: float | None = None  # seconds for the features of a million pixels
         if self.out.exists() and not self.state_file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
         try:
@@ -109,12 +99,16 @@ class Run:
             raise InputError(f"{self.state_file} is damaged ({error}). Delete {self.out} and begin again.") from error
         self.key = files.digest(self.inputs)
 
+    def all(self) -> None:
+        for stage in (self.import_input, self.find_features, self.choose_pairs, self.match, self.map, self.undistort):
+            stage()
+        self.write()
+        self.verdict()
+
     @property
     def names(self) -> list[str]:
         """Names of the stored photographs, sorted."""
         return sorted(path.name for path in self.stored.iterdir())
-
-    # The stages.
 
     def import_input(self) -> None:
         if not self.is_video and (others := files.left_out(self.options.photos, self.inputs)):
@@ -140,9 +134,9 @@ class Run:
     def find_features(self) -> None:
         names, options = self.names, self.options
         one = options.camera == "single" or options.camera == "auto" and files.same_camera(self.stored, names)
-        if one and len(found := set(files.sizes(self.stored, names))) > 1:
+        if one and (count := len(set(files.sizes(self.stored, names)))) > 1:
             raise InputError(
-                f"--camera is single, but {self.options.photos} has photographs of {len(found)} sizes. Leave it out."
+                f"--camera is single, but {self.options.photos} has photographs of {count} sizes. Leave it out."
             )
         chosen = {
             "camera_model": options.camera_model,
@@ -156,7 +150,7 @@ class Run:
                 begun = time.monotonic()
                 structure.extract_features(self.database, self.stored, names, **chosen, advance=advance)
                 sizes = files.sizes(self.stored, names)
-                self.speed = (time.monotonic() - begun) / forecast.looked_at(sizes, options.feature_size)
+                self.speed = (time.monotonic() - begun) / pairs.pixels_searched(sizes, options.feature_size)
 
     def choose_pairs(self) -> None:
         names, matching = self.names, self.options.matching
@@ -177,14 +171,13 @@ class Run:
         every = len(names) * (len(names) - 1) // 2
         if self.speed is not None:
             counts = structure.feature_counts(self.database, names)
-            seconds = self.speed * forecast.still_to_do(files.sizes(self.stored, names), counts, chosen)
-            rest = forecast.in_words(seconds)
+            seconds = self.speed * pairs.remaining_cost(files.sizes(self.stored, names), counts, chosen)
+            rest = pairs.in_words(seconds)
             self.screen.print(f"{len(chosen):,} of {every:,} pairs to match; {rest} to go.", highlight=False)
         with self.stage("match", "match pairs", [], len(chosen)) as advance:
             if advance is None:
                 return
-            found = structure.match_features(self.database, names, chosen, self.work, advance)
-            if found == 0:
+            if structure.match_features(self.database, names, chosen, self.work, advance) == 0:
                 raise InputError(
                     f"{self.options.photos}: no two of the {len(names)} photographs show the same thing. Take them "
                     "closer to each other, with texture in view, and sharp; or try --features 8192."
@@ -222,13 +215,9 @@ class Run:
     def stage(
         self, slot: str, name: str, made: list[Path], total: int, **depends_on: Any
     ) -> Iterator[Callable[[int], None] | None]:
-        """One stage, with a progress bar.
+        """One stage, with a progress bar; yields a function that advances it, or None if the stage is finished.
 
-        Args:
-            made: what the stage writes; removed where it belongs to another input or other options.
-
-        Yields:
-            What advances the bar by a number of steps, or None if the stage is done already.
+        `made` are the stage's files, which are removed if they are of another input or other options.
         """
         self.key = hashlib.sha256(json.dumps([self.key, slot, depends_on], sort_keys=True).encode()).hexdigest()
         before = self.state.get(slot, {})
@@ -259,10 +248,8 @@ class Run:
         self.state[slot] = {"key": self.key, "done": done}
         write_whole(self.state_file, json.dumps(self.state, indent=1) + "\n")
 
-    # The end.
-
     def verdict(self) -> None:
-        """Print what was achieved and what to do next; the numbers go to OUT/prepare.json."""
+        """Print results and the next step; the numbers go to OUT/prepare.json."""
         if self.repeated == len(STAGES):
             self.screen.print(f"{self.out} is prepared already, from these photographs and options.", soft_wrap=True)
         model = structure.colmap().Reconstruction(self.model)
@@ -292,7 +279,7 @@ class Run:
         self.screen.print(train_line(self.out), markup=False, highlight=False, soft_wrap=True)
 
     def _advice(self, registered: int, total: int, error: float) -> Iterator[str]:
-        """What is wrong with a reconstruction, and the fix; nothing for a good one."""
+        """Faults of a reconstruction and their fixes."""
         if registered < GOOD_SHARE * total:
             placed = {path.name for path in (self.out / "images").iterdir()}
             left = [name for name in self.names if name not in placed]
@@ -307,18 +294,17 @@ class Run:
 
 
 def _focal_advice(lengths: list[tuple[float, float]]) -> Iterator[str]:
-    """A word about a focal length that EXIF contradicts, from pairs of EXIF's and the reconstruction's in pixels."""
-    told, found = max(lengths, key=lambda pair: abs(math.log(pair[1] / pair[0])), default=(1.0, 1.0))
-    if abs(math.log(found / told)) > math.log(1 + FOCAL_TOLERANCE):
+    """A contradiction among pairs of focal lengths, EXIF's and the reconstruction's in pixels."""
+    exif, fitted = max(lengths, key=lambda pair: abs(math.log(pair[1] / pair[0])), default=(1.0, 1.0))
+    if abs(math.log(fitted / exif)) > math.log(1 + FOCAL_TOLERANCE):
         yield (
-            f"EXIF tells a focal length of {told:.0f} pixels, {found:.0f} fit best. After cropping or zooming that is "
-            "as it should be. After a walk straight ahead depths may be stretched by as much: photographs to the side "
-            "would tell."
+            f"EXIF has a focal length of {exif:.0f} pixels, {fitted:.0f} fit best. After cropping or zooming this is "
+            "right. After a walk straight ahead depths may be stretched by as much: add photographs to the side."
         )
 
 
 def train_line(out: Path) -> str:
-    """What to type next; where there is no CUDA device, what gives a good result all the same."""
+    """The command to train with: without a CUDA device, one for the CPU."""
     import torch
 
     from nrfgs_ns.training.cpu_command import ten_minute_command

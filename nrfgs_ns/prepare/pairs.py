@@ -1,15 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pairs of photographs are matched: those that may show the same thing.
+"""Pairs of photographs that are worth matching, and a forecast of the time that it takes.
 
-All pairs of 75 photographs are 2,775, and most show nothing in common. A pair is likely if one of the two is among the
-
-    ALIKE       whose largest features look most like the other's
-    NEAREST     next to it, by the positions in EXIF
-    FOLLOWING   that follow it, where photographs are frames of a video or numbered in a row
-
-The largest features of a photograph are few and are found again from far away: matched with each other alone they tell
-how much two photographs share (Wu, Towards linear-time incremental structure from motion, 2013), for a hundredth of the
-cost of matching all. No vocabulary is needed.
+A pair is likely if one of the two is among the ALIKE photographs whose largest features look most like the other's (Wu,
+Towards linear-time incremental structure from motion, 2013: a hundredth of the cost of matching all features), the
+NEAREST by the positions in EXIF, or the FOLLOWING in a video or in a row of numbered names.
 """
 
 import itertools
@@ -19,22 +13,25 @@ from pathlib import Path
 
 import numpy as np
 
-ALIKE = 10
-NEAREST = 5
-FOLLOWING = 5
+ALIKE, NEAREST, FOLLOWING = 10, 5, 5
 LARGEST = 256
-"""Features of a photograph that are compared, at most; fewer where there are more than a thousand photographs."""
+"""Features of a photograph that are compared, at most; fewer of more than a thousand photographs."""
 SAME = 0.8
 """Descriptors with a cosine above this look the same."""
 NUMBERED_SHARE = 0.9
-"""Share of neighbours by name whose numbers must follow each other closely for a folder to look like one walk."""
+"""Share of neighbours by name with close numbers from which a folder counts as one walk."""
 LARGEST_GAP = 3
-"""Numbers that differ by no more follow each other closely: a blurred photograph or two may have been thrown away."""
+"""Difference of close numbers: a blurred photograph or two may be missing."""
 AT_ONCE = 32
-"""Photographs that one is compared with together: bounds the memory."""
+"""Photographs compared with one at once: bounds the memory."""
+MATCH, MAP, WRITE = 4.6e-9, 0.6, 0.12
+"""Cost of a pair, per feature of one photograph and of the other; of a photograph; of writing a million pixels. The
+unit is finding the features of a million pixels. Measured on `castle` and `caliterra` (results/prepare.json)."""
 
 Pairs = list[tuple[int, int]]
-"""Of indices, each once, first < second, sorted."""
+"""Sorted pairs of indices, first < second."""
+Sizes = list[tuple[int, int]]
+"""Width and height of photographs, pixels."""
 
 
 def every_pair(count: int) -> Pairs:
@@ -42,13 +39,8 @@ def every_pair(count: int) -> Pairs:
 
 
 def likely_pairs(alike: np.ndarray, positions: np.ndarray | None, in_a_row: bool) -> Pairs:
-    """The pairs that are worth matching.
-
-    Args:
-        alike: [N, N], how many features each two share; see `shared_features`.
-        positions: [N, 2] in metres, NaN where unknown; None without any.
-        in_a_row: photographs follow each other along a path.
-    """
+    """The pairs that are worth matching, by `shared_features` [N, N], positions [N, 2] in metres (NaN where unknown),
+    and whether photographs follow each other along a path."""
     count = len(alike)
     chosen = np.zeros((count, count), dtype=bool)
     _choose_best(chosen, np.where(alike > 0, alike, -np.inf), ALIKE)
@@ -69,9 +61,7 @@ def _choose_best(chosen: np.ndarray, scores: np.ndarray, number: int) -> None:
 
 
 def shared_features(descriptors: list[np.ndarray], advance: Callable[[int], None]) -> np.ndarray:
-    """How many of their largest features each two photographs share: [N, N], symmetric, 0 on the diagonal.
-
-    Two features are shared if each is the other's best match and they look the same.
+    """Numbers of shared features (mutual best matches that look the same), int [N, N], symmetric, 0 on the diagonal.
 
     Args:
         descriptors: for each photograph [n, 128], largest feature first.
@@ -104,11 +94,30 @@ def numbered_in_a_row(names: list[str]) -> bool:
 
 
 def metres(positions: list[tuple[float, float] | None]) -> np.ndarray | None:
-    """Latitudes and longitudes in degrees as [N, 2] metres east and north of their mean; None where fewer than two
-    are known."""
+    """Latitudes and longitudes in degrees as [N, 2] metres east and north of their mean; None if fewer than two are
+    known."""
     known = np.array([each if each is not None else (np.nan, np.nan) for each in positions], dtype=float).reshape(-1, 2)
     if np.isfinite(known[:, 0]).sum() < 2:
         return None
     degrees = known - np.nanmean(known, axis=0)
     metre = np.radians(1.0) * 6_371_000.0
     return np.stack([degrees[:, 1] * np.cos(np.radians(np.nanmean(known[:, 0]))), degrees[:, 0]], axis=1) * metre
+
+
+def pixels_searched(sizes: Sizes, longest_side: int) -> float:
+    """Millions of pixels of photographs shrunk to a longest side."""
+    return sum(width * height * min(1.0, longest_side / max(width, height)) ** 2 for width, height in sizes) / 1e6
+
+
+def remaining_cost(sizes: Sizes, features: list[int], pairs: Pairs) -> float:
+    """The cost of matching, mapping and writing."""
+    first, second = np.array(pairs, dtype=int).reshape(-1, 2).T
+    counts = np.array(features, dtype=float)
+    pixels = sum(width * height for width, height in sizes) / 1e6
+    return float(MATCH * (counts[first] * counts[second]).sum() + MAP * len(sizes) + WRITE * pixels)
+
+
+def in_words(seconds: float) -> str:
+    if seconds < 90:
+        return "about a minute"
+    return f"about {seconds / 60:.0f} minutes" if seconds < 5400 else f"about {seconds / 3600:.1f} hours"

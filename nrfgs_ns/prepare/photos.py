@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The photographs: found, opened once, turned upright, and the frames of a video."""
+"""Photographs, found, checked and turned upright, and the frames of a video."""
 
 import hashlib
 import os
@@ -17,30 +17,26 @@ from nrfgs_ns.data.pictures import FORMATS, check_depth, exif_of, exif_of_copy, 
 from nrfgs_ns.errors import InputError
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-"""Suffixes of photographs, in any case."""
 HEIF = (".heic", ".heif")
-"""Suffixes of what phones write, which are read where pillow-heif is installed."""
+"""Suffixes that are read if pillow-heif is installed."""
 CONVERT = "To read HEIC, run `pip install pillow-heif`, or convert it to JPEG (`heif-convert`, or the phone's export)."
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-"""Suffixes of videos, in any case."""
 KEPT = (".jpg", ".jpeg", ".png")
-"""Formats that are used as they are; the others become PNG."""
-FEWEST = 3
-"""Photographs from which a scene can be reconstructed at all."""
-FEW = 15
-"""Fewer photographs get a warning."""
+"""Suffixes of files that are copied; others become PNG."""
+FEWEST, FEW = 3, 15
+"""Fewer photographs are refused, or get a warning."""
 SHARPNESS_WIDTH = 320
-"""Frames are shrunk to this width before their sharpness is compared, pixels: motion blur counts, not noise."""
+"""Width at which the sharpness of frames is compared, pixels: motion blur counts, not noise."""
 SMALLEST = 16
 """Pixels of the shorter side, at least."""
 LONGEST_STEM = 120
-"""Letters of a stored name: file systems allow 255 bytes, some of which others need."""
+"""Letters of a stored name, at most."""
 
 Advance = Callable[[], None]
 
 
 def reads_heif() -> bool:
-    """Whether PIL reads HEIC: with pillow-heif, which is told to PIL here."""
+    """Whether PIL reads HEIC, by pillow-heif."""
     try:
         import pillow_heif
     except ImportError:
@@ -50,11 +46,7 @@ def reads_heif() -> bool:
 
 
 def find_inputs(source: Path) -> list[Path]:
-    """The photographs of a folder by sorted name, or a video as a list of one.
-
-    Raises:
-        InputError: there is nothing to be used, or too little.
-    """
+    """The photographs of a folder by sorted name, or a video as a list of one; InputError without enough of them."""
     if source.is_file():
         if source.suffix.lower() in VIDEOS:
             return [source]
@@ -82,7 +74,7 @@ def find_inputs(source: Path) -> list[Path]:
 
 
 def left_out(source: Path, photos: list[Path]) -> str:
-    """Contents of a folder beside its photographs, as a sentence: files by suffix, and folders; "" for nothing."""
+    """A sentence about other contents of a folder, by suffix; "" without any."""
     others = [path for path in source.iterdir() if not path.name.startswith(".") and path not in set(photos)]
     kinds = Counter("folders" if path.is_dir() else path.suffix.lower() or "no suffix" for path in others)
     if not kinds:
@@ -114,9 +106,8 @@ def digest(paths: list[Path]) -> str:
 
 
 def stored_names(photos: list[Path]) -> list[str]:
-    """File names in the scene, in order: all different, short, and of ASCII letters without blanks, which end names in
-    COLMAP's lists."""
-    names: dict[str, None] = {}  # a set in order
+    """Different short file names in ASCII without blanks, which end names in COLMAP's lists."""
+    names: dict[str, None] = {}  # an ordered set
     for index, path in enumerate(photos):
         suffix = path.suffix.lower() if path.suffix.lower() in KEPT else ".png"
         name = re.sub(r"[^\w.-]", "_", path.stem, flags=re.ASCII)[:LONGEST_STEM] + suffix
@@ -127,16 +118,12 @@ def stored_names(photos: list[Path]) -> list[str]:
 
 
 def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
-    """Copy photographs into a folder, decoding each once; those that are rotated by EXIF are turned upright.
-
-    Raises:
-        InputError: naming the file that cannot be decoded.
-    """
+    """Copy photographs into a folder, turned upright by EXIF; InputError names a file that cannot be decoded."""
     folder.mkdir(parents=True, exist_ok=True)
     for path, name in zip(photos, stored_names(photos), strict=True):
         target = folder / name
         if not target.exists():
-            aside = folder.with_name("photo" + target.suffix)  # an interrupted copy must not look like a whole one
+            aside = folder.with_name("photo" + target.suffix)  # so that a cut copy is not taken for a whole one
             with open_picture(path, (*FORMATS, "HEIF") if path.suffix.lower() in HEIF else FORMATS) as image:
                 _store(image, path, aside)
             os.replace(aside, target)
@@ -144,13 +131,13 @@ def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
 
 
 def _store(image: Image.Image, path: Path, target: Path) -> None:
-    """Write one photograph: as it is if it can be, else upright in 8-bit RGB, JPEG as JPEG and the rest as PNG."""
+    """Copy one photograph if it is upright and of 8 bits in a common format, else convert it to upright RGB."""
     check_depth(image, path)
     if min(image.size) < SMALLEST:
         raise InputError(f"{path} is {image.width} x {image.height} pixels, too small to show anything. Remove it.")
     try:
         image.load()
-    except Exception as error:  # PIL lets out whatever it meets in a broken file
+    except Exception as error:  # whatever broken files lead to
         raise InputError(
             f"{path} cannot be decoded ({error or type(error).__name__}). Restore or remove it."
         ) from error
@@ -160,13 +147,13 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
         shutil.copyfile(path, target)
         return
     turned = ImageOps.exif_transpose(image)
-    if turned.mode in ("RGBA", "LA", "PA") or "transparency" in turned.info:  # nothing is behind a cut-out object
+    if turned.mode in ("RGBA", "LA", "PA") or "transparency" in turned.info:  # put a cut-out object on white
         turned = Image.alpha_composite(Image.new("RGBA", turned.size, "white"), turned.convert("RGBA"))
-    turned.convert("RGB").save(target, quality=97, subsampling=0, exif=exif_of_copy(exif))  # has the focal length
+    turned.convert("RGB").save(target, quality=97, subsampling=0, exif=exif_of_copy(exif))
 
 
 def same_camera(folder: Path, names: list[str]) -> bool:
-    """Whether all photographs have one size, and one camera model and focal length as far as EXIF says."""
+    """Whether all photographs agree in size and, by EXIF, in camera model and focal length."""
     seen = set()
     for name in names:
         with open_picture(folder / name) as image:
@@ -181,11 +168,7 @@ def sizes(folder: Path, names: list[str]) -> list[tuple[int, int]]:
 
 
 def open_video(video: Path) -> tuple[Any, int]:
-    """OpenCV's reader of a video, and its number of frames; the first one can be decoded.
-
-    Raises:
-        InputError: OpenCV is not there, or cannot decode the file, or there are too few frames.
-    """
+    """OpenCV's reader of a video, and its number of frames; InputError if it cannot be used."""
     try:
         import cv2
     except ImportError as error:
@@ -205,13 +188,8 @@ def open_video(video: Path) -> tuple[Any, int]:
 
 
 def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:
-    """Write the sharpest frame of each of `frames` equal pieces of a video as JPEG, frame_00000.jpg and so on.
-
-    Sharpness is the variance of the Laplacian.
-
-    Raises:
-        InputError: the video cannot be used.
-    """
+    """Write the sharpest frame (by the variance of the Laplacian) of each of `frames` equal pieces of a video as JPEG,
+    frame_00000.jpg and so on; InputError if it cannot be used."""
     reader, total = open_video(video)
     import cv2
 

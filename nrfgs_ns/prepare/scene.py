@@ -23,17 +23,12 @@ from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare.structure import colmap
 
 DOWNSCALES = (2, 4, 8)
-"""nerfstudio looks for these copies; it takes the largest whose sides are at most 1600 pixels."""
+"""Copies that nerfstudio looks for; it takes the largest with sides of at most 1600 pixels."""
 
 
 def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[], None]) -> None:
-    """Write a scene from an undistorted COLMAP model.
-
-    Args:
-        undistorted: has images/ and sparse/; its images are linked.
-        photos: the photographs by the same names, whose EXIF tells how they were taken.
-        advance: called for each photograph.
-    """
+    """Write a scene from the undistorted images/, which are linked, and sparse/ of a COLMAP model, and from the EXIF of
+    `photos` by the same names. `advance` is called for each."""
     model = colmap().Reconstruction(undistorted / "sparse")
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     for folder in ("images", *(f"images_{factor}" for factor in DOWNSCALES)):
@@ -44,8 +39,7 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[]
         source = undistorted / "images" / image.name
         with open_picture(photos / image.name) as photo:
             exif = exif_of(photo)
-            taken[image.name] = known(exif)
-            kept = exif_of_copy(exif)
+        taken[image.name], kept = known(exif), exif_of_copy(exif)
         with Image.open(source) as picture:
             picture = picture.convert("RGB")
         for factor in DOWNSCALES:
@@ -61,15 +55,11 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[]
     xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
     rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     write_ply(out / "sparse.ply", xyz, rgb)
-    write_whole(out / "transforms.json", json.dumps(transforms(model, images, taken), indent=1) + "\n")
+    write_whole(out / "transforms.json", json.dumps(_transforms(model, images, taken), indent=1) + "\n")
 
 
-def transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float | str]]) -> dict[str, Any]:
-    """The content of transforms.json for images sorted by name. Intrinsics that all share stand at the top.
-
-    Args:
-        taken: for each name, how the photograph was taken, which its frame repeats under "exif": see `data.pictures`.
-    """
+def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float | str]]) -> dict[str, Any]:
+    """The content of transforms.json for images sorted by name, with their EXIF. Shared intrinsics are at the top."""
     cameras = [_intrinsics(model.cameras[image.camera_id]) for image in images]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
     names = [f"images/{image.name}" for image in images]
@@ -88,15 +78,15 @@ def transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float |
                 "file_path": name,
                 **({} if shared else camera),
                 **({"exif": taken[image.name]} if taken[image.name] else {}),
-                "transform_matrix": camera_to_world(image).tolist(),
+                "transform_matrix": _camera_to_world(image).tolist(),
             }
             for name, camera, image in zip(names, cameras, images, strict=True)
         ],
     }
 
 
-def camera_to_world(image: Any) -> np.ndarray:
-    """The pose [4, 4] of a registered image, with y up and z backwards (OpenGL) as nerfstudio has it."""
+def _camera_to_world(image: Any) -> np.ndarray:
+    """The pose [4, 4] of a registered image, y up and z backwards (OpenGL)."""
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().inverse().matrix()
     pose[:3, 1:3] *= -1.0
@@ -104,6 +94,6 @@ def camera_to_world(image: Any) -> np.ndarray:
 
 
 def _intrinsics(camera: Any) -> dict[str, Any]:
-    """Of a PINHOLE camera, in pixels; the centre of the first pixel is (0.5, 0.5) for COLMAP and nerfstudio alike."""
+    """Intrinsics of a PINHOLE camera; COLMAP's and nerfstudio's first pixel has its centre at (0.5, 0.5)."""
     fl_x, fl_y, cx, cy = (float(value) for value in camera.params)
     return {"w": camera.width, "h": camera.height, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}

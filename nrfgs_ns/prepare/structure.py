@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras and sparse points from photographs: SIFT, matching, incremental mapping and undistortion, by pycolmap.
+"""Cameras and sparse points from photographs: SIFT, matching, mapping and undistortion, by pycolmap.
 
-Every step takes up what an interrupted run has left: features and matches are kept in COLMAP's database, which skips
-what it has. Which pairs are matched is decided in `pairs`, not by COLMAP.
+COLMAP's database keeps features and matches, so that an interrupted step continues.
 """
 
 import contextlib
@@ -16,31 +15,25 @@ import numpy as np
 
 from nrfgs_ns.data.pictures import open_picture, read_size, share_of_size
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.prepare.forecast import looked_at
-from nrfgs_ns.prepare.pairs import Pairs
+from nrfgs_ns.prepare.pairs import Pairs, pixels_searched
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 LARGE = 1.5
-"""Millions of pixels from which a photograph has enough features without being doubled, which costs four times as much
-and is worth three times the features in smaller ones."""
+"""Millions of pixels from which a photograph has enough features without being doubled, at four times the cost."""
 PAIRS_AT_ONCE = 64
-"""Pairs handed to COLMAP together: between them progress is shown, and an interruption loses no more."""
+"""Pairs between two updates of the progress; an interruption loses no more."""
 SMALLEST_MODEL = 3
-"""Photographs of a model that is worth anything."""
+"""Photographs of a model, at least."""
 FEWEST_POINTS = 10
-"""Points for each photograph of a model by global mapping, at least."""
+"""Points for each photograph of a globally mapped model, at least."""
 SEED = 0
 
 Advance = Callable[[int], None]
 
 
 def colmap():
-    """The module pycolmap, which is told to say nothing: what went wrong is told here.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """The module pycolmap, silenced; InputError if it is not installed."""
     try:
         import pycolmap
     except ImportError as error:
@@ -66,9 +59,9 @@ def extract_features(
 
     Args:
         one_camera: all photographs share their intrinsics.
-        longest_side: larger photographs are shrunk for this step only, pixels.
-        features: at most so many in a photograph.
-        advance: called with the number of photographs that were done.
+        longest_side: larger photographs are shrunk to it for this step, pixels.
+        features: largest number of features in a photograph.
+        advance: called with numbers of finished photographs.
     """
     pycolmap = colmap()
     options = pycolmap.FeatureExtractionOptions()
@@ -78,7 +71,7 @@ def extract_features(
     batch = max(os.cpu_count() or 1, 4)
     for first in range(0, len(names), batch):
         part = names[first : first + batch]
-        large = min(looked_at([read_size(photos / name)], longest_side) for name in part) >= LARGE
+        large = min(pixels_searched([read_size(photos / name)], longest_side) for name in part) >= LARGE
         options.sift.first_octave = 0 if large else -1  # -1: the photograph is doubled first
         if one_camera and first > 0:
             reader.existing_camera_id = 1  # each call would make a camera of its own
@@ -96,7 +89,7 @@ def extract_features(
 
 
 def _scale_focal_lengths(database: Path, photos: Path, names: list[str]) -> None:
-    """Correct what COLMAP makes of the EXIF of photographs that were made smaller."""
+    """Correct COLMAP's focal lengths by EXIF for photographs that were made smaller."""
     with colmap().Database.open(database) as opened:
         images = {name: opened.read_image_with_name(name) for name in names}
         unread = [name for name, image in images.items() if image is None]
@@ -126,27 +119,20 @@ def largest_features(database: Path, names: list[str], number: int) -> list[np.n
 
 
 def feature_counts(database: Path, names: list[str]) -> list[int]:
-    """How many features each photograph has."""
+    """Number of features of each photograph."""
     with colmap().Database.open(database) as opened:
         return [opened.num_keypoints_for_image(opened.read_image_with_name(name).image_id) for name in names]
 
 
 def focal_lengths(database: Path, model: Any) -> list[tuple[float, float]]:
-    """Of each camera for which EXIF tells a focal length: that one, and the reconstruction's, in pixels."""
+    """Focal lengths by EXIF and by the reconstruction, in pixels, of each camera that has both."""
     with colmap().Database.open(database) as opened:
-        told = {camera.camera_id: camera for camera in opened.read_all_cameras() if camera.has_prior_focal_length}
-    return [(told[i].mean_focal_length(), model.cameras[i].mean_focal_length()) for i in model.cameras if i in told]
+        prior = {camera.camera_id: camera for camera in opened.read_all_cameras() if camera.has_prior_focal_length}
+    return [(prior[i].mean_focal_length(), model.cameras[i].mean_focal_length()) for i in model.cameras if i in prior]
 
 
 def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance) -> int:
-    """Match and verify pairs of photographs.
-
-    Args:
-        advance: called with the number of pairs that were done.
-
-    Returns:
-        How many pairs show the same thing.
-    """
+    """Match and verify pairs of photographs, and return the number of verified ones."""
     pycolmap = colmap()
     pairing, verification = pycolmap.ImportedPairingOptions(), pycolmap.TwoViewGeometryOptions()
     pairing.match_list_path = folder / "pairs.txt"
@@ -165,18 +151,14 @@ def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path,
 
 
 def find_cameras(database: Path, photos: Path, folder: Path, enough: float, advance: Advance) -> tuple[int, str]:
-    """Cameras and points; the largest model is written to `folder`.
+    """Find cameras and points, and write the largest model to `folder`.
 
-    Incremental mapping first. It begins with two photographs from well separated places that share much, which a walk
-    straight ahead does not have: each next photograph sees less of the same, from hardly another angle. If it places
-    fewer than `enough`, global mapping, which solves for all positions at once, is tried; the larger model is taken.
-
-    Args:
-        enough: so many photographs are as many as can be hoped for.
-        advance: called with 1 for each photograph that found its place.
+    Incremental mapping begins with two photographs from well separated places that share much, which a walk straight
+    ahead lacks. If it places fewer than `enough` photographs, global mapping, which solves for all positions at once,
+    is tried, too, and the larger model wins. `advance` is called with 1 for each photograph that is placed.
 
     Returns:
-        How many separate models were found, and by which mapping; 0 if none, and then nothing is written.
+        The number of separate models (0: nothing is written), and the mapping.
     """
     shutil.rmtree(folder, ignore_errors=True)
     models, mapping = _map_incrementally(database, photos, folder, advance), "incremental"
@@ -190,11 +172,7 @@ def find_cameras(database: Path, photos: Path, folder: Path, enough: float, adva
 
 
 def write_model(model: Any, folder: Path) -> None:
-    """Write a reconstruction into a new folder.
-
-    Raises:
-        InputError: it was not written whole, which COLMAP does not say.
-    """
+    """Write a reconstruction into a new folder; InputError if that fails, which COLMAP does not report."""
     folder.mkdir(parents=True)
     model.write(folder)
     _check_model(folder, model)
@@ -203,7 +181,7 @@ def write_model(model: Any, folder: Path) -> None:
 def _check_model(folder: Path, model: Any) -> None:
     try:
         written = _size([colmap().Reconstruction(folder)])
-    except Exception:  # COLMAP lets out whatever it meets
+    except Exception:  # whatever cut files lead to
         written = None
     if written != _size([model]):
         raise _not_whole(folder)
@@ -236,7 +214,7 @@ def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Adva
 
 
 def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
-    """Global mapping keeps points that are 15 pixels off: they are triangulated again, as by incremental mapping."""
+    """Global mapping, whose points (up to 15 pixels off) are triangulated again, as by incremental mapping."""
     pycolmap = colmap()
     options = pycolmap.GlobalPipelineOptions()
     options.min_model_size = SMALLEST_MODEL
@@ -258,7 +236,7 @@ def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
 
 @contextlib.contextmanager
 def _aside(folder: Path) -> Iterator[Path]:
-    """An empty folder that vanishes; COLMAP writes its models there."""
+    """A temporary folder for COLMAP's models."""
     attempts = folder.with_name(folder.name + ".attempts")
     shutil.rmtree(attempts, ignore_errors=True)
     attempts.mkdir(parents=True)
@@ -269,11 +247,8 @@ def _aside(folder: Path) -> Iterator[Path]:
 
 
 def undistort(model: Path, photos: Path, folder: Path) -> None:
-    """Undistorted photographs in folder/images, and their pinhole model in folder/sparse.
-
-    Raises:
-        InputError: they were not written whole, which COLMAP does not say.
-    """
+    """Write undistorted photographs to folder/images and their pinhole model to folder/sparse; InputError if that
+    fails, which COLMAP does not report."""
     pycolmap = colmap()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -285,5 +260,5 @@ def undistort(model: Path, photos: Path, folder: Path) -> None:
         try:
             with open_picture(path) as picture:
                 picture.load()
-        except (InputError, OSError, SyntaxError) as error:  # a PNG that is cut is one of syntax to PIL
+        except (InputError, OSError, SyntaxError) as error:  # SyntaxError: a cut PNG
             raise _not_whole(path) from error

@@ -46,13 +46,6 @@ def test_data_that_is_not_there(tmp_path, capture):
         capture.parse(data=tmp_path / "bare")
 
 
-@pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"", b"[]", b"3"])
-def test_invalid_json(tmp_path, capture, content):
-    (tmp_path / "transforms.json").write_bytes(content)
-    with pytest.raises(InputError, match=r"transforms.json"):
-        capture.parse(data=tmp_path)
-
-
 def test_up_directions_that_cancel(capture):
     frames = capture.meta["frames"] = capture.meta["frames"][:2]
     poses = np.tile(np.eye(4), (2, 1, 1))

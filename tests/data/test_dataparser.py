@@ -9,10 +9,8 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.utils.colmap_parsing_utils import Point3D, write_points3D_binary, write_points3D_text
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
-from PIL import Image
 
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, nrfgs_dataparser
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.errors import InputError
 
@@ -59,12 +57,6 @@ def test_every_eighth_image_by_sorted_name_is_test_but_neither_end(capture):
         assert torch.equal(part.cameras.fx, whole.cameras.fx[chosen])
 
 
-def test_interval_begins_with_the_first_image_as_in_the_literature(capture):
-    parser = capture.parser(eval_mode="interval")
-    assert names(parser.get_dataparser_outputs("train")) == [1, 2, 3, 4, 5, 6, 7, 9]
-    assert names(parser.get_dataparser_outputs("val")) == names(parser.get_dataparser_outputs("test")) == [0, 8]
-
-
 @pytest.mark.parametrize(
     ("count", "test"), [(1, [0]), (2, [0]), (3, [1]), (5, [2]), (8, [3]), (9, [4]), (13, [4]), (14, [4, 12])]
 )
@@ -84,21 +76,6 @@ def test_cameras_are_those_of_nerfstudio(capture, split, distortion):
         assert torch.equal(getattr(ours.cameras, name), getattr(theirs.cameras, name)), name
     assert torch.equal(ours.dataparser_transform, theirs.dataparser_transform)
     assert ours.dataparser_scale == theirs.dataparser_scale
-
-
-def test_downscaled_images(capture):
-    (capture.folder / "images_2").mkdir()
-    for path in (capture.folder / "images").iterdir():
-        Image.new("RGB", (6, 4)).save(capture.folder / "images_2" / path.name)  # 9 / 2 rounded down
-    outputs = capture.parse(downscale_factor=2)
-    assert outputs.image_filenames[0].parent.name == "images_2"
-    assert (outputs.cameras.width == 6).all() and (outputs.cameras.height == 4).all()
-
-
-def test_masks_follow_their_images(capture):
-    capture.add_masks()
-    outputs = capture.parse("val")
-    assert [path.name for path in outputs.mask_filenames] == [path.name for path in outputs.image_filenames]
 
 
 # Splits.
@@ -212,45 +189,6 @@ def test_points_that_are_not_finite_are_dropped_and_counted(capture, printed):
     assert printed().count("3 of 20 points have a NaN or infinite value") == 1
 
 
-def truncate(path):
-    path.write_bytes(path.read_bytes()[:-20])
-
-
-def drop_vertices(path):
-    path.write_bytes(path.read_bytes().replace(b"element vertex", b"element corner"))
-
-
-def drop_z(path):
-    path.write_bytes(path.read_bytes().replace(b"float z", b"float w"))
-
-
-def empty(path):
-    path.write_bytes(b"")
-
-
-def claim_more(path):
-    path.write_bytes(path.read_bytes().replace(b"vertex 20", b"vertex 20000000000"))
-
-
-@pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize(
-    "spoil",
-    [truncate, drop_vertices, drop_z, claim_more, Path.unlink, empty, lambda p: p.write_bytes(b"ply?")],
-    ids=["truncated", "no vertices", "no z", "too few", "missing", "emptied", "no ply"],
-)  # fmt: skip
-def test_unusable_ply(capture, spoil, text):
-    spoil(capture.add_ply(*cloud(), text))
-    with pytest.raises(InputError, match=r"points.ply.*remove ply_file_path"):
-        capture.parse()
-
-
-@pytest.mark.parametrize("colours", [np.full((20, 3), 2.0), np.full((20, 3), 300, "i4"), np.full((20, 3), -1, "i2")])
-def test_colours_out_of_range(capture, colours):
-    capture.add_ply(cloud()[0], colours)
-    with pytest.raises(InputError, match=r"points.ply.*colours"):
-        capture.parse()
-
-
 @pytest.mark.parametrize("points", [None, 0, 3])
 def test_without_points_one_warning(capture, printed, points):
     if points is not None:
@@ -321,11 +259,6 @@ def test_the_users_configuration_is_left_alone(single):
     parser = config.setup()
     parser.get_dataparser_outputs("train")
     assert parser.config is config and repr(config) == before
-
-
-def test_plugin():
-    assert isinstance(nrfgs_dataparser, DataParserSpecification)
-    assert isinstance(nrfgs_dataparser.config, NrfgsDataParserConfig)
 
 
 @pytest.mark.parametrize("first", ["nrfgs_ns.data.dataparser", "nerfstudio.configs.dataparser_configs"])

@@ -112,13 +112,6 @@ def test_points_of_hardly_any_spread_start_nothing(tmp_path, spread):
     assert len(capture.parse().metadata["points3D_xyz"]) == 40
 
 
-def test_points_outside_every_view_start_nothing(tmp_path):
-    capture, xyz = with_points(tmp_path / "scene")
-    capture.add_ply(xyz + (0, 0, 100))
-    with pytest.raises(InputError, match="of the 40 points to start from, 0 % are in any of the 9 training views"):
-        capture.parse()
-
-
 def test_some_points_far_away_are_left_out(tmp_path, printed):
     capture, xyz = with_points(tmp_path / "scene")
     xyz[:3] *= 1e8

@@ -6,7 +6,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from nrfgs_ns.data.pictures import read_position
-from nrfgs_ns.prepare import forecast, pairs
+from nrfgs_ns.prepare import pairs
 
 
 def descriptors(rng: np.random.Generator, number: int) -> np.ndarray:
@@ -100,10 +100,8 @@ def test_positions_are_read_and_laid_out_in_metres(tmp_path):
 
 def test_the_forecast_counts_pairs_and_pixels():
     sizes = [(2000, 1000)] * 4
-    assert forecast.looked_at(sizes, 1000) == pytest.approx(4 * 0.5)
-    assert forecast.looked_at(sizes, 4000) == pytest.approx(4 * 2.0)
-    few = forecast.still_to_do(sizes, [4000] * 4, [(0, 1)])
-    assert forecast.still_to_do(sizes, [4000] * 4, pairs.every_pair(4)) - few == pytest.approx(
-        5 * 16e6 * forecast.MATCH
-    )
-    assert forecast.still_to_do(sizes, [4000] * 4, []) < few
+    assert pairs.pixels_searched(sizes, 1000) == pytest.approx(4 * 0.5)
+    assert pairs.pixels_searched(sizes, 4000) == pytest.approx(4 * 2.0)
+    few = pairs.remaining_cost(sizes, [4000] * 4, [(0, 1)])
+    assert pairs.remaining_cost(sizes, [4000] * 4, pairs.every_pair(4)) - few == pytest.approx(5 * 16e6 * pairs.MATCH)
+    assert pairs.remaining_cost(sizes, [4000] * 4, []) < few
