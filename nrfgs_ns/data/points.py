@@ -66,11 +66,8 @@ def _warn_of_rounding(xyz: np.ndarray, stored: np.dtype, path: Path) -> None:
 
 def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
     """Write a .ply of points [N, 3], stored as float32, with colours uint8 [N, 3]."""
-    names = ("x", "y", "z", "red", "green", "blue")
-    vertices = np.empty(len(xyz), dtype=list(zip(names, ["<f4"] * 3 + ["u1"] * 3, strict=True)))
-    for name, values in zip(names, (*xyz.T, *rgb.T), strict=True):
-        vertices[name] = values
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
+    columns = np.rec.fromarrays([*xyz.astype("<f4").T, *rgb.astype("u1").T], names="x,y,z,red,green,blue")
+    PlyData([PlyElement.describe(np.asarray(columns), "vertex")], byte_order="<").write(str(path))
 
 
 def _check_counts(path: Path) -> None:

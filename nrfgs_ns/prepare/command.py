@@ -111,24 +111,21 @@ class Run:
         return sorted(path.name for path in self.stored.iterdir())
 
     def import_input(self) -> None:
-        if not self.is_video and (others := files.left_out(self.options.photos, self.inputs)):
+        if self.is_video:
+            frames = self.options.frames
+            with self.stage("import", "read the video", [self.stored], frames, frames=frames) as advance:
+                if advance is not None:
+                    shutil.rmtree(self.stored, ignore_errors=True)
+                    files.import_video(self.inputs[0], self.stored, frames, lambda: advance(1))
+            return
+        if others := files.left_out(self.options.photos, self.inputs):
             self.screen.print(others, markup=False, soft_wrap=True)
-        if not self.is_video and len(self.inputs) < files.FEW:
-            self.screen.print(
-                f"Warning: {len(self.inputs)} photographs are few. 30 or more, each showing most of what the one "
-                "before it shows, make a better scene.",
-                style="bold yellow",
-                soft_wrap=True,
-            )
-        total = self.options.frames if self.is_video else len(self.inputs)
-        frames = {"frames": self.options.frames} if self.is_video else {}
-        with self.stage("import", "read the photographs", [self.stored], total, **frames) as advance:
-            if advance is None:
-                return
-            if self.is_video:
-                shutil.rmtree(self.stored, ignore_errors=True)
-                files.import_video(self.inputs[0], self.stored, self.options.frames, lambda: advance(1))
-            else:
+        count = len(self.inputs)
+        if count < files.FEW:
+            warning = f"Warning: {count} photographs are few. Take 30 or more that overlap for a better scene."
+            self.screen.print(warning, style="bold yellow", soft_wrap=True)
+        with self.stage("import", "read the photographs", [self.stored], count) as advance:
+            if advance is not None:
                 files.import_photos(self.inputs, self.stored, lambda: advance(1))
 
     def find_features(self) -> None:
@@ -172,8 +169,9 @@ class Run:
         if self.speed is not None:
             counts = structure.feature_counts(self.database, names)
             seconds = self.speed * pairs.remaining_cost(files.sizes(self.stored, names), counts, chosen)
-            rest = pairs.in_words(seconds)
-            self.screen.print(f"{len(chosen):,} of {every:,} pairs to match; {rest} to go.", highlight=False)
+            self.screen.print(
+                f"{len(chosen):,} of {every:,} pairs to match; {pairs.in_words(seconds)} to go.", highlight=False
+            )
         with self.stage("match", "match pairs", [], len(chosen)) as advance:
             if advance is None:
                 return

@@ -4,10 +4,10 @@
 COLMAP's database keeps features and matches, so that an interrupted step continues.
 """
 
-import contextlib
 import os
 import shutil
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -201,7 +201,7 @@ def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Adva
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = SMALLEST_MODEL
     options.random_seed = SEED
-    with _aside(folder) as attempts:
+    with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = pycolmap.incremental_mapping(
             database,
             photos,
@@ -219,7 +219,7 @@ def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
     options = pycolmap.GlobalPipelineOptions()
     options.min_model_size = SMALLEST_MODEL
     options.random_seed = SEED
-    with _aside(folder) as attempts:
+    with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = list(pycolmap.global_mapping(database, photos, attempts, options=options).values())
         models = [model for model in models if model.num_reg_images() >= SMALLEST_MODEL]
         for model in models:
@@ -232,18 +232,6 @@ def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
             pycolmap.create_default_bundle_adjuster(options, everything, model).solve()
             model.update_point_3d_errors()
     return [model for model in models if model.num_points3D() >= FEWEST_POINTS * model.num_reg_images()]
-
-
-@contextlib.contextmanager
-def _aside(folder: Path) -> Iterator[Path]:
-    """A temporary folder for COLMAP's models."""
-    attempts = folder.with_name(folder.name + ".attempts")
-    shutil.rmtree(attempts, ignore_errors=True)
-    attempts.mkdir(parents=True)
-    try:
-        yield attempts
-    finally:
-        shutil.rmtree(attempts, ignore_errors=True)
 
 
 def undistort(model: Path, photos: Path, folder: Path) -> None:

@@ -287,15 +287,10 @@ def test_inputs_that_cannot_do_are_refused(make, said, tmp_path):
         photos.find_inputs(tmp_path / "in")
 
 
-def test_unreadable_photographs_and_foreign_folders_are_named(tmp_path):
+def test_foreign_folders_and_small_numbers_are_refused(tmp_path):
     folder = tmp_path / "in"
     for i in range(3):
         photo(folder / f"{i}.jpg")
-    whole = (folder / "1.jpg").read_bytes()
-    for broken in (b"junk", whole[: len(whole) // 2]):
-        (folder / "1.jpg").write_bytes(broken)
-        with pytest.raises(InputError, match=r"1\.jpg (is not a readable image|cannot be decoded)"):
-            Run(Prepare(folder, tmp_path / "out"), Console(quiet=True)).import_input()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "precious.txt").touch()
     with pytest.raises(InputError, match="was not made by"):
@@ -449,7 +444,7 @@ EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 50 50\nshowpage\n"
         (lambda path: Image.new("RGB", (1, 1)).save(path), "1 x 1 pixels"),
         (lambda path: Image.new("RGB", (1, 3000)).save(path), "1 x 3000 pixels"),
         (lambda path: Image.new("I;16", (40, 30)).save(path), "more than 8 bits"),
-        (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 40), "not a readable image"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-40]), "cannot be decoded"),
         (lambda path: path.write_bytes(b""), "not a readable image"),
     ],
 )
