@@ -294,11 +294,7 @@ class Bench:
 
 
 def named_run(word: str, known: set[str], where: str) -> tuple[str, dict[str, str]]:
-    """Name and run of METHOD OPTIONS or NAME=METHOD OPTIONS; options may have "=" too.
-
-    Raises:
-        InputError: there is no such method.
-    """
+    """Name and run of METHOD OPTIONS or NAME=METHOD OPTIONS (options may have "=", too), or InputError."""
     name, equals, rest = word.partition("=")
     if not equals or " -" in name:
         name, rest = word, word
@@ -324,13 +320,7 @@ def is_method(name: str) -> bool:
 
 
 def gpu_names(count: int) -> list[str]:
-    """Values of CUDA_VISIBLE_DEVICES for `count` GPUs, out of those that this process may see.
-
-    An empty one, which hides all GPUs, stays empty.
-
-    Raises:
-        InputError: it may see fewer.
-    """
+    """Values of CUDA_VISIBLE_DEVICES for `count` of the visible GPUs, or InputError; "", which hides all, stays."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None:
         names, limit = visible.split(","), f"CUDA_VISIBLE_DEVICES is {visible!r}"

@@ -35,14 +35,10 @@ ROUNDINGS = {
 
 
 def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
-    """The data parser's name and options, the last words of ns-train's command line.
+    """Name and options of the data parser, the last words of ns-train's command line.
 
-    Args:
-        root: folder of the scenes.
-        mirrors: folder for mirrored COLMAP data sets and held-out ones.
-
-    Raises:
-        InputError: the folder is in neither layout, or the downscaled images are missing or of an unknown size.
+    Mirrored and held-out data sets are written below `mirrors`. InputError if the folder has neither layout, or the
+    downscaled images are missing or of an unknown size.
     """
     folder, mirror = root / scene.path, mirrors / scene.name
     if scene.held_out is not None:
@@ -77,16 +73,10 @@ def held_out_views(names: list[str], first: int) -> list[str]:
 
 
 def make_held_out(folder: Path, out: Path, first: int, views: int | None = None) -> None:
-    """Write a data set of a capture's training views at half the size.
+    """Write a data set of a capture's training views at half the size into `out`.
 
-    Args:
-        folder: the capture.
-        out: folder of the data set.
-        first: first held-out view among the training views, by name.
-        views: number of training views to keep, evenly spaced; None: all.
-
-    Raises:
-        InputError: the capture names no training views.
+    `first` is the first held-out view by name; `views` of the others stay, evenly spaced. InputError if the capture
+    names no training views.
     """
     file = folder / "transforms.json"
     meta = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
@@ -131,11 +121,7 @@ def colmap_model(folder: Path) -> str | None:
 
 
 def image_names(model: Path) -> list[str]:
-    """Names of a reconstruction's images, sorted. As nerfstudio does, text is read if both are there.
-
-    Raises:
-        InputError: the list of images is missing or torn.
-    """
+    """Sorted names of a reconstruction's images, like nerfstudio from text if there is text; InputError if it is torn."""
     from nerfstudio.data.utils.colmap_parsing_utils import read_images_binary, read_images_text
 
     text = (model / "cameras.txt").is_file()

@@ -186,11 +186,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def load_spec(path: Path) -> dict[str, Any]:
-    """Content of a YAML file, for `make_spec`.
-
-    Raises:
-        InputError: the file cannot be read, or is no mapping.
-    """
+    """Content of a YAML file, for `make_spec`; InputError if it cannot be read or is no mapping."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -200,15 +196,7 @@ def load_spec(path: Path) -> dict[str, Any]:
 
 
 def make_spec(content: dict[str, Any], where: str) -> Spec:
-    """Check and complete the content of a file.
-
-    Args:
-        content: keys and values as in the module's docstring.
-        where: what error messages call it.
-
-    Raises:
-        InputError: naming the key and the fix.
-    """
+    """Check and complete a file's content; an InputError begins with `where`, and names the key and the fix."""
     if "knobs" in content:
         content = _with_runs_of_knobs(content, where)
     known = [key.name for key in fields(Spec)]
@@ -288,11 +276,7 @@ def steps_of(spec: Spec, run: Method, scene: Scene) -> int | None:
 
 
 def strategy_options(strategy: str) -> list[str]:
-    """Options of ns-train for a strategy of densification; NAME@N is NAME,budget=N.
-
-    Raises:
-        InputError: there is no such strategy, or option of it.
-    """
+    """Options of ns-train for a strategy; NAME@N is NAME,budget=N. InputError if strategy or option is unknown."""
     if strategy == OWN:
         return []
     from nrfgs_ns.densification import strategy_from  # imports torch
@@ -301,12 +285,7 @@ def strategy_options(strategy: str) -> list[str]:
 
 
 def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
-    """Command line of ns-train for one training.
-
-    Args:
-        parser: the data parser and its options (`data.py`).
-        work: folder for checkpoints.
-    """
+    """Command line of ns-train for one training, with a data parser's options (`data.py`), saved below `work`."""
     steps = steps_of(spec, cell.run, cell.scene)
     # Only this project's methods resume from a checkpoint.
     every = spec.checkpoint_every if cell.run.method.startswith("nrfgs") and steps else 10**9
@@ -360,11 +339,7 @@ def settings(words: list[str]) -> list[str]:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Record of a finished run.
-
-    Raises:
-        InputError: the file is not a record.
-    """
+    """Record of a finished run; InputError if the file is not a record."""
     kinds = {"identity": dict, "machine": dict, "jobs": int, "train": dict, "measured": dict}
     try:
         record = json.loads(path.read_text(encoding="utf-8"))

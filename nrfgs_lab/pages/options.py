@@ -55,12 +55,7 @@ class Option(NamedTuple):
 
 
 def own_options(config: Any, prefix: str = "") -> Iterator[Option]:
-    """Options of a configuration, and of those inside it, that this project's code explains.
-
-    Args:
-        config: a dataclass's instance with the defaults.
-        prefix: dotted names down to it.
-    """
+    """Options of a configuration, and of those inside it, that this project's code explains, named after `prefix`."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if isinstance(value, DensificationConfig):

@@ -141,12 +141,7 @@ def _held_out_gain(ours: Mapping, theirs: Mapping, views: list) -> str:
 
 
 def gains_over(harmonics: str, rows: Mapping[str, Iterable[str]]) -> str:
-    """Gains of trials over another on the held-out views that all have.
-
-    Args:
-        harmonics: the other's name.
-        rows: names of trials, by the row's label.
-    """
+    """Gains of trials (names by the row's label) over `harmonics` on the held-out views that all have."""
     base = _views(harmonics)
     tried = {label: _views(*names) for label, names in rows.items()}
     common = [view for view in base if all(view in views for views in tried.values())]

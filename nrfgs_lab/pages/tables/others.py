@@ -40,11 +40,7 @@ def growth_on_captures() -> str:
 
 
 def hard() -> str:
-    """The other trainings, with their PSNR.
-
-    Raises:
-        ValueError: one of them ended with a number that is not finite.
-    """
+    """Hard trainings with their PSNR; ValueError if one ended with a number that is not finite."""
     runs = records("stability")["trainings"]["runs"]
     if not all(one["finite"] for seeds in runs.values() for one in seeds.values()):
         raise ValueError("A training of results/stability.json is not finite to its end.")

@@ -47,11 +47,7 @@ def bench_rows(study: str) -> dict[tuple[str, str, str], Row]:
 
 
 def mean_of(row: Row, column: str) -> float:
-    """A row's mean over seeds.
-
-    Raises:
-        KeyError: no record of the row has it.
-    """
+    """A row's mean over seeds; KeyError if no record has it."""
     mean = row.mean(BY_NAME[column])
     if mean is None:
         raise KeyError(f"{row.run} on {row.scene} has no {column}.")
@@ -97,11 +93,7 @@ def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def table(head: str, rows: dict[str, Any], *cells: Callable[[Any], str]) -> str:
-    """A table: a line for each label and value of `rows`, with a cell by each function of the value.
-
-    Args:
-        head: titles between vertical bars.
-    """
+    """A table with titles between vertical bars, and for each label and value of `rows` a cell by each function."""
     body = ([label, *(cell(value) for cell in cells)] for label, value in rows.items())
     return grid([title.strip() for title in head.split("|")], body)
 

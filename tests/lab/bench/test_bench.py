@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-import threading
 import time
 from pathlib import Path
 
@@ -15,7 +14,6 @@ import pytest
 
 from nrfgs_lab.bench import command as bench
 from nrfgs_lab.bench.command import Bench, gpu_names
-from nrfgs_lab.lock import only_one
 from nrfgs_ns import cli
 from nrfgs_ns.errors import InputError
 
@@ -123,21 +121,6 @@ def test_failures_are_listed_and_tried_again(fake):
     assert not list((fake / "out" / "runs").glob("*.failed"))
 
 
-def test_a_failure_is_shown_whoever_asks(fake, capsys):
-    """Another command of the same file lists it, and is content: it was not asked for it."""
-    file = spec_file(fake, "runs: {SH: nrfgs-sh, NRF: nrfgs}\nscenes: [scene]\nseeds: [1]\nsteps: 100\n")
-    behave(fake, **{"NRF-own-scene-1": "fails"})
-    with pytest.raises(SystemExit):
-        bench_in(fake, spec=file, runs=("NRF",), data=(), seeds=()).main()
-    screen = capsys.readouterr().err
-    assert (
-        "NRF-own-scene-1: started" in screen and "NRF-own-scene-1: FAILED" in screen and "NRF-own-scene-1.log" in screen
-    )
-    bench_in(fake, spec=file, runs=("SH",), data=(), seeds=()).main()
-    table = (fake / "out" / "table.md").read_text()
-    assert "| scene | SH | own | 1 |" in table and "| scene | NRF | own | 0 (1 FAILED) |" in table
-
-
 def test_parts_of_a_file_report_all_that_is_there(fake):
     """Runs, seeds, scenes and strategies of the same file, asked for one after the other."""
     (fake / "data" / "other").mkdir()
@@ -223,23 +206,6 @@ def test_a_broken_record_is_named(text, fake):
     (fake / "out" / "runs" / "SH-own-scene-1.json").write_text(text)
     with pytest.raises(InputError, match="SH-own-scene-1.json is no.*Remove it"):
         bench_in(fake, seeds=(1,)).main()
-
-
-def test_of_two_that_end_together_the_last_one_reports_both(fake, monkeypatch):
-    """A report waits for one that is being made, and reads the records only then."""
-    bench_in(fake, seeds=(1,)).main()
-    record = fake / "out" / "runs" / "NRF-own-scene-1.json"
-    kept = record.read_text()
-    record.unlink()
-    waiting = threading.Event()
-    monkeypatch.setattr("nrfgs_lab.lock.print", lambda *_, **__: waiting.set(), raising=False)
-    other = threading.Thread(target=bench_in(fake, seeds=(1,), report_only=True).main)
-    with only_one(fake / "out" / ".lock", ""):
-        other.start()
-        assert waiting.wait(300)
-        record.write_text(kept)
-    other.join()
-    assert "| scene | NRF | own | 1 |" in (fake / "out" / "table.md").read_text()
 
 
 def spec_file(folder: Path, text: str) -> Path:

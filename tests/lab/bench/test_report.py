@@ -247,25 +247,6 @@ def test_sheet_shows_the_views_where_runs_differ(pictures, tmp_path, monkeypatch
     assert set(np.unique(below)) == {0, 200}
 
 
-def test_many_runs_go_below_one_another(pictures, tmp_path, monkeypatch):
-    """Nine runs and the truth: eight crops in the first line, two in the second, and no wider than eight."""
-    runs = {f"run {n}": pictures["AB"[n % 2]] for n in range(9)}
-    monkeypatch.setattr(crops, "VIEWS", 1)
-    assert crop_sheet(runs, tmp_path / "many.png")
-    assert crop_sheet(dict(list(runs.items())[:7]), tmp_path / "full.png")
-    with Image.open(tmp_path / "many.png") as many, Image.open(tmp_path / "full.png") as full:
-        assert many.width == full.width
-        height = full.height - 16 - 4  # of the sheet's title and gap
-        assert many.height == full.height + height + 4
-        one, other = np.asarray(many), np.asarray(full)
-    assert np.array_equal(one[:height], other[:height])
-    # Run 8 is the first run's twin, in the second place of the second line.
-    step, left = 224, full.width - 8 * 224
-    line = height + 4
-    first, last = one[34:252, left + step :][:, :220], one[34 + line : 252 + line, left + step :][:, :220]
-    assert np.array_equal(first, last) and first.std() > 0
-
-
 def test_pictures_of_another_size_are_left_out(pictures, tmp_path):
     """A run on photographs scaled down, beside the others."""
     for file in numbered(pictures["A"]).values():

@@ -94,13 +94,6 @@ def test_killed_in_the_middle_of_ns_eval(tmp_path, monkeypatch, trained):
     assert json.loads(Path(job.record).read_text())["train"]["steps"] == 41
 
 
-def test_a_finished_training_is_only_evaluated(tmp_path, trained):
-    interrupted(tmp_path, 20, 40, reached=60)
-    record = train_or_continue(job_in(tmp_path, steps=41), tmp_path)
-    assert not trained and record.steps == 41
-    assert record.config_path == str(tmp_path / "scene/nrfgs/2000-01-01/config.yml")
-
-
 @pytest.mark.parametrize(
     "method, steps, checkpoints",
     [("nrfgs", 100, []), ("splatfacto", 100, [20, 40]), ("nrfgs", 100, [33]), ("nrfgs", None, [20])],

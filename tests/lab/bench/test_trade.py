@@ -59,12 +59,10 @@ def test_knobs_become_runs():
     [
         ({"knobs": {}}, "knobs is empty"),
         ({"knobs": {"D": {"values": [1]}}}, "needs option and values, or one of steps"),
-        ({"knobs": {"D": {"option": D, "steps": [1]}}}, "needs option and values"),
         ({"knobs": {"steps": {"steps": 5}}}, "must be a list"),
         ({"knobs": {"head": {"settings": {"x": {"option": "--a"}}}}}, "head x: unknown key"),
         ({"knobs": {"head": {"settings": {"x": 5}}}}, "head x must be a method, or"),
         ({"knobs": {"a": {"settings": {"b c": {}}}, "a b": {"settings": {"c": {}}}}}, "there twice"),
-        ({"knobs": {"head": {"settings": {"x": {"options": "'"}}}}}, "options cannot be split"),
         ({"default": {"options": "--a"}}, "default names no method"),
         ({"runs": {"x": "nrfgs"}}, "Leave runs out"),
         ({"strategies": ["splatfacto", "original"]}, "strategies names several"),

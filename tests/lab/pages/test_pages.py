@@ -22,7 +22,7 @@ from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, pag
 from nrfgs_lab.pages.tables import pages
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.cli import chosen, commands
+from nrfgs_ns.cli import commands
 from nrfgs_ns.densification import strategy_from
 from nrfgs_ns.training import run
 from nrfgs_ns.training.run import evaluate, parse, train
@@ -105,32 +105,6 @@ def test_the_command_line_has_them(words):
         inner = option.flag.split(".dataparser.")
         if len(inner) == len(words):  # the data set's options come after its word
             assert inner[-1].lower() in {flag.lower() for flag in known}, option.flag
-
-
-def help_of(*words: str) -> str:
-    """What `nrfgs WORDS --help` prints."""
-    screen = io.StringIO()
-    with contextlib.redirect_stdout(screen), pytest.raises(SystemExit):
-        chosen([*words, "--help"])
-    return screen.getvalue()
-
-
-SCREEN = 24
-"""Lines of a small terminal."""
-
-
-def test_help_fits_a_screen_before_the_list_of_options():
-    assert len(help_of().splitlines()) <= 2 * SCREEN  # which has a line or three for each command
-    for name in commands():
-        before, found, _ = help_of(name).partition("\n options ")
-        assert found and len(before.splitlines()) <= SCREEN, name
-
-
-def test_help_claims_no_decibels():
-    """What something is worth stands in a page, beside its record."""
-    words = [help_of(name) for name in commands()]
-    words += [option.text for method in methods() for option in own_options(method.config)]
-    assert [text for text in words if re.search(r"\d dB|decibels? (better|worse|more|less)", text)] == []
 
 
 ROOT = Path(__file__).resolve().parents[3]

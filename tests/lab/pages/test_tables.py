@@ -181,19 +181,3 @@ def test_make_targets_and_extras_that_pages_name_are_there():
 def test_every_picture_is_shown():
     shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
     assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_no_line_of_prose_begins_with_a_comment(name):
-    """Markdown takes such a line for HTML: it would end the paragraph, and its links would not be links."""
-    assert re.findall(r"^ {0,3}(<!-- .* -->\S.*)$", PAGES[name], re.MULTILINE) == []
-
-
-CLAIMS = "comparison deviations export exposure expressiveness fewer-splats necessity opacity speed stability trade-off"
-
-
-@pytest.mark.parametrize("name", CLAIMS.split())
-def test_pages_of_claims_have_at_most_600_words(name):
-    """Beside tables and commands, which are for looking up."""
-    prose = re.sub(r"```.*?```|<!--.*?-->|^\|.*?$", "", PAGES[f"docs/{name}.md"], flags=re.DOTALL | re.MULTILINE)
-    assert len(re.findall(r"\S*\w\S*", prose)) <= 600
