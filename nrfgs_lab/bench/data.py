@@ -121,7 +121,7 @@ def colmap_model(folder: Path) -> str | None:
 
 
 def image_names(model: Path) -> list[str]:
-    """Sorted names of a reconstruction's images, like nerfstudio from text if there is text; InputError if it is torn."""
+    """Sorted names of a reconstruction's images, from text if there is text (as nerfstudio); InputError if torn."""
     from nerfstudio.data.utils.colmap_parsing_utils import read_images_binary, read_images_text
 
     text = (model / "cameras.txt").is_file()
