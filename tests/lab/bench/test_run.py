@@ -257,6 +257,8 @@ checkpoint_every: 20
 train_views: 3
 options: --pipeline.model.num-downscales 0
 """
+ORIGINAL, MCMC = (f"{name}_warmup_length_10_refine_every_10" for name in ("original", "mcmc@400"))
+"""The strategies in names of files."""
 
 
 @pytest.mark.slow
@@ -266,23 +268,21 @@ def test_killed_in_the_middle_and_resumed(tiny_scene, tmp_path):
     command += ["--scenes", str(tiny_scene.parent), "--out", str(tmp_path / "out"), "--work", str(tmp_path / "work")]
     runs = tmp_path / "out" / "runs"
     first = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
-    cut_off = tmp_path / "work" / "NRF-original-tiny-1"
+    cut_off = tmp_path / "work" / f"NRF-{ORIGINAL}-tiny-1"
     while not list(cut_off.rglob("nerfstudio_models/step-0000000[4-9]*.ckpt")):
         assert first.poll() is None
         time.sleep(0.02)
     os.killpg(first.pid, signal.SIGKILL)  # the benchmark and its child, as when a machine goes down
     first.wait()
-    assert [file.name for file in runs.iterdir()] == ["SH-original-tiny-1.json"]
-    finished = (runs / "SH-original-tiny-1.json").stat().st_mtime_ns
+    assert [file.name for file in runs.iterdir()] == [f"SH-{ORIGINAL}-tiny-1.json"]
+    finished = (runs / f"SH-{ORIGINAL}-tiny-1.json").stat().st_mtime_ns
 
     subprocess.run(command, check=True)
-    assert (runs / "SH-original-tiny-1.json").stat().st_mtime_ns == finished
+    assert (runs / f"SH-{ORIGINAL}-tiny-1.json").stat().st_mtime_ns == finished
     records = {file.stem: json.loads(file.read_text()) for file in runs.glob("*.json")}
-    assert set(records) == {
-        f"{run}-{strategy}-tiny-1" for run in ("SH", "NRF") for strategy in ("original", "mcmc@400")
-    }
+    assert set(records) == {f"{run}-{strategy}-tiny-1" for run in ("SH", "NRF") for strategy in (ORIGINAL, MCMC)}
     parts = {name: record["train"]["parts"] for name, record in records.items()}
-    assert parts.pop("NRF-original-tiny-1") == 2 and set(parts.values()) == {1}
+    assert parts.pop(f"NRF-{ORIGINAL}-tiny-1") == 2 and set(parts.values()) == {1}
     for name, record in records.items():
         train, measured = record["train"], record["measured"]
         assert train["steps"] == 120 and train["seconds"] > 0
