@@ -38,7 +38,7 @@ VIEWS = 8
 def export_compact(
     load_config: Path, output: Path, options: CompactOptions, measure: bool, report: Path | None
 ) -> None:
-    """Write a compact file, and report what it costs; see `nrfgs export compact --help`."""
+    """Write a compact file, and report its size and loss; see `nrfgs export compact --help`."""
     with few_threads() as threads:
         pipeline = load_model(load_config, "test")
         threads.suit_to(pipeline)

@@ -107,7 +107,7 @@ class Nrfgs:
 
     @classmethod
     def get_method_info(cls) -> dict[str, Any]:
-        """What the data must have, and what is rendered."""
+        """Requirements on the data, and outputs."""
         return {
             "method_id": cls.method,
             "required_features": frozenset(("color", "points3D_xyz", "points3D_rgb")),
@@ -160,14 +160,8 @@ class Nrfgs:
 
     @torch.no_grad()
     def render(self, camera: Any, *, options: dict[str, Any] | None = None) -> dict[str, np.ndarray]:
-        """Render one camera of the data set's world.
-
-        Args:
-            options: "outputs" names what is wanted; all, if it is not there.
-
-        Returns:
-            color [H, W, 3] in [0, 1], depth [H, W] in the data set's unit of length, accumulation [H, W]; float32.
-        """
+        """Render one camera of the data set's world, float32: color [H, W, 3] in [0, 1], depth [H, W] in the data set's
+        unit of length, accumulation [H, W]; or those that options["outputs"] names."""
         self.model.eval()
         outputs = self.model.get_outputs_for_camera(self.world.cameras(camera.item()[None]).to(self.model.device))
         rendered = {

@@ -31,13 +31,10 @@ class Trained(NamedTuple):
 
 
 def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
-    """A finished training, set up as by nerfstudio's `eval_setup`; but its config.yml runs no code.
+    """A finished training, set up as by nerfstudio's `eval_setup`, except that its config.yml runs no code.
 
-    Args:
-        mode: "test" reads the test images; "inference" none, and fits harmonics to the head.
-
-    Raises:
-        InputError: there is no such training, or it is not one of this project's methods.
+    Mode "test" reads the test images; "inference" none, and fits harmonics to the head. InputError if there is no such
+    training, or its method is not this project's.
     """
     from nrfgs_ns.training.checkpoint_files import find, read_latest
     from nrfgs_ns.training.config_file import read_config

@@ -94,7 +94,7 @@ class ViewerPanel(ViewerControl):
         return isinstance(threading.current_thread(), RenderStateMachine)
 
     def set_background(self, background: Tensor) -> None:
-        """Take the viewer's background colour [3]."""
+        """Set the viewer's background colour [3]."""
         self.background = background
 
     def _welcome(self, client) -> None:

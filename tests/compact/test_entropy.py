@@ -14,16 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.compact.entropy import (
-    LOWEST,
-    MOST_LANES,
-    TOKENS,
-    BadStream,
-    decode_table,
-    encode_table,
-    lanes_of,
-    token_of,
-)
+from nrfgs_ns.compact.entropy import LOWEST, BadStream, decode_table, encode_table
 from nrfgs_ns.compact.format import Table, write_container
 
 
@@ -84,17 +75,6 @@ def test_neighbours_are_worth_something():
     table = laplacian(3, 30_000)
     shuffled = table[:, np.random.default_rng(0).permutation(30_000)]
     assert len(encode_table(table)[1]) < 0.8 * len(encode_table(shuffled)[1])
-
-
-def test_tokens():
-    numbers = np.array([0, 31, 32, 39, 40, 47, 63, 64, 2**32 - 1])
-    tokens, spares = token_of(numbers)
-    assert tokens.tolist() == [0, 31, 32, 32, 33, 33, 35, 36, TOKENS - 1]
-    assert spares.tolist() == [0, 0, 3, 3, 3, 3, 3, 4, 29]
-
-
-def test_lanes():
-    assert [lanes_of(1, n) for n in (0, 1, 2048, 2049, 4097, 10**9)] == [1, 1, 1, 2, 4, MOST_LANES]
 
 
 @cache
