@@ -27,8 +27,8 @@ from nerfstudio.scripts.train import _set_random_seed
 from nrfgs_lab.bench.measure import FULL_HD, at_size, frames_per_second
 from nrfgs_lab.bench.run import host_without_downloads
 from nrfgs_lab.bench.spec import QUIET
+from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.files import write_whole
-from nrfgs_ns.training.guard import remove_splats
 from nrfgs_ns.training.run import machine, parse
 
 VARIANTS = "whole", "without graph", "at rest: whole", "at rest: without graph"
@@ -132,7 +132,7 @@ def keep_only(count: int, model: Any, by_group: Mapping[str, torch.optim.Optimiz
     if model.num_points > count:
         surplus = torch.zeros(model.num_points, dtype=torch.bool, device=model.device)
         surplus[torch.randperm(len(surplus), device=model.device)[: len(surplus) - count]] = True
-        remove_splats(model, by_group, surplus)
+        take_rows(model, by_group, (~surplus).nonzero()[:, 0])
 
 
 if __name__ == "__main__":

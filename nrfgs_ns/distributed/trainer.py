@@ -16,7 +16,6 @@ import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import comms, profiler
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 from torch.optim import Optimizer
 
 from nrfgs_ns.distributed import comm
@@ -25,7 +24,7 @@ from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import cut_optimizer_state, gather_model_state, gather_optimizer_state
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.averaging import ParameterMean
-from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, WatchedOptimizers
+from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched, WatchedOptimizers
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 from nrfgs_ns.training.pipeline import NrfgsPipeline, NrfgsPipelineConfig
 from nrfgs_ns.training.stopping import StopRequest
@@ -85,10 +84,10 @@ class ShardedMean(ParameterMean):
     """`ParameterMean` of one device's splats and of the shared weights. All but `install` and `state` must be called on
     all devices, and all begin anew where one must: shared weights stay the same, and a checkpoint has one mean."""
 
-    def _is_of(self, parameters: Mapping[str, Tensor]) -> bool:
-        """Whether on all devices these very objects are those that it is the mean of. The host waits for the answer."""
-        here = super()._is_of(parameters)
-        return all(comm.gather_counts(int(here), next(iter(parameters.values())).device))
+    def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
+        """Whether the rows of all devices still denote the splats that were averaged. The host waits for the answer."""
+        here = super().is_current(optimizers)
+        return all(comm.gather_counts(int(here), parameters_of(next(iter(optimizers.values())))[0].device))
 
     def whole_state(self, model, optimizers: Mapping[str, Optimizer]) -> dict[str, Any]:
         """What a checkpoint of the whole must hold.
@@ -142,25 +141,17 @@ class ShardedGuard(Guard):
         anywhere = here.clone()
         dist.all_reduce(anywhere, dist.ReduceOp.MAX)
         elsewhere = torch.where(anywhere[0] > bad, math.inf, 0.0)
-        return replace(
-            verdict,
-            names=[*verdict.names, ELSEWHERE, ASKED],
-            origins=[*verdict.origins, "elsewhere", "elsewhere"],
-            tensors=[*verdict.tensors, elsewhere, anywhere[1]],
-            owners=[*verdict.owners, None, None],
-            sizes=torch.cat([sizes, elsewhere[None], anywhere[1:]]),
-        )
+        watched = [Watched(ELSEWHERE, "elsewhere", elsewhere), Watched(ASKED, "elsewhere", anywhere[1])]
+        sizes = torch.cat([sizes, elsewhere[None], anywhere[1:]])
+        return replace(verdict, watched=[*verdict.watched, *watched], sizes=sizes)
 
     def _read(self, verdict: Verdict) -> list[float]:
         sizes = super()._read(verdict)
         self.signal = self.signal or int(sizes[-1])
         return sizes
 
-    def _is_empty(self) -> bool:
-        return False  # one device's shard may be, and others are not asked
-
-    def _out_of_sight(self) -> bool:
-        return False  # likewise
+    def _check_visibility(self) -> None:
+        """Nothing: one device's shard may be empty or out of sight, and others are not asked."""
 
     def settle(self) -> None:
         try:
@@ -243,12 +234,8 @@ class ShardedTrainer(NrfgsTrainer):
         super().setup(test_mode)
 
     @property
-    def _is_asked_to_stop(self) -> bool:
-        return self.guard.signal > 0
-
-    @property
-    def _exit_status(self) -> int:
-        return 128 + self.guard.signal
+    def _signal(self) -> int:
+        return self.guard.signal
 
     def _end(self, line: str, status: int) -> None:
         comms.synchronize()  # until the main device has written

@@ -94,7 +94,8 @@ class Nrfgs:
         _set_random_seed(config.machine.seed)
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
-        trainer.guard.before_first_step(trainer._start_step, trainer.optimizers)
+        trainer.guard.step = trainer._start_step
+        trainer.guard.check_parameters(trainer.optimizers)
         if trainer.pace is not None:
             trainer.pace.start()
         self.trainer, self.model, self.step = trainer, trainer.pipeline.model, trainer._start_step

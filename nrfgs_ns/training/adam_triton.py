@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Adam of many tensors in one Triton launch, whatever their learning rates; torch's fused Adam is its twin.
 
-PyTorch launches once for each learning rate, and gives 65,536 numbers to each block of threads: a table of a hundred
-thousand splats keeps a dozen of a card's hundred multiprocessors busy, and small tables take as long as large ones.
-Here a program takes `BLOCK` numbers of any tensor. What the kernel must know of each tensor is a column of one table,
-copied to the device in each step, because gradients lie elsewhere in each.
+PyTorch launches once for each learning rate, with 65,536 numbers to each block of threads: small tables take as long as
+large ones. Here a program takes `BLOCK` numbers of any tensor. Each tensor has a column in a table, which is copied to
+the device in each step, because gradients lie elsewhere in each.
 
-The equations are torch's (Kingma and Ba 2015, with bias correction), in float32; the corrections, which begin at
-1 - beta2, in float64.
+The equations are torch's (Kingma and Ba 2015), in float32; the bias corrections in float64.
 """
 
 from typing import Any

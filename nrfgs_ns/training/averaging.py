@@ -14,11 +14,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.optim import Optimizer
 
-from nrfgs_ns.data.checks import warn
 from nrfgs_ns.training.optimizers import parameters_of
 
 LARGEST_SHARE = 0.02
@@ -51,13 +49,13 @@ class ParameterMean:
     @torch.no_grad()
     def add(self, optimizers: Mapping[str, Optimizer]) -> None:
         """Add the present parameters to the mean."""
-        parameters = _parameters(optimizers)
-        if not self._is_of(parameters):
+        if not self.is_current(optimizers):
+            parameters = _parameters(optimizers)
             self.restarted = self.restarted or self.count > 0
             self._means = {name: torch.zeros_like(parameter) for name, parameter in parameters.items()}
             self._parameters, self.count = parameters, 0
         self.count += 1
-        torch._foreach_lerp_(list(self._means.values()), list(parameters.values()), 1.0 / self.count)
+        torch._foreach_lerp_(list(self._means.values()), list(self._parameters.values()), 1.0 / self.count)
 
     @torch.no_grad()
     def install(self) -> None:
@@ -81,30 +79,10 @@ class ParameterMean:
         self._parameters = parameters
 
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
-        """Whether rows still denote the splats that were averaged."""
-        return self._is_of(_parameters(optimizers))
-
-    def _is_of(self, parameters: Mapping[str, Tensor]) -> bool:
-        """Whether the mean is of these very objects."""
+        """Whether rows still denote the splats that were averaged: the parameters are these very objects."""
+        parameters = _parameters(optimizers)
         same = self._parameters.keys() == parameters.keys()
         return same and all(parameter is self._parameters[name] for name, parameter in parameters.items())
-
-
-def report_mean(count: int, window: int, restarted: bool) -> None:
-    """Say over how many steps a trained model is averaged.
-
-    Args:
-        window: steps that were to be averaged.
-        restarted: whether there are fewer because splats changed within them.
-    """
-    steps = "the last step" if count == 1 else f"the last {count} steps"
-    why = f", not {window}: until then splats were added, removed or reset" if restarted else ""
-    CONSOLE.print(f"The trained model is the mean of its parameters over {steps}{why}.", soft_wrap=True)
-
-
-def report_no_mean(average_steps: int, why: str) -> None:
-    """Say why a trained model is the last step's, though a mean was asked for."""
-    warn(f"average_steps is {average_steps}, but nothing was averaged: {why}. The model is the last step's.")
 
 
 def _parameters(optimizers: Mapping[str, Optimizer]) -> dict[str, Tensor]:

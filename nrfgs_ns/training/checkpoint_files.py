@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checkpoint files: written whole or not at all, and read only if they are what was written.
 
-torch's files are zip archives that carry a CRC of each record, which torch itself does not check: a flipped bit loads
-as another model. Here every byte is checked first, which takes 0.3 s for 500 MB. Nerfstudio's own commands read the
-file without that; for them the pipeline's part carries a checksum of its own (`seal`, `check_seal`).
+torch's files are zip archives with a CRC of each record, which torch does not check: a flipped bit loads as another
+model. `read` checks every byte, in 0.3 s for 500 MB. For nerfstudio's own commands, which read the file themselves, the
+pipeline's part carries a checksum of its own (`seal`, `check_seal`).
 """
 
 import os
@@ -14,6 +14,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +42,8 @@ class Damaged(ValueError):
 
 
 def allow_nerfstudio_checkpoints() -> None:
-    """Let `torch.load(weights_only=True)` read nerfstudio's checkpoints.
-
-    They hold the learning-rate schedulers' state, in which learning rates are numpy scalars. These three types are
-    plain data; nothing that could run code is allowed.
-    """
+    """Let `torch.load(weights_only=True)` read nerfstudio's checkpoints: the numpy scalars in the state of their
+    learning-rate schedulers. These types are plain data."""
     scalar = np._core.multiarray.scalar if hasattr(np, "_core") else np.core.multiarray.scalar
     torch.serialization.add_safe_globals(
         [scalar, (scalar, "numpy.core.multiarray.scalar"), np.dtype, np.dtypes.Float64DType]
@@ -67,7 +65,10 @@ def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = 
     """
     folder.mkdir(parents=True, exist_ok=True)
     final = folder / f"step-{step:09d}.ckpt"
-    remove_abandoned(folder)
+    for abandoned in folder.parent.glob(f"{folder.name}.*.writing"):  # by killed processes
+        with suppress(OSError):  # another process was faster, or it is not ours
+            if time.time() - abandoned.stat().st_mtime > ABANDONED:
+                abandoned.unlink()
     # Beside the folder: nerfstudio's commands take every file within for a checkpoint.
     unfinished = folder.with_name(f"{folder.name}.{secrets.token_hex(8)}.writing")
     try:
@@ -99,16 +100,6 @@ def _not_written(folder: Path, step: int, content: Mapping[str, Any], error: Exc
     )
 
 
-def remove_abandoned(folder: Path) -> None:
-    """Remove unfinished files of killed processes."""
-    for unfinished in folder.parent.glob(f"{folder.name}.*.writing"):
-        try:
-            if time.time() - unfinished.stat().st_mtime > ABANDONED:
-                unfinished.unlink()
-        except OSError:  # another process was faster, or it is not ours
-            pass
-
-
 def read(path: Path) -> dict[str, Any]:
     """Read a checkpoint, tensors in host memory, if every byte is as it was written.
 
@@ -133,17 +124,11 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def read_or_refuse(path: Path) -> dict[str, Any]:
-    """As `read`.
-
-    Raises:
-        InputError: there is no such file, it is a folder, or it is damaged.
-    """
-    if path.is_dir():
-        raise InputError(f"{path} is a folder. Give --load-dir a folder, and --load-checkpoint a file.")
+    """As `read`, with an InputError where there is no such file or it is damaged."""
+    if not path.is_file():
+        raise InputError(f"{path} is no file. Give --load-checkpoint a file, and --load-dir a folder.")
     try:
         return read(path)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file. Check the path that --load-checkpoint names.") from error
     except Damaged as damage:
         raise InputError(f"{path} is damaged: {damage}. Restore it from a copy, or take an older one.") from damage
 
@@ -159,32 +144,27 @@ def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, 
         if step not in checkpoints:
             raise InputError(f"{folder} has no checkpoint of step {step}, only of {', '.join(map(str, checkpoints))}.")
         checkpoints = {step: checkpoints[step]}
-    damages = []
+    damages = ""
     for path in checkpoints.values():
         try:
             content = read(path)
         except Damaged as damage:
-            damages.append(f"{path} is damaged: {damage}.")
+            damages += f"{path} is damaged: {damage}. "
             continue
         if damages:
-            warn(f"{' '.join(damages)} Taking the one before, {path.name}.")
+            warn(f"{damages}Taking the one before, {path.name}.")
         return path, content
-    raise InputError(f"{' '.join(damages)} Restore it from a copy, or train anew.")
+    raise InputError(f"{damages}Restore it from a copy, or train anew.")
 
 
 def checkpoints_in(folder: Path) -> dict[int, Path]:
-    """As `find`.
-
-    Raises:
-        InputError: there are none.
-    """
+    """As `find`, with an InputError where there are none."""
     checkpoints = find(folder)
     if checkpoints:
         return checkpoints
     within = next((inner.parent for inner in sorted(folder.glob("*/step-*.ckpt"))), None)
     fix = f"They are in {within}." if within else "Give the folder nerfstudio_models of a training."
-    what = "holds no checkpoints (step-*.ckpt)" if folder.is_dir() else "is no folder"
-    raise InputError(f"{folder} {what}. {fix}")
+    raise InputError(f"{folder} holds no checkpoints (step-*.ckpt). {fix}")
 
 
 def seal(pipeline: dict[str, Any], step: int) -> None:
@@ -196,10 +176,7 @@ def check_seal(pipeline: Mapping[str, Any], step: int) -> None:
     """Raise InputError where the pipeline's part of a checkpoint is not as it was written. Unsealed ones pass."""
     written = pipeline.get("_extra_state", {}).get("checksum")
     if written is not None and written != _checksum(pipeline, step):
-        raise InputError(
-            f"The checkpoint of step {step} is damaged: its checksum is wrong. Remove it, so that the one before is "
-            "taken, or restore it from a copy."
-        )
+        raise InputError(f"The checkpoint of step {step} is damaged: its checksum is wrong. Restore or remove it.")
 
 
 def _checksum(pipeline: Mapping[str, Any], step: int) -> int:

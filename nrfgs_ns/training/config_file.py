@@ -30,7 +30,8 @@ from nrfgs_ns.errors import InputError
 
 LARGEST_FILE = 1 << 20
 """Bytes; a config.yml has ten thousand."""
-NERFSTUDIO, OURS, OPTIMISERS = "nerfstudio", "nrfgs_ns", "torch.optim"
+OURS = "nrfgs_ns."
+PACKAGES = ("nerfstudio.", OURS, "torch.optim.")
 PATHS = {
     f"{module}.{name}" for module in ("pathlib", "pathlib._local") for name in ("Path", "PosixPath", "WindowsPath")
 }
@@ -50,10 +51,8 @@ def read_config(path: Path) -> TrainerConfig:
         raise InputError(f"{path} is larger than {LARGEST_FILE} bytes. {FIX}.")
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a configuration. {FIX}.") from error
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:
-        raise InputError(f"{path} is not a configuration: {' '.join(str(error).split())}.") from error
+        raise InputError(f"{path} is not a configuration: {' '.join(str(error).split())}. {FIX}.") from error
     if not isinstance(config, TrainerConfig):
         raise InputError(f"{path} is not the configuration of a training. {FIX}.")
     missing = {field.name for field in fields(ExperimentConfig)} - vars(config).keys()
@@ -68,7 +67,8 @@ def check_types(config: Any, source: str, prefix: str = "") -> None:
     """Raise InputError, naming `source`, where an option's value has another type than the dataclass's field."""
     for name, value, hint in _options(config, prefix):
         if not _is_a(value, hint):
-            raise InputError(f"{source}: {name} is {value!r}, which is not of its type, {_words(hint)}. Correct it.")
+            kind = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
+            raise InputError(f"{source}: {name} is {value!r}, which is not of its type, {kind}. Correct it.")
 
 
 def _options(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
@@ -79,10 +79,8 @@ def _options(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
         if field.name.startswith("_") or (not is_dataclass(value) and value == _default(field)):
             continue
         yield name, value, hints[field.name]
-        nested = value.items() if isinstance(value, dict) else [("", value)]
-        for key, inner in nested:
-            groups = inner.items() if isinstance(inner, dict) else [("", inner)]
-            for part, leaf in groups:
+        for key, inner in value.items() if isinstance(value, dict) else [("", value)]:
+            for part, leaf in inner.items() if isinstance(inner, dict) else [("", inner)]:
                 if is_dataclass(leaf) and not isinstance(leaf, type):
                     yield from _options(leaf, ".".join(filter(None, (name, key, part))) + ".")
 
@@ -99,10 +97,6 @@ def _is_a(value: Any, hint: Any) -> bool:
     if kind in (int, float):
         return isinstance(value, (int, kind)) and not isinstance(value, bool)
     return not isinstance(kind, type) or isinstance(value, kind)
-
-
-def _words(hint: Any) -> str:
-    return getattr(hint, "__name__", None) if isinstance(hint, type) else str(hint).replace("typing.", "")
 
 
 def _default(field: Field) -> Any:
@@ -127,41 +121,30 @@ class _Loader(yaml.SafeLoader):
 
 def _refuse(node: yaml.Node, name: str) -> yaml.YAMLError:
     return yaml.constructor.ConstructorError(
-        problem=f"it asks for {name!r}, which is no option of nerfstudio or {OURS}. If you trust the file, "
+        problem=f"it asks for {name!r}, which is no option of nerfstudio or nrfgs_ns. If you trust the file, "
         "nerfstudio's own commands read it",
         problem_mark=node.start_mark,
     )
 
 
-def _part_of(name: str, package: str) -> bool:
-    return name.startswith(f"{package}.")
-
-
 def _class(node: yaml.Node, name: str) -> type:
     """The class of this full name, if it is one of the packages' own."""
     module, _, attribute = name.rpartition(".")
-    if not any(_part_of(name, package) for package in (NERFSTUDIO, OURS, OPTIMISERS)):
+    if not name.startswith(PACKAGES):
         raise _refuse(node, name)
     try:
         kind = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise _refuse(node, name) from error
-    if not isinstance(kind, type) or not any(
-        _part_of(kind.__module__, package) for package in (NERFSTUDIO, OURS, OPTIMISERS)
-    ):
+    if not isinstance(kind, type) or not kind.__module__.startswith(PACKAGES):
         raise _refuse(node, name)
     return kind
-
-
-def _name(loader: _Loader, suffix: str, node: yaml.Node) -> type:
-    """`!!python/name:`, which may be a `_target`; `_object` checks whose."""
-    return _class(node, suffix)
 
 
 def _object(loader: _Loader, suffix: str, node: yaml.Node):
     """`!!python/object:`, a configuration."""
     kind = _class(node, suffix)
-    if not is_dataclass(kind) or not (issubclass(kind, PrintableConfig) or _part_of(kind.__module__, OURS)):
+    if not is_dataclass(kind) or not (issubclass(kind, PrintableConfig) or kind.__module__.startswith(OURS)):
         raise _refuse(node, suffix)
     config = kind.__new__(kind)
     yield config
@@ -199,7 +182,7 @@ def _apply(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
 
 
 TAG = "tag:yaml.org,2002:python/"
-_Loader.add_multi_constructor(f"{TAG}name:", _name)
+_Loader.add_multi_constructor(f"{TAG}name:", lambda loader, name, node: _class(node, name))  # `_object` checks whose
 _Loader.add_multi_constructor(f"{TAG}object:", _object)
 _Loader.add_multi_constructor(f"{TAG}object/apply:", _apply)
 _Loader.add_constructor(f"{TAG}tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))

@@ -9,16 +9,14 @@ LONGEST_SIDE = 240
 """Pixels to which photographs are made smaller: as many as two CPU cores train on in minutes."""
 
 
-def ten_minute_command(data: Path, parser: str | None = None) -> str:
-    """What to type for the data set in a folder, or for its transforms.json; with the name of its parser, if that is
-    to be named."""
+def ten_minute_command(data: Path) -> str:
+    """The command for the data set in a folder, or for its transforms.json."""
     words = ["ns-train", "nrfgs-fast", "--data", str(data), "--time-budget", "10"]
-    words += ["--pipeline.datamanager.camera-res-scale-factor", f"{scale_for(data):g}"]
-    return shlex.join([*words, parser] if parser else words)
+    return shlex.join([*words, "--pipeline.datamanager.camera-res-scale-factor", f"{scale_for(data):g}"])
 
 
 def scale_for(data: Path) -> float:
-    """What brings a data set's photographs to `LONGEST_SIDE`, at most 1; 0.25 where their size is not told."""
+    """Factor from a data set's photographs to `LONGEST_SIDE`, at most 1; 0.25 where their size is unknown."""
     source = data if data.suffix == ".json" else data / "transforms.json"
     try:
         content = json.loads(source.read_text(encoding="utf-8"))

@@ -2,25 +2,21 @@
 """The guard: the first number of a training that is not finite stops it, with the last good state on disk.
 
 Between the backward pass and the optimisers, the guard takes the largest absolute value of the rendered image, of each
-loss and of each gradient, all in one fused call. NaN, infinity, or a gradient beyond `MAX_GRADIENT` (which Adam cannot
-square) condemns the step. What happens then:
+loss and of each gradient, all in one fused call. NaN, infinity, or a gradient beyond `MAX_GRADIENT` condemns the step.
 
 - On a CPU the training stops before the optimisers step.
 - On a GPU, reading the numbers would make the host wait in every step. Instead the verdict stays on the device, where
   fused Adam reads it (`found_inf`) and leaves parameters and moments as they are. A copy travels to the host meanwhile
-  and is read before the next step is computed. An optimiser that cannot read the verdict on the device is treated as on
-  a CPU, waiting included.
+  and is read before the next step is computed. With an optimiser that cannot read the verdict, the host waits.
 
-Either way the remaining parameters and moments are those from before the condemned step, and the trainer writes them as
-that step's checkpoint: a training continued from it has skipped the step. On a GPU, densification may have run in
-between; gradients that are not finite enter its statistics as zero.
+Either way the remaining state is that before the condemned step, and the trainer writes it as that step's checkpoint.
+On a GPU, densification may have run in between; gradients that are not finite enter its statistics as zero.
 
 Parameters are checked before each checkpoint and every `PARAMETERS_EVERY` steps. Splats that are not finite (the
 rasterizer does not draw them, so no gradient shows them) are removed before the checkpoint is written.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -47,8 +43,7 @@ HUGE = 1e3
 """The same for all other tensors: logits, a head's per-splat tensors, shared weights."""
 
 Origin = Literal["rendering", "gradient", "parameter", "elsewhere", "nothing visible", "memory"]
-"""Cause of a stop: a number in the image or a loss, in a gradient or a parameter, or on another device; that nothing is
-visible; or that the memory has run out."""
+"""Cause of a stop; "rendering": a number in the image or a loss, "elsewhere": on another device."""
 
 
 class TrainingStopped(ForTheUser, RuntimeError):
@@ -66,29 +61,34 @@ class TrainingStopped(ForTheUser, RuntimeError):
 
 
 @dataclass
-class Finding:
-    """A tensor that condemned a step."""
+class Watched:
+    """A tensor that may condemn a step."""
 
     name: str
-    size: float
-    """its largest absolute value: NaN, infinite, or too large"""
+    """of a gradient: its optimiser's"""
+    origin: Origin
     tensor: Tensor
+    owner: Tensor | None = None
+    """of a gradient: its parameter"""
 
 
 @dataclass
 class Verdict:
-    """The largest absolute values of a step, on their way to the host."""
+    """The largest absolute values of a step's watched tensors, in host memory once `arrived` has happened."""
 
     step: int
-    names: list[str]
-    """names of the tensors; of gradients, their optimiser's"""
-    origins: list[Origin]
-    tensors: list[Tensor]
+    watched: list[Watched]
     sizes: Tensor
-    """largest absolute values, in host memory once `arrived` has happened"""
-    arrived: torch.cuda.Event | None
-    owners: list[Tensor | None]
-    """of gradients, their parameters"""
+    arrived: torch.cuda.Event | None = None
+
+
+@dataclass
+class Finding:
+    """A tensor that condemned a step, with its largest absolute value: NaN, infinite, or too large."""
+
+    name: str
+    size: float
+    tensor: Tensor
 
 
 class Guard:
@@ -107,62 +107,32 @@ class Guard:
     def model(self):
         return self.pipeline.model
 
-    def before_first_step(self, step: int, optimizers: LeanOptimizers) -> None:
-        """Check the parameters before a training begins, or goes on, at a step."""
-        self.step = step
-        self.check_parameters(optimizers)
-
     def begin(self, step: int, optimizers: LeanOptimizers, settled_later: bool = False) -> None:
-        """Read the verdict on the step before, and now and then check the parameters.
+        """Read the verdict on the step before, and now and then check the parameters. Raises TrainingStopped.
 
         Args:
             settled_later: `step_graph.py` reads the verdict when it has prepared this step.
-
-        Raises:
-            TrainingStopped: the step before was condemned, a parameter is not finite, or nothing is visible any more.
         """
         if not settled_later or step % PARAMETERS_EVERY == 0:
             self.settle()
         self.step = step
-        if self._is_empty():
-            raise TrainingStopped(
-                f"No splat is left in step {step}: all were pruned. Images or masks show nothing, or thresholds of the "
-                "densification are too high.",
-                step,
-                "nothing visible",
-                savable=False,
-            )
-        if self._out_of_sight():
-            raise TrainingStopped(
-                f"No splat has been visible in the last {PATIENCE} steps, so nothing is learnt. Poses and points are "
-                "not of one world, or a learning rate has thrown the splats out of sight. The viewer shows where the "
-                "cameras are.",
-                step,
-                "nothing visible",
-            )
+        self._check_visibility()
         if step % PARAMETERS_EVERY == 0:
             self.check_parameters(optimizers)
 
     def before_optimizers(self, optimizers: LeanOptimizers, gradients_are_scaled: bool) -> None:
-        """Check image, losses and gradients, and condemn the step if one is not finite.
+        """Check image, losses and gradients, and condemn the step if one is not finite: on a CPU, TrainingStopped.
 
         Args:
-            gradients_are_scaled: a GradScaler meets infinite gradients as a matter of course and skips such steps
-                itself: only the image and the losses are checked.
-
-        Raises:
-            TrainingStopped: on a CPU, if the step is condemned.
+            gradients_are_scaled: only image and losses are checked; a GradScaler skips steps with infinite gradients.
         """
-        watched: list[tuple[str, Origin, Tensor, Tensor | None]]
-        watched = [(name, "rendering", value, None) for name, value in self.model.watched.items()]
-        if not gradients_are_scaled:
-            for name, optimizer in optimizers.optimizers.items():
-                for parameter in parameters_of(optimizer):
-                    if parameter.grad is not None and parameter.numel() > 0:
-                        watched.append((name, "gradient", parameter.grad, parameter))
-        names, origins, tensors, owners = [list(column) for column in zip(*watched, strict=True)]
-        sizes = torch.stack(torch._foreach_norm(tensors, math.inf))
-        self._verdict = self._share(Verdict(self.step, names, origins, tensors, sizes, None, owners))
+        watched = [Watched(name, "rendering", value) for name, value in self.model.watched.items()]
+        for name, optimizer in optimizers.optimizers.items() if not gradients_are_scaled else ():
+            for parameter in parameters_of(optimizer):
+                if parameter.grad is not None and parameter.numel() > 0:
+                    watched.append(Watched(name, "gradient", parameter.grad, parameter))
+        sizes = torch.stack(torch._foreach_norm([each.tensor for each in watched], math.inf))
+        self._verdict = self._share(Verdict(self.step, watched, sizes))
         sizes = self._verdict.sizes
         if gradients_are_scaled or not optimizers.all_fused:
             self.settle()
@@ -174,18 +144,25 @@ class Guard:
         if sizes.is_cuda:
             self._send_home(self._verdict)
 
-    def _is_empty(self) -> bool:
-        """Whether no splat is left."""
-        return self.model.num_points == 0
-
-    def _out_of_sight(self) -> bool:
-        """Whether nothing has been visible in the last `PATIENCE` steps: no rows, or, where all splats have one
-        (`step_graph.py`), no pairs of splats and tiles."""
+    def _check_visibility(self) -> None:
+        """Raise TrainingStopped where no splat is left, or none was visible in the last `PATIENCE` steps: no rows, or,
+        where all splats have one (`step_graph.py`), no pairs of splats and tiles."""
+        if self.model.num_points == 0:
+            message = (
+                f"No splat is left in step {self.step}: all were pruned. Images or masks show nothing, or thresholds "
+                "of the densification are too high."
+            )
+            raise TrainingStopped(message, self.step, "nothing visible", savable=False)
         info = getattr(self.model, "info", {})
         rows = info.get("gaussian_ids")
         blind = rows is not None and (len(rows) == 0 or info.get("pairs") == 0)
         self.blind_steps = self.blind_steps + 1 if blind else 0
-        return self.blind_steps >= PATIENCE
+        if self.blind_steps >= PATIENCE:
+            message = (
+                f"No splat has been visible in the last {PATIENCE} steps, so nothing is learnt. Poses and points are "
+                "not of one world, or a learning rate has thrown the splats out of sight (see the viewer)."
+            )
+            raise TrainingStopped(message, self.step, "nothing visible")
 
     def _share(self, verdict: Verdict) -> Verdict:
         """Add other devices' findings, where there are any (`distributed`)."""
@@ -201,27 +178,20 @@ class Guard:
         verdict.arrived.record()
 
     def settle(self) -> None:
-        """Read the verdict on the step before.
-
-        Raises:
-            TrainingStopped: it was condemned.
-        """
+        """Read the verdict on the step before; TrainingStopped if it was condemned."""
         verdict, self._verdict = self._verdict, None
         if verdict is None:
             return
-        sizes = self._read(verdict)
-        bad = [row for row, size in enumerate(sizes) if not size <= MAX_GRADIENT]
+        pairs = zip(verdict.watched, self._read(verdict), strict=True)
+        bad = [(each, size) for each, size in pairs if not size <= MAX_GRADIENT]
         if bad:
-            findings = [
-                Finding(self._full_name(verdict.names[row], verdict.owners[row]), sizes[row], verdict.tensors[row])
-                for row in bad
-            ]
+            findings = [Finding(self._full_name(each), size, each.tensor) for each, size in bad]
             message = report(self.pipeline, verdict.step, findings, MAX_GRADIENT)
             message += (
                 f"\nThe update of step {verdict.step} was not made. The state before it is in that step's checkpoint; "
                 "with --load-dir, training goes on from there."
             )
-            raise TrainingStopped(message, verdict.step, verdict.origins[bad[0]])
+            raise TrainingStopped(message, verdict.step, bad[0][0].origin)
 
     def _read(self, verdict: Verdict) -> list[float]:
         """A verdict's sizes, for which the host waits."""
@@ -229,20 +199,20 @@ class Guard:
             verdict.arrived.synchronize()
         return verdict.sizes.tolist()
 
-    def _full_name(self, name: str, owner: Tensor | None) -> str:
+    def _full_name(self, watched: Watched) -> str:
         """The name of a gradient's parameter, given its optimiser's; other names stay."""
-        if owner is None:
-            return name
-        owners = [known for known, parameter in self.pipeline.named_parameters() if parameter is owner]
-        if not owners and name in self.model.gauss_params:  # densification has made new parameters since
-            owners = [f"gauss_params.{name}"]
-        return f"the gradient of {(owners or [name])[0].removeprefix('_model.')}"
+        if watched.owner is None:
+            return watched.name
+        names = [name for name, parameter in self.pipeline.named_parameters() if parameter is watched.owner]
+        if not names and watched.name in self.model.gauss_params:  # densification has made new parameters since
+            names = [f"gauss_params.{watched.name}"]
+        return f"the gradient of {(names or [watched.name])[0].removeprefix('_model.')}"
 
     def check_parameters(self, optimizers: LeanOptimizers) -> None:
         """Check every parameter, and remove the splats that are not finite.
 
         Raises:
-            TrainingStopped: one is not finite. The rest is good, unless it was one of the shared weights.
+            TrainingStopped: one is not finite. It is savable unless it is a shared weight.
         """
         named = {name: value for name, value in self.pipeline.named_parameters() if value.numel() > 0}
         sizes = torch.stack([size.float() for size in torch._foreach_norm(list(named.values()), math.inf)]).tolist()
@@ -256,8 +226,8 @@ class Guard:
         message = report(self.pipeline, self.step, findings, torch.finfo(torch.float32).max)
         only_splats = all(finding.name.startswith("gauss_params.") for finding in findings)
         if only_splats:
-            bad = torch.stack([~_within(finding.tensor, torch.finfo(torch.float32).max) for finding in findings]).any(0)
-            remove_splats(self.model, optimizers.optimizers, bad)
+            good = torch.stack([_within(finding.tensor, torch.finfo(torch.float32).max) for finding in findings]).all(0)
+            take_rows(self.model, optimizers.optimizers, good.nonzero()[:, 0])
             message += f"\nThe checkpoint of step {self.step} is this state without them; with --load-dir, it goes on."
         else:
             message += "\nNothing has been written: the checkpoint before, if there is one, is the last good state."
@@ -266,11 +236,10 @@ class Guard:
     def _silence_densification(self) -> None:
         """Set gradients on the image plane that are not finite to zero for densification's statistics."""
         means2d = getattr(self.model, "info", {}).get("means2d")
-        if means2d is None or not means2d.retains_grad:  # densification is over, or needs none
-            return
-        for gradient in (means2d.grad, getattr(means2d, "absgrad", None)):
-            if gradient is not None:
-                gradient.nan_to_num_(0.0, 0.0, 0.0)
+        if means2d is not None and means2d.retains_grad:  # densification needs them
+            for gradient in (means2d.grad, getattr(means2d, "absgrad", None)):
+                if gradient is not None:
+                    gradient.nan_to_num_(0.0, 0.0, 0.0)
 
 
 class WatchedOptimizers(LeanOptimizers):
@@ -290,16 +259,6 @@ class WatchedOptimizers(LeanOptimizers):
         if weights:
             self.hold("field", weights)
         super().load_optimizers(loaded_state)
-
-
-def remove_splats(model, optimizers: Mapping[str, torch.optim.Optimizer], bad: Tensor) -> None:
-    """Remove splats from the parameters, their optimisers' moments and densification's statistics.
-
-    Args:
-        optimizers: by group; those of `gauss_params` among them.
-        bad: bool [N].
-    """
-    take_rows(model, optimizers, (~bad).nonzero()[:, 0])
 
 
 def report(pipeline, step: int, findings: list[Finding], limit: float) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a checkpoint says of its training, so that no other one goes on from it: on which data set, with which options.
+"""A checkpoint's data set and options, so that no other training goes on from it.
 
 Options are of two kinds. Some say what the stored numbers mean (the head's, where the world's centre is): with others
 the same numbers are another model, and the checkpoint is refused. The rest say how learning goes on (learning rates,
@@ -10,9 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-import torch
 from nerfstudio.cameras.cameras import Cameras
-from torch import Tensor
 
 from nrfgs_ns.data.checks import some
 from nrfgs_ns.densification import DensificationConfig
@@ -52,31 +50,27 @@ def options_of(config: Any) -> dict[str, str]:
     parts = {"pipeline": config.pipeline, "optimizers": config.optimizers}
     steps = ("schedule_steps", "time_budget", "average_steps", "max_num_iterations", "gradient_accumulation_steps")
     parts |= {name: getattr(config, name) for name in steps}
-    found = {name: value for name, value in leaves(parts) if not _is_among(name, NEUTRAL)}
     return {
         name: value.__name__ if isinstance(value, type) else value if isinstance(value, str) else repr(value)
-        for name, value in found.items()
-        if not isinstance(value, (Tensor, torch.nn.Module))
+        for name, value in leaves(parts)
+        if not _is_among(name, NEUTRAL)
     }
 
 
 def scene_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
-    """What tells a data set from others."""
+    """The names of a data set's images, and its camera centres, [V, 3]."""
     return {"images": names, "centers": cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()}
 
 
 def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: object) -> None:
     """Raise InputError where a checkpoint was trained on another data set."""
     fix = "Go on with the data set that it was trained on, or train anew."
-    gone = [name for name in written["images"] if name not in here["images"]]
-    new = [name for name in here["images"] if name not in written["images"]]
-    if gone or new or len(written["images"]) != len(here["images"]):
-        what = "; ".join(
-            [f"it had {some(gone)}, which are not training images here"] * bool(gone)
-            + [f"it did not have {some(new)}"] * bool(new)
-        )
-        counts = f"{len(written['images'])} training images, there are {len(here['images'])}"
-        raise InputError(f"{data}: the checkpoint was trained on other images ({what or counts}). {fix}")
+    if sorted(written["images"]) != sorted(here["images"]):
+        gone = [name for name in written["images"] if name not in here["images"]]
+        new = [name for name in here["images"] if name not in written["images"]]
+        lists = (("missing", gone), ("new", new))
+        what = "; ".join(f"{kind}: {some(names)}" for kind, names in lists if names) or "other numbers of copies"
+        raise InputError(f"{data}: the checkpoint was trained on other images ({what}). {fix}")
     centers, now = written["centers"].double(), here["centers"].double()
     extent = float((centers.amax(0) - centers.amin(0)).max())
     moved = (centers - now).norm(dim=1) > FAR * max(extent, 1e-12)
@@ -86,28 +80,24 @@ def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: objec
 
 
 def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
-    """Compare a checkpoint's options with this training's. Options that one of the versions lacks are let be.
+    """Compare a checkpoint's options with this training's, those that both have.
 
     Returns:
-        Those that changed and may, as "name: old -> new".
+        Those that changed and may, as "--name old -> new".
 
     Raises:
         InputError: one changed that says what the stored numbers mean.
     """
     changed = [name for name in written if name in here and written[name] != here[name]]
+    typed = {name: "--" + name.replace("_", "-") for name in changed}
     meant = [name for name in changed if _is_among(name, MEANING)]
     if meant:
-        was = "; ".join(f"{_typed(name)} was {written[name]} and is {here[name]}" for name in meant[:3])
+        was = "; ".join(f"{typed[name]} was {written[name]} and is {here[name]}" for name in meant[:3])
         raise InputError(
             f"The checkpoint's training had other options, without which its numbers mean something else: {was}. "
             "Give the same ones, or train anew."
         )
-    return [f"{_typed(name)} {written[name]} -> {here[name]}" for name in changed]
-
-
-def _typed(name: str) -> str:
-    """An option as it is typed."""
-    return "--" + name.replace("_", "-")
+    return [f"{typed[name]} {written[name]} -> {here[name]}" for name in changed]
 
 
 def _is_among(name: str, groups: tuple[str, ...]) -> bool:

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's optimisers, with less work for the host.
+"""Nerfstudio's optimisers, with less work for the host, which bounds a training step on a GPU.
 
-A training step on a GPU is bound by what Python does between kernels. Nerfstudio keeps one Adam for each tensor, and
-each `Optimizer.step` costs the host more than its kernel costs the GPU. Here Adam runs fused, and after its first step
-one kernel does all groups (`adam_triton.py`). State is torch's own, so densification and checkpoints find what they
-expect.
+Nerfstudio keeps one Adam for each tensor, and each `Optimizer.step` costs the host more than its kernel costs the GPU.
+Here Adam runs fused, and after its first step one kernel does all groups (`adam_triton.py`). State is torch's own.
 """
 
 from collections.abc import Iterable
@@ -27,10 +25,8 @@ class LeanOptimizers(Optimizers):
     """Nerfstudio's optimisers, stepped with few calls.
 
     Args:
-        config: optimiser configurations by group, as nerfstudio passes them.
-        param_groups: parameters by group.
         steps_per_log: steps between two learning rates that are logged.
-        pace: moved on by each step, and where the schedules are looked up; None: a step is a step.
+        pace: position on the schedules, which each step moves on; None: the step.
     """
 
     def __init__(self, config, param_groups, steps_per_log: int = 10, pace: Pace | None = None):
@@ -128,11 +124,8 @@ class LeanOptimizers(Optimizers):
 
 
 def fused_adam_step(optimizers: Iterable[Optimizer]) -> None:
-    """One step of several fused Adams whose state exists: in one Triton kernel, or where that cannot be by the operator
-    of `Adam(fused=True).step`.
-
-    An optimiser's `found_inf` (a tensor on the device, 1.0 for "skip this step") is heeded as torch heeds it.
-    """
+    """One step of several fused Adams whose state exists, in one Triton kernel or, where that cannot be, by torch's
+    operator; skipped where an optimiser's `found_inf` (a tensor on the device) is 1, as by torch."""
     work: list[tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]] = []
     skips: list[Tensor | None] = []
     for optimizer in optimizers:
@@ -156,24 +149,11 @@ def fused_adam_step(optimizers: Iterable[Optimizer]) -> None:
 
 def _step_group(group: dict[str, Any], parameters: list[Tensor], states: list[dict], found_inf: Tensor | None) -> None:
     """One step of a group of parameters, whose counters have counted it."""
-    beta1, beta2 = group["betas"]
-    torch._fused_adam_(
-        parameters,
-        [parameter.grad for parameter in parameters],
-        [state["exp_avg"] for state in states],
-        [state["exp_avg_sq"] for state in states],
-        [],
-        [state["step"] for state in states],
-        lr=group["lr"],
-        beta1=beta1,
-        beta2=beta2,
-        weight_decay=group["weight_decay"],
-        eps=group["eps"],
-        amsgrad=False,
-        maximize=False,
-        grad_scale=None,
-        found_inf=found_inf,
-    )
+    means, squares, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
+    options = {"lr": group["lr"], "beta1": group["betas"][0], "beta2": group["betas"][1], "eps": group["eps"]}
+    options |= {"weight_decay": group["weight_decay"], "amsgrad": False, "maximize": False, "grad_scale": None}
+    gradients = [parameter.grad for parameter in parameters]
+    torch._fused_adam_(parameters, gradients, means, squares, [], steps, found_inf=found_inf, **options)
 
 
 _GATE = Gate("Adam")
@@ -183,9 +163,7 @@ _TABLES: dict[torch.device, Any] = {}
 def _step_at_once(work: list[tuple], skips: list[Tensor | None]) -> bool:
     """Make the step of all groups in one kernel, if it can be, uncounted if it is skipped."""
     device = work[0][1][0].device
-    if device.type != "cuda" or any(skip is not skips[0] for skip in skips):
-        return False
-    if not try_kernel(device):
+    if device.type != "cuda" or any(skip is not skips[0] for skip in skips) or not try_kernel(device):
         return False
     from nrfgs_ns.training.adam_triton import AdamTable
 
@@ -196,19 +174,18 @@ def _step_at_once(work: list[tuple], skips: list[Tensor | None]) -> bool:
 
 def try_kernel(device: torch.device) -> bool:
     """Whether Adam's kernel runs on a CUDA device; tried once, which compiles it: the first step would."""
-    return _GATE.opens(device, device, lambda: _try_kernel(device))
 
+    def trial() -> None:
+        from nrfgs_ns.training.adam_triton import AdamTable
 
-def _try_kernel(device: torch.device) -> None:
-    """Compile and run the kernel on one number; raise whatever goes wrong."""
-    from nrfgs_ns.training.adam_triton import AdamTable
+        number = Parameter(torch.ones(1, device=device))
+        number.grad = torch.ones_like(number)
+        state = {name: torch.ones(1, device=device) for name in ("exp_avg", "exp_avg_sq", "step")}
+        group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
+        with torch.no_grad():
+            AdamTable(device).step([(group, [number], [state])], None)
 
-    one = torch.nn.Parameter(torch.ones(1, device=device))
-    one.grad = torch.ones_like(one)
-    state = {name: torch.ones(1, device=device) for name in ("exp_avg", "exp_avg_sq", "step")}
-    group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
-    with torch.no_grad():
-        AdamTable(device).step([(group, [one], [state])], None)
+    return _GATE.opens(device, device, trial)
 
 
 def in_world_units(group: dict[str, Any], scene_unit: float) -> dict[str, Any]:
@@ -223,5 +200,5 @@ def in_world_units(group: dict[str, Any], scene_unit: float) -> dict[str, Any]:
 
 
 def parameters_of(optimizer: Optimizer) -> list[Tensor]:
-    """What an optimiser holds now; densification replaces the tensors that nerfstudio noted down."""
+    """An optimiser's present parameters; densification replaces those that nerfstudio noted down."""
     return [parameter for group in optimizer.param_groups for parameter in group["params"]]

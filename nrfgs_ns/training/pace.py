@@ -2,20 +2,19 @@
 """How fast a training walks through its schedules.
 
 Learning rates, the rise of resolution and of harmonics, and the first and last step of densification are laid out for
-a training of L steps. A training that makes another number of steps can walk through the same schedules at another
-pace: after each step its *position* on them, 0 to L, moves on by the pace's *rate*, and what is scheduled is looked up
-at the position. Without a pace the position is the step, and the rate is 1.
+a training of L steps. A training of another number of steps can walk through the same schedules: after each step its
+*position* on them, 0 to L, moves on by the pace's *rate*. Without a pace the position is the step, and the rate is 1.
 
-- `Pace`: the rate is what it is, L / N for N steps.
+- `Pace`: a constant rate, L / N for N steps.
 - `TimedPace`: the rate is chosen anew after each step such that position L and the end of a time budget meet,
 
       rate(p) = seconds per step / seconds left * integral_p^L c(u) / c(p) du
 
-  where c(u) says what a step at position u costs, up to a factor. A wrong c or a machine that changes its speed
-  makes for an uneven walk, not for another end: training stops when the time is up.
+  where c(u) is the relative cost of a step at position u. A wrong c makes for an uneven walk, not for another end:
+  training stops when the time is up.
 
-What counts rounds rather than progress stays as it is, in steps: the distance between two refinements and two resets of
-opacity, which must see every view, and the averages of Adam.
+The distances between refinements and between resets of opacity, which must see every view, and the averages of Adam
+stay as they are, in steps.
 """
 
 import math
@@ -39,9 +38,12 @@ STEPS_IN_MEDIAN = 51
 """The pace of the machine is the median of this many steps: evaluations and checkpoints in between do not count as
 steps."""
 
+Phases = list[tuple[float, float]]
+Clock = Callable[[], float]
+
 
 def steps_for(views: int) -> int:
-    """How many steps suit a capture: few views are learnt by heart in many."""
+    """Steps that suit a capture: with more, few views are learnt by heart."""
     return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), STEPS)
 
 
@@ -55,26 +57,23 @@ class Pace:
         """0 at the first step; stays at L once it is there"""
 
     def start(self) -> None:
-        """Training begins, or goes on, now."""
+        """Note that training begins, or goes on, now."""
 
     def begin_step(self) -> None:
-        """A step begins now."""
+        """Note that a step begins now."""
 
     def advance(self) -> None:
-        """The position of the next step. Call it once in each step."""
+        """Move on to the position of the next step, once in each step."""
         self.position = min(self.position + self.rate, float(self.length))
 
     def step_at(self, position: float, now: int) -> int:
-        """The first step of this training that will have reached a position, as things look now; 0 if it lies behind.
-
-        Args:
-            now: the step whose position is `self.position`.
-        """
+        """The first step at or beyond a position, at the present rate; 0 if it lies behind. `now` is the step whose
+        position is `self.position`."""
         ahead = (position - self.position) / self.rate
         return now + math.ceil(ahead - ROUNDING) if ahead > -ROUNDING else 0
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint must hold."""
+        """The checkpoint's entry."""
         return {"length": self.length, "rate": self.rate, "position": self.position}
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -86,20 +85,14 @@ class TimedPace(Pace):
     """A rate that lets the schedules end when the time does.
 
     Args:
-        seconds: the budget, positive, from the start of training to the end of its last step: warm-up, evaluations
-            and checkpoints in between and time in which the viewer pauses it are part of it.
-        phases: pairs (position at which the phase ends, cost of a step in it), in order; the last one has no end
-            (infinity). Costs are relative to each other.
+        seconds: the budget, positive, from the start of training to the end of its last step, warm-up, evaluations,
+            checkpoints and pauses included.
+        phases: pairs (position at which the phase ends, relative cost of a step in it), in order; the last one ends
+            at infinity.
         clock: seconds, for tests.
     """
 
-    def __init__(
-        self,
-        length: int,
-        seconds: float,
-        phases: list[tuple[float, float]] | None = None,
-        clock: Callable[[], float] = perf_counter,
-    ):
+    def __init__(self, length: int, seconds: float, phases: Phases | None = None, clock: Clock = perf_counter):
         super().__init__(length)
         self.seconds = seconds
         self.phases = phases or [(math.inf, 1.0)]
@@ -117,7 +110,7 @@ class TimedPace(Pace):
 
     @property
     def step_seconds(self) -> float:
-        """What a step takes at present; 0 before the first has ended."""
+        """Median duration of the latest steps; 0 before the first has ended."""
         return median(self._durations) if self._durations else 0.0
 
     @property
@@ -127,7 +120,7 @@ class TimedPace(Pace):
 
     @property
     def steps_left(self) -> int:
-        """How many steps fit in, as things look now."""
+        """Estimated number of steps to come."""
         return math.ceil((self.length - self.position) / self.rate)
 
     def start(self) -> None:
@@ -144,19 +137,15 @@ class TimedPace(Pace):
             step = self.step_seconds
             # The schedules' last position is for the last step, not for one behind it.
             left = max(self.seconds - self.elapsed, step)
-            self.rate = max(step / left * self._work_left(), 1e-9)
+            work, begin, present = 0.0, self.position, None  # at rate 1, in steps of the present cost
+            for end, cost in self.phases:
+                end = min(end, float(self.length))
+                if end > begin:
+                    present = present or cost
+                    work += (end - begin) * cost / present
+                    begin = end
+            self.rate = max(step / left * work, 1e-9)
         super().advance()
-
-    def _work_left(self) -> float:
-        """Steps of the present cost that would do all that is left at rate 1."""
-        total, begin, present = 0.0, self.position, None
-        for end, cost in self.phases:
-            end = min(end, float(self.length))
-            if end > begin:
-                present = present or cost
-                total += (end - begin) * cost
-                begin = end
-        return total / present if present else 0.0
 
     def state(self) -> dict[str, Any]:
         # A budget that is spent but for half a step is spent.
@@ -169,16 +158,11 @@ class TimedPace(Pace):
 
 
 COST_OF_HALF_RESOLUTION = 0.5
-"""Guess: a step at half the resolution costs half as much, between a quarter, as its pixels, and 1, as its splats. It
-decides how evenly a timed training walks, not when it ends."""
+"""Guess: a step at half the resolution costs half as much: between a quarter, as its pixels, and 1, as its splats."""
 
 
-def resolution_phases(num_downscales: int, resolution_schedule: int) -> list[tuple[float, float]]:
-    """What steps cost while the resolution rises, for `TimedPace`.
-
-    Args:
-        num_downscales: how many times the resolution doubles.
-    """
+def resolution_phases(num_downscales: int, resolution_schedule: int) -> Phases:
+    """Phases for `TimedPace` while the resolution doubles `num_downscales` times."""
     rising = [
         (float((done + 1) * resolution_schedule), COST_OF_HALF_RESOLUTION ** (num_downscales - done))
         for done in range(num_downscales)

@@ -19,20 +19,8 @@ from torch import Tensor
 
 from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.image.overlap import (
-    ENOUGH_STOPS,
-    Looks,
-    Pairs,
-    Sighting,
-    channels,
-    compare,
-    drawn,
-    estimate,
-    sight,
-    slope,
-    spread,
-    varies,
-)
+from nrfgs_ns.image import overlap
+from nrfgs_ns.image.overlap import ENOUGH_STOPS, Looks, Pairs, channels, estimate, slope, spread, varies
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.pinhole import world_to_camera
 
@@ -41,37 +29,36 @@ Exif = dict[str, Any]
 
 
 class Evidence(NamedTuple):
-    """What is known of V photographs before a training."""
+    """Exposures of V photographs, as known before a training."""
 
     pairs: Pairs
     centers: Tensor
     """where they were taken, [V, 3]"""
-    known: Tensor
+    exif: Tensor
     """exposures from EXIF in stops, NaN where it says nothing, [V]"""
     seen: Looks
-    """what the pairs say by themselves"""
+    """exposures from the pairs alone"""
 
     @property
     def learnt_by_itself(self) -> bool:
-        """Whether exposure and white balance are learnt unless somebody says otherwise.
+        """Whether exposure and white balance are learnt unless an option decides.
 
         EXIF's exposure counts as far as the photographs' brightness follows it: one that the light or the camera's own
         tone curve makes up for does not show.
         """
         vary = any(size >= enough for size, enough in zip(self.seen.random, ENOUGH_STOPS, strict=True))
-        followed, _ = slope(self.pairs, self.known)
-        return vary or varies(self.known) and followed * spread(self.known) >= ENOUGH_STOPS[0]
+        followed, _ = slope(self.pairs, self.exif)
+        return vary or varies(self.exif) and followed * spread(self.exif) >= ENOUGH_STOPS[0]
 
 
 def evidence(datamanager: Any) -> Evidence:
     """Compare a training's photographs, whose images have been read."""
     dataset = datamanager.train_dataset
-    told = datamanager.train_dataparser_outputs.metadata
-    exif = exif_of(dataset.image_filenames, told.get("exif"))
-    known = torch.tensor([exposure(of_one) for of_one in exif])
-    pairs = compare_photographs(told.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
+    metadata = datamanager.train_dataparser_outputs.metadata
+    exif = torch.tensor([exposure(entry) for entry in exif_of(dataset.image_filenames, metadata.get("exif"))])
+    pairs = compare_photographs(metadata.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
     centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
-    return Evidence(pairs, centers, known, estimate(pairs, torch.full_like(known, torch.nan), centers))
+    return Evidence(pairs, centers, exif, estimate(pairs, torch.full_like(exif, torch.nan), centers))
 
 
 def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | None, list[str]]:
@@ -85,67 +72,51 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
         The model, None where nothing is learnt; and the evidence in words and numbers.
 
     Raises:
-        InputError: it is asked for together with the bilateral grid.
+        InputError: it is requested together with the bilateral grid.
     """
-    if config.photographs == "off":
+    choice = config.photographs
+    if choice == "on" and config.use_bilateral_grid:
+        raise InputError(
+            "pipeline.model.photographs is on and use_bilateral_grid, too: both would learn the same. Use one."
+        )
+    if choice == "off" or config.use_bilateral_grid:
         return None, []
-    if config.use_bilateral_grid:
-        if config.photographs == "on":
-            raise InputError(
-                "pipeline.model.photographs is on and use_bilateral_grid, too: both would learn the same. Use one."
-            )
-        return None, []
-    found = evidence(datamanager)
-    wanted, why = verdict(config.photographs, found)
+    known = evidence(datamanager)
+    wanted, numbers = verdict(choice, known)
     outcome = f"exposure and white balance {'learnt' if wanted else 'not learnt'}"
-    CONSOLE.print(f"Photographs: {outcome}, {reason(config.photographs, found)}.", soft_wrap=True)
-    notes = [f"photographs: {outcome}: {why}"]
+    if choice == "on":
+        reason = "as requested"
+    elif wanted:
+        reason = "since the photographs differ in brightness or colour"
+    else:
+        reason = f"since {'the photographs agree' if any(known.seen.random) else 'too few common points compare them'}"
+    CONSOLE.print(f"Photographs: {outcome}, {reason}.", soft_wrap=True)
+    notes = [f"photographs: {outcome}: {numbers}"]
     if not wanted:
         return None, notes
-    known = found.known
-    looks = estimate(found.pairs, known, found.centers) if torch.isfinite(known).any() else found.seen
+    looks = estimate(known.pairs, known.exif, known.centers) if torch.isfinite(known.exif).any() else known.seen
     names = [path.name for path in datamanager.train_dataset.image_filenames]
     return PhotographModel(names, channels(looks.stops), looks.held), notes
 
 
-def reason(choice: Choice, found: Evidence) -> str:
-    """Why photographs' exposure is learnt or not, in a few words."""
-    if choice == "on":
-        return "as asked for"
-    if found.learnt_by_itself:
-        return "since the photographs differ in brightness or colour"
-    return "since the photographs agree" if any(found.seen.random) else "since too few common points compare them"
-
-
-def verdict(choice: Choice, found: Evidence) -> tuple[bool, str]:
-    """Whether a training learns photographs' exposure, and why, in words."""
-    pairs, known = found.pairs, found.known
-    exposures, *colors = found.seen.random
-    words = f"exposure varies by {exposures:.2f} stops, colour by {max(colors):.2f}"
-    if not any(found.seen.random):
-        words = "photographs have too few points in common to compare them"
-    needed = found.learnt_by_itself
-    if not needed:
-        words += f" (learnt from {ENOUGH_STOPS[0]:g}, or {ENOUGH_STOPS[1]:g} in colour)"
-    if not torch.isfinite(known).any():
-        words += "; EXIF has no exposures"
-    elif not varies(known):
-        words += f"; EXIF: {'the same' if spread(known) < 0.005 else 'almost the same'} exposure"
-    else:
-        words += f"; EXIF: exposure varies by {spread(known):.2f} stops"
-        _, explained = slope(pairs, known)
-        if explained is not None:
-            words += f", which explains {explained:.0%} of the difference"
-    return needed or choice == "on", "option photographs is on; " * (choice == "on") + words
+def verdict(choice: Choice, known: Evidence) -> tuple[bool, str]:
+    """Whether a training learns photographs' exposure, and the numbers behind that."""
+    exposures, *colors = known.seen.random
+    numbers = f"exposure varies by {exposures:.2f} stops, colour by {max(colors):.2f}"
+    if not any(known.seen.random):
+        numbers = "photographs have too few points in common to compare them"
+    numbers += f" (learnt from {ENOUGH_STOPS[0]:g}, or {ENOUGH_STOPS[1]:g} in colour); EXIF: "
+    if not torch.isfinite(known.exif).any():
+        return known.learnt_by_itself or choice == "on", numbers + "no exposures"
+    numbers += f"exposure varies by {spread(known.exif):.2f} stops"
+    _, explained = slope(known.pairs, known.exif)
+    if varies(known.exif) and explained is not None:
+        numbers += f", which explains {explained:.0%} of the difference"
+    return known.learnt_by_itself or choice == "on", numbers
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
-    """Raise InputError where a training goes on that had learnt other photographs.
-
-    Args:
-        own: of the training that goes on.
-        written: what the checkpoint says of its own, None if it learnt none.
-    """
+    """Raise InputError where a checkpoint, whose entry is `written`, learnt other photographs than the training."""
     if (own is None) != (written is None):
         theirs, ours = ("on", "off") if own is None else ("off", "on")
         raise InputError(
@@ -157,14 +128,14 @@ def check_same_photographs(own: PhotographModel | None, written: Mapping[str, An
 
 
 def exif_of(paths: Sequence[Path], stored: Sequence[Exif] | None) -> list[Exif]:
-    """What the data set says of each photograph, or else its file. [V]"""
-    return [told or read_exif(path) for path, told in zip(paths, stored or [{}] * len(paths), strict=True)]
+    """EXIF of each photograph from the data set, or else from its file. [V]"""
+    return [entry or read_exif(path) for path, entry in zip(paths, stored or [{}] * len(paths), strict=True)]
 
 
 def exposure(exif: Exif) -> float:
     """A photograph's exposure in stops, up to a constant; NaN if it cannot be told."""
     if "exposure_time" not in exif or "iso" not in exif:
-        return float("nan")
+        return math.nan
     return math.log2(exif["exposure_time"]) + math.log2(exif["iso"]) - 2 * math.log2(exif.get("f_number", 1.0))
 
 
@@ -178,20 +149,19 @@ def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequenc
     """
     centers = cameras.camera_to_worlds[:, :3, 3].cpu()
     if points is None or len(points) == 0:
-        return compare([], centers[:0])
-    points = drawn(points)
-    viewmats = world_to_camera(cameras.camera_to_worlds)
-    matrices = cameras.get_intrinsics_matrices()
+        return overlap.compare([], centers[:0])
+    points = overlap.drawn(points)
 
-    def seen(viewmat: Tensor, K: Tensor, batch: Mapping[str, Any]) -> Sighting:
+    def seen(viewmat: Tensor, K: Tensor, batch: Mapping[str, Any]) -> overlap.Sighting:
         image, mask = batch["image"], None
         if image.shape[-1] == 4:
             mask, image = image[..., 3] >= (128 if image.dtype == torch.uint8 else 0.5), image[..., :3]
         if "mask" in batch:
             inside = batch["mask"][..., 0] >= 0.5
             mask = inside if mask is None else mask & inside.to(mask.device)
-        return sight(points, viewmat, K, image, mask)
+        return overlap.sight(points, viewmat, K, image, mask)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        sightings = list(pool.map(seen, viewmats, matrices, images))
-    return compare(sightings, centers)
+        viewmats = world_to_camera(cameras.camera_to_worlds)
+        sightings = list(pool.map(seen, viewmats, cameras.get_intrinsics_matrices(), images))
+    return overlap.compare(sightings, centers)

@@ -3,10 +3,10 @@
 
 import json
 import random
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from time import perf_counter
 from typing import Any, Literal
 
@@ -25,12 +25,11 @@ from nrfgs_ns.image import ssim
 from nrfgs_ns.image.metrics import METRIC_NAMES
 from nrfgs_ns.kernels.trial import tried_meanwhile
 from nrfgs_ns.model.config import NrfgsModelConfig
-from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.rasterizer import load_kernels
 from nrfgs_ns.training import optimizers
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
 from nrfgs_ns.training.config_file import check_types
-from nrfgs_ns.training.evaluation_table import print_evaluation
+from nrfgs_ns.training.evaluation import print_evaluation
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.panel import ViewerPanel
@@ -67,20 +66,16 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
 
 
 class NrfgsPipeline(VanillaPipeline):
-    """VanillaPipeline with three differences.
-
-    Every image is read before the first step, so that a broken one costs no training time. Evaluation reports a metric
-    that cannot be had as null and the values of each image beside their mean. And a checkpoint holds the random
-    generators and the order of the cameras, so that a continued training is the unbroken one.
-    """
+    """VanillaPipeline that reads every image before the first step, so that a broken one costs no training time,
+    evaluates with null for a metric that cannot be had, and whose checkpoints resume exactly."""
 
     config: NrfgsPipelineConfig
     images_per_step: int = 1
-    """images for which a step counts in the schedules (`distributed.schedules`)"""
+    """images that a step counts for in the schedules (`distributed.schedules`)"""
     notes: tuple[str, ...] | list[str] = ()
     """numbers behind what was chosen automatically, in sentences"""
     steps_per_log: int = 1
-    """steps between two at which metrics are taken"""
+    """steps between two evaluations of the training's metrics"""
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
         allow_nerfstudio_checkpoints()
@@ -90,12 +85,15 @@ class NrfgsPipeline(VanillaPipeline):
                 f"pipeline.compact is {config.compact}, but a training does not begin with a compact file. Leave it "
                 "out; --load-dir goes on from a checkpoint."
             )
-        wake = [partial(torch.empty, 1, device=device)] if torch.device(device).type == "cuda" else []
+        on_cuda = torch.device(device).type == "cuda"
+        wake = [partial(torch.empty, 1, device=device)] if on_cuda else []
         with tried_meanwhile(wake, torch.device(device)):  # CUDA starts while the data set is checked
             super().__init__(config, device, test_mode, **kwargs)
         self.model.show_by(ViewerPanel(self.model))
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
-            with tried_meanwhile(_kernel_trials(self.model), self.model.device):
+            kernels = load_kernels, self.model.head.try_kernels, ssim.kernels_run_on, statistics.try_kernel
+            trials = [partial(trial, self.model.device) for trial in (*kernels, optimizers.try_kernel) if on_cuda]
+            with tried_meanwhile(trials, self.model.device):
                 self._check_smallest_image()
                 self.datamanager.load_all_images()
                 photographs, self.notes = photograph_model(config.model, self.datamanager)
@@ -104,7 +102,7 @@ class NrfgsPipeline(VanillaPipeline):
             self.model.fit_on(self.datamanager.train_dataset.cameras)
 
     def _check_smallest_image(self) -> None:
-        """Raise InputError where the training would begin with images that are too small for SSIM."""
+        """Raise InputError where a training's first images are too small for SSIM."""
         cameras, factor = self.datamanager.train_dataset.cameras, 2 ** max(self.config.model.num_downscales, 0)
         width, height = (int(side.min()) // factor for side in (cameras.width, cameras.height))
         if min(width, height) < SMALLEST_SIDE:
@@ -168,10 +166,9 @@ class NrfgsPipeline(VanillaPipeline):
         self.eval()
         if output_path is not None:
             output_path.mkdir(exist_ok=True, parents=True)
-        images = self.datamanager.fixed_indices_eval_dataloader
         names = [Path(name).name for name in self.datamanager.eval_dataset.image_filenames]
+        pairs = list(zip(names, self.datamanager.fixed_indices_eval_dataloader, strict=True))
         per_image: list[dict[str, Any]] = []
-        pairs = list(zip(names, images, strict=True))
         for index, (name, (camera, batch)) in enumerate(track(pairs, "Evaluating", console=CONSOLE, transient=True)):
             start = perf_counter()
             outputs = self.model.get_outputs_for_camera(camera=camera)
@@ -180,23 +177,21 @@ class NrfgsPipeline(VanillaPipeline):
             seconds = perf_counter() - start
             metrics, pictures = self.model.get_image_metrics_and_images(outputs, batch)
             per_image.append({"image": name, **metrics, "seconds_per_image": seconds})
-            if output_path is not None:
-                for key, picture in pictures.items():
-                    file = output_path / f"eval_{key}_{index:04d}_{Path(name).stem}.png"
-                    save_image(picture.permute(2, 0, 1).cpu(), file)
+            for key, picture in pictures.items() if output_path is not None else ():
+                file = output_path / f"eval_{key}_{index:04d}_{Path(name).stem}.png"
+                save_image(picture.permute(2, 0, 1).cpu(), file)
         self.train()
 
         result: dict[str, Any] = {}
         for metric in METRIC_NAMES:
             values = [image[metric] for image in per_image if metric in image]
             if values or get_std:
-                result[metric] = _mean(values)
+                result[metric] = fmean(values) if values else None
             if get_std:
-                result[f"{metric}_std"] = _std(values)
-        timed = [image["seconds_per_image"] for image in per_image][1:] or [per_image[0]["seconds_per_image"]]
-        result["seconds_per_image"] = _mean(timed)
-        result["fps"] = 1.0 / result["seconds_per_image"]
-        result["splats"] = self.model.num_points
+                deviation = torch.tensor(values, dtype=torch.float64).std()  # statistics.stdev takes no infinity
+                result[f"{metric}_std"] = float(deviation) if len(values) > 1 else None
+        seconds = fmean(image["seconds_per_image"] for image in per_image[1:] or per_image)
+        result |= {"seconds_per_image": seconds, "fps": 1.0 / seconds, "splats": self.model.num_points}
         result["parameter_bytes"] = self.model.parameter_bytes
         if get_std:
             result["per_image"] = per_image
@@ -204,10 +199,8 @@ class NrfgsPipeline(VanillaPipeline):
         return result
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What decides the rest of a training beside its parameters: random generators and the order of the cameras.
-
-        Plain numbers, strings and tensors only, which torch reads without trusting the file.
-        """
+        """Random generators and the order of the cameras, as numbers, strings and tensors: torch reads these without
+        trusting the file."""
         return {
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
@@ -236,20 +229,3 @@ class NrfgsPipeline(VanillaPipeline):
         version, numbers, gauss_next = json.loads(state["python_rng"])
         random.setstate((version, tuple(numbers), gauss_next))
         self.datamanager.load_sampling_state(state["sampling"])
-
-
-def _kernel_trials(model: NrfgsModel) -> list[Callable[[], object]]:
-    """What loads or compiles the kernels that a first step would wait for; none on a CPU."""
-    if model.device.type != "cuda":
-        return []
-    trials = load_kernels, model.head.try_kernels, ssim.kernels_run_on, statistics.try_kernel, optimizers.try_kernel
-    return [partial(trial, model.device) for trial in trials]
-
-
-def _mean(values: list[float]) -> float | None:
-    return sum(values) / len(values) if values else None
-
-
-def _std(values: list[float]) -> float | None:
-    """Sample deviation; null for fewer than two values."""
-    return float(torch.tensor(values, dtype=torch.float64).std()) if len(values) > 1 else None

@@ -7,6 +7,7 @@ and without the line.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import timedelta
 from threading import Lock
 from time import perf_counter
 from typing import Any
@@ -22,13 +23,12 @@ from rich.table import Table
 from tyro.conf import Suppress
 
 from nrfgs_ns.image.metrics import psnr
+from nrfgs_ns.progress import SECONDS_BETWEEN_LINES
 
 SHORTEST = 1.0
 """Least seconds between two updates on a terminal."""
 SHARE = 0.005
 """Largest share of the training's time for updates."""
-IN_A_FILE = 30.0
-"""Seconds between two lines where the output is no terminal."""
 
 
 @dataclass
@@ -60,7 +60,6 @@ class ProgressLine(LocalWriter):
     The trainer calls `write_stats_log` after each step, nerfstudio's loop in those that are logged.
 
     Args:
-        config: its options.
         banner_messages: lines printed once above it: the viewer's address.
         clock: seconds, for tests.
     """
@@ -76,8 +75,6 @@ class ProgressLine(LocalWriter):
             CONSOLE.print(message, markup=False, soft_wrap=True)
         self.clock = clock
         self._pipeline: Any = None
-        self._view = 0, ""
-        self._lock = Lock()
         self._live: Live | None = None
         self._is_over = False
         self._last: tuple[int, float] | None = None
@@ -94,10 +91,10 @@ class ProgressLine(LocalWriter):
         data = pipeline.datamanager
         views = data.eval_dataset.image_filenames
         if views:
-            index = len(views) // 2
-            kind = "training" if views[index] in data.train_dataset.image_filenames else "test"
-            self._view = index, f"{kind} view {views[index].name}"
-            self._pipeline, self._lock = pipeline, lock
+            self._pipeline, self._lock, self._view = pipeline, lock, len(views) // 2
+            name = views[self._view]
+            kind = "training" if name in data.train_dataset.image_filenames else "test"
+            self._view_name = f"{kind} view {name.name}"
 
     def begin(self, step: int) -> None:
         """Set the training's first step; before it nerfstudio logs under step 0."""
@@ -129,29 +126,21 @@ class ProgressLine(LocalWriter):
         start = self.clock()
         total = max(writer.GLOBAL_BUFFER["max_iter"], step + 1)
         done = (step + 1) / total
-        parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)", *self._quality()]
+        parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)"]
+        if self._pipeline is not None:
+            with self._lock:
+                quality = psnr_of(self._pipeline, self._view)
+            parts += [] if quality is None else [f"{quality:.1f} dB on {self._view_name}"]
         if self._last is not None and step > self._last[0]:
             rate = (step - self._last[0]) / max(start - self._last[1], 1e-9)
             parts.append(f"{rate:.3g} steps/s")
             if not is_last:
-                parts.append(f"{duration((total - step - 1) / rate)} left")
+                parts.append(f"{timedelta(seconds=round((total - step - 1) / rate))} left")
         self._last = step, start
-        self._show(", ".join(parts), done)
-        now = self.clock()
-        self._due = max(now + SHORTEST, now + (now - start) / SHARE) if CONSOLE.is_terminal else start + IN_A_FILE
-
-    def _quality(self) -> list[str]:
-        """The PSNR of the test view."""
-        if self._pipeline is None:
-            return []
-        index, name = self._view
-        with self._lock:
-            value = psnr_of(self._pipeline, index)
-        return [] if value is None else [f"{value:.1f} dB on {name}"]
-
-    def _show(self, text: str, done: float) -> None:
+        text = ", ".join(parts)
         if not CONSOLE.is_terminal:
             CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+            self._due = start + SECONDS_BETWEEN_LINES
             return
         line = Table.grid(padding=(0, 1))
         line.add_column(width=16)
@@ -161,6 +150,8 @@ class ProgressLine(LocalWriter):
             self._live = Live(console=CONSOLE, auto_refresh=False)
             self._live.start()
         self._live.update(line, refresh=True)
+        now = self.clock()
+        self._due = max(now + SHORTEST, now + (now - start) / SHARE)
 
 
 @torch.no_grad()
@@ -172,16 +163,6 @@ def psnr_of(pipeline: Any, index: int) -> float | None:
     try:
         camera, batch = data.eval_dataset.cameras[index : index + 1].to(model.device), data.cached_eval[index]
         outputs = model.get_outputs_for_camera(camera)
-        truth = model.truth_of(batch, outputs["background"])
-        return psnr(outputs["rgb"], truth, model.mask_of(batch))
+        return psnr(outputs["rgb"], model.truth_of(batch, outputs["background"]), model.mask_of(batch))
     finally:
         pipeline.train()
-
-
-def duration(seconds: float) -> str:
-    """A time such as 45 s, 3 min 20 s, 2 h 05 min."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes:02} min"
-    return f"{minutes} min {rest:02} s" if minutes else f"{rest} s"

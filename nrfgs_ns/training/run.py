@@ -5,6 +5,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
@@ -72,17 +73,10 @@ def train(
     _set_random_seed(config.machine.seed)
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    model = trainer.pipeline.model
-    record = TrainRecord(args, str(config.get_base_dir() / "config.yml"))
+    model, path = trainer.pipeline.model, str(config.get_base_dir() / "config.yml")
+    record = TrainRecord(args, path)
     if earlier is not None:
-        record = replace(
-            earlier,
-            args=args,
-            config_path=record.config_path,
-            parts=earlier.parts + 1,
-            splats=list(earlier.splats),
-            saved=list(earlier.saved),
-        )
+        record = replace(deepcopy(earlier), args=args, config_path=path, parts=earlier.parts + 1)
     last_step = record.steps + trainer.config.max_num_iterations
     started: float | None = None
 
@@ -133,10 +127,9 @@ def evaluate(config_path: Path, output_path: Path, pictures: Path | None = None)
 
 def machine() -> dict[str, str]:
     """Device, versions and source of a measurement."""
+    cuda = torch.cuda.is_available()
     return {
-        "device": torch.cuda.get_device_name()
-        if torch.cuda.is_available()
-        else f"{torch.get_num_threads()} CPU threads",
+        "device": torch.cuda.get_device_name() if cuda else f"{torch.get_num_threads()} CPU threads",
         "python": platform.python_version(),
         "torch": torch.__version__,
         "source": source_digest(),
@@ -144,15 +137,13 @@ def machine() -> dict[str, str]:
 
 
 def source_digest() -> str:
-    """Twelve hexadecimal digits that identify this package's Python files, installed or uncommitted ones, too.
-
-    A commit's digest: `git archive COMMIT nrfgs_ns | tar x -C EMPTY`, and `digest_of(EMPTY/nrfgs_ns)`.
-    """
+    """`digest_of` this package's files, installed or uncommitted ones, too. That of a commit: `git archive COMMIT
+    nrfgs_ns | tar x -C EMPTY`, and `digest_of(EMPTY/nrfgs_ns)`."""
     return digest_of(Path(nrfgs_ns.__file__).parent)
 
 
 def digest_of(package: Path) -> str:
-    """The `source_digest` of a package's folder: of its files' names and contents."""
+    """Twelve hexadecimal digits that identify the names and contents of the Python files in a package's folder."""
     digest = hashlib.sha256()
     for file in sorted(package.rglob("*.py"), key=lambda file: file.relative_to(package).as_posix()):
         for part in (file.relative_to(package).as_posix(), file.read_text(encoding="utf-8")):

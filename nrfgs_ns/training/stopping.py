@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic
 
@@ -27,7 +27,7 @@ TO_LOAD = ("--load-dir", "--load-checkpoint", "--load-step")
 
 
 class StopRequest:
-    """What signals have asked for.
+    """Signals' request to stop.
 
     Attributes:
         signal: the first that was heard; None: the training goes on.
@@ -41,7 +41,7 @@ class StopRequest:
         self._heard_at = 0.0
 
     def hear(self, number: int, frame: object = None) -> None:
-        """A signal has come. Called between two of Python's instructions, in the main thread."""
+        """Handle a signal, in the main thread, between two of Python's instructions."""
         if self.is_over:
             raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
         if self.signal is None:
@@ -66,17 +66,16 @@ def heard_signals(request: StopRequest) -> Iterator[None]:
 
     Only the main thread can do that; in another one nothing changes.
     """
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        before = {one: signal.getsignal(one) for one in SIGNALS}
-        before = {one: handler for one, handler in before.items() if handler not in (signal.SIG_IGN, None)}
-    for one in before:
-        signal.signal(one, request.hear)
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in SIGNALS if is_main}
+    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    for number in before:
+        signal.signal(number, request.hear)
     try:
         yield
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -88,27 +87,23 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def rows_agree(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], counted: Iterable[object]) -> bool:
-    """Whether a state that was interrupted anywhere is one: each splat has a row in every tensor.
-
-    Args:
-        optimizers: by group; those of `splats` among them.
-        counted: densification's statistics; tensors with a row for each splat, or others.
-    """
+    """Whether a state that was interrupted anywhere is consistent: each splat has a row in every tensor, also in those
+    of densification's statistics, `counted`."""
     counts = {len(value) for value in splats.values()}
     counts |= {len(value) for value in counted if isinstance(value, Tensor) and value.dim() > 0}
-    held = [(parameter, optimizers[name]) for name, parameter in splats.items()]
-    same = all(optimizer.param_groups[0]["params"][0] is parameter for parameter, optimizer in held)
-    moments = [
+    pairs = [(parameter, optimizers[name]) for name, parameter in splats.items()]
+    same = all(optimizer.param_groups[0]["params"][0] is parameter for parameter, optimizer in pairs)
+    moments = all(
         value.shape == parameter.shape
-        for parameter, optimizer in held
+        for parameter, optimizer in pairs
         for value in optimizer.state.get(parameter, {}).values()
         if isinstance(value, Tensor) and value.dim() > 0
-    ]
-    return len(counts) == 1 and same and all(moments)
+    )
+    return len(counts) == 1 and same and moments
 
 
 def command_to_go_on(folder: Path, method: str) -> str:
-    """The command that goes on from a folder's last checkpoint: this process's own, if it is `ns-train`'s."""
+    """The command that goes on from a folder's last checkpoint: this process's own with another --load-dir."""
     words, load = sys.argv[1:], ["--load-dir", str(folder)]
     program = "ns-train" if Path(sys.argv[0]).name != "launch.py" else "python -m nrfgs_ns.distributed.launch"
     if words[:1] != [method]:  # a program of another kind
@@ -126,10 +121,8 @@ def command_to_go_on(folder: Path, method: str) -> str:
 
 def _say(line: str) -> None:
     """Write a line to the terminal from within a signal's handler, where print may not be called."""
-    try:
+    with suppress(OSError):
         os.write(2, f"\n{line}\n".encode())
-    except OSError:
-        pass
 
 
 def _let_go_of_terminal() -> None:

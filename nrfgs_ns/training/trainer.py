@@ -26,22 +26,16 @@ from torch import Tensor
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import ForTheUser, InputError
 from nrfgs_ns.training import checkpoint_files
-from nrfgs_ns.training.averaging import ParameterMean, report_mean, report_no_mean, window
+from nrfgs_ns.training.averaging import ParameterMean, window
 from nrfgs_ns.training.checkpoint_files import DiskFull
+from nrfgs_ns.training.evaluation import track
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 from nrfgs_ns.training.optimizers import in_world_units
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
 from nrfgs_ns.training.step_graph import StepGraphs, tell_why_not_recorded
-from nrfgs_ns.training.stopping import (
-    StopRequest,
-    command_to_go_on,
-    heard_signals,
-    is_out_of_memory,
-    rows_agree,
-)
-from nrfgs_ns.training.tracking import track
+from nrfgs_ns.training.stopping import StopRequest, command_to_go_on, heard_signals, is_out_of_memory, rows_agree
 from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, nothing_left_where_refused, report_choices
 
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
@@ -61,7 +55,7 @@ class NrfgsTrainer(Trainer):
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         self.request = StopRequest()
-        self._stop = False
+        self._stop = self._is_ending = False
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's GradScaler
             super().__init__(config, local_rank, world_size)
@@ -71,24 +65,20 @@ class NrfgsTrainer(Trainer):
         self.mean: ParameterMean | None = None
         self.graphs: StepGraphs | None = None
         self._saved_step: int | None = None
-        self._is_ending = False
 
     @property
     def stop_training(self) -> bool:
         """Whether no further step is made. Nerfstudio's loop reads and sets it."""
-        return self._stop or self._is_asked_to_stop
+        return self._stop or self._signal > 0
 
     @stop_training.setter
     def stop_training(self, stop: bool) -> None:
         self._stop = stop
 
     @property
-    def _is_asked_to_stop(self) -> bool:
-        return self.request.signal is not None
-
-    @property
-    def _exit_status(self) -> int:
-        return self.request.exit_status
+    def _signal(self) -> int:
+        """The signal that asks to stop; 0: none."""
+        return self.request.signal or 0
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
@@ -110,12 +100,10 @@ class NrfgsTrainer(Trainer):
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
     def _record_steps(self) -> None:
-        """Let steps be CUDA graphs, where they can; where no step of this training can, say so."""
+        """Let steps be CUDA graphs, where they can; where none can, say so."""
         if self.world_size > 1 or self.use_grad_scaler:
             if self.pipeline.model.device.type == "cuda" and comms.is_main_process():
-                tell_why_not_recorded(
-                    "several devices share the splats" if self.world_size > 1 else "precision is mixed"
-                )
+                tell_why_not_recorded("several devices share the splats" if self.world_size > 1 else "mixed precision")
             return
         self.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
 
@@ -139,10 +127,10 @@ class NrfgsTrainer(Trainer):
             InputError: it is damaged, its data set or the meaning of its numbers is another, or the training is over.
         """
         config = self.config
+        path = config.load_checkpoint
         if config.load_dir is not None:
             path, content = checkpoint_files.read_latest(config.load_dir, config.load_step)
-        elif config.load_checkpoint is not None:
-            path = config.load_checkpoint
+        elif path is not None:
             content = checkpoint_files.read_or_refuse(path)
         else:
             return
@@ -160,14 +148,9 @@ class NrfgsTrainer(Trainer):
         self._follow(training.get("pace"))
         if self.mean is not None and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.pipeline.model, self.optimizers.optimizers)
-        CONSOLE.print(
-            f"Going on from {path}, at step {self._start_step} of {self._total}.", markup=False, soft_wrap=True
-        )
-
-    @property
-    def _total(self) -> str:
-        budget = self.config.time_budget
-        return f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
+        budget = config.time_budget
+        total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
+        CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)
 
     def _check_options(self, written: dict[str, str], path: Path) -> None:
         """Raise InputError where the options do not fit the checkpoint; name those that changed."""
@@ -176,7 +159,6 @@ class NrfgsTrainer(Trainer):
             shown = "; ".join(changed[:5]) + ("; ..." if len(changed) > 5 else "")
             warn(f"Going on with other options than {path.name} was trained with: {shown}.")
         if self.config.time_budget is None and self._start_step >= self.total_steps:
-            # Where the steps are given, schedules are stretched on request alone.
             stretched = self.config.schedule_steps
             schedules = "" if stretched is None else f" --schedule-steps {stretched}"
             raise InputError(
@@ -189,11 +171,7 @@ class NrfgsTrainer(Trainer):
         return scene_of([Path(name).name for name in data.image_filenames], data.cameras)
 
     def _follow(self, written: dict[str, Any] | None) -> None:
-        """Take the checkpoint's position on the schedules; the remaining steps walk through the rest.
-
-        Args:
-            written: the state of the checkpoint's pace; None: it had none.
-        """
+        """Take the position of the checkpoint's pace, if it had one; the remaining steps walk through the rest."""
         pace = self.pace
         if pace is None and written is not None:
             same = "a --time-budget" if "seconds" in written else f"--schedule-steps {written['length']}"
@@ -205,7 +183,7 @@ class NrfgsTrainer(Trainer):
             return
         if written is not None:
             pace.load_state(written)
-        if pace.position == 0.0:
+        else:
             pace.position = float(self._start_step)  # the checkpoint's schedules were not stretched
         if isinstance(pace, TimedPace):
             if pace.is_spent:
@@ -235,7 +213,8 @@ class NrfgsTrainer(Trainer):
             SystemExit: a signal has ended it, with the status of that; the state has been written.
         """
         with self._last_good_state_on_disk():  # the warm-up comes before the first step
-            self.guard.before_first_step(self._start_step, self.optimizers)
+            self.guard.step = self._start_step
+            self.guard.check_parameters(self.optimizers)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
             self.config = replace(self.config, max_num_iterations=sys.maxsize // 2)
         if self.line is not None:
@@ -269,10 +248,7 @@ class NrfgsTrainer(Trainer):
             self.line.step_aside()  # the evaluation has a progress bar of its own
         super().eval_iteration(step)
         if pictures or step_check(step, self.config.steps_per_eval_image):
-            self.pipeline.eval()
-            camera = self.pipeline.datamanager.eval_dataset.cameras[:1].to(self.device)
-            track(self.pipeline.model, camera, step, pictures)
-            self.pipeline.train()
+            track(self.pipeline, step, pictures)
 
     def train_iteration(self, step: int):
         """One step.
@@ -319,7 +295,7 @@ class NrfgsTrainer(Trainer):
 
     @property
     def last_step(self) -> int:
-        """The last step of this training; with a time budget, a number beyond it."""
+        """The training's last step; with a time budget, a number beyond it."""
         return self._start_step + self.config.max_num_iterations - 1
 
     def _average(self, step: int) -> None:
@@ -341,10 +317,10 @@ class NrfgsTrainer(Trainer):
         """Nerfstudio's, whose step number is one too high after an early stop; from here on the model is the mean."""
         self.step, self._is_ending = self._made, True
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
-        if self._is_asked_to_stop and not timed_out and self._made < self.last_step:
+        if self._signal and not timed_out and self._made < self.last_step:
             self._stop_as_asked()
         if self.mean is not None and self._stop and not timed_out:
-            report_no_mean(self.config.average_steps, "the training was stopped before its last step")
+            self._report_no_mean("the training was stopped before its last step")
         else:
             self.take_the_mean()
         if self.line is not None:
@@ -353,11 +329,12 @@ class NrfgsTrainer(Trainer):
 
     def _stop_as_asked(self) -> None:
         """Save, say so, and end the process with the status of the signal."""
-        if self._made < self._start_step:
-            self._end(NOTHING_TO_SAVE, self._exit_status)
-        if self._saved_step != self._made:
-            self.save_checkpoint(self._made)
-        self._end(f"Stopped at step {self._made}, {self._where_it_goes_on}", self._exit_status)
+        outcome = NOTHING_TO_SAVE
+        if self._made >= self._start_step:
+            if self._saved_step != self._made:
+                self.save_checkpoint(self._made)
+            outcome = f"Stopped at step {self._made}, {self._where_it_goes_on}"
+        self._end(outcome, 128 + self._signal)
 
     @property
     def _where_it_goes_on(self) -> str:
@@ -372,10 +349,9 @@ class NrfgsTrainer(Trainer):
     def _train_complete_viewer(self) -> None:
         """Nerfstudio's: the viewer shows the model until Ctrl-C, which may have come in the last step."""
         self.request.is_over = True
-        if self.request.signal is not None:
-            return
-        with suppress(KeyboardInterrupt):
-            super()._train_complete_viewer()
+        if self.request.signal is None:
+            with suppress(KeyboardInterrupt):
+                super()._train_complete_viewer()
 
     @contextmanager
     def _state_on_disk_if_it_fails(self) -> Iterator[None]:
@@ -391,17 +367,18 @@ class NrfgsTrainer(Trainer):
         except Exception as error:
             if self.world_size > 1:  # one device alone cannot write the whole
                 raise
-            memory, what = is_out_of_memory(error), str(error).partition("\n")[0]
-            if memory:
-                error.__traceback__ = None  # its frames hold the step's tensors
-            outcome = self._save_last_step()
-            if memory:
-                message = f"Out of memory in step {self.step}: {what}\n{outcome}"
-                advice = "Fewer splats or smaller images take less (docs/troubleshooting.md)."
-                saved = self._saved_step == self._made
-                raise TrainingStopped(f"{message} {advice}", self.step, "memory", savable=saved) from None
-            print(f"The training failed in step {self.step}. {outcome}", flush=True)
-            raise
+            if not is_out_of_memory(error):
+                print(f"The training failed in step {self.step}. {self._save_last_step()}", flush=True)
+                raise
+            error.__traceback__ = None  # its frames hold the step's tensors
+            outcome, what = self._save_last_step(), str(error).partition("\n")[0]
+            raise TrainingStopped(
+                f"Out of memory in step {self.step}: {what}\n{outcome} Fewer splats or smaller images take less "
+                "(docs/troubleshooting.md).",
+                self.step,
+                "memory",
+                savable=self._saved_step == self._made,
+            ) from None
 
     def _save_last_step(self) -> str:
         """Save the state after the last completed step, if it is consistent; returns a sentence about the outcome."""
@@ -430,17 +407,24 @@ class NrfgsTrainer(Trainer):
         Raises:
             TrainingStopped: the last step met a number that is not finite; the last good state has been written.
         """
-        mean, asked = self.mean, self.config.average_steps
+        mean = self.mean
         if mean is None:
             return
         with self._last_good_state_on_disk():
             self.guard.settle()
         if mean.count == 0:
-            report_no_mean(asked, "the time was up sooner than foreseen")
+            self._report_no_mean("the time was up sooner than foreseen")
             return
-        report_mean(mean.count, window(asked, self._made + 1), mean.restarted)
+        steps = "the last step" if mean.count == 1 else f"the last {mean.count} steps"
+        size = window(self.config.average_steps, self._made + 1)
+        why = f", not {size}: until then splats were added, removed or reset" if mean.restarted else ""
+        CONSOLE.print(f"The trained model is the mean of its parameters over {steps}{why}.", soft_wrap=True)
         with self.train_lock:
             mean.install()
+
+    def _report_no_mean(self, why: str) -> None:
+        steps = self.config.average_steps
+        warn(f"average_steps is {steps}, but nothing was averaged: {why}. The model is the last step's.")
 
     # Checkpoints.
 
@@ -474,11 +458,7 @@ class NrfgsTrainer(Trainer):
             raise
 
     def _write_checkpoint(self, step: int) -> None:
-        """Write a checkpoint (`checkpoint_files`).
-
-        Raises:
-            DiskFull: there is no room.
-        """
+        """Write a checkpoint; DiskFull where there is no room."""
         content = self._checkpoint(step)
         if comms.is_main_process():
             checkpoint_files.seal(content["pipeline"], step)
@@ -487,8 +467,8 @@ class NrfgsTrainer(Trainer):
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
         """A checkpoint's content: nerfstudio's entries, and "training", which this class needs to resume."""
-        training: dict[str, Any] = {"scene": self._scene(), "options": options_of(self.config)}
-        training["options"]["max_num_iterations"] = str(self.total_steps)
+        options = {**options_of(self.config), "max_num_iterations": str(self.total_steps)}
+        training: dict[str, Any] = {"scene": self._scene(), "options": options}
         if self.pace is not None:
             training["pace"] = self.pace.state()
         if self.mean is not None and self.mean.count > 0:

@@ -9,8 +9,6 @@ from itertools import chain, count
 from pathlib import Path
 from pkgutil import resolve_name
 
-from nerfstudio.configs.dataparser_configs import all_dataparsers
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -19,15 +17,7 @@ from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.cpu_command import ten_minute_command
-from nrfgs_ns.training.pace import (
-    FEWEST_STEPS,
-    STEPS,
-    STEPS_PER_VIEW,
-    Pace,
-    TimedPace,
-    resolution_phases,
-    steps_for,
-)
+from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, STEPS_PER_VIEW, Pace, TimedPace, resolution_phases, steps_for
 
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
 """The trainer of these options, which imports this module."""
@@ -37,6 +27,8 @@ AVERAGED = 200
 """Steps to average in the presets and where the steps are chosen by the views."""
 LARGEST_RATE = 100.0
 """Largest learning rate: Adam moves a parameter by about this much in a step, and log-scales of 100 overflow."""
+MOST = 2**32
+"""Bound of all numbers that have no other; numpy takes no larger seed."""
 FEW = 0.9
 """Trust in view dependence below which its reduction is worth a word on the terminal: 180 training views."""
 PLAIN = {"markup": False, "highlight": False, "soft_wrap": True}
@@ -69,46 +61,42 @@ class NrfgsTrainerConfig(TrainerConfig):
         Raises:
             InputError: as `check`.
         """
+        devices, steps = kwargs.get("world_size", 1), self.max_num_iterations or STEPS
         with nothing_left_where_refused(self):
-            self.check(kwargs.get("world_size", 1))
-            if kwargs.get("world_size", 1) == 1:
+            self.check(devices)
+            if devices == 1:
                 return super().setup(**kwargs)
-            # Schedules are not stretched there.
-            whole = replace(
-                self, max_num_iterations=self.max_num_iterations or STEPS, average_steps=self.average_steps or 0
-            )
+            whole = replace(self, max_num_iterations=steps, average_steps=self.average_steps or 0)  # not stretched
             return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
 
     def check(self, devices: int) -> None:
         """Raise InputError where an option is out of range, is not for several devices, or names no checkpoint."""
-        for name, part in (
-            ("experiment_name", self.experiment_name),
-            ("timestamp", self.timestamp),
-            ("relative_model_dir", str(self.relative_model_dir)),
-        ):
-            if part is not None and not _is_within(part):
-                raise InputError(f"{name} is {part!r}; it must be the name of a folder within --output-dir.")
+        for name in ("experiment_name", "timestamp", "relative_model_dir"):
+            part = getattr(self, name)
+            if part is not None and (Path(part).is_absolute() or ".." in Path(part).parts):
+                raise InputError(f"{name} is {str(part)!r}; it must be the name of a folder within --output-dir.")
         for path in (self.get_base_dir(), self.data):
             if path is not None and any("\udc80" <= letter <= "\udcff" for letter in str(path)):
                 raise InputError(f"{str(path)!r} has letters beyond this system's encoding. Set PYTHONUTF8=1.")
+        data, positive = self.pipeline.datamanager, math.ulp(0.0)
+        for name, value, low in (
+            ("time_budget", self.time_budget, positive),
+            ("schedule_steps", self.schedule_steps, positive),
+            ("max_num_iterations", self.max_num_iterations, 0),
+            ("average_steps", self.average_steps, 0),
+            ("pipeline.datamanager.camera_res_scale_factor", data.camera_res_scale_factor, positive),
+            ("pipeline.datamanager.max_thread_workers", data.max_thread_workers, 0),
+            ("logging.steps_per_log", self.logging.steps_per_log, 1),
+            ("machine.seed", self.machine.seed, 0),
+            ("machine.num_devices", self.machine.num_devices, 1),
+            ("machine.num_machines", self.machine.num_machines, 1),
+        ):
+            if value is not None and not low <= value < MOST:
+                least = "positive" if low == positive else f"at least {low}"
+                raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
         for name in ("time_budget", "schedule_steps"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name} is {value}; it must be positive.")
-            if value is not None and devices > 1:
+            if getattr(self, name) is not None and devices > 1:
                 raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
-        for name in ("max_num_iterations", "average_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 0:
-                raise InputError(f"{name} is {value}; it must be zero or positive.")
-        scale = self.pipeline.datamanager.camera_res_scale_factor
-        if not 0 < scale < math.inf:
-            raise InputError(f"pipeline.datamanager.camera_res_scale_factor is {scale}; it must be positive.")
-        workers = self.pipeline.datamanager.max_thread_workers
-        if workers is not None and workers < 0:
-            raise InputError(f"pipeline.datamanager.max_thread_workers is {workers}; it must be zero or positive.")
-        if self.logging.steps_per_log < 1:
-            raise InputError(f"logging.steps_per_log is {self.logging.steps_per_log}; it must be at least 1.")
         self._check_learning_rates()
         self.pipeline.model.check()
         length = self.schedule_steps or self.max_num_iterations or STEPS
@@ -121,20 +109,17 @@ class NrfgsTrainerConfig(TrainerConfig):
     def _check_learning_rates(self) -> None:
         """Raise InputError where a learning rate or its schedule is out of range."""
         for name, group in self.optimizers.items():
-            numbers = {"optimizer.lr": group["optimizer"].lr}
-            schedule = group.get("scheduler")
-            lowest, needed = 0.0, f"from 0 to {LARGEST_RATE:g}"
+            numbers, low, schedule = {"optimizer.lr": group["optimizer"].lr}, 0.0, group.get("scheduler")
             if isinstance(schedule, ExponentialDecaySchedulerConfig):
-                lowest, needed = math.ulp(0.0), f"above 0, since it falls exponentially, and at most {LARGEST_RATE:g}"
+                low = math.ulp(0.0)  # zero cannot fall exponentially
                 numbers["scheduler.lr_final"] = schedule.lr_final
                 if schedule.max_steps <= schedule.warmup_steps:
-                    raise InputError(
-                        f"optimizers.{name}.scheduler.max_steps is {schedule.max_steps}; it must be more than the "
-                        f"warmup_steps, {schedule.warmup_steps}."
-                    )
+                    option = f"optimizers.{name}.scheduler.max_steps is {schedule.max_steps}"
+                    raise InputError(f"{option}; it must be more than the warmup_steps, {schedule.warmup_steps}.")
             for option, value in numbers.items():
-                if value is not None and not lowest <= value <= LARGEST_RATE:
-                    raise InputError(f"optimizers.{name}.{option} is {value}; it must be {needed}.")
+                if value is not None and not low <= value <= LARGEST_RATE:
+                    bound = f"{'above' if low else 'from'} 0, and at most {LARGEST_RATE:g}"
+                    raise InputError(f"optimizers.{name}.{option} is {value}; it must be {bound}.")
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
         """The configuration with automatic values filled in: steps, schedules and mean of a training on one device."""
@@ -161,39 +146,26 @@ class NrfgsTrainerConfig(TrainerConfig):
         config.yml, and shown with NRFGS_DEBUG=1.
 
         Raises:
-            InputError: as `check`; the seed or the number of devices is out of range; there is no data.
+            InputError: as `check`, or there is no data.
         """
         if DEBUG:
             super().print_to_terminal()
-        machine = self.machine
-        for name, value, low, high in (
-            ("seed", machine.seed, 0, 2**32 - 1),
-            ("num_devices", machine.num_devices, 1, 2**16),
-            ("num_machines", machine.num_machines, 1, 2**16),
-        ):
-            if not low <= value <= high:
-                raise InputError(f"machine.{name} is {value}; it must be from {low} to {high}.")
-        devices = machine.num_devices * machine.num_machines
+        devices = self.machine.num_devices * self.machine.num_machines
         self.check(devices)
         datamanager = self.pipeline.datamanager
         data = self.data or datamanager.data
         parser = datamanager.dataparser
         is_here = not isinstance(parser, NrfgsDataParserConfig) or Path("transforms.json").exists()
         if data is None and parser.data == Path() and not is_here:
-            raise InputError(
-                "--data is missing. Name the folder of the data set; `nrfgs prepare PHOTOS SCENE` makes one from "
-                "photographs."
-            )
+            fix = "Name the folder of the data set; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
+            raise InputError(f"--data is missing. {fix}")
         if devices > 1:
             resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
         CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
 
     def save_config(self) -> None:
-        """Make the training's folder and save config.yml there, with paths that do not depend on the working folder.
-
-        Raises:
-            InputError: nothing can be written there, or the folder holds another training.
-        """
+        """Make the training's folder and save config.yml there, with paths that do not depend on the working folder;
+        InputError where nothing can be written there."""
         data = self.pipeline.datamanager
         dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
         pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
@@ -202,10 +174,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
             TrainerConfig.save_config(whole)
         except OSError as error:
-            raise InputError(
-                f"--output-dir {self.output_dir}: {self.get_base_dir()} cannot be written ({error.strerror}). Name "
-                "another folder."
-            ) from error
+            message = f"--output-dir {self.output_dir}: {self.get_base_dir()} cannot be written ({error.strerror})."
+            raise InputError(f"{message} Name another folder.") from error
 
     def _take_a_folder(self) -> None:
         """Make a folder that is this training's alone: a name that another one took gets a number. A training that goes
@@ -221,17 +191,6 @@ class NrfgsTrainerConfig(TrainerConfig):
             except FileExistsError:
                 if not self.get_base_dir().is_dir():
                     raise
-
-
-def _is_within(part: str) -> bool:
-    """Whether a path leads nowhere out of the folder that it is appended to."""
-    return not Path(part).is_absolute() and ".." not in Path(part).parts
-
-
-def _name_of(parser: DataParserConfig) -> str | None:
-    """The parser's subcommand; None for ours, which is the default, and for an unregistered one."""
-    named = (name for name, known in all_dataparsers.items() if type(known) is type(parser))
-    return None if isinstance(parser, NrfgsDataParserConfig) else next(named, None)
 
 
 def _absolute(path: Path | None) -> Path | None:
@@ -257,20 +216,16 @@ def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
 
 
 def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool) -> None:
-    """Say what was chosen automatically, and write the numbers behind it to `NOTES`.
-
-    Args:
-        pipeline: an NrfgsPipeline before its first step.
-        steps_are_chosen: whether the number of views decides the number of steps.
-    """
+    """Say what was chosen automatically, and write the numbers behind it to `NOTES`."""
     model = pipeline.model
     views, given = model.num_views, model.num_train_data
     parts, notes = [], [*pipeline.notes]
     if steps_are_chosen:
         parts.append(f"{steps_for(views):,} steps")
         notes.append(f"steps: {STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,}")
+    if model.trust < FEW:
+        parts.append("view dependence reduced, as suits few views")
     if model.trust < 1.0:
-        parts.append("view dependence reduced, as suits few views" * (model.trust < FEW))
         reduced = ", ".join(f"{name} {value}" for name, value in (model.reduced_head or {}).items())
         notes.append(f"trust in view dependence: {model.trust:.2g} of 1{f' ({reduced})' if reduced else ''}")
     if model.view_noise.sigma > 0.0:
@@ -281,16 +236,14 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
         )
     noun = "training view" if given == 1 else "training views"
     count = f"{given} {noun}" if views == given else f"{views} different training views of {given}"
-    if any(parts):
-        CONSOLE.print(f"{count}: {', '.join(filter(None, parts))} (docs/captures.md).", soft_wrap=True)
-    parser, is_full_size = (
-        config.pipeline.datamanager.dataparser,
-        config.pipeline.datamanager.camera_res_scale_factor == 1,
-    )
-    is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS and is_full_size
-    if config.machine.device_type == "cpu" and is_long:
-        command = ten_minute_command(_absolute(parser.data), _name_of(parser))
+    if parts:
+        CONSOLE.print(f"{count}: {', '.join(parts)} (docs/captures.md).", soft_wrap=True)
+    data = config.pipeline.datamanager
+    is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS
+    is_ours = isinstance(data.dataparser, NrfgsDataParserConfig)
+    if config.machine.device_type == "cpu" and is_long and is_ours and data.camera_res_scale_factor == 1:
+        command = ten_minute_command(_absolute(data.dataparser.data))
         CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {command}", **PLAIN)
     folder = config.get_base_dir()
     if notes and folder.is_dir():
-        (folder / NOTES).write_text("\n".join([f"{count}", *notes]) + "\n", encoding="utf-8")
+        (folder / NOTES).write_text("\n".join([count, *notes]) + "\n", encoding="utf-8")

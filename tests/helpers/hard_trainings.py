@@ -3,9 +3,8 @@
 
     python tests/helpers/hard_trainings.py --out bench/stability --work FOLDER
 
-trains on small procedural scenes: in millimetres and in kilometres with nerfstudio's scaling on and off, at ten times
-the learning rates, under many opacity resets, on black, white and single images. It writes `trainings.json` (one entry
-per run) and `trainings.md`, the table. A run that is in the JSON already is not repeated.
+trains on small procedural scenes and writes `trainings.json`, with one entry for each run. A run that is in the JSON
+already is not repeated.
 """
 
 import json
@@ -41,22 +40,18 @@ less than the blur that every splat gets, and 600 points became 150,000 splats f
 
 @dataclass
 class HardTraining:
-    """One training that a user's capture could be."""
+    """One training that a user's capture could be: its name, the change of the data set, options of ns-train."""
 
     name: str
-    """row of the table, and key of the record"""
     edit: Callable[[Path], None] = lambda folder: None
-    """what is done to the data set before the training"""
     options: dict[str, Any] = field(default_factory=dict)
-    """options of ns-train"""
     auto_scale: bool = True
     """nerfstudio's scaling of poses into a unit cube"""
     method: str = "nrfgs"
-    """what is trained"""
     seeds: tuple[int, ...] = (42,)
     """one training for each"""
     steps: int | None = None
-    """its length where it is not that of the others"""
+    """None: those of the others"""
 
 
 def rescale(folder: Path, factor: float) -> None:
@@ -96,15 +91,11 @@ def keep(folder: Path, count: int, identical: bool = False) -> None:
     path.write_text(json.dumps(meta))
 
 
-def ten_times_faster() -> dict[str, Any]:
-    """Every learning rate times 10."""
-    groups = nrfgs.config.optimizers.items()
-    return {f"--optimizers.{name}.optimizer.lr": 10 * group["optimizer"].lr for name, group in groups}
-
-
 def hard_trainings() -> list[HardTraining]:
     """All rows of the table."""
     seeds = (42, 43, 44)
+    groups = nrfgs.config.optimizers.items()
+    fast = {f"--optimizers.{name}.optimizer.lr": 10 * group["optimizer"].lr for name, group in groups}
     rows = []
     for method in ("nrfgs", "nrfgs-sh"):
         for auto_scale in (True, False):
@@ -114,7 +105,7 @@ def hard_trainings() -> list[HardTraining]:
                 rows.append(HardTraining(name, edit, auto_scale=auto_scale, method=method, seeds=seeds))
     return [
         *rows,
-        HardTraining("learning rates x 10", options=ten_times_faster()),
+        HardTraining("learning rates x 10", options=fast),
         HardTraining("100,000 steps", options=NO_SCREEN_SIZE, steps=100_000),
         HardTraining("opacity reset every 50 steps", options=RESETS),
         HardTraining("black images", partial(paint, value=0)),
@@ -126,16 +117,8 @@ def hard_trainings() -> list[HardTraining]:
 
 
 def run(training: HardTraining, seed: int, steps: int, work: Path) -> dict[str, Any]:
-    """Train, evaluate, and look at every number that a user could get to see.
-
-    Args:
-        steps: training steps.
-        work: folder for the data set and the outputs; emptied.
-
-    Returns:
-        "psnr" and "l1" of the test images, "splats", and "finite": every tensor of the checkpoint and every number of
-        the evaluation.
-    """
+    """Train and evaluate in the folder `work`, which is emptied. "finite": every tensor of the checkpoint and every
+    number of the evaluation is."""
     shutil.rmtree(work, ignore_errors=True)
     data = write_scene(SCENE, work / "scene")
     training.edit(data)
@@ -160,49 +143,28 @@ def run(training: HardTraining, seed: int, steps: int, work: Path) -> dict[str, 
     _, pipeline, _, _ = eval_setup(Path(record.config_path))
     tensors = all(bool(torch.isfinite(value).all()) for value in pipeline.model.parameters())
     numbers = [results[name] for name in ("psnr", "ssim", "l1")]
-    return {
-        "psnr": results["psnr"],
-        "l1": results["l1"],
-        "splats": results["splats"],
-        "finite": tensors and all(number is not None and not math.isnan(number) for number in numbers),
-    }
+    finite = tensors and all(number is not None and not math.isnan(number) for number in numbers)
+    return {"psnr": results["psnr"], "l1": results["l1"], "splats": results["splats"], "finite": finite}
 
 
-def table(runs: dict[str, dict[str, dict[str, Any]]]) -> str:
-    """The records as a Markdown table: means over seeds, and the PSNR's sample deviation."""
-    lines = ["| training | seeds | PSNR | L1 | splats | all finite |", "|---|---|---|---|---|---|"]
-    for name, by_seed in runs.items():
-        records = list(by_seed.values())
-        psnr, l1, splats = (np.array([record[key] for record in records]) for key in ("psnr", "l1", "splats"))
-        spread = f" ± {psnr.std(ddof=1):.2f}" if len(psnr) > 1 else ""
-        finite = "yes" if all(record["finite"] for record in records) else "NO"
-        cells = f"{len(records)} | {psnr.mean():.2f}{spread} | {l1.mean():.4f} | {splats.mean():,.0f} | {finite}"
-        lines.append(f"| {name} | {cells} |")
-    return "\n".join(lines) + "\n"
-
-
-def main(out: Path, work: Path, steps: int = 400, rows: tuple[str, ...] = ()) -> None:
-    """Run all hard trainings and write their table.
+def main(out: Path, work: Path, steps: int = 400) -> None:
+    """Run all hard trainings.
 
     Args:
-        out: folder for trainings.json and trainings.md.
+        out: folder for trainings.json.
         work: folder for data sets and checkpoints.
         steps: steps of each training that has no length of its own.
-        rows: names of the trainings to run, if not all.
     """
     out.mkdir(parents=True, exist_ok=True)
     file = out / "trainings.json"
     record = json.loads(file.read_text()) if file.exists() else {"machine": machine(), "steps": steps, "runs": {}}
-    chosen = [training for training in hard_trainings() if not rows or training.name in rows]
-    todo = [(training, seed) for training in chosen for seed in training.seeds]
+    todo = [(training, seed) for training in hard_trainings() for seed in training.seeds]
     for index, (training, seed) in enumerate(track(todo, "Hard trainings")):
         done = record["runs"].setdefault(training.name, {})
-        if str(seed) in done:
-            continue
-        # A folder each: tensorboard's writers outlive their training.
-        done[str(seed)] = run(training, seed, training.steps or steps, work / f"run-{index}")
-        file.write_text(json.dumps(record, indent=1) + "\n")
-        (out / "trainings.md").write_text(table(record["runs"]))
+        if str(seed) not in done:
+            # A folder each: tensorboard's writers outlive their training.
+            done[str(seed)] = run(training, seed, training.steps or steps, work / f"run-{index}")
+            file.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

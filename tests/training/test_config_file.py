@@ -15,8 +15,6 @@ from nrfgs_ns import method_config
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.config_file import read_config
 
-METHODS = ["nrfgs", "nrfgs_fast", "nrfgs_best", "nrfgs_sh", "nrfgs_vdgs", "nrfgs_gsnb", "nrfgs_sg"]
-
 
 @pytest.fixture
 def saved(tmp_path):
@@ -28,7 +26,7 @@ def saved(tmp_path):
     return save
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", ["nrfgs", "nrfgs_best", "nrfgs_gsnb"])
 def test_what_is_saved_is_read_back(saved, name):
     config = replace(getattr(method_config, name).config, data=Path("/some where/scène"))
     assert read_config(saved(yaml.dump(config))) == config
@@ -131,12 +129,6 @@ def test_a_pipeline_refuses_it_too():
         config.setup(device="cpu")
 
 
-def test_a_file_that_is_cut_off_is_refused(saved):
-    for length in [*range(1, len(WHOLE), 997), len(WHOLE) - 2]:
-        with pytest.raises(InputError):
-            read_config(saved(WHOLE[:length]))
-
-
 def test_an_option_that_is_newer_than_the_file_has_its_default(saved):
     config = replace(method_config.nrfgs.config, average_steps=3)
     text = yaml.dump(config)
@@ -148,11 +140,15 @@ def test_an_option_that_is_newer_than_the_file_has_its_default(saved):
 
 
 def test_a_file_that_is_not_there_or_no_configuration(tmp_path):
+    for length in (1, 1000, len(WHOLE) - 2):
+        (tmp_path / "cut").write_text(WHOLE[:length])
+        with pytest.raises(InputError):
+            read_config(tmp_path / "cut")
     with pytest.raises(InputError, match="no such file. Name the config.yml"):
         read_config(tmp_path / "config.yml")
     (tmp_path / "large").write_bytes(b"a" * (1 << 21))
     with pytest.raises(InputError, match="larger than"):
         read_config(tmp_path / "large")
     (tmp_path / "binary").write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match="not a configuration. Name the config.yml"):
+    with pytest.raises(InputError, match="not a configuration: .* Name the config.yml"):
         read_config(tmp_path / "binary")

@@ -109,6 +109,14 @@ def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fuse
     with pytest.raises(TrainingStopped, match="stopped at step 3") as stopped:
         trainer.train()
     assert stopped.value.step == 3
+    message, count = str(stopped.value), trainer.pipeline.model.num_points
+    parts = (
+        ("loss main_loss",)
+        if name == "loss"
+        else (f"the gradient of gauss_params.{name}", f"1 of {count} splats, first 7.")
+    )
+    for part in (*parts, "Likely cause: ", "The update of step 3 was not made."):
+        assert part in message, message
     ((step, state),) = checkpoints(trainer).items()
     assert step == 3
     after = numbers(state)
@@ -119,27 +127,18 @@ def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fuse
     for path in same:
         assert torch.equal(after[path], before[path]), path
     assert all(torch.isfinite(tensor).all() for tensor in after.values())
-
-
-@pytest.mark.parametrize("fused", [False, True], ids=["on the host", "on the device"])
-def test_training_goes_on_from_where_it_stopped(start, fused):
-    trainer = start(fused=fused)
-    poison(trainer, at=3, name="means", value=NAN)
-    with pytest.raises(TrainingStopped):
-        trainer.train()
-    again = start({"--load-dir": trainer.checkpoint_dir})
-    assert again._start_step == 4
+    again = start({"--load-dir": trainer.checkpoint_dir}, steps=5)
     again.train()
-    assert max(checkpoints(again)) == 9
+    assert again._start_step == 4 and max(checkpoints(again)) == 4
 
 
 @pytest.mark.parametrize("fused", [False, True], ids=["on the host", "on the device"])
 def test_a_condemned_last_step_is_reported_too(start, fused):
-    trainer = start(fused=fused)
-    poison(trainer, at=9, name="quats", value=INF)
-    with pytest.raises(TrainingStopped, match="step 9"):
+    trainer = start(fused=fused, steps=3)
+    poison(trainer, at=2, name="quats", value=INF)
+    with pytest.raises(TrainingStopped, match="step 2"):
         trainer.train()
-    assert set(checkpoints(trainer)) == {9}
+    assert set(checkpoints(trainer)) == {2}
 
 
 def test_large_gradients_that_adam_can_square_pass(start):
@@ -148,21 +147,6 @@ def test_large_gradients_that_adam_can_square_pass(start):
     trainer.train()
     moments = trainer.optimizers.optimizers["scales"].state_dict()["state"][0]["exp_avg_sq"]
     assert torch.isfinite(moments).all() and moments.max() > 1e33
-
-
-def test_the_message_names_tensor_rows_and_cause(start):
-    trainer = start()
-    poison(trainer, at=2, name="latents", value=NAN, row=5)
-    with pytest.raises(TrainingStopped) as stopped:
-        trainer.train()
-    message = str(stopped.value)
-    for part in (
-        "Training stopped at step 2: the gradient of gauss_params.latents has NaN.",
-        f"1 of {trainer.pipeline.model.num_points} splats, first 5.",
-        "Likely cause: ",
-        "The update of step 2 was not made.",
-    ):
-        assert part in message, message
 
 
 def test_the_cause_broken_image(start):
@@ -180,7 +164,7 @@ def test_the_cause_learning_rate(start):
         trainer.train()
 
 
-@pytest.mark.parametrize("name", ["means", "quats", "opacities", "latents"])
+@pytest.mark.parametrize("name", ["means", "latents"])
 def test_a_splat_that_is_not_finite_is_named_and_left_out(start, name):
     trainer = start(steps=3)
     count = trainer.pipeline.model.num_points
@@ -288,11 +272,10 @@ def test_a_training_without_splats_stops_and_saves_nothing(start):
 
 def test_now_and_then_a_view_may_see_nothing():
     nothing, something = {"gaussian_ids": torch.empty(0)}, {"gaussian_ids": torch.arange(3)}
-    guard = Guard(SimpleNamespace(model=SimpleNamespace(info=nothing)))
+    guard = Guard(SimpleNamespace(model=SimpleNamespace(info=nothing, num_points=3)))
 
-    def blind(info, steps=1):
-        guard.model.info = info
-        return [guard._out_of_sight() for _ in range(steps)]
-
-    assert not any(blind(nothing, PATIENCE - 1) + blind(something) + blind({}))
-    assert not any(blind(nothing, PATIENCE - 1)) and blind(nothing) == [True]
+    for infos in ([nothing] * (PATIENCE - 1), [something], [{}], [nothing] * (PATIENCE - 1)):
+        for guard.model.info in infos:
+            guard._check_visibility()
+    with pytest.raises(TrainingStopped):
+        guard._check_visibility()

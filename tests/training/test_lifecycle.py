@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils import writer
@@ -19,8 +18,8 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance import gsnb, sg
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training.checkpoint_files import DiskFull, read_latest
-from nrfgs_ns.training.run import evaluate, parse
+from nrfgs_ns.training.checkpoint_files import read_latest
+from nrfgs_ns.training.run import evaluate
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -43,6 +42,8 @@ METHODS = {
     "nrfgs-sg": {},
 }
 """Each method, with options for a test."""
+POINTS = 300
+"""Of the tiny scene."""
 STORED = {
     "nrfgs": (3 + 32, 6664),
     "nrfgs-sh": (48, 0),
@@ -98,6 +99,8 @@ def test_train_eval_render(method, finished, tmp_path, tiny_scene):
     colors, shared = STORED[method]
     assert results["parameter_bytes"] == 4 * (pipeline.model.num_points * (3 + 3 + 4 + 1 + colors) + shared)
 
+    if method != "nrfgs":
+        return
     ComputePSNR(config, tmp_path / "again.json", render_output_path=tmp_path / "pairs").main()
     assert [file.name[:13] for file in sorted((tmp_path / "pairs").iterdir())] == ["eval_img_0000", "eval_img_0001"]
     DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
@@ -105,16 +108,6 @@ def test_train_eval_render(method, finished, tmp_path, tiny_scene):
     for output in ("rgb", "depth", "accumulation", "gt-rgb"):
         folder = tmp_path / "renders" / "test" / output
         assert sorted(file.stem for file in folder.rglob("*.png")) == sorted(Path(name).stem for name in names)
-
-
-def test_training_changes_everything_and_densifies(finished, tiny_scene):
-    _, pipeline, _, _ = eval_setup(finished("nrfgs"))
-    model = pipeline.model
-    points = json.loads((tiny_scene / "scene.json").read_text())["config"]["points"]
-    assert model.num_points != points
-    assert {len(value) for value in model.gauss_params.values()} == {model.num_points}
-    # A field that had not learnt would still have zero output layers.
-    assert model.head.low[-1].weight.abs().max() > 0 and model.head.high[-1].weight.abs().max() > 0
 
 
 @pytest.mark.parametrize(
@@ -129,6 +122,7 @@ def test_training_changes_everything_and_densifies(finished, tiny_scene):
 def test_all_that_a_head_adds_is_learning(method, groups, finished):
     """Adam's running mean of every tensor's gradient has moved, and there is one for each of the tensor's numbers."""
     state = checkpoint_of(finished(method))
+    assert len(state["pipeline"]["_model.gauss_params.means"]) != POINTS, "nothing was densified"
     for group in groups:
         learning = state["optimizers"][group]["state"]
         assert learning and all((of_one["exp_avg"] != 0).any() for of_one in learning.values()), group
@@ -192,25 +186,6 @@ def test_checkpoint_of_another_head_is_refused(method, more, says, finished, tin
     assert "--load-config" in str(error.value)
 
 
-def test_unknown_head_is_refused_before_training(tiny_scene, tmp_path):
-    config = parse(options(tiny_scene, tmp_path))
-    config.pipeline.model.appearance = "sparkle"
-    with pytest.raises(InputError, match="sparkle"):
-        config.setup(local_rank=0, world_size=1).setup()
-
-
-def test_impossible_setting_is_refused_before_training(tiny_scene, tmp_path):
-    with pytest.raises(InputError, match="num_bands is 0"):
-        set_up(options(tiny_scene, tmp_path, "nrfgs", {"--pipeline.model.appearance.num-bands": 0}))
-
-
-def test_saved_config_is_the_run(finished):
-    config = yaml.load(finished("nrfgs").read_text(), Loader=yaml.Loader)
-    assert config.pipeline.model.appearance.latent_dim == 32
-    assert config.machine.device_type == "cpu" or torch.cuda.is_available()
-    assert config.pipeline.model.densification == BUSY["--pipeline.model.densification"]
-
-
 def test_a_training_writes_into_no_log_of_an_earlier_one(tiny_scene, tmp_path):
     earlier = []
     for name in ("first", "second"):
@@ -239,20 +214,3 @@ def test_the_collector_is_held_off_while_training_and_no_longer(ends, tiny_scene
     with nullcontext() if ends else pytest.raises(KeyboardInterrupt):
         trainer.train()
     assert calls == ["collect", "freeze", "step", "unfreeze"]
-
-
-def test_checkpoint_is_written_aside_and_moved(tiny_scene, tmp_path, monkeypatch):
-    """A save that is cut short leaves the older checkpoint, and nothing that --load-dir would take for a newer one."""
-    trainer = set_up(options(tiny_scene, tmp_path, steps=1))
-    trainer.train()
-    folder = trainer.checkpoint_dir
-    before = sorted(folder.iterdir())
-
-    def torn(state, path):
-        Path(path).write_bytes(b"half a check")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(torch, "save", torn)
-    with pytest.raises(DiskFull):
-        trainer.save_checkpoint(5)
-    assert sorted(folder.iterdir()) == before

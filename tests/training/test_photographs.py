@@ -36,61 +36,28 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 @pytest.mark.parametrize(
     ("choice", "pairs", "known", "wanted", "words"),
     [
-        (
-            "auto",
-            SAME,
-            [NAN] * 11,
-            False,
-            "varies by 0.01 stops, colour by 0.01 (learnt from 0.12, or 0.06 in colour); EXIF has no exposures",
-        ),
+        ("auto", SAME, [NAN] * 11, False, "varies by 0.01 stops, colour by 0.01"),
         ("auto", DIFFERENT, [NAN] * 11, True, "exposure varies by 0.38 stops"),
         ("auto", pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them"),
         ("auto", pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
-        (
-            "auto",
-            pairs_with([]),
-            [NAN] * 11,
-            False,
-            "in common to compare them (learnt from 0.12, or 0.06 in colour); EXIF has no exposures",
-        ),
-        ("auto", SAME, [0.3] * 11, False, "EXIF: the same exposure"),
-        ("auto", SAME, [0.3] + [NAN] * 10, False, "EXIF: the same exposure"),
-        ("auto", SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: almost the same exposure"),
+        ("auto", SAME, [0.3] + [NAN] * 10, False, "EXIF: exposure varies by 0.00 stops"),
+        ("auto", SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: exposure varies by 0.10 stops"),
         # The light changed, and the camera followed it.
         ("auto", SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of the difference"),
-        ("auto", pairs_with([0.0] * 10), [0.0, 0.9] * 5 + [0.0], False, "which explains 0% of the difference"),
-        (
-            "auto",
-            DIFFERENT,
-            [0.0, 0.5] * 5 + [0.0],
-            True,
-            "colour by 0.01; EXIF: almost the same",
-        ),
-        (
-            "auto",
-            DIFFERENT,
-            [0.0, 0.7] * 5 + [0.0],
-            True,
-            "exposure varies by 0.35 stops, which explains",
-        ),
-        ("on", SAME, [NAN] * 11, True, "option photographs is on; exposure varies"),
+        ("auto", DIFFERENT, [0.0, 0.7] * 5 + [0.0], True, "exposure varies by 0.35 stops, which explains"),
+        ("on", SAME, [NAN] * 11, True, "EXIF: no exposures"),
     ],
 )
-def test_the_evidence_decides_and_is_told(choice, pairs, known, wanted, words):
+def test_the_evidence_decides(choice, pairs, known, wanted, words):
     seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
-    found, why = verdict(choice, Evidence(pairs, CENTERS, torch.tensor(known), seen))
-    assert found == wanted
-    assert words in why
+    decision, numbers = verdict(choice, Evidence(pairs, CENTERS, torch.tensor(known), seen))
+    assert decision == wanted and words in numbers
 
 
 def test_exposure_in_stops():
-    assert exposure({"exposure_time": 0.02, "iso": 100, "f_number": 4.0}) - exposure(
-        {"exposure_time": 0.01, "iso": 50, "f_number": 4.0}
-    ) == pytest.approx(2.0)
-    assert exposure({"exposure_time": 0.01, "iso": 100, "f_number": 2.0}) - exposure(
-        {"exposure_time": 0.01, "iso": 100, "f_number": 4.0}
-    ) == pytest.approx(2.0)
-    assert exposure({"exposure_time": 1e300, "iso": 1e300, "f_number": 1e-300}) == pytest.approx(1200 * math.log2(10))
+    exif = {"exposure_time": 0.01, "iso": 100, "f_number": 4.0}
+    assert exposure({**exif, "exposure_time": 0.02, "iso": 200}) - exposure(exif) == pytest.approx(2.0)
+    assert exposure({**exif, "f_number": 2.0}) - exposure(exif) == pytest.approx(2.0)
     assert math.isnan(exposure({"f_number": 2.0, "iso": 100})) and math.isnan(exposure({}))
 
 
@@ -172,16 +139,12 @@ def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path, monkeypatc
     checkpoint = checkpoint_of(config)
     assert not any("photograph" in name for name in checkpoint["pipeline"])
     assert "photograph" not in checkpoint["optimizers"]
-    monkeypatch.setenv("NRFGS_LOOK", "view_001.png")
-    load_model(config, "test")
-    assert "learnt no photograph's exposure" in " ".join(capsys.readouterr().out.split())
-
-
-def test_a_checkpoint_of_the_other_choice_is_refused(tiny_scene, tmp_path):
-    config = trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 2, QUICK))
     more = {"--load-dir": models_of(config), "--pipeline.model.photographs": "on"}
     with pytest.raises(InputError, match="pipeline.model.photographs off"):
         trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "on", 2, QUICK, more))
+    monkeypatch.setenv("NRFGS_LOOK", "view_001.png")
+    load_model(config, "test")
+    assert "learnt no photograph's exposure" in " ".join(capsys.readouterr().out.split())
 
 
 def test_both_corrections_at_once_are_refused(tiny_scene, tmp_path):
@@ -202,8 +165,6 @@ def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished,
     monkeypatch.setenv("NRFGS_LOOK", brightest)
     assert (model.get_outputs_for_camera(camera)["rgb"] - mean).mean() > 0.02
     monkeypatch.setenv("NRFGS_LOOK", "nobody.jpg")
-    with pytest.raises(InputError, match="nobody.jpg"):
-        model.get_outputs_for_camera(camera)
     with pytest.raises(InputError, match="nobody.jpg"):  # a training says so before its first step
         model.learn_photographs(model.photograph)
 
@@ -261,11 +222,14 @@ def test_what_is_behind_a_cut_out_photograph_is_exposed_with_it(tiny_scene, tmp_
 
 def test_robust_loss_trims_and_goes_on(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr("nrfgs_ns.image.robust.FIRST_STEP", 1)
-    robust = {"--pipeline.model.robust-loss": 0.1}
-    whole = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "whole", 4, QUICK, robust))
-    assert checkpoint_of(whole)["pipeline"]["_model.trimming.histogram"].sum() > 0
-    half = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "half", 2, QUICK, robust))
-    rest = command_line("nrfgs-sh", tiny_scene, tmp_path / "rest", 4, QUICK, robust, {"--load-dir": models_of(half)})
-    assert_same_training(checkpoint_of(whole), checkpoint_of(trained(rest)), rtol=0, atol=0)
-    with pytest.raises(InputError, match="robust_loss is 2.0"):
-        trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 1, QUICK, {"--pipeline.model.robust-loss": 2.0}))
+
+    def train(name, steps, *more):
+        out = tmp_path / name
+        return trained(
+            command_line("nrfgs-sh", tiny_scene, out, steps, QUICK, {"--pipeline.model.robust-loss": 0.1}, *more)
+        )
+
+    whole = checkpoint_of(train("whole", 4))
+    assert whole["pipeline"]["_model.trimming.histogram"].sum() > 0
+    rest = train("rest", 4, {"--load-dir": models_of(train("half", 2))})
+    assert_same_training(whole, checkpoint_of(rest), rtol=0, atol=0)

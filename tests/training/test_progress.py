@@ -35,7 +35,7 @@ def screen(monkeypatch):
 
 def test_a_training_with_the_line_is_the_one_without(screen, tiny_scene, tmp_path, monkeypatch):
     """The second goes on from a checkpoint, though nerfstudio names step 0 with what it logs before the first step."""
-    monkeypatch.setattr(progress, "IN_A_FILE", 0.0)
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
     said = screen(terminal=False)
     options = {"--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4"}
     half = trained(command_line("nrfgs", tiny_scene, tmp_path / "half", 6, options))
@@ -76,4 +76,4 @@ def test_in_a_file_there_is_a_line_each_minute(seconds_a_step, screen, monkeypat
             printed = len(said.getvalue())
             written.append(now[0])
     gaps = [after - before for before, after in zip(written, written[1:], strict=False)]
-    assert max(gaps) <= 60 and min(gaps) >= progress.IN_A_FILE - 1e-6 and written[0] == seconds_a_step
+    assert max(gaps) <= 60 and min(gaps) >= progress.SECONDS_BETWEEN_LINES - 1e-6 and written[0] == seconds_a_step

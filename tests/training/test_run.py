@@ -6,37 +6,26 @@ from pathlib import Path
 
 import pytest
 
+import nrfgs_ns
 from nrfgs_ns.training.cpu_command import scale_for, ten_minute_command
-from nrfgs_ns.training.evaluation_table import far_below, print_evaluation
-from nrfgs_ns.training.run import digest_of, machine, source_digest
-
-
-def package(folder: Path, files: dict[str, bytes]) -> Path:
-    for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content)
-    return folder
+from nrfgs_ns.training.evaluation import far_below, print_evaluation
+from nrfgs_ns.training.run import digest_of, machine
 
 
 def test_the_digest_is_of_names_and_contents(tmp_path):
+    def digest(files: dict[str, bytes]) -> str:
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        for name, content in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+        return digest_of(folder)
+
     files = {"a.py": b"x = 1\n", "part/b.py": b""}
-    digest = digest_of(package(tmp_path / "one", files))
-    assert len(digest) == 12 and int(digest, 16) >= 0
-    assert digest_of(package(tmp_path / "same", {**files, "part/c.txt": b"notes", "d.pyc": b"\xff"})) == digest
-    assert digest_of(package(tmp_path / "windows", {**files, "a.py": b"x = 1\r\n"})) == digest
-    others = (
-        {**files, "a.py": b"x = 2\n"},
-        {**files, "c.py": b""},
-        {"a.py": b"", "part/b.py": b"x = 1\n"},
-        {"a.py": b"x = 1\n", "other/b.py": b""},
-    )
-    assert digest not in [digest_of(package(tmp_path / str(i), other)) for i, other in enumerate(others)]
-
-
-def test_a_record_names_the_source_it_was_made_with():
-    import nrfgs_ns
-
-    assert machine()["source"] == source_digest() == digest_of(Path(nrfgs_ns.__file__).parent)
+    same = {**files, "part/c.txt": b"notes"}, {**files, "a.py": b"x = 1\r\n"}
+    others = {**files, "a.py": b"x = 2\n"}, {**files, "c.py": b""}, {"a.py": b"", "part/b.py": b"x = 1\n"}
+    assert {digest(each) for each in same} == {digest(files)}
+    assert digest(files) not in [digest(each) for each in others]
+    assert machine()["source"] == digest_of(Path(nrfgs_ns.__file__).parent)
 
 
 @pytest.mark.parametrize(
@@ -58,26 +47,23 @@ def test_the_scale_fits_the_photographs(content, scale, tmp_path):
     )
 
 
-def test_a_folder_without_transforms_has_a_command_too(tmp_path):
-    assert "--time-budget 10" in ten_minute_command(tmp_path / "nowhere")
-
-
 def views(*psnrs: float | None) -> list[dict]:
     return [
         {"image": f"{index}.png", **({} if value is None else {"psnr": value})} for index, value in enumerate(psnrs)
     ]
 
 
-def test_views_far_below_the_rest_are_named_the_worst_first():
-    found = far_below(views(25.0, 26.0, 12.0, 25.5, 26.5, 8.0, 25.2, 25.8, None))
-    assert [name for name, *_ in found] == ["5.png", "2.png"]
-
-
-def test_views_that_differ_as_views_do_are_not():
-    assert far_below(views(20.0, 22.0, 24.0, 26.0, 28.0, 30.0)) == []  # spread widely
-    assert far_below(views(25.0, 25.1, 25.0, 25.1, 25.0, 23.0)) == []  # spread little: 2 dB are not far
-    assert far_below(views(25.0, 25.0, 25.0, 5.0)) == []  # too few
-    assert far_below([]) == []
+@pytest.mark.parametrize(
+    ("psnrs", "names"),
+    [
+        ((25.0, 26.0, 12.0, 25.5, 26.5, 8.0, 25.2, 25.8, None), ["5.png", "2.png"]),
+        ((20.0, 22.0, 24.0, 26.0, 28.0, 30.0), []),  # spread widely
+        ((25.0, 25.1, 25.0, 25.1, 25.0, 23.0), []),  # spread little: 2 dB are not far
+        ((25.0, 25.0, 25.0, 5.0), []),  # too few
+    ],
+)
+def test_views_far_below_the_rest_are_named_the_worst_first(psnrs, names):
+    assert [name for name, *_ in far_below(views(*psnrs))] == names
 
 
 def test_the_table_has_what_was_measured(capsys):

@@ -12,7 +12,7 @@ import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, command_line, trained
-from smoke_runs import PLAIN, after_one_step, bound, cases, gain_bound
+from smoke_runs import PLAIN, bound, gain_bound
 from smoke_runs import STEPS as SHORT
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
@@ -53,11 +53,6 @@ def test_real_photographs_train_and_the_field_is_ahead_of_harmonics(scene, captu
     }
     assert all(value > bound(f"{scene}/{method}") for method, value in reached.items()), reached
     assert reached["nrfgs"] - reached["nrfgs-sh"] > gain_bound(scene), reached
-
-
-def test_bounds_of_short_trainings_tell_learning_from_nothing():
-    assert all(bound(case) > after_one_step(case) + 2 for case in cases())
-    assert gain_bound("fox") > 0 and gain_bound("kitchen") > 0
 
 
 SERVER = Path(__file__).resolve().parents[1] / "helpers" / "forked_trainings.py"

@@ -4,7 +4,6 @@
 import os
 import signal
 import sys
-import threading
 
 import pytest
 import torch
@@ -34,19 +33,6 @@ def test_what_is_ignored_stays_so():
         assert request.signal is None
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_another_thread_changes_nothing():
-    before, seen = signal.getsignal(signal.SIGINT), []
-
-    def look():
-        with heard_signals(StopRequest()):
-            seen.append(signal.getsignal(signal.SIGINT))
-
-    thread = threading.Thread(target=look)
-    thread.start()
-    thread.join()
-    assert seen == [before]
 
 
 @pytest.mark.parametrize(
