@@ -58,11 +58,8 @@ def find(folder: Path) -> dict[int, Path]:
 
 
 def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = True) -> Path:
-    """Write a checkpoint beside its folder, sync it to disk, move it into the folder, and remove older ones.
-
-    Raises:
-        DiskFull: it could not be written.
-    """
+    """Write a checkpoint beside its folder, sync it to disk, move it into the folder, and remove older ones; DiskFull
+    where it cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)
     final = folder / f"step-{step:09d}.ckpt"
     for abandoned in folder.parent.glob(f"{folder.name}.*.writing"):  # by killed processes
@@ -101,12 +98,7 @@ def _not_written(folder: Path, step: int, content: Mapping[str, Any], error: Exc
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a checkpoint, tensors in host memory, if every byte is as it was written.
-
-    Raises:
-        Damaged: it is not.
-        FileNotFoundError: there is none.
-    """
+    """Read a checkpoint, tensors in host memory; Damaged where a byte is not as it was written."""
     allow_nerfstudio_checkpoints()
     try:
         with zipfile.ZipFile(path) as archive:
@@ -135,10 +127,7 @@ def read_or_refuse(path: Path) -> dict[str, Any]:
 
 def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, Any]]:
     """Read a folder's last checkpoint, or that of a step; where the last is damaged the one before, with a warning.
-
-    Raises:
-        InputError: there is none, or none that can be read.
-    """
+    InputError where none can be read."""
     checkpoints = checkpoints_in(folder)
     if step is not None:
         if step not in checkpoints:

@@ -39,12 +39,8 @@ FIX = "Name the config.yml that the training saved"
 
 
 def read_config(path: Path) -> TrainerConfig:
-    """The configuration of a training.
-
-    Raises:
-        InputError: there is no such file, it is no whole configuration, it names anything else, or a value has another
-            type than its option.
-    """
+    """The configuration of a training; InputError where the file is no whole one, names anything else than the module's
+    docstring lists, or has a value of another type than its option."""
     if not path.is_file():
         raise InputError(f"{path}: no such file. {FIX}.")
     if path.stat().st_size > LARGEST_FILE:

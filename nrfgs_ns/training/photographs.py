@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a training learns what happened to each photograph, and from where it starts.
-
-It does if the capture needs it: if EXIF says that exposure varies, or if photographs disagree about the same points by
-more than their places explain (`image/overlap.py`). What they say is where it starts.
+"""Whether a training learns each photograph's exposure and white balance, and from where it starts: it does if EXIF
+says that exposure varies, or if photographs disagree about the same points by more than their places explain
+(`image/overlap.py`).
 """
 
 import math

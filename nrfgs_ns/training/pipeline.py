@@ -81,10 +81,7 @@ class NrfgsPipeline(VanillaPipeline):
         allow_nerfstudio_checkpoints()
         check_types(config, "config.yml", "pipeline.")  # nerfstudio's commands construct whatever the file holds
         if test_mode == "val" and config.compact is not None:
-            raise InputError(
-                f"pipeline.compact is {config.compact}, but a training does not begin with a compact file. Leave it "
-                "out; --load-dir goes on from a checkpoint."
-            )
+            raise InputError(f"pipeline.compact is {config.compact}; a training begins with --load-dir. Leave it out.")
         on_cuda = torch.device(device).type == "cuda"
         wake = [partial(torch.empty, 1, device=device)] if on_cuda else []
         with tried_meanwhile(wake, torch.device(device)):  # CUDA starts while the data set is checked
@@ -112,11 +109,8 @@ class NrfgsPipeline(VanillaPipeline):
             )
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load a checkpoint, or the compact file that the configuration names.
-
-        Raises:
-            InputError: either cannot be this model's, or the checkpoint is damaged.
-        """
+        """Load a checkpoint, or the compact file that the configuration names; InputError where it cannot be this
+        model's, or is damaged."""
         check_seal(loaded_state, step)
         if self.config.compact is not None:
             state = model_state(self.model, self.config.compact)

@@ -31,7 +31,6 @@ class TrainRecord:
     args: list[str]
     """the command, after `ns-train`"""
     config_path: str
-    """its config.yml"""
     steps: int = 0
     """completed steps"""
     seconds: float = 0.0

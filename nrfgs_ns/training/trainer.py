@@ -47,10 +47,9 @@ class NrfgsTrainer(Trainer):
     Attributes:
         total_steps: steps of the whole training, including those before a checkpoint.
         line: the progress line; None: nothing is shown, or nerfstudio's table.
-        pace: how fast the training walks through its schedules; None: position and step are the same.
-        steps_are_chosen: whether the number of training views decides how many steps are made.
+        pace: position on the schedules; None: the step.
+        steps_are_chosen: whether the number of training views decides the number of steps.
         mean: the parameters' mean over the last steps; None without `average_steps`.
-        request: the signal that was received, if any.
     """
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
@@ -121,11 +120,7 @@ class NrfgsTrainer(Trainer):
     # Resuming.
 
     def _load_checkpoint(self) -> None:
-        """Resume from the checkpoint that the configuration names, if any.
-
-        Raises:
-            InputError: it is damaged, its data set or the meaning of its numbers is another, or the training is over.
-        """
+        """Resume from the checkpoint that the configuration names, if any; InputError where that cannot be."""
         config = self.config
         path = config.load_checkpoint
         if config.load_dir is not None:
@@ -185,16 +180,15 @@ class NrfgsTrainer(Trainer):
             pace.load_state(written)
         else:
             pace.position = float(self._start_step)  # the checkpoint's schedules were not stretched
-        if isinstance(pace, TimedPace):
-            if pace.is_spent:
-                raise InputError(
-                    f"The training has used its time budget of {self.config.time_budget:g} minutes: there is nothing "
-                    "left to do. A larger --time-budget goes on."
-                )
-        else:
+        if not isinstance(pace, TimedPace):
             rate = (pace.length - pace.position) / self.config.max_num_iterations
             if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # an unchanged rate stays the same to the last bit
                 pace.rate = max(rate, 1e-9)
+        elif pace.is_spent:
+            raise InputError(
+                f"The training has used its time budget of {self.config.time_budget:g} minutes: there is nothing "
+                "left to do. A larger --time-budget goes on."
+            )
         self.pipeline.model.schedule_at(int(pace.position))
 
     def optimizer_configs(self) -> dict[str, Any]:
@@ -206,11 +200,11 @@ class NrfgsTrainer(Trainer):
     # Training.
 
     def train(self) -> None:
-        """Train, from parameters that are finite.
+        """Train.
 
         Raises:
             TrainingStopped: a number is not finite, or the memory has run out; what is good has been written.
-            SystemExit: a signal has ended it, with the status of that; the state has been written.
+            SystemExit: a signal has ended it, with that signal's status; the state has been written.
         """
         with self._last_good_state_on_disk():  # the warm-up comes before the first step
             self.guard.step = self._start_step
@@ -251,11 +245,7 @@ class NrfgsTrainer(Trainer):
             track(self.pipeline, step, pictures)
 
     def train_iteration(self, step: int):
-        """One step.
-
-        Raises:
-            TrainingStopped: this step, or on a GPU the one before, met a number that is not finite.
-        """
+        """One step; TrainingStopped where it, or on a GPU the one before, met a number that is not finite."""
         model, pace = self.pipeline.model, self.pace
         if pace is not None:
             pace.begin_step()
@@ -355,11 +345,8 @@ class NrfgsTrainer(Trainer):
 
     @contextmanager
     def _state_on_disk_if_it_fails(self) -> Iterator[None]:
-        """Save the last complete step when something other than a signal or the guard ends the training.
-
-        Raises:
-            TrainingStopped: the memory has run out. Other exceptions are raised again.
-        """
+        """Save the last complete step when something other than a signal or the guard ends the training. Raises
+        TrainingStopped where the memory has run out; other exceptions are raised again."""
         try:
             yield
         except (InputError, TrainingStopped, DiskFull):
@@ -402,11 +389,8 @@ class NrfgsTrainer(Trainer):
         return f"Step {self._made} is {self._where_it_goes_on}."
 
     def take_the_mean(self) -> None:
-        """Replace the parameters by their mean over the last steps, if there is one, and say so.
-
-        Raises:
-            TrainingStopped: the last step met a number that is not finite; the last good state has been written.
-        """
+        """Replace the parameters by their mean over the last steps, if there is one, and say so; TrainingStopped where
+        the last step met a number that is not finite."""
         mean = self.mean
         if mean is None:
             return
@@ -429,12 +413,8 @@ class NrfgsTrainer(Trainer):
     # Checkpoints.
 
     def save_checkpoint(self, step: int) -> None:
-        """Write a checkpoint of finite numbers. Where the disk is full the training goes on, with a warning.
-
-        Raises:
-            TrainingStopped: a number is not finite; the last good state has been written.
-            DiskFull: at the end of the training.
-        """
+        """Write a checkpoint of finite numbers, or raise TrainingStopped, with the last good state on disk. Where the
+        disk is full the training goes on with a warning, except at its end: DiskFull."""
         with self._last_good_state_on_disk():
             self.guard.settle()
             self.guard.check_parameters(self.optimizers)

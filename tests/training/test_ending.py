@@ -242,7 +242,7 @@ def test_a_folder_beyond_the_systems_encoding_is_refused(tiny_scene, tmp_path):
     "more", [{"--pipeline.model.num-downscales": 5}, {"--pipeline.datamanager.camera-res-scale-factor": 0.01}]
 )
 def test_images_too_small_to_begin_with_are_refused(more, tiny_scene, tmp_path):
-    with pytest.raises(InputError, match="(1 x 1|0 x 0) pixels.*--pipeline.model.num-downscales"):
+    with pytest.raises(InputError, match="1 x 1 pixels.*--pipeline.model.num-downscales|0.01 leaves nothing"):
         ready(tiny_scene, tmp_path, more)
 
 
@@ -300,23 +300,17 @@ def test_a_configuration_leads_to_its_data_from_any_folder(tiny_scene, tmp_path,
     assert config.output_dir == Path("out"), "the configuration itself stays what it is"
 
 
-@pytest.mark.parametrize("words", [[], ["nrfgs-data"], ["colmap"]])
-def test_what_ns_train_says_before_it_begins(words, tiny_scene, tmp_path, capsys):
+def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, capsys):
     """Data may be named as nerfstudio's documentation does it: `ns-train nrfgs nrfgs-data --data FOLDER`."""
-    config = parse(["nrfgs", *words, "--data", str(tiny_scene)])
-    capsys.readouterr()
-    config.print_to_terminal()
-    said = capsys.readouterr().out.splitlines()
-    assert said == [f"nrfgs on {tiny_scene}"]
-
-
-def test_without_data_the_working_folder_is_looked_at(tiny_scene, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="--data is missing"):
         parse(["nrfgs"]).print_to_terminal()
     monkeypatch.chdir(tiny_scene)
-    parse(["nrfgs"]).print_to_terminal()
-    assert f"nrfgs on {tiny_scene}" in capsys.readouterr().out
+    for words in ([], ["--data", str(tiny_scene)], ["nrfgs-data", "--data", str(tiny_scene)]):
+        config = parse(["nrfgs", *words])
+        capsys.readouterr()
+        config.print_to_terminal()
+        assert capsys.readouterr().out.splitlines() == [f"nrfgs on {tiny_scene}"]
 
 
 def test_only_who_needs_the_advice_gets_it(tiny_scene, tmp_path, capsys):

@@ -149,18 +149,20 @@ def test_large_gradients_that_adam_can_square_pass(start):
     assert torch.isfinite(moments).all() and moments.max() > 1e33
 
 
-def test_the_cause_broken_image(start):
+@pytest.mark.parametrize(
+    ("name", "scale", "cause"),
+    [
+        ("loss", None, r"the image or mask is broken: .*view_\d+.png"),
+        ("scales", 25.0, "Lower --optimizers.scales.optimizer.lr"),
+    ],
+)
+def test_the_cause_broken_image(name, scale, cause, start):
+    """Or a learning rate."""
     trainer = start()
-    poison(trainer, at=2, name="loss", value=NAN)
-    with pytest.raises(TrainingStopped, match=r"the image or mask is broken: .*view_\d+.png"):
-        trainer.train()
-
-
-def test_the_cause_learning_rate(start):
-    trainer = start()
-    trainer.pipeline.model.scales.data[3] = 25.0
-    poison(trainer, at=2, name="scales", value=INF, row=3)
-    with pytest.raises(TrainingStopped, match="Lower --optimizers.scales.optimizer.lr"):
+    if scale is not None:
+        trainer.pipeline.model.scales.data[3] = scale
+    poison(trainer, at=2, name=name, value=NAN, row=3)
+    with pytest.raises(TrainingStopped, match=cause):
         trainer.train()
 
 

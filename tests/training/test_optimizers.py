@@ -78,7 +78,7 @@ def assert_same(sides):
             assert torch.equal(mine.state[a][name], value), name
 
 
-@pytest.mark.parametrize("options", [{}, {"weight_decay": 0.1}, {"betas": (0.5, 0.9)}])
+@pytest.mark.parametrize("options", [{}, {"weight_decay": 0.1, "betas": (0.5, 0.9)}])
 def test_steps_are_torchs(options):
     sides = twins(**options)
     for step in range(5):

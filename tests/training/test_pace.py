@@ -16,7 +16,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.method_config import nrfgs, nrfgs_best, nrfgs_fast, nrfgs_sh
+from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import pace, trainer_config
 from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import STEPS_BEFORE_PLANNING, Pace, TimedPace, resolution_phases, steps_for
@@ -268,24 +268,19 @@ VIEWS = 8
 """Training views of the tiny scene."""
 
 
-def test_few_views_have_ten_thousand_steps_and_many_thirty_thousand():
-    assert [steps_for(views) for views in (1, 17, 83, 84, 150, 250, 255, 5000)] == [
-        10_000, 10_000, 10_000, 10_080, 18_000, 30_000, 30_000, 30_000,
-    ]  # fmt: skip
+def test_what_is_left_open_is_chosen_and_what_is_given_stays():
+    few_and_many = {1: 10_000, 83: 10_000, 84: 10_080, 250: 30_000, 5000: 30_000}
+    assert {views: steps_for(views) for views in few_and_many} == few_and_many
 
+    def chosen(**options):
+        config = replace(nrfgs.config, **options).for_views(60)
+        return config.max_num_iterations, config.schedule_steps, config.average_steps
 
-def test_what_is_left_open_is_chosen_and_what_is_said_stays():
-    chosen = nrfgs.config.for_views(60)
-    assert (chosen.max_num_iterations, chosen.schedule_steps, chosen.average_steps) == (10_000, 30_000, 200)
+    assert chosen() == (10_000, 30_000, 200)
     assert nrfgs.config.max_num_iterations == 0, "the registered configuration was changed"
-    said = replace(nrfgs.config, max_num_iterations=700).for_views(60)
-    assert (said.max_num_iterations, said.schedule_steps, said.average_steps) == (700, None, 0)
-    own = replace(nrfgs.config, schedule_steps=7, average_steps=0).for_views(60)
-    assert (own.max_num_iterations, own.schedule_steps, own.average_steps) == (10_000, 7, 0)
-    timed = replace(nrfgs.config, time_budget=2.0).for_views(60)
-    assert (timed.max_num_iterations, timed.schedule_steps, timed.average_steps) == (30_000, 30_000, 200)
-    for other, steps in ((nrfgs_fast, 10_000), (nrfgs_best, 30_000), (nrfgs_sh, 30_000)):
-        assert other.config.for_views(60).max_num_iterations == steps
+    assert chosen(max_num_iterations=700) == (700, None, 0)
+    assert chosen(schedule_steps=7, average_steps=0) == (10_000, 7, 0)
+    assert chosen(time_budget=2.0) == (30_000, 30_000, 200)
 
 
 @pytest.fixture
