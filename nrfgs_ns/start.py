@@ -41,10 +41,8 @@ def with_methods() -> None:
 
 
 def _compile_when_called(torch_compile: Callable) -> Callable:
-    """Nerfstudio's `torch_compile`, which as a decorator waits for the function's first call.
-
-    torch.compile imports torch's compiler, a tenth of a command's start, for one function of splatfacto's.
-    """
+    """Nerfstudio's `torch_compile` as a decorator that waits for the function's first call: torch's compiler, imported
+    for one function of splatfacto's, is a tenth of a command's start."""
 
     @functools.wraps(torch_compile)
     def decorator_or_compiled(*args: Any, **options: Any) -> Any:
@@ -61,11 +59,8 @@ def _compile_when_called(torch_compile: Callable) -> Callable:
 
 
 def _names_of_callers() -> list[SimpleNamespace]:
-    """Names of the running functions, the caller's first, as inspect.stack() has them.
-
-    When nerfstudio lists the methods that could be installed, it asks 26 times for the function two calls up through
-    inspect.stack(), which reads the source of every frame: two fifths of a command's start.
-    """
+    """Names of the running functions, the caller's first. Nerfstudio asks 26 times through inspect.stack(), which reads
+    the source of every frame: two fifths of a command's start."""
     frame, frames = sys._getframe(1), []
     while frame is not None:
         frames.append(SimpleNamespace(function=frame.f_code.co_name))
