@@ -103,7 +103,8 @@ def test_exported_files(tiny_scene, tmp_path):
     worth = ply["psnr_model"] - ply["psnr_base"]
     assert worth > 0.5
     assert abs(ply["loss_db"]) < worth / 3 and abs(compact["loss_db"]) < worth / 3
-    assert compact["view_dependent"] > 0 and compact["ply_ratio"] > 3
+    # Nearly half of so small a file is the network, which all splats share.
+    assert compact["view_dependent"] > 0 and compact["ply_ratio"] > 2
 
 
 def test_every_mode(tiny_scene, tmp_path):
