@@ -173,7 +173,7 @@ CATALOGUE = [
         "below 0: clamped at 0 after the residual, no gradient below",
         "not bounded above; finite to 1e18. Not finite: the splat is not drawn, the guard names it",
         (
-            f"{HEAD}::test_base_colours",
+            f"{HEAD}::test_coordinates_latents_and_base_colours",
             f"{RASTER}::test_large_colours",
             f"{RASTER}::test_a_splat_that_is_not_finite_is_not_there",
         ),
@@ -184,7 +184,7 @@ CATALOGUE = [
         "any to 1e20",
         "0: colour and direction alone speak",
         "tanh saturates: residual at its bound, gradient 0. Beside weights, |z||W|^2 must stay below 1e38",
-        (f"{HEAD}::test_latents_of_1e4_to_1e20", f"{HEAD}::test_latents_and_weights_together"),
+        (f"{HEAD}::test_coordinates_latents_and_base_colours", f"{HEAD}::test_latents_and_weights_together"),
         lambda: field(latent=1e20) and field(latent=1e4, weight=1e4),
     ),
     Quantity(
@@ -249,7 +249,7 @@ CATALOGUE = [
         "[0, inf), within 0.2 of c",
         "clamped at 0",
         "the image is clamped at 1, without gradient above",
-        (f"{HEAD}::test_latents_and_weights_together", f"{HEAD}::test_base_colours"),
+        (f"{HEAD}::test_latents_and_weights_together", f"{HEAD}::test_coordinates_latents_and_base_colours"),
         field,
     ),
     Quantity(
