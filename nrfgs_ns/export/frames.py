@@ -37,11 +37,14 @@ class Similarity:
             return splats
         rotation = self.rotation.to(splats.means.device)
         quats = np.roll(splats.quats.double().cpu().numpy(), -1, axis=1)
-        turned = Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(quats)
+        undrawn = ~(np.linalg.norm(quats, axis=1) > 0)  # without a rotation, which SciPy refuses
+        quats[undrawn] = 1.0
+        turned = (Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(quats)).as_quat()
+        turned[undrawn] = np.nan
         means = self.scale * splats.means.double() @ rotation.T + self.translation.to(rotation)
         return splats._replace(
             means=means.to(splats.means.dtype),
-            quats=torch.from_numpy(np.roll(turned.as_quat(), 1, axis=1)).to(splats.quats),
+            quats=torch.from_numpy(np.roll(turned, 1, axis=1)).to(splats.quats),
             scales=splats.scales + torch.tensor(self.scale).log().item(),
             features_rest=torch.einsum(
                 "ab,nbc->nac", _turned_harmonics(rotation).to(splats.features_rest), splats.features_rest

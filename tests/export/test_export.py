@@ -23,6 +23,7 @@ from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export import ply
 from nrfgs_ns.export.command import Compact, Export, Ply, Web
+from nrfgs_ns.export.frames import Y_DOWN
 from nrfgs_ns.export.options import CompactOptions, WebOptions
 from nrfgs_ns.export.ply import read_splats, render_splats, write_splats
 from nrfgs_ns.image.metrics import psnr
@@ -121,6 +122,12 @@ def test_splats_that_cannot_be_drawn_are_left_out(tmp_path):
     with pytest.raises(InputError, match="none of the 6 splats"):
         write_splats(splats, tmp_path / "none.ply")
     assert not list(tmp_path.glob("none.ply*"))
+
+
+def test_a_splat_without_a_rotation_is_left_out_of_a_turned_scene(tmp_path):
+    splats = random_splats(4)
+    splats.quats[2] = 0.0
+    assert write_splats(Y_DOWN.moved(splats), tmp_path / "splats.ply") == 3
 
 
 def test_other_files_are_refused(tmp_path, tiny_scene):
