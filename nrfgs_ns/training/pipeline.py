@@ -182,8 +182,8 @@ class NrfgsPipeline(VanillaPipeline):
             if values or get_std:
                 result[metric] = fmean(values) if values else None
             if get_std:
-                deviation = torch.tensor(values, dtype=torch.float64).std()  # statistics.stdev takes no infinity
-                result[f"{metric}_std"] = float(deviation) if len(values) > 1 else None
+                spread = torch.tensor(values, dtype=torch.float64)  # statistics.stdev takes no infinity
+                result[f"{metric}_std"] = float(spread.std()) if len(values) > 1 else None
         seconds = fmean(image["seconds_per_image"] for image in per_image[1:] or per_image)
         result |= {"seconds_per_image": seconds, "fps": 1.0 / seconds, "splats": self.model.num_points}
         result["parameter_bytes"] = self.model.parameter_bytes

@@ -83,9 +83,10 @@ def finished(tiny_scene, tmp_path_factory):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_train_eval_render(method, finished, tmp_path, tiny_scene):
+def test_train_eval_render(method, finished, tmp_path, tiny_scene, recwarn):
     config = finished(method)
     results = evaluate(config, tmp_path / "eval.json")
+    assert not [warning for warning in recwarn if "degrees of freedom" in str(warning.message)]
     images = results["per_image"]
     assert len(images) == 2
     assert results["psnr"] == pytest.approx(sum(image["psnr"] for image in images) / 2)
