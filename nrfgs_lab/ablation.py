@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 from torch import Tensor
 
+from nrfgs_lab.training_run import machine
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.reduce import (
@@ -37,7 +38,6 @@ from nrfgs_ns.model.harmonics_fit import look_through
 from nrfgs_ns.progress import progress
 from nrfgs_ns.trained.find import NamesTraining
 from nrfgs_ns.trained.loading import load_model
-from nrfgs_ns.training.run import machine
 
 TIMED = 5
 """Evaluations of a view's head; the fastest counts, because other work on the machine only adds."""

@@ -20,12 +20,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from nrfgs_lab.training_run import machine, train
 from nrfgs_ns.compact import finetune
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.options import CompactOptions, PlyOptions
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import harmonics_tune
-from nrfgs_ns.training.run import machine, train
 
 
 @dataclass

@@ -22,9 +22,9 @@ from torch import nn
 
 from nrfgs_lab.bench.spec import Job
 from nrfgs_lab.lock import only_one
+from nrfgs_lab.training_run import TrainRecord, evaluate, machine, train
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
-from nrfgs_ns.training.run import TrainRecord, evaluate, machine, train
 
 PROGRESS_SECONDS = 1.0
 """Time between two notes of a training's step."""

@@ -76,7 +76,7 @@ class Demo:
             # Heavy imports only when there is work to do: `nrfgs --help` answers at once, and so does a refusal.
             from nrfgs_lab.demo.pictures import contact_sheet, strip
             from nrfgs_lab.demo.views import Look, where_it_shines
-            from nrfgs_ns.training.run import evaluate, machine, train
+            from nrfgs_lab.training_run import evaluate, machine, train
 
             views, highlights = {}, {}
             for method, label in self.methods.items():

@@ -22,10 +22,10 @@ import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from nrfgs_lab.bench.spec import QUIET
+from nrfgs_lab.training_run import machine, parse
 from nrfgs_ns.distributed.launch import free_port, join_group
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import initial_splats
-from nrfgs_ns.training.run import machine, parse
 
 
 @dataclass

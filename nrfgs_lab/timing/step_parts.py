@@ -27,9 +27,9 @@ from nerfstudio.scripts.train import _set_random_seed
 from nrfgs_lab.bench.measure import FULL_HD, at_size, frames_per_second
 from nrfgs_lab.bench.run import host_without_downloads
 from nrfgs_lab.bench.spec import QUIET
+from nrfgs_lab.training_run import machine, parse
 from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.files import write_whole
-from nrfgs_ns.training.run import machine, parse
 
 VARIANTS = "whole", "without graph", "at rest: whole", "at rest: without graph"
 UNTIMED = 5

@@ -33,9 +33,8 @@ from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory
 from nrfgs_ns.training.checkpoint_files import read_or_refuse
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.identity import leaves
-from nrfgs_ns.training.run import parse
 from nrfgs_ns.training.trainer import NrfgsTrainer
-from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig
+from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, parse
 
 BACKGROUND = "pipeline.model.background_color"
 MODELS = "nerfstudio_models"

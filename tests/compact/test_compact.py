@@ -18,6 +18,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import command_line, set_up, trained
 from torch.testing import assert_close
 
+from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_rank
@@ -32,7 +33,6 @@ from nrfgs_ns.compact.tables import Precision
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.trained.loading import load_file, load_model
-from nrfgs_ns.training.run import evaluate
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

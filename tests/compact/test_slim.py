@@ -10,7 +10,7 @@ from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.reduce import latent_basis, with_diffuse, with_rank
 from nrfgs_ns.compact import slim as slimming
 from nrfgs_ns.compact.slim import EIGHT_BIT_STEP, FieldViews, dropped, look_over, slim
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 LOUD = {

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from nrfgs_ns.densification import Mcmc, Original, Splatfacto, strategy_from
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.host import gsplat_version
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -11,7 +11,7 @@ from nrfgs_ns.densification.thinning import ROUNDS, least_missed, missed
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.robust import Trimming
 from nrfgs_ns.model.training_views import TrainingPictures
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

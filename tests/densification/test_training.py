@@ -8,9 +8,9 @@ from densification_cases import arguments, tensors, trainer_of
 from short_trainings import checkpoint_of, models_of, set_up
 from torch.testing import assert_close
 
+from nrfgs_lab.training_run import train
 from nrfgs_ns.densification import CHANGE, UNSEEN
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training.run import train
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -31,7 +31,7 @@ from nrfgs_ns.model import harmonics_fit, harmonics_tune
 from nrfgs_ns.model.harmonics_fit import STRENGTHS, Moments, Observations, PlainSplats, fit_harmonics, observe
 from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.trained.loading import load_model
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

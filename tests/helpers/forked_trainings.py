@@ -13,7 +13,7 @@ import traceback
 
 import torch
 
-from nrfgs_ns.training.run import train
+from nrfgs_lab.training_run import train
 
 
 def dying_at(step: int):

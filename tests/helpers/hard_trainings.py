@@ -25,8 +25,8 @@ from plyfile import PlyData
 from rich.progress import track
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
+from nrfgs_lab.training_run import evaluate, machine, train
 from nrfgs_ns.method_config import nrfgs
-from nrfgs_ns.training.run import evaluate, machine, train
 
 SCENE = SceneConfig(views=16, width=48, height=36, points=600, samples=2)
 """Small enough for a run a minute on one core."""

@@ -8,8 +8,8 @@ import torch
 from nerfstudio.scripts.train import _set_random_seed
 from torch.testing import assert_close
 
+from nrfgs_lab.training_run import parse, train
 from nrfgs_ns.training.checkpoint_files import read_latest
-from nrfgs_ns.training.run import parse, train
 from nrfgs_ns.training.trainer import NrfgsTrainer
 
 QUIET = {

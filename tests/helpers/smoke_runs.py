@@ -59,7 +59,7 @@ def psnr(method: str, data: Path, out: Path, steps: int, options: dict[str, Any]
     """PSNR of a training's test views."""
     from short_trainings import command_line, trained
 
-    from nrfgs_ns.training.run import evaluate
+    from nrfgs_lab.training_run import evaluate
 
     config = trained(command_line(method, data, out, steps, options, {"--machine.seed": seed}))
     return evaluate(config, out / "eval.json")["psnr"]

@@ -9,11 +9,11 @@ import pytest
 import torch
 from short_trainings import command_line, trained
 
+from nrfgs_lab.training_run import evaluate, parse
 from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.options import CompactOptions, PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.rasterizer import composite
-from nrfgs_ns.training.run import evaluate, parse
 from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture
 
 pytestmark = [

@@ -7,8 +7,8 @@ from nerfstudio.engine.optimizers import Optimizers
 from smoke_runs import METHODS, PLAIN, STEPS, bound
 from torch.testing import assert_close
 
+from nrfgs_lab.training_run import evaluate, parse, train
 from nrfgs_ns.appearance.sh import eval_sh
-from nrfgs_ns.training.run import evaluate, parse, train
 
 pytestmark = [
     pytest.mark.gpu,

@@ -18,7 +18,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import FixedPinholes, pinhole, world_to_camera
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -10,7 +10,7 @@ from nrfgs_ns.model.warmup import warm_up
 
 @pytest.fixture
 def build(tiny_scene, tmp_path, no_cuda):
-    from nrfgs_ns.training.run import parse
+    from nrfgs_ns.training.trainer_config import parse
 
     def pipeline(method="nrfgs", *options):
         config = parse([method, "--data", str(tiny_scene), "--output-dir", str(tmp_path), *options])

@@ -16,8 +16,8 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.checkpoint_files import DiskFull, find
 from nrfgs_ns.training.guard import TrainingStopped
-from nrfgs_ns.training.run import parse
 from nrfgs_ns.training.trainer import NrfgsTrainer, writer
+from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

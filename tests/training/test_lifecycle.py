@@ -15,11 +15,11 @@ from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
+from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance import gsnb, sg
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.checkpoint_files import read_latest
-from nrfgs_ns.training.run import evaluate
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -15,12 +15,12 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 
+from nrfgs_lab.training_run import parse, train
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import pace, trainer_config
 from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import STEPS_BEFORE_PLANNING, Pace, TimedPace, resolution_phases, steps_for
-from nrfgs_ns.training.run import parse, train
 
 LENGTH = 30_000
 

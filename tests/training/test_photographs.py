@@ -15,7 +15,7 @@ from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, verdict
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 
 NAN = math.nan
 

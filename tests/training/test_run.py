@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import nrfgs_ns
+from nrfgs_lab.training_run import digest_of, machine
 from nrfgs_ns.training.cpu_command import scale_for, ten_minute_command
 from nrfgs_ns.training.evaluation import far_below, print_evaluation
-from nrfgs_ns.training.run import digest_of, machine
 
 
 def test_the_digest_is_of_names_and_contents(tmp_path):

@@ -16,9 +16,9 @@ from smoke_runs import PLAIN, bound, gain_bound
 from smoke_runs import STEPS as SHORT
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
+from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.training.checkpoint_files import read_latest
-from nrfgs_ns.training.run import evaluate
 
 
 def psnr(method: str, data: Path, out: Path, steps: int, *options: dict) -> float:

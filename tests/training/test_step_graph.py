@@ -7,7 +7,7 @@ import pytest
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 
-from nrfgs_ns.training.run import evaluate, parse, train
+from nrfgs_lab.training_run import evaluate, parse, train
 from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs
 from nrfgs_ns.training.trainer import NrfgsTrainer
 

@@ -23,7 +23,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact
 from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.trained.view import View, view_file
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")

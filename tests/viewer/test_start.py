@@ -14,7 +14,7 @@ from viser import _icons
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 from nrfgs_ns.viewer import start
 
 pytestmark = pytest.mark.usefixtures("no_cuda")

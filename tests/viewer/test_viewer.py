@@ -37,7 +37,7 @@ from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 from nrfgs_ns.viewer.pictures import (
     BASE,
     DEPTH,

@@ -19,9 +19,9 @@ from nrfgs_lab.bench.command import Bench
 from nrfgs_lab.bench.executor import Queue, Submitted, Task
 from nrfgs_lab.bench.run import forget_other_arguments, last_checkpoint, record_until, train_or_continue
 from nrfgs_lab.bench.spec import Job
+from nrfgs_lab.training_run import TrainRecord
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
-from nrfgs_ns.training.run import TrainRecord
 
 
 def job_in(folder: Path, method="nrfgs", steps=100) -> Job:

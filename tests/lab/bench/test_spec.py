@@ -29,7 +29,7 @@ from nrfgs_lab.pages.options import methods
 from nrfgs_lab.pages.tables.methods import HEADS, best_trial
 from nrfgs_ns.densification import Mcmc, Original, Splatfacto
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training.run import parse
+from nrfgs_ns.training.trainer_config import parse
 
 ROOT = Path(__file__).resolve().parents[3]
 SMALL = {"runs": {"SH": "nrfgs-sh", "NRF": "nrfgs"}, "scenes": ["bonsai"]}

@@ -14,18 +14,18 @@ from pathlib import Path
 import pytest
 import torch
 import tyro
+from nerfstudio.configs import method_configs
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
 from smoke_runs import after_one_step
 
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
 from nrfgs_lab.pages.tables import pages
+from nrfgs_lab.training_run import evaluate, parse, train
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import commands
 from nrfgs_ns.densification import strategy_from
-from nrfgs_ns.training import run
-from nrfgs_ns.training.run import evaluate, parse, train
 from nrfgs_ns.viewer.pictures import modes
 
 CONTRIBUTING = Path(__file__).resolve().parents[3] / "docs" / "contributing.md"
@@ -65,7 +65,7 @@ def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tm
     assert descriptions["linear"] == "Colours that are linear in the view direction."
     # nerfstudio looks for methods when it is first imported; here it was imported long ago.
     monkeypatch.setitem(eval_utils.all_methods, "linear", configs["linear"])
-    monkeypatch.setattr(run, "AnnotatedBaseConfigUnion", run.tyro.extras.subcommand_type_from_defaults(configs))
+    monkeypatch.setattr(method_configs, "AnnotatedBaseConfigUnion", tyro.extras.subcommand_type_from_defaults(configs))
     args = ["linear", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "25"]
     args += ["--vis", "tensorboard", "--pipeline.model.densification", "splatfacto,warmup_length=5,refine_every=10"]
     args += ["--steps-per-eval-image", "1000", "--steps-per-eval-all-images", "1000"]

@@ -12,16 +12,14 @@ from time import perf_counter
 from typing import Any
 
 import torch
-import tyro
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler
 from nerfstudio.utils.misc import step_check
 
 import nrfgs_ns
+from nrfgs_ns.training.trainer_config import parse
 
 
 @dataclass
@@ -43,15 +41,6 @@ class TrainRecord:
     """pairs (step, seconds until then) of the checkpoints"""
     parts: int = 1
     """number of processes: more than one if it was interrupted and went on from a checkpoint"""
-
-
-def parse(args: list[str]) -> TrainerConfig:
-    """The configuration that `ns-train ARGS` would run."""
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=args)
-    if config.data:
-        config.pipeline.datamanager.data = config.data
-    config.set_timestamp()
-    return config
 
 
 def train(
@@ -131,18 +120,13 @@ def machine() -> dict[str, str]:
         "device": torch.cuda.get_device_name() if cuda else f"{torch.get_num_threads()} CPU threads",
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "source": source_digest(),
+        "source": digest_of(Path(nrfgs_ns.__file__).parent),
     }
 
 
-def source_digest() -> str:
-    """`digest_of` this package's files, installed or uncommitted ones, too. That of a commit: `git archive COMMIT
-    nrfgs_ns | tar x -C EMPTY`, and `digest_of(EMPTY/nrfgs_ns)`."""
-    return digest_of(Path(nrfgs_ns.__file__).parent)
-
-
 def digest_of(package: Path) -> str:
-    """Twelve hexadecimal digits that identify the names and contents of the Python files in a package's folder."""
+    """Twelve hexadecimal digits that identify the names and contents of a package's Python files, uncommitted ones too.
+    Those of a commit: `git archive COMMIT nrfgs_ns | tar x -C EMPTY`, and `digest_of(EMPTY/nrfgs_ns)`."""
     digest = hashlib.sha256()
     for file in sorted(package.rglob("*.py"), key=lambda file: file.relative_to(package).as_posix()):
         for part in (file.relative_to(package).as_posix(), file.read_text(encoding="utf-8")):
