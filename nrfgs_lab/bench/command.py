@@ -17,14 +17,13 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Annotated, Literal
+from typing import IO, Annotated
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from nrfgs_lab.bench.data import parser_options
-from nrfgs_lab.bench.executor import Queue, Submitted
 from nrfgs_lab.bench.report import FAILURE, report
 from nrfgs_lab.bench.spec import (
     DEFAULT,
@@ -58,7 +57,7 @@ class Running:
     """A running child."""
 
     name: str
-    process: subprocess.Popen | Submitted
+    process: subprocess.Popen
     log: IO
     job: Job
 
@@ -76,6 +75,8 @@ class Bench:
 
     spec: Annotated[Path | None, tyro.conf.Positional] = None
     """YAML file with runs or knobs, strategies, scenes, seeds, ...; options given here override it"""
+    plan: str = ""
+    """the plan to run, of a file with several"""
     scenes: Path = Path(".")
     """folder in which the data sets lie"""
     out: Path = Path("bench")
@@ -102,19 +103,13 @@ class Bench:
     """GPUs to spread the runs over"""
     minutes: float | None = None
     """stop after this time; the next call goes on"""
-    executor: Literal["local", "slurm"] | None = None
-    """run each training as a task of submitit: on this machine, or in a Slurm queue. None: as a child process"""
-    slurm: tuple[str, ...] = ()
-    """parameters of a task, KEY=VALUE: timeout_min=600 partition=gpu gpus_per_node=1 cpus_per_task=8 ..."""
-    queued: int = 64
-    """slurm: largest number of runs in the queue"""
     report_only: bool = False
     """run nothing: report what is there"""
     redo_stale: bool = False
     """rename records of other arguments to NAME.stale, and run them again"""
 
     def main(self) -> None:
-        plan, chosen = self.plan()
+        plan, chosen = self.chosen()
         check_writable(self.out / "table.md", "--out")
         parsers = None if self.report_only else self.parsers(chosen)
         stale = self.stale(plan, chosen, parsers)
@@ -145,10 +140,10 @@ class Bench:
         if failed and not self.report_only:
             sys.exit(f"nrfgs: {len(failed)} of the runs FAILED: {', '.join(failed)}. Logs: {self.work}/NAME.log")
 
-    def plan(self) -> tuple[Spec, list[Cell]]:
+    def chosen(self) -> tuple[Spec, list[Cell]]:
         """The whole benchmark, and the trainings that this command chooses."""
         where = str(self.spec or "nrfgs bench")
-        content = load_spec(self.spec) if self.spec else {}
+        content = load_spec(self.spec, self.plan) if self.spec else {}
         given = {"steps": self.steps, "options": self.options, "train_views": self.train_views, "jobs": self.jobs}
         content |= {key: value for key, value in {**given, "gpus": self.gpus}.items() if value is not None}
         data, of_file = [scene_path(name) for name in self.data], as_list(content.get("scenes") or [])
@@ -233,11 +228,7 @@ class Bench:
         for folder in (self.out / "runs", self.work):
             folder.mkdir(parents=True, exist_ok=True)
         waiting, running, finished, steps_finished = list(pending.items()), {}, 0, 0
-        queue = Queue(self.executor, self.work, self.slurm) if self.executor else None
-        if self.executor == "slurm":
-            slots = [""] * self.queued
-        else:
-            slots = [gpu for _ in range(plan.jobs) for gpu in gpu_names(plan.gpus)]
+        slots = [gpu for _ in range(plan.jobs) for gpu in gpu_names(plan.gpus)]
         # A training on a GPU needs few CPU threads, but torch takes all cores: side by side they wait for each other.
         threads = max(1, (os.cpu_count() or 1) // len(slots))
         end = float("inf") if self.minutes is None else time.monotonic() + 60 * self.minutes
@@ -266,7 +257,7 @@ class Bench:
                                 write_whole(record.with_suffix(FAILURE), json.dumps(note, indent=1) + "\n")
                                 say(f"  see {done.log.name}")
                         if slot not in running and waiting:
-                            running[slot] = self.start(*waiting.pop(0), gpu, threads, queue)
+                            running[slot] = self.start(*waiting.pop(0), gpu, threads)
                             say(f"{running[slot].name}: started")
                     steps = steps_finished + sum(child.steps() for child in running.values())
                     progress.update(bar, completed=steps, description=f"{finished} of {len(pending)} runs")
@@ -278,16 +269,12 @@ class Bench:
                     child.process.wait()
                     child.log.close()
 
-    def start(self, name: str, job: Job, gpu: str, threads: int, queue: Queue | None) -> Running:
-        """Start a job on a GPU, or queue it. OMP_NUM_THREADS goes before `threads`."""
+    def start(self, name: str, job: Job, gpu: str, threads: int) -> Running:
+        """Start a job on a GPU. OMP_NUM_THREADS goes before `threads`."""
         self.record(name).with_suffix(FAILURE).unlink(missing_ok=True)
         file = self.work / f"{name}.job.json"
         write_whole(file, json.dumps(asdict(job), indent=1))
         log = (self.work / f"{name}.log").open("a")
-        if queue is not None:
-            note = self.work / f"{name}.task.json"
-            task = queue.start(name, [*CHILD, str(file.resolve())], Path(log.name), gpu, note)
-            return Running(name, task, log, job)
         environment = {"OMP_NUM_THREADS": str(threads), **os.environ, "CUDA_VISIBLE_DEVICES": gpu}
         process = subprocess.Popen([*CHILD, str(file)], stdout=log, stderr=subprocess.STDOUT, env=environment)
         return Running(name, process, log, job)

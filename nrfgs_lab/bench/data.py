@@ -2,21 +2,22 @@
 """Data parsers of a benchmark: every 8th image by name is a test image.
 
 - `transforms.json`: `nrfgs-data`, with the data set's own split if it names one.
-- `sparse/0` (or `colmap/sparse/0`, or `sparse`): nerfstudio's `colmap`. It counts images in the order of COLMAP's
-  numbers, so the folder is mirrored by links into the work folder, beside lists of the names of each split.
+- A COLMAP model: nerfstudio's `colmap`. It counts images in the order of COLMAP's numbers, so the folder is mirrored by
+  links into the work folder, beside lists of the names of each split.
 - Held out: a data set of the training views alone, at half the size, some of which are test views, in the work folder:
   for choosing settings without looking at test views.
 """
 
 import json
 import shutil
-import struct
 from pathlib import Path
 
 from PIL import Image
 
 from nrfgs_lab.bench.spec import Scene
 from nrfgs_lab.lock import only_one
+from nrfgs_ns.data.checks import find_colmap
+from nrfgs_ns.data.colmap import read_model
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole, write_whole
@@ -24,21 +25,13 @@ from nrfgs_ns.files import whole, write_whole
 TEST_EVERY = 8
 QUALITY = 92
 """Quality of the JPEGs of held-out data sets."""
-MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
-"""Places of a COLMAP reconstruction."""
-ROUNDINGS = {
-    "floor": lambda side, factor: side // factor,
-    "round": lambda side, factor: int(side / factor + 0.5),
-    "ceil": lambda side, factor: -(-side // factor),
-}
-"""nerfstudio's option -> side of a downscaled image."""
 
 
 def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     """Name and options of the data parser, the last words of ns-train's command line.
 
     Mirrored and held-out data sets are written below `mirrors`. InputError if the folder has neither layout, or the
-    downscaled images are missing or of an unknown size.
+    downscaled images are missing.
     """
     folder, mirror = root / scene.path, mirrors / scene.name
     if scene.held_out is not None:
@@ -50,20 +43,18 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
         scale = [] if scene.downscale is None else ["--downscale-factor", str(scene.downscale)]
         split = [] if names_its_split(folder / "transforms.json") else ["--eval-mode", "interval"]
         return ["nrfgs-data", "--data", str(folder), *split, *scale, *scene.options]
-    model = colmap_model(folder)
+    model = find_colmap(folder)
     if model is None:
         raise InputError(
-            f"{folder} has neither transforms.json nor a COLMAP reconstruction ({', '.join(MODELS)} with cameras.bin "
-            "or cameras.txt). Give a folder in one of these layouts (--scenes ROOT, and scenes: in the file)."
+            f"{folder} has neither transforms.json nor a COLMAP model (sparse/0 or colmap/sparse/0). Name a folder "
+            "that has one below --scenes."
         )
-    factor = scene.downscale or 1
+    smaller = folder / f"images_{scene.downscale}"
+    if scene.downscale and not smaller.is_dir():
+        raise InputError(f"{smaller} is missing. Downscale the images into it, or choose a factor that is there.")
     mirror_with_split(folder, model, mirror)
-    return [
-        *("colmap", "--data", str(mirror), "--colmap-path", model),
-        *("--downscale-factor", str(factor)),
-        *(["--downscale-rounding-mode", rounding(folder, factor, model)] if factor > 1 else []),
-        *scene.options,
-    ]
+    parser = ["colmap", "--data", str(mirror), "--colmap-path", model, "--downscale-factor", str(scene.downscale or 1)]
+    return [*parser, *scene.options]
 
 
 def held_out_views(names: list[str], first: int) -> list[str]:
@@ -112,32 +103,9 @@ def names_its_split(transforms: Path) -> bool:
         return False
 
 
-def colmap_model(folder: Path) -> str | None:
-    """Path of the reconstruction in a folder, or None."""
-    for model in MODELS:
-        if any((folder / model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return model
-    return None
-
-
-def image_names(model: Path) -> list[str]:
-    """Sorted names of a reconstruction's images, from text if there is text (as nerfstudio); InputError if torn."""
-    from nerfstudio.data.utils.colmap_parsing_utils import read_images_binary, read_images_text
-
-    text = (model / "cameras.txt").is_file()
-    file = model / ("images.txt" if text else "images.bin")
-    try:
-        images = read_images_text(file) if text else read_images_binary(file)
-    except (OSError, ValueError, IndexError, struct.error) as error:
-        raise InputError(
-            f"{file} cannot be read as COLMAP's ({error}). Restore it, or export the model anew."
-        ) from error
-    return sorted(image.name for image in images.values())
-
-
 def mirror_with_split(folder: Path, model: str, mirror: Path) -> None:
     """Link the content of `folder` into `mirror`, beside lists of training and test images; replace links elsewhere."""
-    names = image_names(folder / model)
+    names = sorted(view.name for view in read_model(folder / model)[1])
     if len(names) < 2:
         raise InputError(f"{folder / model} has {len(names)} images; one to train on and one to test are needed.")
     mirror.mkdir(parents=True, exist_ok=True)
@@ -153,26 +121,3 @@ def mirror_with_split(folder: Path, model: str, mirror: Path) -> None:
                 aside.symlink_to(target, target_is_directory=target.is_dir())
     for split, members in lists.items():
         write_whole(mirror / f"{split}_list.txt", "".join(f"{name}\n" for name in members))
-
-
-def rounding(folder: Path, factor: int, model: str) -> str:
-    """Rounding of the sides of images_FACTOR, from the first image of the reconstruction."""
-    originals, smaller = folder / "images", folder / f"images_{factor}"
-    if not smaller.is_dir():
-        raise InputError(
-            f"{smaller} is missing. Downscale the images into it, or choose a factor that is there (scenes: downscale)."
-        )
-    name = image_names(folder / model)[0]
-    original, same = originals / name, smaller / name
-    for file in (original, same):
-        if not file.is_file():
-            raise InputError(f"{smaller} and {originals} must hold images of the same names; {file} is missing.")
-    with Image.open(original) as large, Image.open(same) as small:
-        sizes = large.size, small.size
-    for mode, rounded in ROUNDINGS.items():
-        if tuple(rounded(side, factor) for side in sizes[0]) == sizes[1]:
-            return mode
-    raise InputError(
-        f"{same} is {sizes[1][0]} x {sizes[1][1]}, which is not {sizes[0][0]} x {sizes[0][1]} / {factor} however "
-        "rounded. Downscale the images again."
-    )

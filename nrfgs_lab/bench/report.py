@@ -18,7 +18,7 @@ FAILURE = ".failed"
 
 
 def report(spec: Spec, cells: list[Cell], out: Path, work: Path, stale: dict[str, str]) -> None:
-    """Print the table; write table.md, summary.json, splats.png, crops/, with knobs tradeoff.{md,json,png} into OUT.
+    """Print the table; write table.md, summary.json, splats.png, crops/, with knobs tradeoff.{md,png} into OUT.
 
     Args:
         spec: the benchmark.

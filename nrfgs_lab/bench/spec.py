@@ -185,14 +185,17 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def load_spec(path: Path) -> dict[str, Any]:
-    """Content of a YAML file, for `make_spec`; InputError if it cannot be read or is no mapping."""
+def load_spec(path: Path, plan: str = "") -> dict[str, Any]:
+    """Content of a YAML file, or of one of its `plans`, for `make_spec`; InputError if it cannot be read."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
-    _require(isinstance(content, dict), f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md.")
-    return content
+    plans = content.get("plans", {"": content}) if isinstance(content, dict) else {"": content}
+    if plan not in plans:
+        raise InputError(f"{path} has {', '.join(filter(None, plans)) or 'no plans'}. Give --plan one of them.")
+    _require(isinstance(plans[plan], dict), f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md.")
+    return plans[plan]
 
 
 def make_spec(content: dict[str, Any], where: str) -> Spec:

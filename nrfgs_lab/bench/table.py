@@ -28,8 +28,6 @@ class Column:
     """values are divided by this"""
     is_time: bool = False
     """valid only for runs alone on their GPU, and comparable on one machine"""
-    in_summary_only: bool = False
-    """in summary.json, not in the table"""
 
 
 def _at(*keys: str) -> Callable[[Record], float | None]:
@@ -53,13 +51,11 @@ def _gap(record: Record) -> float | None:
 METRICS = {"PSNR": ("{:.2f}", 1), "SSIM": ("{:.4f}", 1), "MS-SSIM": ("{:.4f}", 1), "LPIPS": ("{:.4f}", -1)}
 METRICS |= {"FLIP": ("{:.4f}", -1), "L1": ("{:.4f}", -1)}
 """Metric -> format, and 1 where more is better."""
-NAMES = *METRICS, *(f"cc {name}" for name in METRICS)
-KEYS = {name: name.lower().replace("-", "_").replace(" ", "_") for name in NAMES}
-"""Metric, plain or colour-corrected -> its key in a record."""
 
 
-def _metric(name: str, **more: bool) -> Column:
-    return Column(name, _at("measured", "test", KEYS[name]), *METRICS[name.removeprefix("cc ")], **more)
+def _metric(name: str) -> Column:
+    key = name.lower().replace("-", "_").replace(" ", "_")
+    return Column(name, _at("measured", "test", key), *METRICS[name.removeprefix("cc ")])
 
 
 COLUMNS = (
@@ -73,16 +69,8 @@ COLUMNS = (
     Column("peak MB", _at("train", "peak_memory_bytes"), "{:.1f}", -1, 1e6),
     Column("train PSNR", _at("measured", "train", "psnr"), "{:.2f}"),
     Column("gap", _gap, "{:.2f}"),
-    *(_metric(name, in_summary_only=True) for name in ("cc MS-SSIM", "cc LPIPS", "cc L1")),
-    *(
-        Column(f"train {name}", _at("measured", "train", key), "{:.4f}", in_summary_only=True)
-        for name, key in KEYS.items()
-        if name in ("SSIM", "MS-SSIM", "LPIPS", "L1", "cc PSNR")
-    ),
 )
 BY_NAME = {column.name: column for column in COLUMNS}
-SHOWN = tuple(column for column in COLUMNS if not column.in_summary_only)
-"""Columns of the table."""
 MISSING, STALE, FAILED = "missing", "stale", "FAILED"
 ABSENCES = (MISSING, STALE, FAILED)
 """Reasons for a missing record, the gravest last."""
@@ -237,12 +225,12 @@ def markdown(rows: list[Row]) -> str:
     present = [row for row in rows if has_run(row)]
     for place in dict.fromkeys((row.scene, row.strategy) for row in present):
         group = [row for row in present if (row.scene, row.strategy) == place]
-        ranked = {column.name: ranks(group, column) for column in SHOWN}
+        ranked = {column.name: ranks(group, column) for column in COLUMNS}
         for number, row in enumerate(group):
             mark = {1: "**{}**", 2: "_{}_"}
-            cells = [mark.get(ranked[one.name].get(number), "{}").format(row.text(one)) for one in SHOWN]
+            cells = [mark.get(ranked[one.name].get(number), "{}").format(row.text(one)) for one in COLUMNS]
             body.append([*map(plain_markdown, [row.scene, row.run, row.strategy, row.seeds]), *cells])
-    lines = [HEAD + [column.name for column in SHOWN], ["---"] * len(HEAD) + ["---:"] * len(SHOWN), *body]
+    lines = [HEAD + [column.name for column in COLUMNS], ["---"] * len(HEAD) + ["---:"] * len(COLUMNS), *body]
     text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
     return text + "".join(f"\n{note}\n" for note in [*map(plain_markdown, not_run(rows)), *notes(rows)])
 

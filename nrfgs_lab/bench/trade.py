@@ -12,7 +12,6 @@ Costs (time, frames, bytes) are compared as ratios, by their logarithms. Without
 down; otherwise a setting is better, worse, or within the noise.
 """
 
-import json
 import math
 import statistics
 from collections.abc import Sequence
@@ -146,96 +145,62 @@ def front_of(rows: Sequence[Row], cost: str) -> list[str]:
 
 
 def report(rows: list[Row], knobs: dict[str, str], out: Path) -> None:
-    """Write OUT/tradeoff.{md,json,png} and print the table.
+    """Write OUT/tradeoff.{md,png} and print the table.
 
     Args:
         rows: those of a plan with knobs, and their averages over scenes.
         knobs: run -> knob.
     """
-    results, texts = [], []
+    texts = []
     for scene in dict.fromkeys(row.scene for row in rows):
         of_scene = [row for row in rows if row.scene == scene]
         default = next((row for row in of_scene if row.run == DEFAULT), None)
         if default is not None:
-            result = compare(of_scene, default, knobs)
-            results.append({"scene": scene, **result})
-            texts.append(f"### {plain_markdown(scene)}\n\n{table(of_scene, default, result)}")
+            texts.append(f"### {plain_markdown(scene)}\n\n{table(of_scene, default)}")
     text = "\n".join([*texts, *(f"{note}\n" for note in [*LEGEND, *notes(rows)])])
     write_whole(out / "tradeoff.md", text)
-    write_whole(out / "tradeoff.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
     if any(row.records for row in rows):
         draw(rows, knobs, out / "tradeoff.png")
     Console(soft_wrap=True, markup=False, highlight=False).print(text)
     print(f"Trade: {out / 'tradeoff.md'}, {out / 'tradeoff.png'}")
 
 
-def compare(rows: list[Row], default: Row, knobs: dict[str, str]) -> dict[str, Any]:
-    """Comparison of one scene's settings with the default, as plain data: fronts by cost, and each setting's means,
-    changes with their noise (null if unknown), and prices.
-    """
-    changed = {name: changes(rows, default, BY_NAME[name], name in RATIOS) for name in SHOWN}
-
-    def plain(change: Change | None) -> dict[str, Any] | None:
-        if change is None:
-            return None
-        noise = change.noise if change.noise < math.inf else None
-        return {"value": change.value, "noise": noise, "is_noise": change.is_noise}
-
-    settings = []
-    for row in rows:
-        prices = {}
-        for cost, (column, power) in COSTS.items():
-            gain, paid = changed["PSNR"].get(row.run), changed[column].get(row.run)
-            if row is not default and gain is not None and paid is not None:
-                prices[cost] = price(gain, paid, power)
-        settings.append(
-            {
-                "knob": knobs[row.run],
-                "run": row.run,
-                "strategy": row.strategy,
-                "seeds": sorted(row.records),
-                "absent": {str(seed): why for seed, why in row.absent.items()},
-                "values": {name: [row.mean(BY_NAME[name]), row.deviation(BY_NAME[name])] for name in SHOWN},
-                "changes": {name: plain(changed[name].get(row.run)) for name in SHOWN},
-                "prices": prices,
-            }
-        )
-    return {"fronts": {cost: front_of(rows, cost) for cost in COSTS}, "settings": settings}
-
-
-def table(rows: list[Row], default: Row, result: dict[str, Any]) -> str:
+def table(rows: list[Row], default: Row) -> str:
     """Markdown table of one scene: the default in absolute numbers, the settings as changes."""
+    changed = {name: changes(rows, default, BY_NAME[name], name in RATIOS) for name in SHOWN}
+    fronts = {cost: front_of(rows, cost) for cost in COSTS}
     head = [*HEAD, *(f"dB per doubling of {cost}" for cost in COSTS)]
     lines = [head, ["---"] * 2 + ["---:"] * (len(head) - 2)]
-    for row, plain in zip(rows, result["settings"], strict=True):
+    for row in rows:
         if row is default:
             cells, prices = [row.text(BY_NAME[name]) for name in SHOWN], [""] * len(COSTS)
         else:
-            cells = [change_text(plain["changes"][name], name) for name in SHOWN]
-            prices = [price_text(plain["prices"].get(cost)) for cost in COSTS]
-        stars = [" ★" if row.run in result["fronts"][cost] else "" for cost in COSTS]
+            cells = [change_text(changed[name].get(row.run), name) for name in SHOWN]
+            gain = changed["PSNR"].get(row.run)
+            prices = [price_text(gain, changed[column].get(row.run), power) for column, power in COSTS.values()]
+        stars = [" ★" if row.run in front else "" for front in fronts.values()]
         prices = [(text + star).strip() for text, star in zip(prices, stars, strict=True)]
         name = plain_markdown(row.run)
         lines.append([f"**{name}**" if row is default else name, row.seeds, *cells, *prices])
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
-def change_text(change: dict[str, Any] | None, name: str) -> str:
+def change_text(change: Change | None, name: str) -> str:
     """A change in a cell of the table."""
     if change is None:
         return "-"
-    value = change["value"]
+    value = change.value
     text = f"x {value:.2f}" if name in RATIOS else f"{value:+.2f}" if name == "PSNR" else f"{value:+.4f}"
-    if not change["is_noise"]:
+    if not change.is_noise:
         return text
-    return f"[{text}]" if change["noise"] is None else f"({text})"
+    return f"[{text}]" if change.noise == math.inf else f"({text})"
 
 
-def price_text(priced: tuple[str, float | None] | None) -> str:
+def price_text(gain: Change | None, cost: Change | None, power: int) -> str:
     """A price in a cell of the table."""
-    if priced is None:
+    if gain is None or cost is None:
         return "-"
-    kind, number = priced
+    kind, number = price(gain, cost, power)
     return f"{number:.2f}" if number is not None else WORDS[kind]
 
 

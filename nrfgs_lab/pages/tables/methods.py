@@ -27,7 +27,7 @@ BUDGETS = "mcmc@150000", "mcmc@75000"
 
 
 def half(scene: str, run: str, rule: str = ORIGINAL) -> Trainings:
-    """A run of docs/bench/methods.yaml, or of budgets.yaml."""
+    """A run of the plan `methods`, or of `budgets`."""
     return trainings("methods" if rule == ORIGINAL else "budgets", scene, run, rule)
 
 
@@ -148,7 +148,7 @@ def over_gsnb() -> str:
 
 TRIALS = {"third": "a third of its rate", "triple": "three times its rate", "shrinkage": "shrinkage"}
 HEADS = {"SH": "3DGS", "VDGS": "VDGS", "GSNB": "GSNB", "SG": "SG", "NRF": "NRF-GS"}
-"""Head, as heads.yaml calls it -> its run."""
+"""Head, as the plan `heads` calls it -> its run."""
 
 
 def chosen() -> str:
@@ -178,7 +178,7 @@ def trial_gains(head: str, trial: str) -> list[float]:
 
 SCENES = "bonsai", "goldcape", "fox"
 SAME = {"3DGS": "SH", "VDGS": "VDGS", "GSNB": "GSNB", "NRF": "NRF"}
-"""A run of docs/bench/deviations.yaml that changes nothing -> the same one of heads.yaml."""
+"""A run of the plan `deviations` that changes nothing -> the same one of `heads`."""
 
 
 def worth(change: str) -> str:

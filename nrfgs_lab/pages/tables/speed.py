@@ -14,7 +14,7 @@ SITTING = timedelta(minutes=10)
 
 
 def row_of(run: str, scene: str = "bonsai") -> Row:
-    """Whole trainings, by their names in docs/bench/speed.yaml."""
+    """Whole trainings, by their names in the plan `speed`."""
     return bench_rows("speed")[scene, "own", run]
 
 

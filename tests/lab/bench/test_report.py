@@ -15,7 +15,6 @@ from nrfgs_lab.bench.report import draw_splats, pictures_of, report
 from nrfgs_lab.bench.spec import cells_of, identity, make_spec
 from nrfgs_lab.bench.table import (
     COLUMNS,
-    SHOWN,
     Row,
     markdown,
     ranks,
@@ -82,7 +81,7 @@ def test_strange_names_break_no_table(tmp_path):
     """Each line has the table's columns, and no letter of a name means anything to Markdown or matplotlib."""
     strange = [Row("s", name, "own", {1: record(30.0 + i)}).fill() for i, name in enumerate(NAMES)]
     lines = [line for line in markdown(strange).splitlines() if line.startswith("|")]
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4 + len(SHOWN) + 1}
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4 + len(COLUMNS) + 1}
     assert [re.split(r"(?<!\\)\|", line)[2].strip() for line in lines[2:]] == list(NAMES.values())
     draw_splats([*strange, Row("$^$", "elsewhere", "own", {1: record(30.0)}).fill()], tmp_path)
     assert (tmp_path / "splats.png").stat().st_size > 0

@@ -4,11 +4,11 @@
 import json
 import re
 import shutil
-import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from nerfstudio.utils.eval_utils import eval_setup  # noqa: F401  (registers the data parsers once, before the timing)
 from PIL import Image
 
@@ -16,6 +16,7 @@ from nrfgs_lab.bench.data import held_out_views, parser_options
 from nrfgs_lab.bench.spec import (
     PRESET_STEPS,
     Scene,
+    Spec,
     cells_of,
     command,
     differences,
@@ -42,11 +43,28 @@ def spec(**more):
 # The file.
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "docs" / "bench").glob("*.yaml")), ids=lambda file: file.stem)
-def test_shipped_files_are_valid(file):
-    plan = make_spec(load_spec(file), file.name)
-    cells = cells_of(plan)
-    assert {cell.run for cell in cells} == set(plan.runs) and {cell.scene for cell in cells} == set(plan.scenes)
+def plans() -> dict[tuple[str, str], Spec]:
+    """Each plan of the shipped files, by file and name."""
+    result = {}
+    for file in sorted((ROOT / "docs" / "bench").glob("*.yaml")):
+        for name in yaml.safe_load(file.read_text()).get("plans", [""]):
+            result[file.stem, name] = make_spec(load_spec(file, name), file.name)
+    return result
+
+
+def test_shipped_files_are_valid():
+    for plan in plans().values():
+        cells = cells_of(plan)
+        assert {cell.run for cell in cells} == set(plan.runs) and {cell.scene for cell in cells} == set(plan.scenes)
+
+
+def test_a_file_with_several_plans_wants_a_choice(tmp_path):
+    for plan in ("", "growth"):
+        with pytest.raises(InputError, match="has methods, budgets, .*Give --plan one of them"):
+            load_spec(ROOT / "docs" / "bench" / "methods.yaml", plan)
+    (tmp_path / "one.yaml").write_text("runs: {A: nrfgs}")
+    with pytest.raises(InputError, match="has no plans"):
+        load_spec(tmp_path / "one.yaml", "growth")
 
 
 def test_seeds_come_one_after_the_other_and_strategies_together():
@@ -222,37 +240,21 @@ VIEWS = 10
 FOCAL = 60.0
 
 
-def colmap_scene(folder: Path, text: bool, size=(96, 72), model="sparse/0") -> Path:
+def colmap_scene(folder: Path, size=(96, 72), model="sparse/0") -> Path:
     """A COLMAP data set of 10 cameras on a line looking along z, whose numbers run against their names."""
     rng = np.random.default_rng(0)
-    (folder / "images").mkdir(parents=True)
-    (folder / model).mkdir(parents=True)
-    names = [f"frame_{view:02d}.png" for view in range(VIEWS)]
-    for view, name in enumerate(names):
-        Image.fromarray(np.full((size[1], size[0], 3), 20 * view, np.uint8)).save(folder / "images" / name)
-    poses = [(VIEWS - view, (0.1 * view, 0.05 * view, 3.0 + 0.02 * view**2), names[view]) for view in range(VIEWS)]
-    points = [(i + 1, rng.normal(size=3), rng.integers(0, 255, size=3)) for i in range(20)]
-    camera = (FOCAL, FOCAL, size[0] / 2, size[1] / 2)
     out = folder / model
-    if text:
-        numbers = " ".join(map(str, camera))
-        (out / "cameras.txt").write_text(f"# cameras\n1 PINHOLE {size[0]} {size[1]} {numbers}\n")
-        lines = [f"{i} 1 0 0 0 {x} {y} {z} 1 {name}\n\n" for i, (x, y, z), name in poses]
-        (out / "images.txt").write_text("# images\n" + "".join(lines))
-        lines = [f"{i} {' '.join(map(str, xyz))} {' '.join(map(str, rgb))} 0.5\n" for i, xyz, rgb in points]
-        (out / "points3D.txt").write_text("# points\n" + "".join(lines))
-        return folder
-    pinhole = 1
-    cameras = struct.pack("<Q", 1) + struct.pack("<iiQQ4d", 1, pinhole, *size, *camera)
-    images = struct.pack("<Q", VIEWS)
-    for i, translation, name in poses:
-        images += struct.pack("<i7di", i, 1.0, 0.0, 0.0, 0.0, *translation, 1) + name.encode() + b"\0"
-        images += struct.pack("<Q", 0)
-    cloud = struct.pack("<Q", len(points))
-    for i, xyz, rgb in points:
-        cloud += struct.pack("<Q3d3Bd", i, *xyz, *(int(value) for value in rgb), 0.5) + struct.pack("<Q", 0)
-    for name, content in (("cameras", cameras), ("images", images), ("points3D", cloud)):
-        (out / f"{name}.bin").write_bytes(content)
+    (folder / "images").mkdir(parents=True)
+    out.mkdir(parents=True)
+    lines = []
+    for view in range(VIEWS):
+        name = f"frame_{view:02d}.png"
+        Image.fromarray(np.full((size[1], size[0], 3), 20 * view, np.uint8)).save(folder / "images" / name)
+        lines.append(f"{VIEWS - view} 1 0 0 0 {0.1 * view} {0.05 * view} {3 + 0.02 * view**2} 1 {name}\n\n")
+    (out / "images.txt").write_text("# images\n" + "".join(lines))
+    (out / "cameras.txt").write_text(f"1 PINHOLE {size[0]} {size[1]} {FOCAL} {FOCAL} {size[0] / 2} {size[1] / 2}\n")
+    points = (" ".join(map(str, [*rng.normal(size=3), *rng.integers(0, 255, size=3)])) for _ in range(20))
+    (out / "points3D.txt").write_text("".join(f"{i} {point} 0.5\n" for i, point in enumerate(points, 1)))
     return folder
 
 
@@ -267,9 +269,9 @@ def names_of(dataset) -> list[str]:
     return sorted(Path(name).name for name in dataset.image_filenames)
 
 
-@pytest.mark.parametrize("text, model", [(True, "sparse/0"), (False, "sparse/0"), (False, "colmap/sparse/0")])
-def test_colmap_is_read_with_every_8th_by_name(text, model, tmp_path):
-    colmap_scene(tmp_path / "data" / "line", text, model=model)
+@pytest.mark.parametrize("model", ["sparse/0", "colmap/sparse/0"])
+def test_colmap_is_read_with_every_8th_by_name(model, tmp_path):
+    colmap_scene(tmp_path / "data" / "line", model=model)
     before = sorted((tmp_path / "data").rglob("*"))
     parser = parser_options(tmp_path / "data", Scene("line"), tmp_path / "mirrors")
     assert parser[0] == "colmap"
@@ -285,33 +287,23 @@ def test_colmap_is_read_with_every_8th_by_name(text, model, tmp_path):
     parser_options(tmp_path / "data", Scene("line"), tmp_path / "mirrors")  # a second time, over the first
 
 
-@pytest.mark.parametrize(
-    "size, factor, small, mode",
-    [
-        ((96, 72), 2, (48, 36), "floor"),
-        ((99, 73), 4, (25, 18), "round"),
-        ((99, 73), 4, (24, 18), "floor"),
-        ((97, 73), 8, (13, 10), "ceil"),
-    ],
-)
-def test_downscaled_folders_of_any_rounding(size, factor, small, mode, tmp_path):
-    scene = colmap_scene(tmp_path / "data" / "line", text=False, size=size)
-    shutil.copytree(scene / "images", scene / f"images_{factor}")
-    for file in (scene / f"images_{factor}").iterdir():
-        Image.open(file).resize(small).save(file)
-    parser = parser_options(tmp_path / "data", Scene("line", downscale=factor), tmp_path / "mirrors")
-    assert parser[parser.index("--downscale-rounding-mode") + 1] == mode
-    data = load(parser)
+def test_downscaled_folders_are_read_with_the_scene_s_options(tmp_path):
+    scene = colmap_scene(tmp_path / "data" / "line", size=(97, 73))
+    shutil.copytree(scene / "images", scene / "images_8")
+    for file in (scene / "images_8").iterdir():
+        Image.open(file).resize((13, 10)).save(file)
+    up = Scene("line", downscale=8, options=("--downscale-rounding-mode", "ceil"))
+    data = load(parser_options(tmp_path / "data", up, tmp_path / "mirrors"))
     cameras = data.train_dataset.cameras
-    assert (cameras.width[0].item(), cameras.height[0].item()) == small
-    assert tuple(data.cached_train[0]["image"].shape[:2]) == small[::-1]
-    assert cameras.fx[0].item() == pytest.approx(FOCAL / factor, rel=0.02)
+    assert (cameras.width[0].item(), cameras.height[0].item()) == (13, 10)
+    assert tuple(data.cached_train[0]["image"].shape[:2]) == (10, 13)
+    assert cameras.fx[0].item() == pytest.approx(FOCAL / 8, rel=0.1)
 
 
 def test_a_data_set_of_the_same_name_elsewhere_is_read_there(tmp_path):
     """--scenes has changed, --work has not: a link to the first place would train on other photographs."""
     for place in ("first", "second"):
-        colmap_scene(tmp_path / place / "line", text=False)
+        colmap_scene(tmp_path / place / "line")
         parser = parser_options(tmp_path / place, Scene("line"), tmp_path / "mirrors")
         mirror = Path(parser[parser.index("--data") + 1])
         assert (mirror / "images").resolve() == (tmp_path / place / "line" / "images").resolve()
@@ -385,10 +377,8 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
     "prepare, scene, says",
     [
         (lambda folder: folder.mkdir(parents=True), Scene("line"), "neither transforms.json nor"),
-        (lambda folder: colmap_scene(folder, True), Scene("line", downscale=4), "images_4 is missing"),
-        (lambda folder: wrong_size(colmap_scene(folder, True)), Scene("line", downscale=4), "however rounded"),
-        (lambda folder: torn(colmap_scene(folder, False), None), Scene("line"), "images.bin cannot be read"),
-        (lambda folder: torn(colmap_scene(folder, False), b"abc"), Scene("line"), "images.bin cannot be read"),
+        (colmap_scene, Scene("line", downscale=4), "images_4 is missing"),
+        (lambda folder: (colmap_scene(folder) / "sparse/0/images.txt").write_text("1 2"), Scene("line"), "images.txt"),
     ],
 )
 def test_data_that_cannot_be_read_are_named(prepare, scene, says, tmp_path):
@@ -397,22 +387,8 @@ def test_data_that_cannot_be_read_are_named(prepare, scene, says, tmp_path):
         parser_options(tmp_path, scene, tmp_path / "mirrors")
 
 
-def wrong_size(folder: Path) -> None:
-    (folder / "images_4").mkdir()
-    Image.new("RGB", (50, 20)).save(folder / "images_4" / "frame_00.png")
-
-
-def torn(folder: Path, content: bytes | None) -> None:
-    """Leave this of the list of images, or nothing."""
-    file = folder / "sparse/0/images.bin"
-    file.unlink()
-    if content is not None:
-        file.write_bytes(content)
-
-
 def test_compared_heads_have_what_held_out_views_chose():
-    plans = [make_spec(load_spec(ROOT / f"docs/bench/{name}.yaml"), name) for name in ("heads", "methods")]
-    trials, rows = ({run.name: run for run in plan.runs} for plan in plans)
+    trials, rows = ({run.name: run for run in plans()["methods", name].runs} for name in ("heads", "methods"))
     for head, run in HEADS.items():
         trial = trials[f"{head} {best_trial(head)}".strip()]
         assert rows[run].method == trial.method

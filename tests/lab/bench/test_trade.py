@@ -2,6 +2,7 @@
 """Knobs become a benchmark, its records become a front and prices, and noise is called noise."""
 
 import math
+import re
 
 import pytest
 from hypothesis import given
@@ -11,11 +12,11 @@ from scipy.stats import t as student
 from nrfgs_lab.bench.spec import cells_of, make_spec
 from nrfgs_lab.bench.table import BY_NAME, Row
 from nrfgs_lab.bench.trade import (
+    HEAD,
     PSNR,
     Change,
     change_text,
     changes,
-    compare,
     draw,
     front_of,
     noise_bound,
@@ -158,6 +159,10 @@ def test_front_by_frames_wants_many():
     assert front_of(rows, "time for a frame") == ["fast", "slow"]
 
 
+def cells(markdown: str) -> list[list[str]]:
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in markdown.splitlines()]
+
+
 def test_table_and_figure(tmp_path):
     """Half the time for 1 dB: 1 dB per doubling. 0.01 dB is noise; peak memory is unknown; a setting has no record."""
     rows = [
@@ -167,15 +172,12 @@ def test_table_and_figure(tmp_path):
         row("none"),
     ]
     knobs = {"default": "default", "D_4|": "D", "D 8": "D", "none": "K $"}
-    result = compare(rows, rows[0], knobs)
-    assert result["fronts"]["training time"] == ["D_4|", "D 8"]
-    settings = {one["run"]: one for one in result["settings"]}
-    assert settings["D_4|"]["prices"]["training time"] == ("trade", pytest.approx(1.0))
-    assert settings["D 8"]["changes"]["PSNR"]["is_noise"] and settings["D 8"]["prices"]["training time"][0] == "noise"
-    assert settings["D_4|"]["changes"]["peak MB"] is None and settings["none"]["prices"] == {}
-    text = table(rows, rows[0], result)
-    assert r"| D_4\| | 2 | -1.00 |" in text and "| D 8 | 2 | (+0.01) |" in text and "| none | 0 | - |" in text
-    assert change_text({"value": 1.0, "noise": None, "is_noise": True}, "FPS") == "[x 1.00]"
+    assert front_of(rows, "training time") == ["D_4|", "D 8"]
+    lines = {line[0].strip("*"): line for line in cells(table(rows, rows[0]))}
+    assert lines[r"D_4\|"][1:3] == ["2", "-1.00"] and lines[r"D_4\|"][-3] == "1.00 ★"
+    assert lines["D 8"][2] == "(+0.01)" and lines["D 8"][-3] == "PSNR unclear ★"
+    assert lines["D 8"][HEAD.index("peak memory")] == "-" and lines["none"][1:] == ["0", *["-"] * 11]
+    assert change_text(Change(1.0, math.inf), "FPS") == "[x 1.00]"
     shared = [row("default", record(30.0, jobs=2)), row("D 8", record(31.0, jobs=2))]  # without times
     draw(shared, knobs, tmp_path / "figure.png")
     draw(rows, knobs, tmp_path / "figure.png")
