@@ -2,7 +2,6 @@
 """A compact file as the tables of a model. `format.py`, `encode.py` and `entropy.py` describe the file."""
 
 import math
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,23 +12,20 @@ from torch import Tensor
 from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.encode import FORMAT, GROUPS
-from nrfgs_ns.compact.format import LARGEST_RATIO, SMALL, read_container
-from nrfgs_ns.compact.quantise import Grid, from_morton
-from nrfgs_ns.compact.tables import COLUMNS, splats_of
+from nrfgs_ns.compact.format import LARGEST_RATIO, LONGEST_REASON, SMALL, read_container
+from nrfgs_ns.compact.tables import COLUMNS, Grid, from_morton, splats_of
 from nrfgs_ns.errors import InputError
 
 MOST_BANDS = 16
 """Of a head: the sixteenth repeats every ten microradians."""
 NUMBERS = 14
-"""Of a splat beside its latents."""
+"""Numbers of a splat, except its latents."""
 WIDTHS = dict(zip(COLUMNS, (1, 3, 3, 3), strict=True))
 """Columns of each table in the stream "splats"."""
-LONGEST = 200
-"""Characters of what a message quotes."""
 
 
 class Decoded(NamedTuple):
-    """What a compact file holds."""
+    """Content of a compact file."""
 
     config: NrfConfig
     """of the head"""
@@ -44,33 +40,27 @@ def decode(path: Path) -> Decoded:
     """Read a compact file; InputError if it cannot be read, is damaged, or describes no field."""
     header, streams = read_container(path)
     try:
-        if header["format"] != FORMAT:
-            raise ValueError(f"it holds {header['format']!r}")
-        config, weights = _config(header["head"]), _weights(streams)
+        if header["format"] != FORMAT or header["head"]["name"] != "nrf":
+            raise ValueError(f"it holds {header['format']!r} with a head named {header['head']['name']!r}")
+        config, weights = _config(header["head"]["config"]), _weights(streams)
         _check(header, config, weights, sum(stream.nbytes for stream in streams.values()))
         return Decoded(config, weights, _splats(header, streams, config.latent_dim), header)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:LONGEST]
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:LONGEST_REASON]
         raise InputError(
             f"{path} does not describe a field ({type(error).__name__}: {reason}). Export it again with nrfgs export "
             "compact."
         ) from error
 
 
-def _config(head: dict[str, Any]) -> NrfConfig:
-    if head["name"] != "nrf":
-        raise ValueError(f"a head named {head['name']!r}")
-    known = {field.name for field in fields(NrfConfig)} - {"_target"}
-    if unknown := head["config"].keys() - known:
-        raise ValueError(f"an unknown option {sorted(unknown)[0]!r} of the head")
-    config = NrfConfig(**head["config"])
+def _config(options: dict[str, Any]) -> NrfConfig:
     usual = NrfConfig(opacity_bound=NrfConfig().bound)
-    for name in known:
-        value, default = getattr(config, name), getattr(usual, name)
-        right = isinstance(value, (int, float) if isinstance(default, float) else type(default))
-        right &= isinstance(value, bool) == isinstance(default, bool)
-        if not right or isinstance(value, float) and not math.isfinite(value):
+    for name, value in options.items():
+        kind = type(getattr(usual, name))
+        right = type(value) is kind or (type(value), kind) == (int, float)
+        if not right or kind is float and not math.isfinite(value):
             raise ValueError(f"the head's {name} is {ascii(value)}")
+    config = NrfConfig(**options)
     if config.num_bands > MOST_BANDS:
         raise ValueError(f"the head has {config.num_bands} bands")
     config.validate()
@@ -80,33 +70,28 @@ def _config(head: dict[str, Any]) -> NrfConfig:
 def _check(header: dict[str, Any], config: NrfConfig, weights: dict[str, Tensor], unpacked: int) -> None:
     """Raise ValueError for sizes that the file does not have, and impossible grids."""
     unit = header["head"]["scene_unit"]
-    if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < float(unit) < math.inf:
+    if type(unit) not in (int, float) or not 0 < unit < math.inf:
         raise ValueError(f"the head's scene_unit is {ascii(unit)}")
     rows, inputs = weights["low.0.weight"].shape
     if config.latent_dim >= inputs or config.hidden_width > rows:  # before a head of that size is built
-        sizes = f"latents of {config.latent_dim} and {config.hidden_width} hidden units"
-        raise ValueError(f"head.low.0.weight of shape {[rows, inputs]} with {sizes}")
-    columns = {"means": 3, "turns": 3, "scales": 3, "opacities": 1, "colors": 3, "latents": config.latent_dim}
+        raise ValueError(f"head.low.0.weight of shape {[rows, inputs]} for {config}")
+    columns = {"means": 3, **WIDTHS, "latents": config.latent_dim}
     for name, count in columns.items():
         low, step = (np.asarray(header["grids"][name][part]) for part in ("low", "step"))
         right = low.shape == step.shape == (count,) and {low.dtype.kind, step.dtype.kind} <= {"i", "f"}
         if not right or not np.isfinite([low, step]).all() or not (step > 0).all():
             raise ValueError(f"the grid of {name} is not {count} numbers with positive steps")
-    with torch.random.fork_rng(devices=[]):  # whose numbers are not looked at
-        shapes = {name: list(value.shape) for name, value in config.setup().state_dict().items()}
-    for name in shapes.keys() | weights.keys():
-        shape = list(weights[name].shape) if name in weights else "none"
-        if shape != shapes.get(name):
-            raise ValueError(f"head.{name} of shape {shape}, for a head that has {shapes.get(name, 'none')}")
-        if not torch.isfinite(weights[name]).all():
-            raise ValueError(f"head.{name} is not finite")
+    with torch.random.fork_rng(devices=[]):
+        shapes = {name: value.shape for name, value in config.setup().state_dict().items()}
+    if {name: value.shape for name, value in weights.items()} != shapes:
+        raise ValueError("the head's weights do not have the shapes of its options")
+    if not all(torch.isfinite(weight).all() for weight in weights.values()):
+        raise ValueError("the head's weights are not finite")
     counts = [header["splats"][group] for group in GROUPS]
     if not all(isinstance(count, int) and count >= 0 for count in counts):
         raise ValueError(f"{counts} splats")
-    count = sum(counts)
-    tables = 4 * count * (config.latent_dim + NUMBERS)
-    if tables > max(LARGEST_RATIO * unpacked, SMALL):
-        raise ValueError(f"{count} splats with latents of {config.latent_dim}, unpacked from {unpacked} bytes")
+    if 4 * sum(counts) * (config.latent_dim + NUMBERS) > max(LARGEST_RATIO * unpacked, SMALL):
+        raise ValueError(f"{sum(counts)} splats with latents of {config.latent_dim}, unpacked from {unpacked} bytes")
 
 
 def _weights(streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
@@ -143,11 +128,11 @@ def _splats(header: dict[str, Any], streams: dict[str, np.ndarray], rank: int) -
 
 
 def model_state(model, path: Path) -> dict[str, Any]:
-    """What `load_state_dict` of a model with the file's head takes, from a compact file; InputError as `decode`."""
+    """State dictionary of a model with the file's head, from a compact file; InputError as `decode`."""
     decoded = decode(path)
     splats = dict(decoded.splats)
     diffuse = splats.pop(DIFFUSE)
-    # What is no part of a picture stays as the model has it.
+    # The rest is no part of a picture.
     own = {n: v for n, v in model.state_dict().items() if not n.startswith(("gauss_params.", "head."))}
     return {
         **own,

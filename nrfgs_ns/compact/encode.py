@@ -37,28 +37,27 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.compact.format import Table
-from nrfgs_ns.compact.quantise import MOST_BITS, Grid, morton
-from nrfgs_ns.compact.tables import COLUMNS, Precision, steps_of, tables_of
+from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, steps_of, tables_of
 from nrfgs_ns.errors import InputError
 
 FORMAT = "nrfgs-compact"
 LARGEST_LOGIT = 10.0
-"""Opacities' logits are cut off here: beyond, the opacity changes by less than 5e-5."""
+"""Cut-off of the opacities' logits: beyond, the opacity changes by less than 5e-5."""
 LARGEST_HALF = 6e4
-"""Weights beyond float16's range are kept in float32."""
+"""Largest weight in float16; larger ones are float32."""
 LARGEST_CODE = 2**30
-"""Whole numbers are cut off here: nothing that a splat has is a thousand million steps from 0."""
+"""Cut-off of whole numbers."""
 GROUPS = ("view", DIFFUSE)
 
 
 def encode(
-    field: Field, precision: Precision, render: dict[str, Any], steps: Mapping[str, np.ndarray] | None = None
+    field: Field, render: dict[str, Any], steps: Mapping[str, np.ndarray] | None = None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray | Table]]:
     """The header and streams of a compact file, without the splats that are not finite.
 
     Args:
-        precision: the steps of the grids, unless `steps` of a fine-tuned field's tables are given.
         render: the header's "render".
+        steps: of the grids of a fine-tuned field's tables; None: `steps_of`.
 
     Raises:
         InputError: no splat is finite.
@@ -71,8 +70,15 @@ def encode(
     tables, diffuse = tables_of({name: value[finite] for name, value in field.splats.items()})
     tables["opacities"] = tables["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
     tables["colors"][diffuse] = tables["colors"][diffuse].clamp_min(0.0)  # as it is drawn
-    steps = steps_of(tables, precision) if steps is None else dict(steps)
-    steps["means"] = wide_enough(steps["means"], np.ptp(tables["means"].cpu().numpy(), axis=0))
+    steps = steps_of(tables) if steps is None else dict(steps)
+    needed = np.ptp(tables["means"].cpu().numpy(), axis=0) / (2**MOST_BITS - 1)
+    if (needed > steps["means"]).any():
+        CONSOLE.print(
+            f"[bold yellow]Some splats are so far from the others that {MOST_BITS} bits are too few for a coordinate: "
+            f"means are rounded to {float(needed.max()):.3g} units instead of {float(steps['means'].min()):.3g}.",
+            soft_wrap=True,
+        )
+    steps["means"] = np.maximum(steps["means"], needed).clip(min=np.finfo(np.float32).tiny)
     grids, codes = {}, {}
     for name, table in tables.items():
         values = table.cpu().numpy()
@@ -107,15 +113,3 @@ def encode(
         "grids": {name: {"low": grid.low.tolist(), "step": grid.step.tolist()} for name, grid in grids.items()},
     }
     return header, streams
-
-
-def wide_enough(steps: np.ndarray, extent: np.ndarray) -> np.ndarray:
-    """Steps of the means, [3], no finer than MOST_BITS allow over the sides [3] of the splats' box."""
-    needed = extent / (2**MOST_BITS - 1)
-    if (needed > steps).any():
-        CONSOLE.print(
-            f"[bold yellow]Some splats are so far from the others that {MOST_BITS} bits are too few for a coordinate: "
-            f"means are rounded to {float(needed.max()):.3g} units instead of {float(steps.min()):.3g}.",
-            soft_wrap=True,
-        )
-    return np.maximum(steps, needed).clip(min=np.finfo(np.float32).tiny)

@@ -50,6 +50,7 @@ u = 0, 1, 2, 3, 4, ...; the prediction is, rounded down,
 At the end every state is 2^16 and no word is left: a reader checks it.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -59,26 +60,24 @@ Array = np.ndarray
 PRECISION = 14
 """Bits of a frequency: those of a context sum up to 2^14."""
 LOWEST = 1 << 16
-"""States are at least this."""
+"""Smallest state."""
 WORD = 16
 MOST_LANES = 1024
 SYMBOLS_OF_A_LANE = 2048
-"""Of a table of two million numbers or fewer; larger ones have longer lanes."""
 DIRECT = 32
-"""Residuals that have a token of their own; larger ones share one with those that begin with the same three bits."""
+"""Residuals with a token of their own; larger ones share one with those that begin with the same three bits."""
 TOKENS = DIRECT + 4 * 27
-"""0 to 2^32 - 1."""
 CONTEXTS = (1, 2, 3, 4, 6, 8, 12)
-"""How many an encoder tries for a column."""
+"""Numbers of contexts that an encoder tries for a column."""
 MOST_CONTEXTS = 16
 BITS_OF_A_FREQUENCY = 10
-"""What a frequency adds to a stream, about."""
+"""Cost of a frequency in a stream, about."""
 ACTIVITY = 4
 """Neighbours whose tokens say how large a residual is going to be."""
 LARGEST_SHARE = 16
 MOST_ACTIVITY = ACTIVITY * LARGEST_SHARE * (TOKENS - 1)
 SHIFT = 8
-"""Bits behind the point of a prediction's weights."""
+"""Fractional bits of a prediction's weights."""
 PREDICTORS = 6
 LARGEST_WEIGHT = 1 << 16
 LARGEST = 1 << 32
@@ -91,31 +90,13 @@ class BadStream(ValueError):
     """A stream that no encoder wrote."""
 
 
-def lanes_of(columns: int, rows: int) -> int:
-    """How many lanes code a table: the smallest power of two that gives none more than SYMBOLS_OF_A_LANE numbers, at
-    most MOST_LANES."""
-    wanted = -(-columns * rows // SYMBOLS_OF_A_LANE)
-    return min(1 << max(wanted - 1, 0).bit_length(), MOST_LANES)
-
-
-def token_of(unsigned: Array) -> tuple[Array, Array]:
-    """Tokens of numbers >= 0, and how many low bits each leaves to be told."""
-    bits = np.frexp(np.maximum(unsigned, 1).astype(np.float64))[1] - 1
-    spare = np.where(unsigned < DIRECT, 0, bits - 2)
-    tokens = np.where(unsigned < DIRECT, unsigned, DIRECT + 4 * (bits - 5) + ((unsigned >> spare) & 3))
-    return tokens.astype(np.int64), spare.astype(np.int64)
-
-
-def folded(residuals: Array) -> Array:
-    """0, -1, 1, -2, ... as 0, 1, 2, 3, ..."""
-    return np.where(residuals < 0, -2 * residuals - 1, 2 * residuals)
-
-
 class _Lanes:
     """A table [C, n] in the order in which it is coded: [C, S, lanes], with zeros behind the last row."""
 
     def __init__(self, columns: int, rows: int):
-        self.columns, self.rows, self.lanes = columns, rows, lanes_of(columns, rows)
+        wanted = -(-columns * rows // SYMBOLS_OF_A_LANE)
+        self.columns, self.rows = columns, rows
+        self.lanes = min(1 << max(wanted - 1, 0).bit_length(), MOST_LANES)
         self.steps = -(-rows // self.lanes)
 
     def laid(self, table: Array) -> Array:
@@ -127,7 +108,7 @@ class _Lanes:
         return laid.transpose(0, 2, 1).reshape(len(laid), self.lanes * self.steps)[:, : self.rows]
 
     def active(self, step: int) -> int:
-        """Lanes that have a row in a step: the first so many."""
+        """Number of lanes that have a row in a step, always the first ones."""
         return -(-(self.rows - step) // self.steps)
 
 
@@ -139,12 +120,12 @@ def _before(values: Array, count: int) -> Array:
 
 
 def _from_left(laid: Array, column: int) -> list[Array]:
-    """What a prediction reads of the two columns to the left: the same row, and the row before it."""
+    """The predictors in each of the two columns to the left: the same row, and the row before it."""
     zero = np.zeros_like(laid[0])
-    found = []
+    inputs = []
     for left in (column - 1, column - 2):
-        found += [laid[left], _before(laid[left], 1)] if left >= 0 else [zero, zero]
-    return found
+        inputs += [laid[left], _before(laid[left], 1)] if left >= 0 else [zero, zero]
+    return inputs
 
 
 # ---- encoding
@@ -173,20 +154,23 @@ def encode_table(table: Array, signed: Array | bool = True) -> tuple[Array, byte
         if np.abs(laid[column] - prediction).max(initial=0) >= LARGEST >> 1:
             weights, prediction = NO_PREDICTION
         residuals = laid[column] - prediction
-        unsigned = folded(residuals) if signed[column] else residuals
+        unsigned = np.where(residuals < 0, -2 * residuals - 1, 2 * residuals) if signed[column] else residuals
         unsigned = np.where(real, unsigned, 0)
-        tokens[column], spares[column] = token_of(unsigned)
+        bits = np.frexp(np.maximum(unsigned, 1).astype(np.float64))[1].astype(np.int64) - 1
+        spares[column] = np.where(unsigned < DIRECT, 0, bits - 2)
+        far = DIRECT + 4 * (bits - 5) + ((unsigned >> spares[column]) & 3)
+        tokens[column] = np.where(unsigned < DIRECT, unsigned, far)
         lows[column] = unsigned & ((1 << spares[column]) - 1)
         shares, thresholds, contexts[column] = _fitted_contexts(tokens, column, real)
         model += [int(signed[column]), *weights, *shares, len(thresholds), *thresholds]
-        found = []
+        table = []
         for context in range(len(thresholds) + 1):
             counts = np.bincount(tokens[column][real & (contexts[column] == context)], minlength=TOKENS)
-            found.append(_normalised(counts))
-            used = np.flatnonzero(found[-1])
+            table.append(_normalised(counts))
+            used = np.flatnonzero(table[-1])
             first, last = int(used[0]), int(used[-1])
-            model += [first, last - first + 1, *map(int, found[-1][first : last + 1])]
-        frequencies.append(np.array(found))
+            model += [first, last - first + 1, *map(int, table[-1][first : last + 1])]
+        frequencies.append(np.array(table))
     return np.array(model, dtype=np.int32), _coded(lanes, frequencies, contexts, tokens, spares, lows)
 
 
@@ -199,18 +183,14 @@ def _fitted_prediction(laid: Array, column: int, real: Array) -> tuple[list[int]
     ridge = 1e-6 * np.trace(gram) / len(gram) + 1e-9
     fit = np.linalg.solve(gram + ridge * np.eye(len(gram)), matrix @ values[real].astype(np.float64))
     weights = np.rint(fit * (1 << SHIFT)).clip(-LARGEST_WEIGHT, LARGEST_WEIGHT).astype(np.int64)
-    return weights.tolist(), predicted(weights, inputs)
-
-
-def predicted(weights: Array, inputs: list[Array]) -> Array:
     total = weights[0] + (1 << (SHIFT - 1))
-    for weight, values in zip(weights[1:], inputs, strict=True):
-        total = total + weight * values
-    return total >> SHIFT
+    for weight, neighbours in zip(weights[1:], inputs, strict=True):
+        total = total + weight * neighbours
+    return weights.tolist(), total >> SHIFT
 
 
 def _fitted_contexts(tokens: Array, column: int, real: Array) -> tuple[list[int], list[int], Array]:
-    """How much each neighbour's token counts, thresholds of the sum, and each number's context."""
+    """Shares of the neighbours' tokens in the activity, its thresholds, and each number's context."""
     own = tokens[column]
     zero = np.zeros_like(own)
     neighbours = [_before(own, 1), _before(own, 2)]
@@ -237,7 +217,7 @@ def _fitted_contexts(tokens: Array, column: int, real: Array) -> tuple[list[int]
 
 
 def _bits(counts: Array) -> float:
-    """About what tokens cost that occur so often in each context [K, TOKENS], and the contexts' frequencies."""
+    """Estimated cost of tokens by their counts in each context [K, TOKENS], and of the contexts' frequencies."""
     totals = counts.sum(axis=1, keepdims=True).clip(1)
     entropy = -(counts * np.log2(np.where(counts > 0, counts / totals, 1.0))).sum()
     return float(entropy + BITS_OF_A_FREQUENCY * (counts > 0).sum())
@@ -247,13 +227,12 @@ def _normalised(counts: Array) -> Array:
     """Frequencies that sum up to 2^PRECISION, at least 1 where there is a count."""
     total = 1 << PRECISION
     if counts.sum() == 0:
-        counts = counts.copy()
-        counts[0] = 1
-    found = np.where(counts > 0, np.maximum(np.rint(counts * (total / counts.sum())), 1), 0).astype(np.int64)
-    while (over := int(found.sum()) - total) != 0:  # from the most frequent, which it costs least
-        largest = int(found.argmax())
-        found[largest] -= min(over, int(found[largest]) - 1) if over > 0 else over
-    return found
+        counts = np.eye(1, len(counts), dtype=np.int64)[0]
+    shares = np.where(counts > 0, np.maximum(np.rint(counts * (total / counts.sum())), 1), 0).astype(np.int64)
+    while (over := int(shares.sum()) - total) != 0:  # from the most frequent, which it costs least
+        largest = int(shares.argmax())
+        shares[largest] -= min(over, int(shares[largest]) - 1) if over > 0 else over
+    return shares
 
 
 def _coded(
@@ -310,13 +289,11 @@ def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
     words = np.frombuffer(data, "<u2", offset=4 * lanes.lanes).astype(np.int64)
     if (state < LOWEST).any():
         raise BadStream("a state is too small")
-    reader = _Model(model)
     laid = np.zeros((columns, lanes.steps, lanes.lanes), dtype=np.int64)
     tokens = np.zeros((3, lanes.steps, lanes.lanes), dtype=np.int64)  # of this column, and of the two to the left
     at = 0
     mask = (1 << PRECISION) - 1
-    for column in range(columns):
-        part = reader.column()
+    for column, part in enumerate(_read_model(model, columns)):
         own, out = tokens[column % 3], laid[column]
         base = part.weights[0] + (1 << (SHIFT - 1))
         for weight, values in zip(part.weights[3:], _from_left(laid, column), strict=True):
@@ -364,7 +341,7 @@ def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
             token_1, token_2 = own[step], token_1
         if (np.abs(out) >= LARGEST).any():
             raise BadStream("a number is too large")
-    if at != len(words) or (state != LOWEST).any() or not reader.empty:
+    if at != len(words) or (state != LOWEST).any():
         raise BadStream("it does not end where its table does")
     return lanes.taken_up(laid)
 
@@ -382,7 +359,7 @@ def _refilled(x: Array, words: Array, at: int) -> tuple[Array, int]:
 
 
 class _Column(NamedTuple):
-    """What a model says of a column. A slot is a context's number, times 2^PRECISION, and a state's low bits."""
+    """A column's model. A slot is a context's number, times 2^PRECISION, and a state's low bits."""
 
     signed: bool
     weights: list[int]
@@ -395,55 +372,41 @@ class _Column(NamedTuple):
     frequencies: Array
     """of the slot's token"""
     offsets: Array
-    """how far the slot is from its token's first one"""
+    """distance of the slot from its token's first one"""
 
 
-class _Model:
-    """Reads a model's numbers."""
+def _read_model(model: Array, columns: int) -> Iterator[_Column]:
+    """The columns of a model, one after the other; BadStream if it is none."""
+    numbers, at = model.astype(np.int64), 0
 
-    def __init__(self, numbers: Array):
-        self.numbers, self.at = numbers.astype(np.int64), 0
-
-    @property
-    def empty(self) -> bool:
-        return self.at == len(self.numbers)
-
-    def take(self, count: int) -> Array:
-        found = self.numbers[self.at : self.at + count]
-        self.at += count
-        if count < 0 or len(found) != count:
+    def take(count: int) -> Array:
+        nonlocal at
+        at += count
+        if count < 0 or at > len(numbers):
             raise BadStream("its model is cut short")
-        return found
+        return numbers[at - count : at]
 
-    def column(self) -> _Column:
-        signed = bool(self.take(1)[0])
-        weights = self.take(1 + PREDICTORS).tolist()
-        shares = self.take(ACTIVITY).tolist()
-        (count,) = self.take(1).tolist()
-        if not 0 <= count < MOST_CONTEXTS or max(map(abs, weights)) > LARGEST_WEIGHT:
-            raise BadStream("its model has too many contexts, or a weight that is too large")
-        thresholds = self.take(count)
-        if (np.diff(thresholds) <= 0).any() or not all(0 <= share <= LARGEST_SHARE for share in shares):
-            raise BadStream("its model's contexts are in no order")
-        table = np.zeros((count + 1, TOKENS), dtype=np.int64)
+    for _ in range(columns):
+        signed = bool(take(1)[0])
+        weights, shares = take(1 + PREDICTORS).tolist(), take(ACTIVITY).tolist()
+        count = int(take(1)[0])
+        possible = count < MOST_CONTEXTS and max(map(abs, weights)) <= LARGEST_WEIGHT
+        thresholds = take(count)
+        possible &= (np.diff(thresholds) > 0).all() and 0 <= min(shares) and max(shares) <= LARGEST_SHARE
+        table = np.zeros((min(count, MOST_CONTEXTS) + 1, TOKENS), dtype=np.int64)
         for frequencies in table:
-            first, used = self.take(2).tolist()
-            if not (0 <= first and 0 < used and first + used <= TOKENS):
-                raise BadStream("its model has tokens that are none")
-            frequencies[first : first + used] = self.take(used)
-        if (table < 0).any() or (table.sum(axis=1) != 1 << PRECISION).any():
-            raise BadStream("its model's frequencies do not add up")
+            first, used = take(2).tolist()
+            possible &= 0 <= first and 0 < used and first + used <= TOKENS
+            if possible:
+                frequencies[first : first + used] = take(used)
+        if not possible or (table < 0).any() or (table.sum(axis=1) != 1 << PRECISION).any():
+            raise BadStream("its model is none")
         starts = np.cumsum(table, axis=1) - table
         tokens = np.repeat(np.tile(np.arange(TOKENS), count + 1), table.ravel())
         slots = np.arange(len(tokens)) & ((1 << PRECISION) - 1)
-        contexts = np.searchsorted(thresholds, np.arange(MOST_ACTIVITY + 1), side="right")
-        return _Column(
-            signed,
-            weights,
-            shares,
-            count + 1,
-            contexts << PRECISION,
-            tokens,
-            np.repeat(table.ravel(), table.ravel()),
-            slots - np.repeat(starts.ravel(), table.ravel()),
-        )
+        contexts = np.searchsorted(thresholds, np.arange(MOST_ACTIVITY + 1), side="right") << PRECISION
+        offsets = slots - np.repeat(starts.ravel(), table.ravel())
+        frequencies = np.repeat(table.ravel(), table.ravel())
+        yield _Column(signed, weights, shares, count + 1, contexts, tokens, frequencies, offsets)
+    if at != len(numbers):
+        raise BadStream("its model does not end where its table does")

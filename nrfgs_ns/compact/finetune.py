@@ -7,7 +7,6 @@ whose bytes cost more than the pictures would lose without them (`without_them`)
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,19 +16,16 @@ from torch import Tensor, nn
 from nrfgs_ns.appearance.field import Field, Sight
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
-from nrfgs_ns.compact.quantise import MOST_BITS, Grid, morton
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
-from nrfgs_ns.compact.tables import COLUMNS, Precision, splats_of, steps_of, tables_of
-from nrfgs_ns.model.view_noise import ViewNoise
+from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
+from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 
-BYTE = 8
-"""Bits."""
 EVERY = 4
-"""Steps of which one counts bits, for all of them: it takes longer than a picture."""
+"""Steps for each count of the bits, which takes longer than a picture."""
 REPORT_EVERY = 20 * EVERY
 """Steps between two reports: reading a number waits for the GPU."""
 NOISY = 0.3
-"""Share of the steps in which noise stands for rounding; in the rest, numbers are rounded."""
+"""Share of the steps with noise instead of rounding."""
 RATES = {"means": 1.6e-6, "turns": 5e-4, "scales": 2e-3, "opacities": 1e-2, "colors": 7e-4, "latents": 4e-3}
 """Learning rates of the tables; the means' in scene units, the latents' in standard deviations of the strongest."""
 STEPS_RATE, DENSITY_RATE, FIELD_RATE = 3e-2, 2e-2, 5e-4
@@ -42,36 +38,28 @@ LAST = 0.03
 """Final share of the learning rates, which fall by a cosine."""
 
 
-def prepared(field: Field, weight: Tensor) -> Field:
-    """The field at the start of a fine-tune: its latents are their own principal components, weighted by the splats'
-    contributions to the training views, weight [N] >= 0."""
-    return with_rank(field, latent_basis(field, weight), field.head.config.latent_dim)
-
-
 class CodedSplats(nn.Module):
-    """The tables of a field (`tables.py`), each with learnable steps that begin with those of `precision`."""
+    """The tables of a field (`tables.py`), each with learnable steps."""
 
-    def __init__(self, splats: Mapping[str, Tensor], precision: Precision):
+    def __init__(self, splats: Mapping[str, Tensor]):
         super().__init__()
         values, diffuse = tables_of(splats)
-        steps = steps_of(values, precision)
+        steps = steps_of(values)
         grid = Grid(values["means"].amin(dim=0).cpu().numpy(), steps["means"])
         codes = grid.codes(values["means"].cpu().numpy()).clip(max=2**MOST_BITS - 1)
         order = torch.from_numpy(np.argsort(morton(codes), kind="stable")).to(diffuse.device)  # as in a file
         values["latents"] = values["latents"][(~diffuse).cumsum(0)[order[~diffuse[order]]] - 1]
         values |= {name: values[name][order] for name in ("means", *COLUMNS)}
         self.diffuse = diffuse[order]
+        values = {name: table.float() for name, table in values.items()}
         self.tables = nn.ModuleDict(
-            {
-                name: Rounded(table.float(), torch.from_numpy(steps[name]).to(table).float())
-                for name, table in values.items()
-            }
+            {name: Rounded(table, torch.from_numpy(steps[name]).to(table)) for name, table in values.items()}
         )
-        self.density = Density(self._row({name: table.float() for name, table in values.items()}))
-        self.density_of_latents = Density(values["latents"].float())
+        self.density = Density(self._row(values))
+        self.density_of_latents = Density(values["latents"])
 
     def forward(self, rounded: bool) -> dict[str, Tensor]:
-        """The tables as read back from a file."""
+        """The tables as a file would give them back."""
         return {name: table(rounded) for name, table in self.tables.items()}
 
     def splats(self, tables: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -150,40 +138,29 @@ def without_them(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]
     return growth / error, float(loss)
 
 
-@dataclass
-class Tuned:
-    """A field that was trained for the file."""
-
-    field: Field
-    steps: dict[str, np.ndarray]
-    """of each of the file's tables, one for each column; the field's numbers lie on them"""
-
-
 def fine_tune(
-    model,
-    field: Field,
-    next_view: Callable[[int], tuple[Any, dict[str, Any]]],
-    noise: ViewNoise,
-    views: int,
-    steps: int,
-    rate: float,
-    precision: Precision,
-    on_step: Callable[[int, float], None] = lambda *_: None,
-) -> Tuned:
+    pipeline, field: Field, weight: Tensor, steps: int, rate: float, on_step: Callable[[int, float], None]
+) -> tuple[Field, dict[str, np.ndarray]]:
     """Fine-tune a field for its size in a file.
 
     Args:
-        model: renders the field; its own splats stay as they are.
-        field: the field to begin with (`prepared`), with a neural residual field's head.
-        next_view: step -> a training camera and its photograph.
-        noise: moves the head's camera centres.
-        views: number of training views on which splats are weighed.
+        pipeline: of the trained model, whose own splats stay as they are, and of its training views.
+        field: the field to begin with.
+        weight: the splats' contributions to the training views. [N]
         rate: loss for a byte of each splat.
-        precision: the first steps of the grids.
         on_step: called with the step and the bits, every REPORT_EVERY steps.
+
+    Returns:
+        the field, and the steps of its tables' columns: its numbers lie on them.
     """
+    model, next_view = pipeline.model, pipeline.datamanager.next_train
+    centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
+    noise = ViewNoise.as_long_as(model.noise_factor * camera_spacing(centers), torch.initial_seed())
+    # Latents begin as their own principal components.
+    field = with_rank(field, latent_basis(field, weight), field.head.config.latent_dim)
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
-    coded, count = CodedSplats(field.splats, precision), len(field.splats["means"])
+    coded, count = CodedSplats(field.splats), len(field.splats["means"])
+    of_bits = rate / (8 * count)  # loss of a bit
     groups = [{"params": [table.values], "lr": RATES[name]} for name, table in coded.tables.items()]
     groups[0]["lr"] *= model.scene_unit
     if len(latents := coded.tables["latents"].values) > 1:
@@ -199,43 +176,38 @@ def fine_tune(
         optimizer, lambda step: LAST + (1 - LAST) * 0.5 * (1 + np.cos(np.pi * min(step / steps, 1.0)))
     )
     prunings = [round(share * steps) for share in PRUNINGS]
-    turns = torch.arange(count, device=coded.diffuse.device) % max(len(prunings), 1)
-    was_training = model.training
+    turns = torch.arange(count, device=coded.diffuse.device) % len(prunings)
     model.train()
-    try:
-        for step in range(steps):
-            if step in prunings:
-                with torch.no_grad():
-                    tables = coded(rounded=True)
-                    cost = coded.bits(tables) * (WORTH * rate / (BYTE * count))
-                growth, loss = without_them(model, Field(head, coded.splats(tables)), map(next_view, range(views)))
-                # The training's loss is about the root of the squared error.
-                kept = (turns != prunings.index(step)) | (0.5 * loss * growth > cost)
-                coded.keep(kept, optimizer)
-                turns = turns[kept]
-            camera, batch = next_view(step)
-            tables = coded(rounded=step >= NOISY * steps)
-            splats = coded.splats(tables)
-            field = Field(head, splats)
-            perturbed = field._replace(splats=noise.moved(splats, step))
-            outputs, _ = model.render(field, camera, perturbed)
-            loss = model.photometric_loss(outputs, batch)
-            if step % EVERY == 0:
-                bits = coded.bits(tables)
-                loss = loss + EVERY * rate / (BYTE * count) * bits.sum()
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            if step % REPORT_EVERY == 0:
-                on_step(step, float(bits.detach().sum()))
-    finally:
-        model.train(was_training)
+    for step in range(steps):
+        if step in prunings:
+            with torch.no_grad():
+                tables = coded(rounded=True)
+                cost = coded.bits(tables) * (WORTH * of_bits)
+            growth, loss = without_them(model, Field(head, coded.splats(tables)), map(next_view, range(len(centers))))
+            # The training's loss is about the root of the squared error.
+            kept = (turns != prunings.index(step)) | (0.5 * loss * growth > cost)
+            coded.keep(kept, optimizer)
+            turns = turns[kept]
+        camera, batch = next_view(step)
+        tables = coded(rounded=step >= NOISY * steps)
+        splats = coded.splats(tables)
+        outputs, _ = model.render(Field(head, splats), camera, Field(head, noise.moved(splats, step)))
+        loss = model.photometric_loss(outputs, batch)
+        if step % EVERY == 0:
+            bits = coded.bits(tables).sum()
+            loss = loss + EVERY * of_bits * bits
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        if step % REPORT_EVERY == 0:
+            on_step(step, float(bits.detach()))
+    model.eval()
     with torch.no_grad():
         splats = coded.splats(coded(rounded=True))
-    steps = {name: table.steps.detach().cpu().double().numpy() for name, table in coded.tables.items()}
+    grids = {name: table.steps.detach().cpu().double().numpy() for name, table in coded.tables.items()}
     field = Field(head.requires_grad_(False).eval(), splats)
     used = (splats["latents"] != 0).any(dim=0).nonzero()[:, 0]
     if 0 < len(used) < splats["latents"].shape[1]:
-        field, steps["latents"] = with_components(field, used), steps["latents"][used.cpu().numpy()]
-    return Tuned(field, steps)
+        field, grids["latents"] = with_components(field, used), grids["latents"][used.cpu().numpy()]
+    return field, grids

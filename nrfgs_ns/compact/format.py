@@ -52,21 +52,20 @@ CHECKSUM = struct.Struct("<I")
 MODEL = struct.Struct("<II")
 """Numbers of a coded table's model, and its bytes."""
 DTYPES = ("uint8", "uint16", "uint32", "uint64", "float16", "float32")
-ENTRY = {"name": str, "coding": str, "dtype": str, "shape": list, "bytes": int, "crc32": int}
-"""Keys of a stream's entry in the header, and their types."""
 CODINGS = {"xz": DTYPES, "rans": ("int16", "int32", "uint32")}
 """Codings, and the types of numbers that each holds."""
 LARGEST_RATIO = 32
-"""Times its own size that a file may unpack to. Those of results/compact.json unpack to at most ten times theirs."""
+"""Largest unpacked size, in sizes of the file. Files of results/compact.json reach ten."""
 SMALL = 2**24
-"""Bytes that any file may unpack to."""
-MOST_AXES = 4
+"""Bytes to which any file may unpack."""
 MOST_COLUMNS = 1024
-"""Of a coded table."""
+"""Largest number of columns in a coded table."""
 LARGEST_DICTIONARY = 2**26
 """Bytes within which xz looks for repetitions."""
 LARGEST_MEMORY = 2**28
 """Bytes that xz may take to unpack: more than the dictionary needs."""
+LONGEST_REASON = 200
+"""Characters of a message's reason, which may quote the file."""
 
 
 class Table(NamedTuple):
@@ -103,79 +102,45 @@ def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str,
 
 
 def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The header and the streams, by name, of a file.
-
-    Raises:
-        InputError: there is no such file, it is of another kind or version, or damaged.
-    """
+    """The header and the streams, by name, of a file; InputError if it is missing, of another kind, or damaged."""
     try:
-        data = path.read_bytes() if path.is_file() else None
-    except OSError:
-        data = None
-    if data is None:
-        raise InputError(f"{path} cannot be read as a file. Export it again, or fix the path.")
-    fix = "Copy it again, or export it again with nrfgs export compact."
-    if data[: len(MAGIC)] != MAGIC[: len(data)] or not data:
-        raise InputError(f"{path} is not a compact file of nrfgs: it begins with {data[:8]!r}. {fix}")
-    if len(data) < PREAMBLE.size:
-        raise InputError(f"{path} is cut short: {len(data)} bytes. {fix}")
-    _, version, length, total = PREAMBLE.unpack_from(data)
-    first = PREAMBLE.size + length + CHECKSUM.size
-    # Another version may be laid out differently: its number comes before whether the file is whole.
-    if version != VERSION:
+        if not path.is_file():
+            raise ValueError("it is no file")
+        return _read(path.read_bytes())
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, lzma.LZMAError, struct.error) as error:
+        reason = " ".join(str(error).split())[:LONGEST_REASON]
         raise InputError(
-            f"{path} is of version {version} of the format, and this program reads version {VERSION}. "
-            f"{'Install a newer nrfgs-ns, or copy it again.' if version > VERSION else fix}"
-        )
-    if len(data) != total or len(data) < first:
-        raise InputError(f"{path} has {len(data)} bytes, and its header says {total}. {fix}")
-    header_end = first - CHECKSUM.size
-    if zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
-        raise InputError(f"{path} is damaged: the header's checksum does not hold. {fix}")
-    try:
-        header = _header(data[PREAMBLE.size : header_end], max(LARGEST_RATIO * len(data), SMALL))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: its header is none of a compact file ({error}). {fix}") from error
-    streams = {}
+            f"{path} cannot be read as a compact file ({reason}). Copy it again, or export it again with nrfgs export "
+            "compact."
+        ) from error
+
+
+def _read(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The header and the streams of a file's bytes; any of several errors if they are not one."""
+    if not data.startswith(MAGIC):
+        raise ValueError(f"it begins with {data[: len(MAGIC)]!r}")
+    _, version, length, total = PREAMBLE.unpack_from(data)
+    if version != VERSION:  # another version may be laid out differently
+        raise ValueError(f"it is of version {version} of the format, and this program reads version {VERSION}")
+    header_end = PREAMBLE.size + length
+    if len(data) != total or zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
+        raise ValueError(f"it is damaged or cut short: {len(data)} bytes, of {total}")
+    header, first = json.loads(data[PREAMBLE.size : header_end]), header_end + CHECKSUM.size
+    unpacked, streams = 0, {}
     for entry in header["streams"]:
+        named, sizes = f"the stream {ascii(entry)}", entry["shape"]
+        if entry["dtype"] not in CODINGS[entry["coding"]] or not all(isinstance(size, int) for size in sizes):
+            raise ValueError(named)
+        unpacked += math.prod(max(size, 1) for size in sizes) * np.dtype(entry["dtype"]).itemsize
+        if min(sizes, default=0) < 0 or unpacked > max(LARGEST_RATIO * len(data), SMALL):
+            raise ValueError(f"{named} would unpack to more than {LARGEST_RATIO} times the file")
         body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
         if len(body) != entry["bytes"] or zlib.crc32(body) != entry["crc32"]:
-            raise InputError(f"{path} is damaged: the checksum of its stream {entry['name']!r} does not hold. {fix}")
-        try:
-            streams[entry["name"]] = (_uncoded if entry["coding"] == "rans" else _unpack)(entry, body)
-        except (ValueError, lzma.LZMAError, struct.error) as error:  # made to mislead: the checksum holds
-            raise InputError(f"{path}: its stream {entry['name']!r} cannot be decoded ({error}). {fix}") from error
+            raise ValueError(f"the checksum of its stream {entry['name']!r} does not hold")
+        streams[entry["name"]] = (_uncoded if entry["coding"] == "rans" else _unpack)(entry, body)
     if first != len(data):
-        raise InputError(f"{path} has {len(data) - first} bytes after its last stream. {fix}")
+        raise ValueError(f"it has {len(data) - first} bytes after its last stream")
     return header, streams
-
-
-def _header(text: bytes, most: int) -> dict[str, Any]:
-    """The header; ValueError if a stream's entry is impossible, or all unpack to more than `most` bytes together."""
-    header = json.loads(text)
-    entries = header.get("streams") if isinstance(header, dict) else None
-    if not isinstance(entries, list):
-        raise ValueError("no list of streams")
-    total = 0
-    for entry in entries:
-        named = f"the stream {ascii(entry)[:200]}"
-        if not (isinstance(entry, dict) and all(_is(entry.get(key), kind) for key, kind in ENTRY.items())):
-            raise ValueError(named)
-        sizes, coding = entry["shape"], entry["coding"]
-        possible = entry["dtype"] in CODINGS.get(coding, ()) and entry["bytes"] >= 0
-        possible &= len(sizes) <= MOST_AXES and all(_is(size, int) and 0 <= size < 2**48 for size in sizes)
-        if not possible or coding == "rans" and len(sizes) != 2:
-            raise ValueError(named)
-        total += math.prod(sizes) * np.dtype(entry["dtype"]).itemsize
-        if total > most:
-            raise ValueError(f"{named} would unpack to more than {most} bytes")
-    if len({entry["name"] for entry in entries}) < len(entries):
-        raise ValueError("two streams of one name")
-    return header
-
-
-def _is(value: Any, kind: type) -> bool:
-    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def _pack(raw: bytes) -> bytes:

@@ -8,8 +8,8 @@ x then costs
     -log2 P(x),    P(x) = sum_k w_k (F((x + step/2 - m - m_k) / b_k) - F((x - step/2 - m - m_k) / b_k)),
 
 F the logistic function: a mixture of two, each column its own, about a mean m that is linear in the row before, the one
-before that, and the row's earlier columns; its widths b_k grow with how far the neighbours were from their means. That
-is what the coder of a file expects a number by (`entropy.py`), but nothing of this is in a file.
+before that, and the row's earlier columns; its widths b_k grow with the neighbours' distances from their means. The
+coder of a file (`entropy.py`) expects numbers by the same neighbours, but nothing of this is in a file.
 """
 
 import math
@@ -19,11 +19,11 @@ from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
 WIDTHS = (-2.0, -0.3)
-"""Logarithms of the logistics' widths to begin with, in standard deviations of the column."""
+"""Logarithms of the logistics' first widths, in standard deviations of the column."""
 SEEN = 0.3
-"""Added to how far neighbours were off, in usual widths."""
+"""Added to the neighbours' errors, in usual widths."""
 NARROWEST = 0.05
-"""Of a logistic, in steps: narrower ones cost nothing less."""
+"""Narrowest logistic, in steps: narrower ones cost nothing less."""
 
 
 class Rounded(nn.Module):
@@ -36,7 +36,6 @@ class Rounded(nn.Module):
 
     @property
     def steps(self) -> Tensor:
-        """[C]"""
         return self.log_steps.exp()
 
     def forward(self, rounded: bool) -> Tensor:
@@ -56,10 +55,9 @@ class Density(nn.Module):
 
     def __init__(self, values: Tensor):
         super().__init__()
-        columns = values.shape[1]
-        spread = values.std(dim=0, correction=0) if len(values) else values.new_zeros(columns)
+        columns, none = values.shape[1], values[:0].sum(dim=0)
+        spread, mean = (values.std(dim=0, correction=0), values.mean(dim=0)) if len(values) else (none, none)
         widths = spread.clamp_min(1e-6).log()[:, None] + values.new_tensor(WIDTHS)
-        mean = values.mean(dim=0) if len(values) else values.new_zeros(columns)
         self.centers = nn.Parameter(mean[:, None].repeat(1, len(WIDTHS)))
         self.log_widths = nn.Parameter(widths)
         self.log_shares = nn.Parameter(torch.zeros_like(widths))
@@ -75,7 +73,7 @@ class Density(nn.Module):
         mean = values @ self.of_left.tril(-1).T + before @ self.of_left_before.tril(-1).T
         residuals = values - (mean + self.of_before[0] * before + self.of_before[1] * before_2)
 
-        # How far the neighbours were off, in usual widths; no gradient makes them be off by less for it.
+        # The neighbours' errors in usual widths, as constants.
         usual = self.log_widths.detach().mean(dim=-1).exp().maximum(steps.detach())
         off = residuals.detach().abs() / usual
         left, left_2 = (nn.functional.pad(off, (k, 0))[:, : off.shape[1]] for k in (1, 2))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What a field can do without: residuals that training views hardly show, and components of the latents.
+r"""Residuals that training views do not show, and components of the latents, left out of a field.
 
 A residual has a part that all views see, which the base colour can hold as well, and the rest. Seen in training view v
 with colour y_v and opacity a_v, and contributing w_v (alpha T, summed over the view's pixels) to the picture, splat i
@@ -34,7 +34,7 @@ EIGHT_BIT_STEP = 1.0 / 255.0
 THRESHOLDS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, float("inf"))
 """Largest changes below which residuals are dropped, in 8-bit steps."""
 SHARE_FOR_RESIDUALS = 0.5
-"""Share of the allowed loss that dropping residuals may take. The latents' rank may take the rest."""
+"""Share of the allowed loss for dropped residuals; the rest is for the latents' rank."""
 
 
 class Residuals(NamedTuple):
@@ -94,27 +94,22 @@ class FieldViews:
 
     def __init__(self, model, views: list, photographs: Sequence[int | None] | None = None):
         self.model, self.views = model, []
-        self.photographs = [None] * len(views) if photographs is None else list(photographs)
+        self.photographs = [None] * len(views) if photographs is None else photographs
         for camera, batch in views:
             with torch.no_grad():
                 view = model.project(camera.to(model.device))
             truth = model.truth_of(batch, model.background_color.to(model.device))
             self.views.append((view, truth, model.mask_of(batch)))
 
+    @torch.no_grad()
     def psnr(self, field: Field) -> float:
         """Mean over the views, inside masks, dB; views whose mask is empty are left out."""
-        scores = self.scores(field)
-        return sum(scores) / max(len(scores), 1)
-
-    @torch.no_grad()
-    def scores(self, field: Field) -> list[float]:
-        """The terms of `psnr`."""
         scores = []
         for (view, truth, mask), photograph in zip(self.views, self.photographs, strict=True):
             outputs, _ = self.model.composite(view, field.seen_from(view), photograph=photograph)
-            score = psnr(outputs["rgb"], truth, mask)
-            scores += [] if score is None else [score]
-        return scores
+            scores.append(psnr(outputs["rgb"], truth, mask))
+        scores = [score for score in scores if score is not None]
+        return sum(scores) / max(len(scores), 1)
 
 
 def dropped(field: Field, seen: Residuals, threshold: float) -> Field:
@@ -127,7 +122,7 @@ class Slimmed(NamedTuple):
 
     field: Field
     threshold: float
-    """residuals below this many 8-bit steps are dropped; 0 for none"""
+    """residuals below it are dropped, 8-bit steps; 0: none"""
     rank: int
     """numbers in a latent"""
 
@@ -135,14 +130,8 @@ class Slimmed(NamedTuple):
 def slim(
     field: Field, seen: Residuals, views: FieldViews, lowest_psnr: float, on_trial: Callable[[str], None]
 ) -> Slimmed:
-    """The smallest field that keeps a PSNR, of those that drop residuals and components of the latents.
-
-    First the largest of THRESHOLDS within its share of the allowed loss, then the lowest rank for the other splats.
-
-    Args:
-        lowest_psnr: on the views, dB.
-        on_trial: called with the name of each candidate.
-    """
+    """The smallest field that keeps a PSNR on the views, dB: first the largest of THRESHOLDS within its share of the
+    allowed loss, then the lowest rank for the other splats. `on_trial` is called with the name of each candidate."""
     enough = lowest_psnr + (1 - SHARE_FOR_RESIDUALS) * (views.psnr(field) - lowest_psnr)
     threshold = 0.0
     for candidate in reversed(THRESHOLDS):

@@ -11,39 +11,113 @@ latents    [V, R]   of the V splats that are not diffuse
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.head import SH_C0, base_colors
-from nrfgs_ns.compact.quantise import nearest_turn
+
+Array = np.ndarray
 
 COLUMNS = ("opacities", "scales", "colors", "turns")
 """Tables of all splats, beside the means, in the order of a file."""
 SMALLEST_W2 = 1e-6
 """Smallest w^2 of a rotation: x, y and z may be rounded beyond unit length."""
+STEPS = {
+    "means": 1 / 32,
+    "turns": 2**0.5 / 255,
+    "scales": 1 / 16,
+    "opacities": 1 / 16,
+    "colors": 1 / 512,
+    "latents": 1 / 16,
+}
+"""Steps of the grids of a field that was not trained for the file: means in standard deviations of the median splat,
+latents in those of the strongest. Means are finer than the others, because a splat smaller than the median suffers
+more, and pixels notice places first. A sixteenth is 6 % of a size, and at most 1/64 of an opacity."""
+MOST_BITS = 21
+"""Bits of a coordinate: three of them are interleaved in 63."""
 
 
-@dataclass(frozen=True)
-class Precision:
-    """Steps of the grids. No number is off by more than half of its step."""
+class Grid(NamedTuple):
+    """A uniform grid for each column: value = low + step code."""
 
-    means: float = 0.03125
-    """largest step of a coordinate, in standard deviations of the median splat; 10 to 21 bits for each axis. Finer than
-    the others, because a splat smaller than the median suffers more, and pixels notice places first"""
-    quats: int = 8
-    """bits of each of a rotation's three smaller components"""
-    scales: float = 0.0625
-    """step of a log scale: a sixteenth is 6 % of a size"""
-    opacities: float = 0.0625
-    """step of an opacity's logit: a sixteenth is at most 1/64 of opacity"""
-    colors: float = 1 / 512
-    """step of a base colour, in units of white"""
-    latents: float = 0.0625
-    """step of a latent's components, in standard deviations of the strongest"""
+    low: Array
+    """[C]"""
+    step: Array
+    """[C], > 0"""
+
+    def codes(self, values: Array) -> Array:
+        """Nearest grid points of [N, C], int64, of those within 2^62 steps. Off by at most step / 2, and float64's
+        rounding."""
+        return np.rint((values - self.low) / self.step).clip(-(2.0**62), 2.0**62).astype(np.int64)
+
+    def values(self, codes: Array) -> Array:
+        """[N, C]"""
+        return self.low + self.step * codes
+
+
+def morton(codes: Array) -> Array:
+    """Interleaved bits of three coordinates [N, 3] of up to 21 bits, uint64 [N]: bit 3 k + a is bit k of axis a."""
+    spread = np.zeros(len(codes), dtype=np.uint64)
+    for axis in range(3):
+        x = codes[:, axis].astype(np.uint64)
+        for shift, mask in _SPREADS:
+            x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+        spread |= x << np.uint64(axis)
+    return spread
+
+
+def from_morton(interleaved: Array) -> Array:
+    """The coordinates [N, 3], int64, of `morton`'s numbers [N]."""
+    columns = []
+    for axis in range(3):
+        x = (interleaved >> np.uint64(axis)) & np.uint64(_SPREADS[-1][1])
+        for (shift, _), (_, mask) in zip(_SPREADS[::-1], [*_SPREADS[-2::-1], (0, 0x1FFFFF)], strict=True):
+            x = (x | (x >> np.uint64(shift))) & np.uint64(mask)
+        columns.append(x.astype(np.int64))
+    return np.stack(columns, axis=1)
+
+
+_SPREADS = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+"""Shifts and masks that pull 21 bits apart, two zeros between neighbours."""
+
+
+GROUP = Rotation.create_group("O")
+"""The 24 rotations that take the axes to the axes."""
+OCTAHEDRAL = np.roll(GROUP.as_quat(), 1, axis=1)
+"""The same as quaternions (w, x, y, z). [24, 4]"""
+NEAR = 0.8
+"""A rotation by 74 degrees; the nearest of 24 turns by no more than 62.8, where w is 0.853."""
+
+
+def nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:
+    """The same ellipsoids by the rotations that turn least: of the 24 ways to name an ellipsoid's axes, the one whose
+    rotation is nearest to the identity. A rotation with |w| > NEAR is left as it is.
+
+    Args:
+        quats: rotations (w, x, y, z) of any length but 0. [N, 4]
+        scales: one for each axis. [N, 3]
+
+    Returns:
+        quats [N, 4] of unit length with w >= NEAR, and scales [N, 3], permuted.
+    """
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    best = np.abs(unit @ (OCTAHEDRAL * [1, -1, -1, -1]).T).argmax(axis=1)  # |w| of q g
+    best[np.abs(unit[:, 0]) > NEAR] = OCTAHEDRAL[:, 0].argmax()  # the identity
+    turned = np.roll((Rotation.from_quat(np.roll(unit, -1, axis=1)) * GROUP[best]).as_quat(), 1, axis=1)
+    turned *= np.where(turned[:, :1] < 0, -1.0, 1.0)
+    axes = np.abs(GROUP.as_matrix()).argmax(axis=1)  # new axis j is old axis axes[j]
+    return turned, np.take_along_axis(scales, axes[best], axis=1)
 
 
 def tables_of(splats: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
@@ -78,17 +152,10 @@ def splats_of(tables: Mapping[str, Tensor], diffuse: Tensor) -> dict[str, Tensor
     }
 
 
-def steps_of(tables: Mapping[str, Tensor], precision: Precision) -> dict[str, np.ndarray]:
-    """Steps of the grids, one for each column: `precision`, for tables that were not trained for the file."""
+def steps_of(tables: Mapping[str, Tensor]) -> dict[str, Array]:
+    """STEPS for tables that were not trained for the file, one for each column."""
     median = float(np.exp(np.median(tables["scales"].mean(dim=1).cpu().numpy())))
     latents = tables["latents"]
     spread = float(latents.std(dim=0, correction=0).max()) if len(latents) > 1 else 0.0
-    steps = {
-        "means": precision.means * median,
-        "turns": 2.0**0.5 / (2**precision.quats - 1),
-        "scales": precision.scales,
-        "opacities": precision.opacities,
-        "colors": precision.colors,
-        "latents": precision.latents * spread if spread > 0 else 1.0,
-    }
-    return {name: np.full(tables[name].shape[1], step) for name, step in steps.items()}
+    units = {"means": median, "latents": spread if spread > 0 else 1.0 / STEPS["latents"]}
+    return {name: np.full(tables[name].shape[1], step * units.get(name, 1.0)) for name, step in STEPS.items()}

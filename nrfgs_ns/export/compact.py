@@ -4,26 +4,21 @@
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import torch
 import yaml
-from torch import Tensor
 
-from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.finetune import REPORT_EVERY, fine_tune, prepared
+from nrfgs_ns.compact.finetune import REPORT_EVERY, fine_tune
 from nrfgs_ns.compact.format import read_container, write_container
 from nrfgs_ns.compact.slim import FieldViews, look_over, slim
-from nrfgs_ns.compact.tables import Precision
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.options import CompactOptions
 from nrfgs_ns.files import write_whole
-from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.progress import progress
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import find_data, finish, load_model, lost, measure_loss
@@ -70,79 +65,49 @@ def export_compact(
 
 
 def packed(pipeline, load_config: Path, options: CompactOptions) -> tuple[dict, dict, dict[str, Any]]:
-    """The header and streams of a model's compact file, and their numbers for a report."""
-    chosen = choose(pipeline, load_config, options)
-    begin = perf_counter()
-    field, steps = trained_for_the_file(pipeline, chosen, options)
-    trained = perf_counter()
-    model = pipeline.model
-    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
-    header, streams = encode(field, Precision(), render, steps)
-    count = sum(header["splats"].values())
-    numbers = {
-        "splats": model.num_points,
-        "written": count,
-        "view_dependent": header["splats"]["view"],
-        "rank": header["head"]["config"]["latent_dim"],
-        "threshold": chosen.threshold if chosen.threshold != float("inf") else None,
-        "seconds": {"finetune": trained - begin, "encode": perf_counter() - trained},
-        "ply_bytes": PLY_BYTES * count,
-    }
-    return header, streams, numbers
-
-
-class Chosen(NamedTuple):
-    """The part of a model that is written; `weight` [N] is each splat's contribution to the training views, pixels."""
-
-    field: Field
-    threshold: float
-    """residuals below this many 8-bit steps are dropped; 0 for none"""
-    weight: Tensor
-
-
-def trained_for_the_file(
-    pipeline, chosen: Chosen, options: CompactOptions
-) -> tuple[Field, dict[str, np.ndarray] | None]:
-    """The chosen field after the options' fine-tune, and its grids' steps; without one, the field and None."""
-    if options.finetune == 0:
-        return chosen.field, None
-    model = pipeline.model
-    centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
-    noise = ViewNoise.as_long_as(model.noise_factor * camera_spacing(centers), torch.initial_seed())
-    field, steps = prepared(chosen.field, chosen.weight), options.finetune
-    views, settings = pipeline.datamanager.next_train, (len(centers), steps, options.rate, Precision())
-    with progress("Training for the file", -(-steps // REPORT_EVERY)) as advance:
-
-        def on_step(step: int, bits: float) -> None:
-            advance(f"Training for the file ({bits / 8e6:.2f} MB)")
-
-        tuned = fine_tune(model, field, views, noise, *settings, on_step)
-    return tuned.field, tuned.steps
-
-
-def choose(pipeline, load_config: Path, options: CompactOptions) -> Chosen:
-    """The field to write, slimmed within the budget unless a fine-tune follows."""
+    """The header and streams of a model's compact file, fine-tuned or slimmed within the budget, and their numbers for
+    a report."""
     model, data = pipeline.model, pipeline.datamanager
     if not isinstance(model.head, NeuralResidualField):
         raise InputError(
             f"{load_config}: a compact file holds a neural residual field, and this model has the {model.head.name!r} "
             "head. Use nrfgs export ply."
         )
-    with torch.no_grad():
-        field = model.field.detached()
-        images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
-        cameras = data.train_dataset.cameras
-        with progress(f"Looking at the splats from {len(cameras)} training views"):
-            seen = look_over(model, cameras)
-        if options.finetune > 0 or options.budget == 0:
-            return Chosen(field, 0.0, seen.weight)
+    images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
+    cameras = data.train_dataset.cameras
+    with progress(f"Looking at the splats from {len(cameras)} training views"):
+        seen = look_over(model, cameras)
+    begin = perf_counter()
+    field, threshold, steps = model.field.detached(), 0.0, None
+    if options.finetune > 0:
+        with progress("Training for the file", -(-options.finetune // REPORT_EVERY)) as advance:
+
+            def on_step(step: int, bits: float) -> None:
+                advance(f"Training for the file ({bits / 8e6:.2f} MB)")
+
+            field, steps = fine_tune(pipeline, field, seen.weight, options.finetune, options.rate, on_step)
+    elif options.budget > 0:
         chosen = evenly_spaced(len(images), VIEWS)
         pairs = [(cameras[i : i + 1].to(model.device), images[i]) for i in chosen]
         views = FieldViews(model, pairs, photographs_of(model, data.train_dataset.image_filenames, chosen))
         with progress("Choosing what to leave out") as advance:
             lowest = views.psnr(field) - options.budget
             slimmed = slim(field, seen, views, lowest, lambda candidate: advance(f"Without {candidate}"))
-    return Chosen(slimmed.field, slimmed.threshold, seen.weight)
+        field, threshold = slimmed.field, slimmed.threshold
+    trained = perf_counter()
+    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
+    header, streams = encode(field, render, steps)
+    count = sum(header["splats"].values())
+    numbers = {
+        "splats": model.num_points,
+        "written": count,
+        "view_dependent": header["splats"]["view"],
+        "rank": header["head"]["config"]["latent_dim"],
+        "threshold": threshold if threshold != float("inf") else None,
+        "seconds": {"finetune": trained - begin if options.finetune else 0.0, "encode": perf_counter() - trained},
+        "ply_bytes": PLY_BYTES * count,
+    }
+    return header, streams, numbers
 
 
 def photographs_of(model, files: Sequence[Path], chosen: Sequence[int]) -> list[int | None]:

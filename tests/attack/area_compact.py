@@ -25,13 +25,12 @@ def written() -> bytes:
     from nrfgs_ns.appearance.nrf import NrfConfig
     from nrfgs_ns.compact.encode import encode
     from nrfgs_ns.compact.format import write_container
-    from nrfgs_ns.compact.tables import Precision
 
     torch.manual_seed(3)
     head = NrfConfig(latent_dim=8, hidden_width=16, output_init="default").setup().requires_grad_(False)
     columns = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "features_dc": 3, "latents": 8}
     splats = {name: torch.randn(60, count) for name, count in columns.items()}
-    header, streams = encode(Field(head, splats), Precision(), {})
+    header, streams = encode(Field(head, splats), {})
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "field.nrf"
         write_container(path, header, streams)

@@ -29,7 +29,6 @@ from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
-from nrfgs_ns.compact.tables import Precision
 from nrfgs_ns.export.command import Web
 from nrfgs_ns.export.options import CompactOptions
 from nrfgs_ns.export.web.page import page as page_of
@@ -131,7 +130,7 @@ def random_scene(folder: Path, mode: str, options: dict) -> tuple[Path, list[dic
         "latents": torch.randn(count, head.config.latent_dim),
     }
     field = with_diffuse(Field(head, splats), torch.rand(count) < 0.3, splats["features_dc"], splats["opacities"])
-    header, streams = encode(field, Precision(), {"rasterize_mode": mode, "background": [0.1, 0.2, 0.3]})
+    header, streams = encode(field, {"rasterize_mode": mode, "background": [0.1, 0.2, 0.3]})
     write_container(folder / "scene.nrf", header, streams)
     photographs = []
     for k in range(3):

@@ -11,7 +11,6 @@ from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
-from nrfgs_ns.compact.tables import Precision
 
 
 def field(count: int = 60) -> Field:
@@ -30,8 +29,8 @@ def field(count: int = 60) -> Field:
     return with_diffuse(Field(head, splats), diffuse, splats["features_dc"], splats["opacities"])
 
 
-def through_a_file(one: Field, tmp_path: Path, precision: Precision | None = None) -> Decoded:
-    header, streams = encode(one, precision or Precision(), {"rasterize_mode": "classic"})
+def through_a_file(one: Field, tmp_path: Path) -> Decoded:
+    header, streams = encode(one, {"rasterize_mode": "classic"})
     write_container(tmp_path / "f.nrf", header, streams)
     return decode(tmp_path / "f.nrf")
 
