@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """COLMAP models, binary or text (https://colmap.github.io/format.html). A damaged file raises InputError.
 
-nerfstudio reads cameras and points in text. Its readers of images cut names at blanks, and its binary ones reserve
-gigabytes where a damaged file announces many entries.
+nerfstudio's readers are used for cameras and for points in text. Its readers of images cut names at blanks, and its
+binary ones of images and points reserve gigabytes where a damaged file announces many features.
 """
 
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from nerfstudio.data.utils import colmap_parsing_utils as nerfstudio_colmap
-from nerfstudio.data.utils.colmap_parsing_utils import CAMERA_MODEL_IDS, qvec2rotmat
+from nerfstudio.data.utils.colmap_parsing_utils import (
+    qvec2rotmat,
+    read_cameras_binary,
+    read_cameras_text,
+    read_points3D_text,
+)
 
 from nrfgs_ns.data.checks import find_colmap, shown
 from nrfgs_ns.errors import InputError
@@ -53,11 +57,11 @@ def read_model(folder: Path) -> tuple[dict[int, dict[str, Any]], list[View], Pat
         InputError: a file is missing or damaged, or has a camera model that cannot be undistorted.
     """
     path = _file(folder, "cameras")
-    read = nerfstudio_colmap.read_cameras_text if path.suffix == ".txt" else _cameras
-    cameras = {id: _lens(*camera, path) for id, camera in _read(read, path).items()}
+    stored = _read(read_cameras_text if path.suffix == ".txt" else read_cameras_binary, path)
+    cameras = {id: _lens(camera, path) for id, camera in stored.items()}
     path = path.with_stem("images")
-    read = _images_text if path.suffix == ".txt" else _images
-    views = sorted(_view(*image, path) for image in _read(read, path).values())
+    images = _read(_images_text, path) if path.suffix == ".txt" else _read(_entries, path, _image)
+    views = sorted((_view(image, path) for image in images), key=lambda view: view.id)
     if not views:
         raise InputError(f"{path} holds no photograph. Export the COLMAP model again.")
     strangers = [view.name for view in views if view.camera not in cameras]
@@ -70,10 +74,9 @@ def read_points(folder: Path) -> tuple[np.ndarray, np.ndarray, Path]:
     """Positions and colours, float64 [N, 3] each, of points3D.bin or points3D.txt, and the file."""
     path = _file(folder, "points3D")
     if path.suffix == ".txt":
-        points = _read(nerfstudio_colmap.read_points3D_text, path)
-        rows = [(*point.xyz, *point.rgb) for point in points.values()]
+        rows = [(*point.xyz, *point.rgb) for point in _read(read_points3D_text, path).values()]
     else:
-        rows = _read(_points, path)
+        rows = _read(_entries, path, _point)
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     return table[:, :3], table[:, 3:], path
 
@@ -89,38 +92,36 @@ def _file(folder: Path, stem: str) -> Path:
     raise InputError(f"{folder} holds neither {stem}.bin nor {stem}.txt. {where} --colmap-path.")
 
 
-def _read(read: Callable[[Path], Any], path: Path) -> Any:
+def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
     try:
-        return read(path)
-    except InputError:
-        raise
+        return read(path, *rest)
     except Exception as error:  # whatever damaged bytes lead to
         raise InputError(
-            f"{path} cannot be read ({shown(str(error))}). Restore it, or export the COLMAP model again."
+            f"{path} cannot be read ({type(error).__name__}: {shown(str(error))}). Restore it, or export the COLMAP "
+            "model again."
         ) from error
 
 
-def _parameters(model: str, path: Path) -> tuple[str, ...]:
-    if model not in MODELS:
+def _lens(camera: Any, path: Path) -> dict[str, Any]:
+    names = MODELS.get(camera.model)
+    if names is None:
         raise InputError(
-            f"{path}: camera model {shown(model)} is not supported. Undistort the photographs (colmap "
+            f"{path}: camera model {shown(camera.model)} is not supported. Undistort the photographs (colmap "
             f"image_undistorter), or use one of {', '.join(MODELS)}."
         )
-    return MODELS[model]
-
-
-def _lens(id: int, model: str, width: int, height: int, values: np.ndarray, path: Path) -> dict[str, Any]:
-    names = _parameters(model, path)
-    if len(values) != len(names):
-        raise InputError(f"{path}: a {model} camera has {len(values)} parameters instead of {len(names)}. Correct it.")
-    lens = dict(zip(names, map(float, values), strict=True))
+    if len(camera.params) != len(names):
+        raise InputError(
+            f"{path}: a {camera.model} camera has {len(camera.params)} parameters instead of {len(names)}. Correct it."
+        )
+    lens = dict(zip(names, map(float, camera.params), strict=True))
     if "f" in lens:
         lens["fl_x"] = lens["fl_y"] = lens.pop("f")
-    kind = "OPENCV_FISHEYE" if "FISHEYE" in model else "OPENCV"
-    return {"camera_model": kind, "w": width, "h": height, **lens}
+    kind = "OPENCV_FISHEYE" if "FISHEYE" in camera.model else "OPENCV"
+    return {"camera_model": kind, "w": camera.width, "h": camera.height, **lens}
 
 
-def _view(id: int, quaternion: np.ndarray, position: np.ndarray, camera: int, name: str, path: Path) -> View:
+def _view(image: tuple, path: Path) -> View:
+    id, quaternion, position, camera, name = image
     length = np.linalg.norm(quaternion)
     if not (abs(length - 1) <= QUATERNION_TOLERANCE and np.isfinite(position).all()):
         raise InputError(
@@ -132,69 +133,40 @@ def _view(id: int, quaternion: np.ndarray, position: np.ndarray, camera: int, na
     return View(id, name, camera, pose)
 
 
-class _Bytes:
-    """A file's bytes, read from front to back; an error at the end."""
-
-    def __init__(self, path: Path):
-        self.data, self.at = path.read_bytes(), 0
-
-    def take(self, layout: str) -> tuple:
-        start = self.at
-        self.skip(struct.calcsize(layout))
-        return struct.unpack_from(layout, self.data, start)
-
-    def skip(self, count: int) -> None:
-        self.at += count
-        if self.at > len(self.data):
-            raise ValueError("it ends too soon")
-
-    def end(self) -> None:
-        if self.at < len(self.data):
-            raise ValueError("more follows the last entry")
-
-    def word(self) -> str:
-        start = self.at
-        self.at = self.data.index(b"\0", start) + 1
-        return self.data[start : self.at - 1].decode("utf-8")
-
-
-def _cameras(path: Path) -> dict[int, tuple]:
-    file, cameras = _Bytes(path), {}
-    for _ in range(file.take("<Q")[0]):
-        id, number, width, height = file.take("<iiQQ")
-        model = CAMERA_MODEL_IDS[number].model_name if number in CAMERA_MODEL_IDS else f"number {number}"
-        cameras[id] = (id, model, width, height, file.take(f"<{len(_parameters(model, path))}d"))
-    file.end()
-    return cameras
-
-
-def _images(path: Path) -> dict[int, tuple]:
-    file, images = _Bytes(path), {}
-    for _ in range(file.take("<Q")[0]):
-        id, *pose, camera = file.take("<i7di")
-        images[id] = (id, np.array(pose[:4]), np.array(pose[4:]), camera, file.word())
-        file.skip(24 * file.take("<Q")[0])  # features
-    file.end()
-    return images
-
-
-def _images_text(path: Path) -> dict[int, tuple]:
-    images = {}
+def _images_text(path: Path) -> list[tuple]:
+    """Id, quaternion, position, camera and name of each photograph, as `_image` reads them."""
+    images = []
     lines = iter(path.read_text(encoding="utf-8").splitlines())
     for line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
             id, *pose, camera, name = line.split(maxsplit=9)
             pose = np.array(pose, dtype=np.float64).reshape(7)
-            images[int(id)] = (int(id), pose[:4], pose[4:], int(camera), name.strip())
+            images.append((int(id), pose[:4], pose[4:], int(camera), name.strip()))
             next(lines, None)  # features
     return images
 
 
-def _points(path: Path) -> list[list[float]]:
-    file, rows = _Bytes(path), []
-    for _ in range(file.take("<Q")[0]):
-        _, *row, _ = file.take("<Q3d3Bd")
-        file.skip(8 * file.take("<Q")[0])  # track
-        rows.append(row)
-    file.end()
-    return rows
+def _entries(path: Path, read: Callable[[BinaryIO], tuple]) -> list[tuple]:
+    """The entries of a binary file, which end where the file does."""
+    with path.open("rb") as file:
+        entries = [read(file) for _ in range(_take(file, "<Q")[0])]
+        if file.tell() != path.stat().st_size:
+            raise ValueError("the file is longer or shorter than its entries")
+    return entries
+
+
+def _image(file: BinaryIO) -> tuple:
+    id, *pose, camera = _take(file, "<i7di")
+    name = b"".join(iter(lambda: _take(file, "c")[0], b"\0")).decode("utf-8")
+    file.seek(24 * _take(file, "<Q")[0], 1)  # features
+    return id, np.array(pose[:4]), np.array(pose[4:]), camera, name
+
+
+def _point(file: BinaryIO) -> tuple:
+    _, *position_and_color, _ = _take(file, "<Q3d3Bd")
+    file.seek(8 * _take(file, "<Q")[0], 1)  # track
+    return tuple(position_and_color)
+
+
+def _take(file: BinaryIO, layout: str) -> tuple:
+    return struct.unpack(layout, file.read(struct.calcsize(layout)))

@@ -52,8 +52,6 @@ class NrfgsColmapDataParser(NrfgsDataParser):
             frame["transform_matrix"] = pose * np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backwards
             if config.masks_path is not None:
                 frame["mask_path"] = view.name
-            if config.depths_path is not None:
-                frame["depth_file_path"] = view.name
             frames.append(frame)
         meta = {"frames": frames, "camera_model": kinds.pop()}
         if config.assume_colmap_world_coordinate_convention:
@@ -66,13 +64,7 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         return self._folder / self.config.colmap_path
 
     def _root(self, key: str) -> Path:
-        config = self.config
-        folders = {
-            "file_path": config.images_path,
-            "mask_path": config.masks_path,
-            "depth_file_path": config.depths_path,
-        }
-        return self._folder / folders[key]
+        return self._folder / (self.config.images_path if key == "file_path" else self.config.masks_path)
 
     def _file(self, name: str, key: str = "file_path") -> Path:
         path = self._root(key) / name

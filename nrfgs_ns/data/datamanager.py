@@ -2,7 +2,6 @@
 """Images in memory and their order in training: nerfstudio's datamanager, made to fail early and clearly, to run
 without an accelerator, and to continue after an interruption."""
 
-import math
 import random
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -43,32 +42,27 @@ class NrfgsInputDataset(InputDataset):
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
         super().__init__(dataparser_outputs, scale_factor)
         for name in ("width", "height"):  # as images and masks are rounded; nerfstudio does it in float32
-            full = getattr(dataparser_outputs.cameras, name).flatten().tolist()
-            sides = [[int(side * scale_factor)] for side in full]
-            if min(sides, default=[1])[0] < 1:
+            sides = (getattr(dataparser_outputs.cameras, name).double() * scale_factor).int()
+            if (sides < 1).any():
                 raise InputError(
                     f"--pipeline.datamanager.camera-res-scale-factor {scale_factor} leaves nothing of the images. Give "
                     "a larger one."
                 )
-            setattr(self.cameras, name, torch.tensor(sides, dtype=getattr(self.cameras, name).dtype))
-        lost = ~torch.isfinite(self.cameras.camera_to_worlds).flatten(1).all(dim=1)
-        if lost.any():  # nerfstudio's own parsers do not look
-            names = [str(path) for path, is_lost in zip(self.image_filenames, lost.tolist(), strict=True) if is_lost]
-            raise InputError(f"The pose of {some(names)} holds NaN or Inf. Recompute it, or remove the frame.")
+            setattr(self.cameras, name, sides.to(getattr(self.cameras, name)))
         # A copy: the datamanager removes entries from the list, which all datasets share.
         self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
         self.metadata["scene_unit"] = scene_unit(self.cameras.camera_to_worlds[:, :3, 3])
         self.metadata["different_views"] = different_views(self.cameras.camera_to_worlds)
         # Undistortion crops the cameras while it loads the images.
         self._sizes = torch.cat([self.cameras.width, self.cameras.height], dim=-1).tolist()
+        self.downscale = self.metadata.get("downscale", 1)
+        """size of the files / size of the cameras; nerfstudio's own parsers do not say it"""
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
-        """A decoded image, uint8 [H, W, 3 or 4], scaled by scale_factor."""
+        """A decoded image, uint8 [H, W, 3 or 4], of its camera's size."""
         path = self.image_filenames[image_idx]
-        pixels = read_picture(path)
-        if self.scale_factor != 1.0:
-            size = [int(side * self.scale_factor) for side in pixels.size]
-            pixels = pixels.resize(size, resample=Image.Resampling.BILINEAR)
+        sampling = Image.Resampling.BILINEAR if self.downscale == 1 else Image.Resampling.LANCZOS
+        pixels = self._smaller(read_picture(path), image_idx, sampling)
         width, height = self._sizes[image_idx]
         if pixels.size != (width, height):
             raise InputError(
@@ -77,14 +71,17 @@ class NrfgsInputDataset(InputDataset):
             )
         return np.array(pixels)
 
+    def _smaller(self, picture: Image.Image, index: int, sampling: Image.Resampling) -> Image.Image:
+        """A picture in full size, made smaller by `downscale` and `scale_factor`."""
+        size = [int(side * self.scale_factor) for side in picture.size] if self.downscale == 1 else self._sizes[index]
+        return picture.resize(size, sampling)
+
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, its mask and its index; InputError if a file cannot be used."""
         image = self.get_image_float32(image_idx) if image_type == "float32" else self.get_image_uint8(image_idx)
         data = {"image_idx": image_idx, "image": image}
         if (masks := self._dataparser_outputs.mask_filenames) is not None:
-            mask = read_mask(masks[image_idx])
-            if self.scale_factor != 1.0:
-                mask = mask.resize([int(side * self.scale_factor) for side in mask.size], Image.Resampling.NEAREST)
+            mask = self._smaller(read_mask(masks[image_idx]), image_idx, Image.Resampling.NEAREST)
             if mask.size != (image.shape[1], image.shape[0]):
                 raise InputError(
                     f"{masks[image_idx]} is {mask.width} x {mask.height}, but its image {image.shape[1]} x "
@@ -203,24 +200,19 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     def _place(self) -> Literal["device", "memory", "files"]:
         """Where decoded images are kept: on the device if they take at most half of its free memory, else on the host,
         else in files."""
-        device, each = torch.device(self.device), 1 if self.config.cache_images_type == "uint8" else 4
-        size = 0
+        each, size = (1 if self.config.cache_images_type == "uint8" else 4), 0
         for dataset in (self.train_dataset, self.eval_dataset):
             channels = 3 * each + (dataset._dataparser_outputs.mask_filenames is not None)
             size += channels * int((dataset.cameras.width.long() * dataset.cameras.height).sum())
-        if device.type == "cuda" and self.config.cache_images == "gpu":
-            if size <= torch.cuda.mem_get_info(device)[0] / 2:
+        if torch.device(self.device).type == "cuda" and self.config.cache_images == "gpu":
+            if size <= torch.cuda.mem_get_info(self.device)[0] / 2:
                 return "device"
-            CONSOLE.print(
-                f"Decoded images take {size / 1e9:.1f} GB, half of the GPU's free memory: the host keeps them."
-            )
-        budget, free = self.config.image_memory, free_memory()
-        budget = budget * 1e9 if budget is not None else math.inf if free is None else free / 2
+        budget = free_memory() / 2 if self.config.image_memory is None else 1e9 * self.config.image_memory
         if size <= budget:
             return "memory"
         CONSOLE.print(
             f"Decoded images take {size / 1e9:.1f} GB, and may take {budget / 1e9:.1f} (--pipeline.datamanager."
-            f"image-memory): they are read from files in {cache_folder('pixels')}.",
+            f"image-memory): they are read from files in {cache_folder()}.",
             markup=False,
             soft_wrap=True,
         )
@@ -241,7 +233,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             move = Tensor.pin_memory if place == "memory" else lambda values: values.to(self.device)
             return data | {name: move(data[name]) for name in ("image", "mask") if name in data}
 
-        sizes = list(zip(dataset.cameras.width[:, 0].tolist(), dataset.cameras.height[:, 0].tolist(), strict=True))
+        widths, heights = (dataset.downscale * side[:, 0] for side in (dataset.cameras.width, dataset.cameras.height))
+        sizes = list(zip(widths.tolist(), heights.tolist(), strict=True))
         workers = self.config.max_thread_workers
         pictures = in_parallel(lambda index: read(dataset, index, kind), sizes, f"Reading {split} images", workers)
         images = [placed(data) for data in pictures]

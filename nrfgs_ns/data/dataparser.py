@@ -32,7 +32,7 @@ from nrfgs_ns.data.checks import (
     warn,
 )
 from nrfgs_ns.data.lenses import SMALLEST, cameras_of, read_lenses
-from nrfgs_ns.data.pictures import read_size, smaller_copies, stored_exif
+from nrfgs_ns.data.pictures import read_size, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
@@ -46,7 +46,7 @@ with_data_parsers()
 MIN_POINTS = 4
 """Fewer points cannot start a training: a splat's first size is its distance to its three nearest neighbours."""
 ORIENTATIONS = ("pca", "up", "vertical", "none")
-FOLDERS = {"file_path": "images", "mask_path": "masks", "depth_file_path": "depths"}
+FOLDERS = {"file_path": "images", "mask_path": "masks"}
 """A frame's files -> folder of their smaller copies, followed by _ and the factor."""
 COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """The applied_transform of data sets from before nerfstudio wrote it down."""
@@ -97,7 +97,7 @@ class NrfgsDataParser(DataParser):
     - A data set of one image loads. It keeps its own scale, having no extent to normalise by.
     - Points are read by plyfile, or straight from colmap/sparse/0 without a question at the terminal.
     - Cameras far from the origin are moved there in float64 (see `world`).
-    - With a downscale_factor of which there is no folder, images are resized into a cache.
+    - With a downscale_factor of which there is no folder, images are resized when they are read.
     - To render from a checkpoint, nerfstudio presets `downscale_factor`: neither images nor points need be there.
     """
 
@@ -115,22 +115,22 @@ class NrfgsDataParser(DataParser):
             warn(f"{scene.source}: no image is kept for {split}. The training images are evaluated instead.")
         rows = scene.splits[chosen]
         frames = [scene.meta["frames"][row] for row in rows]
-        files = {key: self._files(frames, key, scene.factor) for key in FOLDERS}
+        images, masks = (self._files(frames, key, scene.factor) for key in FOLDERS)
         cameras = scene.cameras[torch.from_numpy(rows)]
         if self._images_needed:
-            files |= self._checked_files(scene, rows, files, cameras)
+            self._check_sizes(scene, rows, images, masks, cameras)
+        copies = all(self._has_copies(key, scene.factor) for key in FOLDERS if key in frames[0])
         box = self.config.scene_scale * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         outputs = PlacedOutputs(
-            image_filenames=files["file_path"],
+            image_filenames=images,
             cameras=cameras,
             scene_box=SceneBox(aabb=box),
-            mask_filenames=files["mask_path"] or None,
+            mask_filenames=masks or None,
             dataparser_scale=scene.scale * number(scene.meta.get("applied_scale", 1.0)),
             dataparser_transform=after(scene.transform, scene.to_frames),
             metadata={
-                "depth_filenames": files["depth_file_path"] or None,
                 "exif": [stored_exif(frame, scene.source) for frame in frames],
-                "depth_unit_scale_factor": self.config.depth_unit_scale_factor,
+                "downscale": 1 if copies else scene.factor,
                 "mask_color": getattr(self.config, "mask_color", None),
             },
         )
@@ -248,32 +248,22 @@ class NrfgsDataParser(DataParser):
         root = self._root(key)
         return root.with_name(f"{root.name}_{factor}")
 
-    def _checked_files(
-        self, scene: Scene, rows: np.ndarray, files: dict[str, list[Path]], cameras: Cameras
-    ) -> dict[str, list[Path]]:
-        """Images and masks, checked to have their cameras' sizes, and resized where the data set has no copies."""
-        sizes = list(zip(cameras.width.flatten().tolist(), cameras.height.flatten().tolist(), strict=True))
+    def _check_sizes(
+        self, scene: Scene, rows: np.ndarray, images: list[Path], masks: list[Path], cameras: Cameras
+    ) -> None:
+        """Images and masks have the size of their cameras, or the full one where the data set has no smaller copies."""
+        small = [(int(width), int(height)) for width, height in zip(cameras.width, cameras.height, strict=True)]
         full = [(int(width), int(height)) for width, height in scene.lenses[rows, 4:6]]
-        result = {}
-        for key, what, fix in (
-            ("file_path", "images", "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy alike."),
-            ("mask_path", "masks", "Make them as large as the images."),
+        for key, paths, what, fix in (
+            ("file_path", images, "images", "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy alike."),
+            ("mask_path", masks, "masks", "Make them as large as the images."),
         ):
-            paths = files[key]
-            if not paths:
-                continue
-            if scene.factor > 1 and not self._has_copies(key, scene.factor):
+            if paths and self._has_copies(key, scene.factor):
+                check_unique(paths, f"{scene.source}: frames")
+                rounding = "Remove {}, or with `colmap` give --downscale-rounding-mode round or ceil."
+                check_headers(paths, small, what, rounding.format(self._copies(key, scene.factor)))
+            elif paths:
                 check_headers(paths, full, what, fix)
-                result[key] = smaller_copies(paths, sizes, what)
-                continue
-            check_unique(paths, f"{scene.source}: frames")
-            if scene.factor > 1:
-                fix = (
-                    f"Remove {paths[0].parent}, so that copies are made, or with `colmap` give "
-                    "--downscale-rounding-mode round or ceil."
-                )
-            check_headers(paths, sizes, what, fix)
-        return result
 
     @cached_property
     def _placed_points(self) -> dict[str, torch.Tensor]:

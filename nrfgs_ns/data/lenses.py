@@ -36,7 +36,7 @@ LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
 
 
 def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
-    """Intrinsics of every frame, by nerfstudio's rule: the top level's where it has them.
+    """Intrinsics of every frame: the top level's where it has them.
 
     Returns:
         float64 [V, 12]: `PIXELS`, then `DISTORTION`.
@@ -44,49 +44,59 @@ def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
     Raises:
         InputError: a number is missing or out of range, or given twice with two values.
     """
-    frames = meta["frames"]
     _check_model(meta, source)
-    for key in ("distortion_params", *PIXELS, *DISTORTION):
-        other = [frame["file_path"] for frame in frames if key in meta and key in frame and frame[key] != meta[key]]
+    shared = {key: meta[key] for key in (*PIXELS, *DISTORTION, "distortion_params") if key in meta}
+    for key, value in shared.items():
+        other = [frame["file_path"] for frame in meta["frames"] if frame.get(key, value) != value]
         if other:
             raise InputError(
                 f"{source}: {key} of {some(other)} is not the one at the top level, which would be used for all "
                 "frames. Remove it at the top level, or in these frames."
             )
-    table = np.empty((len(frames), len(PIXELS) + len(DISTORTION)))
-    for index, key in enumerate(PIXELS):
-        table[:, index] = [_pixels(holder, name, key, source) for holder, name in _holders(meta, key in meta)]
-    shared = any(key in meta for key in (*DISTORTION, "distortion_params"))
-    table[:, len(PIXELS) :] = [_distortion(holder, name, source) for holder, name in _holders(meta, shared)]
-    focal, center, sides = table[:, 0:2], table[:, 2:4], table[:, 4:6]
-    size = sides.max(axis=1, keepdims=True)
-    small = ~((SMALLEST <= sides) & (sides <= LARGEST)).all(axis=1)
-    focal_is_odd = ~((WIDEST * size <= focal) & (focal <= NARROWEST * size)).all(axis=1)
-    center_is_odd = ~(np.abs(center - sides / 2) <= FARTHEST_CENTER * sides).all(axis=1)
-    for index in np.flatnonzero(small | focal_is_odd | center_is_odd)[:1]:
-        fl_x, fl_y, cx, cy, w, h = table[index, :6]
-        where = f"{source}: {shown(frames[index]['file_path'])}"
-        if small[index]:
-            raise InputError(f"{where} is {w:g} x {h:g} pixels. Use images of {SMALLEST} to {LARGEST} a side.")
+    return np.array(
+        [_lens({**frame, **shared}, f"of {shown(frame['file_path'])}", source) for frame in meta["frames"]]
+    )
+
+
+def _lens(values: dict[str, Any], of: str, source: Path) -> list[float]:
+    for key in PIXELS:
+        if not np.isfinite(number(values.get(key))):
+            what = f"is {shown(repr(values[key]))}" if key in values else "is missing"
+            hint = " (from a field of view: w / (2 tan(camera_angle_x / 2)))" if key in ("fl_x", "fl_y") else ""
+            raise InputError(f"{source}: {key} {of} {what}. Add it, a number of pixels{hint}.")
+    fl_x, fl_y, cx, cy, w, h = pixels = [number(values[key]) for key in PIXELS]
+    size = max(w, h)
+    if not (
+        all(SMALLEST <= side <= LARGEST for side in (w, h))
+        and all(WIDEST * size <= focal <= NARROWEST * size for focal in (fl_x, fl_y))
+        and all(abs(center - side / 2) <= FARTHEST_CENTER * side for center, side in ((cx, w), (cy, h)))
+    ):
         raise InputError(
-            f"{where} has fl_x {fl_x:g}, fl_y {fl_y:g}, cx {cx:g}, cy {cy:g} for an image of {w:g} x {h:g}: no lens "
-            "does that. Give them in pixels of this image."
+            f"{source}: the lens {of} has fl_x {fl_x:g}, fl_y {fl_y:g}, cx {cx:g}, cy {cy:g} for an image of {w:g} x "
+            f"{h:g}: no lens does that. Give them in pixels of this image, of {SMALLEST} to {LARGEST} a side."
         )
-    return table
+    stored = values.get("distortion_params", [values.get(key, 0.0) for key in DISTORTION])
+    distortion = [number(value) for value in stored] if isinstance(stored, list) else []
+    if len(distortion) != len(DISTORTION) or not np.isfinite(distortion).all():
+        raise InputError(
+            f"{source}: the distortion {of} is {shown(repr(stored))}. Give six numbers, 0 for none: "
+            f"{', '.join(DISTORTION)}."
+        )
+    return pixels + distortion
 
 
 def _check_model(meta: dict[str, Any], source: Path) -> None:
     """The camera model is one that is drawn, and has no parameters beyond its own."""
     model = meta.get("camera_model", "OPENCV")
     drawn = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in DRAWN]
-    if not isinstance(model, str) or model not in drawn:
+    if model not in drawn:
         raise InputError(
             f"{source}: camera_model {shown(repr(model))} is not drawn here. Use one of {', '.join(drawn)}, or "
             "undistort the photographs to one of them."
         )
     kind = CAMERA_MODEL_TO_TYPE[model]
-    for holder, name in [(meta, "the top level"), *_holders(meta, False)]:
-        where = f"of {shown(name)} is"
+    for holder in (meta, *meta["frames"]):
+        where = f"of {shown(holder['file_path'])} is" if holder is not meta else "of the top level is"
         if CAMERA_MODEL_TO_TYPE.get(str(holder.get("camera_model", model))) != kind:
             raise InputError(
                 f"{source}: camera_model {where} not {model}, the top level's, which is used for all frames. "
@@ -100,36 +110,6 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
                     f"{source}: {key} {where} {shown(repr(holder[key]))}, a distortion that cannot be undone here. "
                     f"Undistort the photographs, or fit a model of {', '.join(DISTORTION)}."
                 )
-
-
-def _holders(meta: dict[str, Any], shared: bool) -> list[tuple[dict[str, Any], str]]:
-    """The top level alone, or every frame; each with its name for messages."""
-    return [(meta, "the top level")] if shared else [(frame, frame["file_path"]) for frame in meta["frames"]]
-
-
-def _pixels(holder: dict[str, Any], name: str, key: str, source: Path) -> float:
-    if key not in holder:
-        hint = " (from a field of view: w / (2 tan(camera_angle_x / 2)))" if key in ("fl_x", "fl_y") else ""
-        raise InputError(f"{source}: {key} is missing, at the top and in {shown(name)}. Add it, in pixels{hint}.")
-    value = number(holder[key])
-    least = {"w": 1.0, "h": 1.0, "cx": -np.inf, "cy": -np.inf}.get(key, 1e-300)
-    if not (np.isfinite(value) and value >= least):
-        raise InputError(
-            f"{source}: {key} of {shown(name)} is {shown(repr(holder[key]))}. Give a number of pixels, above 0."
-        )
-    return value
-
-
-def _distortion(holder: dict[str, Any], name: str, source: Path) -> list[float]:
-    """Six parameters in nerfstudio's order, of the top level or of a frame."""
-    values = holder.get("distortion_params", [holder.get(key, 0.0) for key in DISTORTION])
-    numbers = [number(value) for value in values] if isinstance(values, list) else []
-    if len(numbers) != len(DISTORTION) or not np.isfinite(numbers).all():
-        raise InputError(
-            f"{source}: the distortion of {shown(name)} is {shown(repr(values))}. Give six numbers, 0 for none: "
-            f"{', '.join(DISTORTION)}."
-        )
-    return numbers
 
 
 def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: torch.Tensor, source: Path) -> Cameras:

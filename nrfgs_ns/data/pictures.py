@@ -1,22 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of photographs and masks: formats, EXIF, and smaller copies in a cache."""
+"""Files of photographs and masks: formats, memory for decoding, EXIF."""
 
 import contextlib
-import hashlib
 import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from PIL import ExifTags, Image
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.files import whole
 
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "PPM")
 """Formats that PIL may open. It goes by a file's first bytes, and starts Ghostscript for one of the others."""
@@ -88,13 +86,13 @@ def read_mask(path: Path) -> Image.Image:
     return Image.fromarray(inside.astype(np.uint8) * 255)
 
 
-def free_memory() -> int | None:
-    """Bytes of available memory; None where the system does not say."""
+def free_memory() -> float:
+    """Bytes of available memory; infinite where the system does not say."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
     except (OSError, StopIteration, ValueError):
-        return None
+        return math.inf
 
 
 def in_parallel(
@@ -103,7 +101,7 @@ def in_parallel(
     """Results of `read(0)`, `read(1)`, ..., which decode pictures of these sizes (width, height), on `workers` threads.
 
     By default there is a thread for each processor; half of the free memory bounds their number. The first failure ends
-    the reading. `what` names the progress bar.
+    the reading. `what` labels the progress bar.
 
     Raises:
         InputError: there is no memory for decoding the largest picture.
@@ -113,67 +111,23 @@ def in_parallel(
     width, height = max(sizes, key=math.prod, default=(1, 1))
     each, free = BYTES_PER_PIXEL * width * height, free_memory()
     workers = workers or os.cpu_count() or 1
-    if free is not None and each > free:
+    if each > free:
         raise InputError(
             f"Decoding an image of {width} x {height} takes about {each / 1e9:.1f} GB of memory, and {free / 1e9:.1f} "
             "are free. Close other programs, or make the images and masks smaller."
         )
-    if free is not None:
-        workers = max(min(workers, free // (2 * each + 1)), 1)
-    columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with ThreadPoolExecutor(workers) as pool, Progress(*columns, console=CONSOLE, transient=True) as bar:
+    workers = max(int(min(workers, free / (2 * each + 1))), 1)
+    with ThreadPoolExecutor(workers) as pool:
         try:
-            yield from bar.track(pool.map(read, range(len(sizes))), total=len(sizes))
+            yield from track(pool.map(read, range(len(sizes))), what, len(sizes), console=CONSOLE, transient=True)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
 
 
-def cache_folder(kind: str = "images") -> Path:
-    """Folder of a kind of cached files, in XDG_CACHE_HOME or ~/.cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nrfgs-ns" / kind
-
-
-def smaller_copies(
-    paths: Sequence[Path], sizes: Sequence[tuple[int, int]], kind: Literal["images", "masks"]
-) -> list[Path]:
-    """Cached copies of pictures at smaller sizes (width, height), made where missing or older than their originals.
-
-    They keep their names. Photographs are filtered (Lanczos; JPEG stays JPEG, of quality 95, the rest is kept without
-    loss), masks are sampled.
-    """
-    copies = [_copy_of(path, size, kind) for path, size in zip(paths, sizes, strict=True)]
-    missing = [job for job in zip(paths, sizes, copies, strict=True) if not job[2].is_file()]
-    if missing:
-        from nerfstudio.utils.rich_utils import CONSOLE
-
-        full = [read_size(path) for path, _, _ in missing]
-        list(in_parallel(lambda index: _resize(*missing[index], kind), full, f"Resizing {kind}"))
-        CONSOLE.print(f"{len(missing)} {kind} were resized into {cache_folder()}.", markup=False, soft_wrap=True)
-    return copies
-
-
-def _copy_of(path: Path, size: tuple[int, int], kind: str) -> Path:
-    """Path of a copy, in a folder named after everything that decides its pixels."""
-    stat = path.stat()
-    identity = f"{path.resolve()} {stat.st_size} {stat.st_mtime_ns} {size} {kind}"
-    return cache_folder() / hashlib.sha256(identity.encode("utf-8", "surrogateescape")).hexdigest()[:24] / path.name
-
-
-def _resize(path: Path, size: tuple[int, int], copy: Path, kind: str) -> None:
-    picture = read_picture(path) if kind == "images" else read_mask(path)
-    sampling = Image.Resampling.LANCZOS if kind == "images" else Image.Resampling.NEAREST
-    with open_picture(path) as image:
-        lossy = kind == "images" and picture.mode == "RGB" and image.format in ("JPEG", "MPO")
-    exif = exif_of_copy(picture.getexif())
-    form = "JPEG" if lossy else "PNG"
-    try:
-        with whole(copy) as aside:
-            picture.resize(size, sampling).save(aside, form, quality=95, compress_level=1, exif=exif)
-    except OSError as error:
-        raise InputError(
-            f"{copy} cannot be written ({error.strerror}). Make room there, or set XDG_CACHE_HOME to another folder."
-        ) from error
+def cache_folder() -> Path:
+    """Folder of cached files, in XDG_CACHE_HOME or ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nrfgs-ns"
 
 
 NUMBERS = {
@@ -269,9 +223,7 @@ def share_of_size(path: Path) -> float:
     exif, size = _exif_at(path)
     details = exif.get_ifd(ExifTags.IFD.Exif)
     sides = [_number(details.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
-    if None in sides or ExifTags.Base.FocalLengthIn35mmFilm in details:
-        return 1.0
-    return max(size) / max(sides)
+    return 1.0 if None in sides or ExifTags.Base.FocalLengthIn35mmFilm in details else max(size) / max(sides)
 
 
 def read_position(path: Path) -> tuple[float, float] | None:

@@ -7,7 +7,6 @@ camera has changed.
 
 import hashlib
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,10 @@ from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_imag
 
 from nrfgs_ns.data.pictures import cache_folder
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.files import whole, write_whole
+from nrfgs_ns.files import whole
 
 LENS = ("fx", "fy", "cx", "cy", "width", "height")
 """Fields of a camera that undistortion changes."""
-MAPPED = ("image", "mask")
 PAGE = 4096
 """Bytes."""
 
@@ -60,19 +58,30 @@ def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
         InputError: there is no room for them.
     """
     folder = _folder(dataset, index, image_type)
-    about = _about(folder)
-    if about is None:
+    mapped = ("image",) if dataset._dataparser_outputs.mask_filenames is None else ("image", "mask")
+    try:
+        pixels, lens = _read(folder, mapped)
+    except (OSError, ValueError, EOFError):  # missing, or cut, as cleaners of caches leave them
         data = undistorted(dataset, index, image_type)
+        lens = np.array([getattr(dataset.cameras, name)[index].item() for name in LENS])
         try:
-            _write(folder, data, [getattr(dataset.cameras, name)[index].item() for name in LENS])
+            for name, values in {**{name: data[name].numpy() for name in mapped}, "lens": lens}.items():
+                with whole(folder / f"{name}.npy") as aside, aside.open("wb") as file:
+                    np.save(file, values)
         except OSError as error:
             raise InputError(
                 f"{folder} cannot be written ({error.strerror}). Make room there, set XDG_CACHE_HOME to another "
                 "folder, or give more --pipeline.datamanager.image-memory."
             ) from error
-        about = _about(folder)
-    _set_lens(dataset.cameras, index, about["lens"])
-    return {"image_idx": index} | {name: _mapped(folder, name, about[name]) for name in MAPPED if name in about}
+        pixels, lens = _read(folder, mapped)
+    _set_lens(dataset.cameras, index, lens.tolist())
+    return {"image_idx": index, **pixels}
+
+
+def _read(folder: Path, mapped: Sequence[str]) -> tuple[dict[str, torch.Tensor], np.ndarray]:
+    """Mapped files, whose tensors may be written to without changing them, and `LENS`."""
+    pixels = {name: torch.from_numpy(np.load(folder / f"{name}.npy", mmap_mode="c")) for name in mapped}
+    return pixels, np.load(folder / "lens.npy")
 
 
 def look_through(image: torch.Tensor) -> None:
@@ -80,47 +89,16 @@ def look_through(image: torch.Tensor) -> None:
     image.view(torch.uint8).flatten()[::PAGE].sum()
 
 
-def _write(folder: Path, data: dict[str, Any], lens: list[float]) -> None:
-    about: dict[str, Any] = {"lens": lens}
-    for name in MAPPED:
-        if name in data:
-            values = data[name].contiguous()
-            with whole(folder / f"{name}.bin") as aside:
-                values.view(torch.uint8).numpy().tofile(aside)
-            about[name] = [str(values.dtype).removeprefix("torch."), *values.shape]
-    write_whole(folder / "about.json", json.dumps(about))  # last: with it the photograph is there
-
-
-def _about(folder: Path) -> dict[str, Any] | None:
-    """The description of a folder's files; None where one is missing or cut, as cleaners of caches leave them."""
-    try:
-        about = json.loads((folder / "about.json").read_text(encoding="utf-8"))
-        sizes = {name: (folder / f"{name}.bin").stat().st_size for name in MAPPED if name in about}
-        announced = {name: np.dtype(about[name][0]).itemsize * math.prod(about[name][1:]) for name in sizes}
-        return about if sizes == announced else None
-    except (OSError, ValueError):
-        return None
-
-
-def _mapped(folder: Path, name: str, form: list) -> torch.Tensor:
-    """A mapped file; writing into the tensor leaves the file alone."""
-    kind, *shape = form  # not torch.from_file, which takes only names that are UTF-8
-    return torch.from_numpy(np.memmap(folder / f"{name}.bin", dtype=kind, mode="c", shape=tuple(shape)))
-
-
 def _folder(dataset: Any, index: int, image_type: str) -> Path:
     """Folder of a photograph's files, named after everything that decides its pixels."""
-    outputs = dataset._dataparser_outputs
-    paths = [outputs.image_filenames[index]]
-    if outputs.mask_filenames is not None:
-        paths.append(outputs.mask_filenames[index])
+    outputs, cameras = dataset._dataparser_outputs, dataset.cameras
+    paths = [names[index] for names in (outputs.image_filenames, outputs.mask_filenames) if names is not None]
     files = [(str(path.resolve()), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in paths]
-    cameras = dataset.cameras
     distortion = None if cameras.distortion_params is None else cameras.distortion_params[index].tolist()
     camera = [distortion, *(getattr(cameras, name)[index].item() for name in (*LENS, "camera_type"))]
     kept = [files, camera, image_type, dataset.scale_factor, str(dataset.mask_color), str(outputs.alpha_color)]
     name = hashlib.sha256(json.dumps(kept).encode("utf-8", "surrogateescape")).hexdigest()[:24]
-    return cache_folder("pixels") / name
+    return cache_folder() / name
 
 
 def _set_lens(cameras: Cameras, index: int, lens: Sequence[float]) -> None:
