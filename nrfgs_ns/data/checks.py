@@ -23,11 +23,11 @@ ROTATION_TOLERANCE = 1e-2
 LAST_ROW_TOLERANCE = 1e-6
 POSITION_TOLERANCE = 1e-8
 """Camera positions that agree to this share of their size are one place; in UTM coordinates it is 5 cm."""
-FAR_OUTSIDE, RATHER_FAR = 100.0, 20.0
-"""A camera this many times as far from the middle as three in four has a wrong pose, or deserves a warning."""
+FAR_OUTSIDE = 100.0
+"""A camera this many times as far from the middle as three in four has a wrong pose: the farthest scales the scene."""
 LONGEST_JSON = 2**26
 """Bytes of a transforms.json, at most: a hundred thousand frames."""
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".dng")
+PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".dng")
 """Suffixes of a camera's files."""
 SHOWN, LONGEST = 3, 160
 """Items that a message lists before it counts the rest, and characters of each."""
@@ -94,17 +94,11 @@ def _advice_without_transforms(folder: Path) -> str:
         return "Point --data at a folder that holds a transforms.json, or at the file."
     if model := find_colmap(folder):
         return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
-    if (folder / "transforms_train.json").is_file():
-        return "There is a data set of Blender's: put `blender-data` at the end of the command."
-    places = [folder, folder / "images"]
-    if any(file.suffix.lower() in PHOTOGRAPHS for place in places if place.is_dir() for file in place.iterdir()):
+    if any(file.suffix.lower() in PHOTOGRAPHS for pattern in ("*", "images/*") for file in folder.glob(pattern)):
         return (
             f"There are photographs without poses: `nrfgs prepare {folder} SCENE` finds the poses; then train on SCENE."
         )
-    return (
-        "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` (or nerfstudio's ns-process-data) makes "
-        "one from photographs."
-    )
+    return "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
 
 
 def find_colmap(folder: Path) -> str | None:
@@ -129,18 +123,17 @@ def check_options(config: Any) -> None:
 
 
 def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
-    """Every frame names an image of its own; masks and depths are named by all frames or by none."""
+    """Every frame names an image of its own; masks are named by all frames or by none."""
     nameless = [f"frames[{i}]" for i, frame in enumerate(frames) if not _is_name(frame.get("file_path"))]
     if nameless:
         raise InputError(f"{source}: {some(nameless)} without a file_path. Name the image, or remove the frame.")
     check_unique((os.path.normpath(frame["file_path"]) for frame in frames), f"{source}: frames")
-    for field, hint in (("mask_path", " (an all-white mask keeps the whole image)"), ("depth_file_path", "")):
-        without = [frame["file_path"] for frame in frames if not _is_name(frame.get(field))]
-        if without and any(field in frame for frame in frames):
-            raise InputError(
-                f"{source}: {field} is given for some frames but not for {some(without)}. "
-                f"Give one for every frame{hint}, or for none."
-            )
+    without = [frame["file_path"] for frame in frames if not _is_name(frame.get("mask_path"))]
+    if without and any("mask_path" in frame for frame in frames):
+        raise InputError(
+            f"{source}: mask_path is given for some frames but not for {some(without)}. Give one for every frame (an "
+            "all-white mask keeps the whole image), or for none."
+        )
 
 
 def _is_name(value: Any) -> bool:
@@ -180,22 +173,14 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
             f"{source}: all {len(frames)} cameras stand at the same place, so the scene has no scale and no depth. "
             "Recompute the poses from images with parallax, or set --auto-scale-poses False."
         )
-    _check_spread(position, names, source)
-    return poses
-
-
-def _check_spread(positions: np.ndarray, names: Sequence[str], source: Path) -> None:
-    """No camera is far outside the others' spread: the farthest one scales the scene."""
-    distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    distance = np.linalg.norm(position - np.median(position, axis=0), axis=1)
     usual = np.quantile(distance, 0.75)
-    far = distance > RATHER_FAR * usual
-    if usual == 0 or not far.any():
-        return
-    which = some([f"{names[i]} ({distance[i] / usual:.3g} times)" for i in np.argsort(-distance)[: far.sum()]])
-    finding = f"{source}: much farther from the middle of the cameras than three quarters of them: {which}."
-    if distance.max() > FAR_OUTSIDE * usual:
-        raise InputError(f"{finding} Correct these poses, or remove the frames: the scene would shrink to a speck.")
-    warn(f"{finding} If these poses are wrong, remove the frames: the scene is scaled to the farthest camera.")
+    reject(
+        (distance > FAR_OUTSIDE * usual) & (usual > 0),
+        f"is more than {FAR_OUTSIDE:g} times as far from the middle of the cameras as three quarters of them",
+        "Correct the pose, or remove the frame: the scene would shrink to a speck.",
+    )
+    return poses
 
 
 def check_applied(meta: dict[str, Any], source: Path) -> None:
@@ -204,10 +189,9 @@ def check_applied(meta: dict[str, Any], source: Path) -> None:
         applied = matrix(meta["applied_transform"])
         if applied.shape != (3, 4) or not np.isfinite(applied).all():
             raise InputError(f"{source}: applied_transform is not a 3 x 4 matrix of numbers. Correct or remove it.")
-    if not 0 < number(meta.get("applied_scale", 1.0)) < np.inf:
-        raise InputError(
-            f"{source}: applied_scale is {shown(repr(meta['applied_scale']))}. Give a positive number or remove it."
-        )
+    scale = meta.get("applied_scale", 1.0)
+    if not 0 < number(scale) < np.inf:
+        raise InputError(f"{source}: applied_scale is {shown(repr(scale))}. Give a positive number or remove it.")
 
 
 def check_unique(names: Iterable[Any], where: str) -> None:

@@ -88,10 +88,6 @@ class NrfgsInputDataset(InputDataset):
                     f"{image.shape[0]}. Make the mask as large as the image."
                 )
             data["mask"] = torch.from_numpy(np.array(mask)).unsqueeze(-1).bool()
-            if self.mask_color:
-                color = torch.tensor(self.mask_color)
-                outside = color if image_type == "float32" else (255 * color).round().to(torch.uint8)
-                image[~data["mask"][..., 0], :3] = outside
         return data
 
 

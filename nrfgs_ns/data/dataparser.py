@@ -131,7 +131,6 @@ class NrfgsDataParser(DataParser):
             metadata={
                 "exif": [stored_exif(frame, scene.source) for frame in frames],
                 "downscale": 1 if copies else scene.factor,
-                "mask_color": getattr(self.config, "mask_color", None),
             },
         )
         if self.config.load_3D_points and self._images_needed:
@@ -152,10 +151,6 @@ class NrfgsDataParser(DataParser):
         lenses = read_lenses(meta, source)
         check_applied(meta, source)
         poses = check_poses(frames, source, need_spread=config.auto_scale_poses and len(frames) > 1)
-        if getattr(config, "mask_color", None) is not None and "mask_path" not in frames[0]:
-            raise InputError(
-                f"{source}: --mask-color is set, but no frame has a mask_path. Add masks or drop the option."
-            )
         factor = self._factor(frames, source) if self._images_needed else self.downscale_factor
         order = self._order(frames)
         frames = meta["frames"] = [frames[row] for row in order]

@@ -47,7 +47,7 @@ def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
     _check_model(meta, source)
     shared = {key: meta[key] for key in (*PIXELS, *DISTORTION, "distortion_params") if key in meta}
     for key, value in shared.items():
-        other = [frame["file_path"] for frame in meta["frames"] if frame.get(key, value) != value]
+        other = [frame["file_path"] for frame in meta["frames"] if key in frame and frame[key] != value]
         if other:
             raise InputError(
                 f"{source}: {key} of {some(other)} is not the one at the top level, which would be used for all "

@@ -139,7 +139,7 @@ NUMBERS = {
 NAMES = {"make": ExifTags.Base.Make, "model": ExifTags.Base.Model}
 KEPT = (*NAMES.values(), ExifTags.Base.DateTime)
 KEPT_EXIF = (*NUMBERS.values(), ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DateTimeOriginal)
-"""Tags of the main and the photographic directory that hold for copies in another size, too."""
+"""Tags of the main and the photographic directory that hold for a turned or smaller copy, too."""
 
 
 def read_exif(path: Path) -> dict[str, float | str]:
@@ -204,17 +204,12 @@ def _number(value: Any) -> float | None:
 
 
 def exif_of_copy(exif: Image.Exif) -> bytes:
-    """EXIF, for PIL's `exif` option, of a turned, undistorted or smaller copy: camera, exposure, date, position."""
+    """EXIF, for PIL's `exif` option, of a turned copy: camera, exposure, date, position."""
     copy, details = Image.Exif(), exif.get_ifd(ExifTags.IFD.Exif)
     copy.update({tag: exif[tag] for tag in KEPT if tag in exif})
-    parts = {
-        ExifTags.IFD.Exif: {tag: details[tag] for tag in KEPT_EXIF if tag in details},
-        ExifTags.IFD.GPSInfo: exif.get_ifd(ExifTags.IFD.GPSInfo),
-    }
-    for part, kept in parts.items():
-        if kept:
-            copy.get_ifd(part).update(kept)
-    return copy.tobytes() if len(copy) or any(parts.values()) else b""
+    copy.get_ifd(ExifTags.IFD.Exif).update({tag: details[tag] for tag in KEPT_EXIF if tag in details})
+    copy.get_ifd(ExifTags.IFD.GPSInfo).update(exif.get_ifd(ExifTags.IFD.GPSInfo))
+    return copy.tobytes()
 
 
 def share_of_size(path: Path) -> float:
@@ -224,22 +219,3 @@ def share_of_size(path: Path) -> float:
     details = exif.get_ifd(ExifTags.IFD.Exif)
     sides = [_number(details.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
     return 1.0 if None in sides or ExifTags.Base.FocalLengthIn35mmFilm in details else max(size) / max(sides)
-
-
-def read_position(path: Path) -> tuple[float, float] | None:
-    """Latitude and longitude of a photograph in degrees, or None."""
-    gps = _exif_at(path)[0].get_ifd(ExifTags.IFD.GPSInfo)
-    angles = []
-    for tag, side, negative, bound in (
-        (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef, "S", 90.0),
-        (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef, "W", 180.0),
-    ):
-        try:
-            degrees, minutes, seconds = (float(part) for part in gps[tag])
-        except (KeyError, TypeError, ValueError, ZeroDivisionError):
-            return None
-        angle = degrees + minutes / 60 + seconds / 3600
-        if not abs(angle) <= bound:
-            return None
-        angles.append(-angle if str(gps.get(side, "")).strip(" \0").upper() == negative else angle)
-    return (angles[0], angles[1]) if any(angles) else None  # devices without a fix write 0, 0

@@ -96,7 +96,7 @@ def _folder(dataset: Any, index: int, image_type: str) -> Path:
     files = [(str(path.resolve()), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in paths]
     distortion = None if cameras.distortion_params is None else cameras.distortion_params[index].tolist()
     camera = [distortion, *(getattr(cameras, name)[index].item() for name in (*LENS, "camera_type"))]
-    kept = [files, camera, image_type, dataset.scale_factor, str(dataset.mask_color), str(outputs.alpha_color)]
+    kept = [files, camera, image_type, dataset.scale_factor, str(outputs.alpha_color)]
     name = hashlib.sha256(json.dumps(kept).encode("utf-8", "surrogateescape")).hexdigest()[:24]
     return cache_folder() / name
 

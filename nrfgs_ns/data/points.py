@@ -7,6 +7,7 @@ unnoticed.
 """
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,25 +33,26 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         _check_counts(path)
         vertices = PlyData.read(path)["vertex"].data
-        stored = np.stack([vertices[axis] for axis in "xyz"], axis=-1)
-        if stored.dtype.kind not in "iuf":  # lists: NumPy before 2.2 takes lists of one for numbers
-            raise ValueError("x, y and z are not numbers")
-    except KeyError as error:
-        raise InputError(f"{path} has no vertex element. {fix}") from error
+        stored = _columns(vertices, "xyz")
+        has_colors = {"red", "green", "blue"} <= set(vertices.dtype.names)
+        rgb = _columns(vertices, ("red", "green", "blue")) if has_colors else np.full(stored.shape, GREY)
     except Exception as error:  # plyfile lets out whatever it meets in a broken file
         raise InputError(f"{path} cannot be read as vertices with x, y, z ({shown(str(error))}). {fix}") from error
-    if {"red", "green", "blue"} <= set(vertices.dtype.names):
-        rgb = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)
-        if rgb.dtype.kind not in "iuf":
-            raise InputError(f"{path}: its colours are not numbers. {fix}")
-        rgb = rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0)
-    else:
+    if not has_colors:
         warn(f"{path} has no colours; its points start in mid grey.")
-        rgb = np.full(stored.shape, float(GREY))
+    rgb = rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0)
     xyz, rgb = _finite(stored.astype(np.float64), rgb, path)
     if stored.dtype.kind == "f" and len(xyz):
         _warn_of_rounding(xyz, stored.dtype, path)
     return xyz, rgb
+
+
+def _columns(vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Properties of vertices, [N, 3]."""
+    table = np.stack([vertices[name] for name in names], axis=-1)
+    if table.dtype.kind not in "iuf":  # lists: NumPy before 2.2 takes lists of one for numbers
+        raise ValueError(f"{', '.join(names)} are not numbers")
+    return table
 
 
 def _warn_of_rounding(xyz: np.ndarray, stored: np.dtype, path: Path) -> None:

@@ -28,22 +28,18 @@ ONE_WORLD = "Poses, intrinsics and points must be of one reconstruction, in one 
 
 
 def in_reach(xyz: np.ndarray, cameras: Cameras, source: Path) -> np.ndarray:
-    """Which points [N, 3] are near enough to belong to the scene, bool [N]; a warning counts the others.
-
-    Raises:
-        InputError: fewer than half are.
-    """
+    """Which points [N, 3] are near enough to belong to the scene, bool [N]; a warning counts the others."""
     positions = cameras.camera_to_worlds[:, :3, 3].double().numpy()
     middle = positions.mean(axis=0)
     distance = np.abs(xyz - middle).max(axis=1, initial=0)
     reach = np.abs(positions - middle).max() or np.median(distance)  # of cameras at one place, the points' own
     near = distance <= FARTHEST * reach
     lost = np.count_nonzero(~near)
-    finding = f"{source}: {lost} of {len(xyz)} points are {FARTHEST:,.0f} times as far away as the farthest camera"
-    if lost > len(xyz) / 2:
-        raise InputError(f"{finding}. {ONE_WORLD}")
     if lost:
-        warn(f"{finding} and are left out.")
+        warn(
+            f"{source}: {lost} of {len(xyz)} points are {FARTHEST:,.0f} times as far away as the farthest camera and "
+            "are left out."
+        )
     return near
 
 
@@ -54,7 +50,7 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
     visible = [_in_view(points, cameras[index]) for index in range(len(names))]
     blind = [name for name, seen in zip(names, visible, strict=True) if not seen.any()]
     share = torch.stack(visible).any(dim=0).float().mean().item()
-    if share < FEWEST_SEEN:
+    if not share >= FEWEST_SEEN:  # nor without points
         raise InputError(
             f"{source}: of the {len(xyz)} points to start from, {100 * share:.2g} % are in any of the {len(names)} "
             f"training views. {ONE_WORLD}"

@@ -28,7 +28,6 @@ def test_refused(capture, change, words):
     ({"eval_mode": "fraction", "train_split_fraction": 1.5}, "--eval-mode fraction"),
     ({"downscale_factor": 0}, "--downscale-factor"),
     ({"downscale_factor": 4}, "--downscale-factor 4 leaves images of 3 x 2"),
-    ({"mask_color": (0.0, 0.0, 0.0)}, "--mask-color"),
 ])  # fmt: skip
 def test_impossible_options_are_refused(capture, options, word):
     with pytest.raises(InputError, match=word):
@@ -39,10 +38,7 @@ def test_data_that_is_not_there(tmp_path, capture):
     with pytest.raises(InputError, match=r"nowhere: no such file or folder.*--data"):
         capture.parse(data=tmp_path / "nowhere")
     (tmp_path / "bare").mkdir()
-    with pytest.raises(InputError, match=r"transforms.json is missing.*ns-process-data"):
-        capture.parse(data=tmp_path / "bare")
-    (tmp_path / "bare" / "transforms_train.json").write_text("{}")
-    with pytest.raises(InputError, match=r"put `blender-data` at the end"):
+    with pytest.raises(InputError, match=r"transforms.json is missing.*nrfgs prepare"):
         capture.parse(data=tmp_path / "bare")
 
 

@@ -165,19 +165,6 @@ def test_free_memory_bounds_the_threads_that_decode(monkeypatch, free, threads):
     assert max(most) == threads
 
 
-def test_mask_colour_on_bytes_is_that_on_floats(capture):
-    capture.add_masks()
-    colour = (1.0, 0.4, 0.0)
-    as_bytes, as_floats = (
-        manager(capture, {"mask_color": colour}, cache_images_type=kind).cached_train[2]
-        for kind in ("uint8", "float32")
-    )
-    assert as_bytes["image"].dtype == torch.uint8
-    torch.testing.assert_close(as_bytes["image"].float(), as_floats["image"] * 255, atol=1e-3, rtol=0)
-    outside = as_bytes["image"][~as_bytes["mask"][..., 0]]
-    assert len(outside) > 0 and (outside == torch.tensor([255, 102, 0])).all()
-
-
 def test_undistorted_images_can_be_read_again(capture):
     """Undistortion crops the cameras; the file keeps its size, and the viewer reads it a second time."""
     capture.meta |= {"k1": 0.3, "fl_x": 12.0, "fl_y": 12.0}

@@ -120,18 +120,13 @@ def test_some_points_far_away_are_left_out(tmp_path, printed):
     assert "3 of 40 points are 100,000 times as far away" in printed()
 
 
-@pytest.mark.parametrize("factor", [30.0, 1000.0])
-def test_a_camera_far_outside_is_named(tmp_path, printed, factor):
+def test_a_camera_far_outside_is_named(tmp_path):
     capture, _ = with_points(tmp_path / "scene", images=24)
     matrix = np.array(capture.meta["frames"][5]["transform_matrix"])
-    matrix[:3, 3] = (5, 6, 7) + factor * (matrix[:3, 3] - (5, 6, 7))
+    matrix[:3, 3] = (5, 6, 7) + 1000 * (matrix[:3, 3] - (5, 6, 7))
     capture.meta["frames"][5]["transform_matrix"] = matrix.tolist()
-    if factor == 1000.0:
-        with pytest.raises(InputError, match=r"images/018.png \(1e\+03 times\).*remove the frames"):
-            capture.parse()
-    else:
+    with pytest.raises(InputError, match=r"images/018.png is more than 100 times as far.*remove the frame"):
         capture.parse()
-        assert "images/018.png (30 times)" in printed()
 
 
 def test_empty_masks_are_named(tmp_path, printed):

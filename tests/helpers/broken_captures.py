@@ -100,7 +100,6 @@ META = {  # what is done to the data set -> what the message must say
         with_masks(lambda c: c.meta["frames"][4].pop("mask_path")),
         "mask_path images/005.png all-white for none",
     ),
-    "one depth only": (lambda c: c.meta["frames"][4].update(depth_file_path="d.png"), "depth_file_path for none"),
 }
 
 FILES = {
