@@ -53,9 +53,7 @@ def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
                 f"{source}: {key} of {some(other)} is not the one at the top level, which would be used for all "
                 "frames. Remove it at the top level, or in these frames."
             )
-    return np.array(
-        [_lens({**frame, **shared}, f"of {shown(frame['file_path'])}", source) for frame in meta["frames"]]
-    )
+    return np.array([_lens({**frame, **shared}, f"of {shown(frame['file_path'])}", source) for frame in meta["frames"]])
 
 
 def _lens(values: dict[str, Any], of: str, source: Path) -> list[float]:

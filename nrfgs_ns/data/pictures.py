@@ -34,12 +34,12 @@ def open_picture(path: Path, formats: Sequence[str] = FORMATS) -> Image.Image:
     Raises:
         InputError: it is not an image of these formats.
     """
-    with _named(path, "is not a readable image"):
+    with naming(path, "is not a readable image"):
         return Image.open(path, formats=formats)
 
 
 @contextlib.contextmanager
-def _named(path: Path, finding: str) -> Iterator[None]:
+def naming(path: Path, finding: str) -> Iterator[None]:
     """PIL lets out whatever its readers meet in a broken file: make it InputError."""
     try:
         yield
@@ -69,7 +69,7 @@ def read_picture(path: Path) -> Image.Image:
     with open_picture(path) as image:
         check_depth(image, path)
         transparent = image.mode.endswith(("A", "a")) or (image.mode == "P" and "transparency" in image.info)
-        with _named(path, "cannot be decoded"):
+        with naming(path, "cannot be decoded"):
             return image.convert("RGBA" if transparent else "RGB")
 
 
@@ -81,7 +81,7 @@ def read_mask(path: Path) -> Image.Image:
                 f"{path}: a mask must have one grey channel (0 outside, anything else inside), not colours or a "
                 "palette. Save it as 8-bit grey."
             )
-        with _named(path, "cannot be decoded"):
+        with naming(path, "cannot be decoded"):
             inside = np.array(image) > (HALF if image.format == "JPEG" else 0)
     return Image.fromarray(inside.astype(np.uint8) * 255)
 

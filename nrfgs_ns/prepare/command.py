@@ -6,15 +6,15 @@ the previous stage. A finished stage with the same key is skipped, an unfinished
 removed. Running a stage forgets the later ones.
 """
 
-import contextlib
 import hashlib
+import itertools
 import json
-import math
 import shlex
 import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,18 +22,17 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from nrfgs_ns.data.pictures import read_position
+from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.prepare import pairs, structure
 from nrfgs_ns.prepare import photos as files
+from nrfgs_ns.prepare.pairs import Advance
 from nrfgs_ns.prepare.structure import CameraModel
 
 STAGES = ("import", "features", "pairs", "match", "map", "undistort", "write")
 GOOD_SHARE = 0.9
 """Share of the photographs that a good reconstruction places."""
-FOCAL_TOLERANCE = 0.15
-"""Relative error of EXIF's focal lengths, in whole millimetres of a 35 mm camera."""
 GOOD_ERROR = 1.5
 """Mean reprojection error of a good reconstruction, pixels."""
 
@@ -89,8 +88,6 @@ class Run:
         self.stored, self.database, self.model = self.work / "photos", self.work / "database.db", self.work / "model"
         self.undistorted, self.pairs_file = self.work / "undistorted", self.work / "likely_pairs.json"
         self.state_file = self.work / "state.json"
-        self.repeated = 0  # finished stages
-        self.speed: float | None = None  # seconds for the features of a million pixels
         if self.out.exists() and not self.state_file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
         try:
@@ -100,8 +97,13 @@ class Run:
         self.key = files.digest(self.inputs)
 
     def all(self) -> None:
-        for stage in (self.import_input, self.find_features, self.choose_pairs, self.match, self.map, self.undistort):
-            stage()
+        """Every stage, then the verdict."""
+        self.import_input()
+        self.find_features()
+        self.choose_pairs()
+        self.match()
+        self.map()
+        self.undistort()
         self.write()
         self.verdict()
 
@@ -113,10 +115,8 @@ class Run:
     def import_input(self) -> None:
         if self.is_video:
             frames = self.options.frames
-            with self.stage("import", "read the video", [self.stored], frames, frames=frames) as advance:
-                if advance is not None:
-                    shutil.rmtree(self.stored, ignore_errors=True)
-                    files.import_video(self.inputs[0], self.stored, frames, lambda: advance(1))
+            read = partial(files.import_video, self.inputs[0], self.stored, frames)
+            self.stage("import", "read the video", [self.stored], frames, read, frames=frames)
             return
         if others := files.left_out(self.options.photos, self.inputs):
             self.screen.print(others, markup=False, soft_wrap=True)
@@ -124,14 +124,13 @@ class Run:
         if count < files.FEW:
             warning = f"Warning: {count} photographs are few. Take 30 or more that overlap for a better scene."
             self.screen.print(warning, style="bold yellow", soft_wrap=True)
-        with self.stage("import", "read the photographs", [self.stored], count) as advance:
-            if advance is not None:
-                files.import_photos(self.inputs, self.stored, lambda: advance(1))
+        read = partial(files.import_photos, self.inputs, self.stored)
+        self.stage("import", "read the photographs", [self.stored], count, read)
 
     def find_features(self) -> None:
         names, options = self.names, self.options
         one = options.camera == "single" or options.camera == "auto" and files.same_camera(self.stored, names)
-        if one and (count := len(set(files.sizes(self.stored, names)))) > 1:
+        if one and (count := len({read_size(self.stored / name) for name in names})) > 1:
             raise InputError(
                 f"--camera is single, but {self.options.photos} has photographs of {count} sizes. Leave it out."
             )
@@ -142,49 +141,38 @@ class Run:
             "features": options.features,
         }
         database = [self.database, *(self.database.with_name(self.database.name + end) for end in ("-wal", "-shm"))]
-        with self.stage("features", "find features", database, len(names), **chosen) as advance:
-            if advance is not None:
-                begun = time.monotonic()
-                structure.extract_features(self.database, self.stored, names, **chosen, advance=advance)
-                sizes = files.sizes(self.stored, names)
-                self.speed = (time.monotonic() - begun) / pairs.pixels_searched(sizes, options.feature_size)
+        find = partial(structure.extract_features, self.database, self.stored, names, **chosen)
+        self.stage("features", "find features", database, len(names), find, **chosen)
 
     def choose_pairs(self) -> None:
         names, matching = self.names, self.options.matching
-        with self.stage("pairs", "choose pairs", [self.pairs_file], len(names), matching=matching) as advance:
-            if advance is None:
-                return
+
+        def choose(advance: Advance) -> None:
             if matching == "exhaustive":
-                chosen = pairs.every_pair(len(names))
+                chosen = list(itertools.combinations(range(len(names)), 2))
             else:
                 descriptors = structure.largest_features(self.database, names, pairs.LARGEST)
-                positions = pairs.metres([read_position(self.stored / name) for name in names])
+                positions = pairs.metres(structure.positions(self.database, names))
                 in_a_row = self.is_video or pairs.numbered_in_a_row(names)
                 chosen = pairs.likely_pairs(pairs.shared_features(descriptors, advance), positions, in_a_row)
             write_whole(self.pairs_file, json.dumps(chosen) + "\n")
 
+        self.stage("pairs", "choose pairs", [self.pairs_file], len(names), choose, matching=matching)
+
     def match(self) -> None:
         names, chosen = self.names, [tuple(pair) for pair in json.loads(self.pairs_file.read_text())]
-        every = len(names) * (len(names) - 1) // 2
-        if self.speed is not None:
-            counts = structure.feature_counts(self.database, names)
-            seconds = self.speed * pairs.remaining_cost(files.sizes(self.stored, names), counts, chosen)
-            self.screen.print(
-                f"{len(chosen):,} of {every:,} pairs to match; {pairs.in_words(seconds)} to go.", highlight=False
-            )
-        with self.stage("match", "match pairs", [], len(chosen)) as advance:
-            if advance is None:
-                return
+
+        def match(advance: Advance) -> None:
             if structure.match_features(self.database, names, chosen, self.work, advance) == 0:
                 raise InputError(
                     f"{self.options.photos}: no two of the {len(names)} photographs show the same thing. Take them "
                     "closer to each other, with texture in view, and sharp; or try --features 8192."
                 )
 
+        self.stage("match", "match pairs", [], len(chosen), match)
+
     def map(self) -> None:
-        with self.stage("map", "find the cameras", [self.model], len(self.names)) as advance:
-            if advance is None:
-                return
+        def find(advance: Advance) -> None:
             enough = GOOD_SHARE * len(self.names)
             models, mapping = structure.find_cameras(self.database, self.stored, self.model, enough, advance)
             if models == 0:
@@ -194,10 +182,11 @@ class Run:
                 )
             self.state |= {"models": models, "mapping": mapping}
 
+        self.stage("map", "find the cameras", [self.model], len(self.names), find)
+
     def undistort(self) -> None:
-        with self.stage("undistort", "undistort", [self.undistorted], 1) as advance:
-            if advance is not None:
-                structure.undistort(self.model, self.stored, self.undistorted)
+        undistort = partial(structure.undistort, self.model, self.stored, self.undistorted)
+        self.stage("undistort", "undistort", [self.undistorted], 1, undistort)
 
     def write(self) -> None:
         from nrfgs_ns.prepare.scene import DOWNSCALES, write_scene
@@ -205,26 +194,21 @@ class Run:
         made = [self.out / "transforms.json", self.out / "sparse.ply", self.out / "images"]
         made += [self.out / f"images_{factor}" for factor in DOWNSCALES]
         registered = len(list((self.undistorted / "images").iterdir()))
-        with self.stage("write", "write the scene", made, registered) as advance:
-            if advance is not None:
-                write_scene(self.undistorted, self.stored, self.out, lambda: advance(1))
 
-    @contextlib.contextmanager
+        write = partial(write_scene, self.undistorted, self.stored, self.out)
+        self.stage("write", "write the scene", made, registered, write)
+
     def stage(
-        self, slot: str, name: str, made: list[Path], total: int, **depends_on: Any
-    ) -> Iterator[Callable[[int], None] | None]:
-        """One stage, with a progress bar; yields a function that advances it, or None if the stage is finished.
+        self, slot: str, name: str, made: list[Path], total: int, work: Callable[[Advance], None], **depends_on: Any
+    ) -> None:
+        """Do one stage, with a progress bar of `total` pieces, unless it is finished.
 
         `made` are the stage's files, which are removed if they are of another input or other options.
         """
         self.key = hashlib.sha256(json.dumps([self.key, slot, depends_on], sort_keys=True).encode()).hexdigest()
         before = self.state.get(slot, {})
         if before == {"key": self.key, "done": True} and all(path.exists() for path in made[:1]):
-            self.repeated += 1
-            yield None
             return
-        if before and before["key"] != self.key:
-            self.screen.print(f"{name}: again, since the photographs or the options are others than before")
         if before.get("key") != self.key:
             for path in made:
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
@@ -234,7 +218,7 @@ class Run:
         columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
         with Progress(*columns, console=self.screen) as progress:
             task = progress.add_task(name, total=total)
-            yield lambda steps: progress.advance(task, steps)
+            work(lambda steps: progress.advance(task, steps))
             progress.update(task, completed=total)
         spent = time.monotonic() - begun[0], time.process_time() - begun[1]
         self.state.setdefault("seconds", {})[slot] = [round(each, 1) for each in spent]
@@ -248,8 +232,6 @@ class Run:
 
     def verdict(self) -> None:
         """Print results and the next step; the numbers go to OUT/prepare.json."""
-        if self.repeated == len(STAGES):
-            self.screen.print(f"{self.out} is prepared already, from these photographs and options.", soft_wrap=True)
         model = structure.colmap().Reconstruction(self.model)
         total, registered = len(self.names), model.num_reg_images()
         numbers = {
@@ -271,8 +253,7 @@ class Run:
             f"{error:.2f} px.",
             soft_wrap=True,
         )
-        lengths = structure.focal_lengths(self.database, model)
-        for advice in (*self._advice(registered, total, error), *_focal_advice(lengths)):
+        for advice in self._advice(registered, total, error):
             self.screen.print(f"- {advice}", markup=False, soft_wrap=True)
         self.screen.print(train_line(self.out), markup=False, highlight=False, soft_wrap=True)
 
@@ -289,16 +270,6 @@ class Run:
             yield "Try --features 8192, or take more photographs, sharp and with more overlap."
         if error > GOOD_ERROR:
             yield "The error is large: try --camera-model OPENCV, or --camera per-image if the zoom was changed."
-
-
-def _focal_advice(lengths: list[tuple[float, float]]) -> Iterator[str]:
-    """A contradiction among pairs of focal lengths, EXIF's and the reconstruction's in pixels."""
-    exif, fitted = max(lengths, key=lambda pair: abs(math.log(pair[1] / pair[0])), default=(1.0, 1.0))
-    if abs(math.log(fitted / exif)) > math.log(1 + FOCAL_TOLERANCE):
-        yield (
-            f"EXIF has a focal length of {exif:.0f} pixels, {fitted:.0f} fit best. After cropping or zooming this is "
-            "right. After a walk straight ahead depths may be stretched by as much: add photographs to the side."
-        )
 
 
 def train_line(out: Path) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of photographs that are worth matching, and a forecast of the time that it takes.
+"""Pairs of photographs that are worth matching.
 
 A pair is likely if one of the two is among the ALIKE photographs whose largest features look most like the other's (Wu,
 Towards linear-time incremental structure from motion, 2013: a hundredth of the cost of matching all features), the
@@ -24,18 +24,11 @@ LARGEST_GAP = 3
 """Difference of close numbers: a blurred photograph or two may be missing."""
 AT_ONCE = 32
 """Photographs compared with one at once: bounds the memory."""
-MATCH, MAP, WRITE = 4.6e-9, 0.6, 0.12
-"""Cost of a pair, per feature of one photograph and of the other; of a photograph; of writing a million pixels. The
-unit is finding the features of a million pixels. Measured on `castle` and `caliterra` (results/prepare.json)."""
 
+Advance = Callable[[int], None]
+"""Called with the number of finished pieces of work."""
 Pairs = list[tuple[int, int]]
 """Sorted pairs of indices, first < second."""
-Sizes = list[tuple[int, int]]
-"""Width and height of photographs, pixels."""
-
-
-def every_pair(count: int) -> Pairs:
-    return list(itertools.combinations(range(count), 2))
 
 
 def likely_pairs(alike: np.ndarray, positions: np.ndarray | None, in_a_row: bool) -> Pairs:
@@ -60,7 +53,7 @@ def _choose_best(chosen: np.ndarray, scores: np.ndarray, number: int) -> None:
         chosen[row, order[scores[row, order] > -np.inf]] = True
 
 
-def shared_features(descriptors: list[np.ndarray], advance: Callable[[int], None]) -> np.ndarray:
+def shared_features(descriptors: list[np.ndarray], advance: Advance) -> np.ndarray:
     """Numbers of shared features (mutual best matches that look the same), int [N, N], symmetric, 0 on the diagonal.
 
     Args:
@@ -93,31 +86,10 @@ def numbered_in_a_row(names: list[str]) -> bool:
     return sum(1 <= step <= LARGEST_GAP for step in steps) >= NUMBERED_SHARE * len(steps) > 0
 
 
-def metres(positions: list[tuple[float, float] | None]) -> np.ndarray | None:
-    """Latitudes and longitudes in degrees as [N, 2] metres east and north of their mean; None if fewer than two are
-    known."""
-    known = np.array([each if each is not None else (np.nan, np.nan) for each in positions], dtype=float).reshape(-1, 2)
-    if np.isfinite(known[:, 0]).sum() < 2:
+def metres(positions: np.ndarray) -> np.ndarray | None:
+    """Latitudes and longitudes [N, 2] in degrees, NaN where unknown, as metres east and north of their mean; None if
+    fewer than two are known."""
+    if np.isfinite(positions[:, 0]).sum() < 2:
         return None
-    degrees = known - np.nanmean(known, axis=0)
-    metre = np.radians(1.0) * 6_371_000.0
-    return np.stack([degrees[:, 1] * np.cos(np.radians(np.nanmean(known[:, 0]))), degrees[:, 0]], axis=1) * metre
-
-
-def pixels_searched(sizes: Sizes, longest_side: int) -> float:
-    """Millions of pixels of photographs shrunk to a longest side."""
-    return sum(width * height * min(1.0, longest_side / max(width, height)) ** 2 for width, height in sizes) / 1e6
-
-
-def remaining_cost(sizes: Sizes, features: list[int], pairs: Pairs) -> float:
-    """The cost of matching, mapping and writing."""
-    first, second = np.array(pairs, dtype=int).reshape(-1, 2).T
-    counts = np.array(features, dtype=float)
-    pixels = sum(width * height for width, height in sizes) / 1e6
-    return float(MATCH * (counts[first] * counts[second]).sum() + MAP * len(sizes) + WRITE * pixels)
-
-
-def in_words(seconds: float) -> str:
-    if seconds < 90:
-        return "about a minute"
-    return f"about {seconds / 60:.0f} minutes" if seconds < 5400 else f"about {seconds / 3600:.1f} hours"
+    latitude, longitude = np.radians(positions - np.nanmean(positions, axis=0)).T
+    return 6_371_000.0 * np.stack([longitude * np.cos(np.radians(np.nanmean(positions[:, 0]))), latitude], axis=1)

@@ -7,14 +7,14 @@ import re
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from PIL import ExifTags, Image, ImageOps
 
-from nrfgs_ns.data.pictures import FORMATS, check_depth, exif_of, exif_of_copy, known, open_picture, read_size
+from nrfgs_ns.data.pictures import FORMATS, check_depth, exif_of, exif_of_copy, known, naming, open_picture
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.prepare.pairs import Advance
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 HEIF = (".heic", ".heif")
@@ -31,8 +31,6 @@ SMALLEST = 16
 """Pixels of the shorter side, at least."""
 LONGEST_STEM = 120
 """Letters of a stored name, at most."""
-
-Advance = Callable[[], None]
 
 
 def reads_heif() -> bool:
@@ -127,7 +125,7 @@ def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
             with open_picture(path, (*FORMATS, "HEIF") if path.suffix.lower() in HEIF else FORMATS) as image:
                 _store(image, path, aside)
             os.replace(aside, target)
-        advance()
+        advance(1)
 
 
 def _store(image: Image.Image, path: Path, target: Path) -> None:
@@ -135,12 +133,8 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
     check_depth(image, path)
     if min(image.size) < SMALLEST:
         raise InputError(f"{path} is {image.width} x {image.height} pixels, too small to show anything. Remove it.")
-    try:
+    with naming(path, "cannot be decoded"):
         image.load()
-    except Exception as error:  # whatever broken files lead to
-        raise InputError(
-            f"{path} cannot be decoded ({error or type(error).__name__}). Restore or remove it."
-        ) from error
     exif = exif_of(image)
     upright = exif.get(ExifTags.Base.Orientation, 1) == 1
     if upright and image.mode in ("RGB", "L") and path.suffix.lower() in KEPT:
@@ -162,20 +156,10 @@ def same_camera(folder: Path, names: list[str]) -> bool:
     return len(seen) == 1
 
 
-def sizes(folder: Path, names: list[str]) -> list[tuple[int, int]]:
-    """Width and height of stored photographs, pixels."""
-    return [read_size(folder / name) for name in names]
-
-
 def open_video(video: Path) -> tuple[Any, int]:
     """OpenCV's reader of a video, and its number of frames; InputError if it cannot be used."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise InputError(
-            f"{video}: reading a video needs OpenCV, which cannot be imported ({error}). Run `pip install "
-            "opencv-python-headless`, or extract frames with another program and name their folder."
-        ) from error
+    import cv2  # slow
+
     reader = cv2.VideoCapture(str(video))
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
     if total < FEWEST or not reader.read()[0]:
@@ -190,10 +174,11 @@ def open_video(video: Path) -> tuple[Any, int]:
 def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:
     """Write the sharpest frame (by the variance of the Laplacian) of each of `frames` equal pieces of a video as JPEG,
     frame_00000.jpg and so on; InputError if it cannot be used."""
-    reader, total = open_video(video)
     import cv2
 
-    folder.mkdir(parents=True, exist_ok=True)
+    reader, total = open_video(video)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     frames = min(frames, total)
     sharpest, piece, written = (-1.0, None), 0, 0
     try:
@@ -204,7 +189,7 @@ def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> No
                     coded = cv2.imencode(".jpg", sharpest[1], [cv2.IMWRITE_JPEG_QUALITY, 97])[1]
                     (folder / f"frame_{written:05d}.jpg").write_bytes(coded)  # imwrite is silent where the disk is full
                     written += 1
-                    advance()
+                    advance(1)
                 sharpest, piece = (-1.0, None), index * frames // total
             if not decoded:
                 break

@@ -9,24 +9,24 @@
 import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from nrfgs_ns.data.pictures import exif_of, exif_of_copy, known, open_picture
+from nrfgs_ns.data.pictures import read_exif, read_picture
 from nrfgs_ns.data.points import write_ply
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.files import write_whole
+from nrfgs_ns.prepare.pairs import Advance
 from nrfgs_ns.prepare.structure import colmap
 
 DOWNSCALES = (2, 4, 8)
 """Copies that nerfstudio looks for; it takes the largest with sides of at most 1600 pixels."""
 
 
-def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[], None]) -> None:
+def write_scene(undistorted: Path, photos: Path, out: Path, advance: Advance) -> None:
     """Write a scene from the undistorted images/, which are linked, and sparse/ of a COLMAP model, and from the EXIF of
     `photos` by the same names. `advance` is called for each."""
     model = colmap().Reconstruction(undistorted / "sparse")
@@ -34,23 +34,18 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Callable[[]
     for folder in ("images", *(f"images_{factor}" for factor in DOWNSCALES)):
         shutil.rmtree(out / folder, ignore_errors=True)
         (out / folder).mkdir(parents=True)
-    taken: dict[str, dict[str, float | str]] = {}
+    taken = {image.name: read_exif(photos / image.name) for image in images}
     for image in images:
         source = undistorted / "images" / image.name
-        with open_picture(photos / image.name) as photo:
-            exif = exif_of(photo)
-        taken[image.name], kept = known(exif), exif_of_copy(exif)
-        with Image.open(source) as picture:
-            picture = picture.convert("RGB")
+        picture = read_picture(source)
         for factor in DOWNSCALES:
             size = max(picture.width // factor, 1), max(picture.height // factor, 1)  # as nerfstudio rounds its cameras
-            smaller = picture.resize(size, Image.Resampling.LANCZOS)
-            smaller.save(out / f"images_{factor}" / image.name, quality=95, exif=kept)
+            picture.resize(size, Image.Resampling.LANCZOS).save(out / f"images_{factor}" / image.name, quality=95)
         try:
             os.link(source, out / "images" / image.name)
         except OSError:  # a file system without hard links
             shutil.copyfile(source, out / "images" / image.name)
-        advance()
+        advance(1)
     points = list(model.points3D.values())
     xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
     rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)

@@ -7,20 +7,19 @@ COLMAP's database keeps features and matches, so that an interrupted step contin
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from nrfgs_ns.data.pictures import open_picture, read_size, share_of_size
+from nrfgs_ns.data.pictures import read_size, share_of_size
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.prepare.pairs import Pairs, pixels_searched
+from nrfgs_ns.prepare.pairs import Advance, Pairs
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
-LARGE = 1.5
-"""Millions of pixels from which a photograph has enough features without being doubled, at four times the cost."""
+LARGE = 1.5e6
+"""Pixels from which a photograph has enough features without being doubled, at four times the cost."""
 PAIRS_AT_ONCE = 64
 """Pairs between two updates of the progress; an interruption loses no more."""
 SMALLEST_MODEL = 3
@@ -28,8 +27,6 @@ SMALLEST_MODEL = 3
 FEWEST_POINTS = 10
 """Points for each photograph of a globally mapped model, at least."""
 SEED = 0
-
-Advance = Callable[[int], None]
 
 
 def colmap():
@@ -49,11 +46,11 @@ def extract_features(
     database: Path,
     photos: Path,
     names: list[str],
+    advance: Advance,
     camera_model: CameraModel,
     one_camera: bool,
     longest_side: int,
     features: int,
-    advance: Advance,
 ) -> None:
     """SIFT features of every photograph, on the CPU.
 
@@ -61,7 +58,6 @@ def extract_features(
         one_camera: all photographs share their intrinsics.
         longest_side: larger photographs are shrunk to it for this step, pixels.
         features: largest number of features in a photograph.
-        advance: called with numbers of finished photographs.
     """
     pycolmap = colmap()
     options = pycolmap.FeatureExtractionOptions()
@@ -71,8 +67,9 @@ def extract_features(
     batch = max(os.cpu_count() or 1, 4)
     for first in range(0, len(names), batch):
         part = names[first : first + batch]
-        large = min(pixels_searched([read_size(photos / name)], longest_side) for name in part) >= LARGE
-        options.sift.first_octave = 0 if large else -1  # -1: the photograph is doubled first
+        sizes = [read_size(photos / name) for name in part]
+        searched = min(w * h * min(1.0, longest_side / max(w, h)) ** 2 for w, h in sizes)
+        options.sift.first_octave = 0 if searched >= LARGE else -1  # -1: the photograph is doubled first
         if one_camera and first > 0:
             reader.existing_camera_id = 1  # each call would make a camera of its own
         pycolmap.extract_features(
@@ -118,17 +115,12 @@ def largest_features(database: Path, names: list[str], number: int) -> list[np.n
     return found
 
 
-def feature_counts(database: Path, names: list[str]) -> list[int]:
-    """Number of features of each photograph."""
+def positions(database: Path, names: list[str]) -> np.ndarray:
+    """Latitudes and longitudes of photographs in degrees, [N, 2], NaN where EXIF has no position with an altitude."""
     with colmap().Database.open(database) as opened:
-        return [opened.num_keypoints_for_image(opened.read_image_with_name(name).image_id) for name in names]
-
-
-def focal_lengths(database: Path, model: Any) -> list[tuple[float, float]]:
-    """Focal lengths by EXIF and by the reconstruction, in pixels, of each camera that has both."""
-    with colmap().Database.open(database) as opened:
-        prior = {camera.camera_id: camera for camera in opened.read_all_cameras() if camera.has_prior_focal_length}
-    return [(prior[i].mean_focal_length(), model.cameras[i].mean_focal_length()) for i in model.cameras if i in prior]
+        known = {prior.corr_data_id.id: prior.position[:2] for prior in opened.read_all_pose_priors()}
+        places = [known.get(opened.read_image_with_name(name).image_id, np.zeros(2)) for name in names]
+    return np.array([place if place.any() else (np.nan, np.nan) for place in places])  # a device without a fix: 0, 0
 
 
 def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance) -> int:
@@ -167,28 +159,9 @@ def find_cameras(database: Path, photos: Path, folder: Path, enough: float, adva
         if _size(others)[0] > _size(models)[0]:
             models, mapping = others, "global"
     if models:
-        write_model(max(models, key=lambda model: _size([model])), folder)
+        folder.mkdir(parents=True)
+        max(models, key=lambda model: _size([model])).write(folder)
     return len(models), mapping
-
-
-def write_model(model: Any, folder: Path) -> None:
-    """Write a reconstruction into a new folder; InputError if that fails, which COLMAP does not report."""
-    folder.mkdir(parents=True)
-    model.write(folder)
-    _check_model(folder, model)
-
-
-def _check_model(folder: Path, model: Any) -> None:
-    try:
-        written = _size([colmap().Reconstruction(folder)])
-    except Exception:  # whatever cut files lead to
-        written = None
-    if written != _size([model]):
-        raise _not_whole(folder)
-
-
-def _not_whole(path: Path) -> InputError:
-    return InputError(f"{path} was not written whole: the disk may be full. Make room, and run this again.")
 
 
 def _size(models: list[Any]) -> tuple[int, int]:
@@ -234,19 +207,9 @@ def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
     return [model for model in models if model.num_points3D() >= FEWEST_POINTS * model.num_reg_images()]
 
 
-def undistort(model: Path, photos: Path, folder: Path) -> None:
-    """Write undistorted photographs to folder/images and their pinhole model to folder/sparse; InputError if that
-    fails, which COLMAP does not report."""
-    pycolmap = colmap()
+def undistort(model: Path, photos: Path, folder: Path, advance: Advance) -> None:
+    """Write undistorted photographs to folder/images and their pinhole model to folder/sparse."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    pycolmap.undistort_images(folder, model, photos, output_type="COLMAP", jpeg_quality=97)
-    distorted = pycolmap.Reconstruction(model)
-    _check_model(folder / "sparse", distorted)
-    for number in distorted.reg_image_ids():
-        path = folder / "images" / distorted.images[number].name
-        try:
-            with open_picture(path) as picture:
-                picture.load()
-        except (InputError, OSError, SyntaxError) as error:  # SyntaxError: a cut PNG
-            raise _not_whole(path) from error
+    colmap().undistort_images(folder, model, photos, output_type="COLMAP", jpeg_quality=97)
+    advance(1)

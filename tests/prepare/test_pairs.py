@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pairs are worth matching, and how long the rest will take."""
+"""Which pairs are worth matching."""
+
+import itertools
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from nrfgs_ns.data.pictures import read_position
-from nrfgs_ns.prepare import pairs
+from nrfgs_ns.prepare import pairs, structure
+
+pytest.importorskip("pycolmap")
 
 
 def descriptors(rng: np.random.Generator, number: int) -> np.ndarray:
@@ -54,7 +57,7 @@ def test_alike_near_and_following_photographs_are_paired():
     following = pairs.likely_pairs(nothing, None, in_a_row=True)
     assert following == [(i, j) for i in range(count) for j in range(i + 1, min(i + 6, count))]
     every = pairs.likely_pairs(np.ones((8, 8), int), None, in_a_row=True)
-    assert every == pairs.every_pair(8), "of few photographs, every pair"
+    assert every == list(itertools.combinations(range(8), 2)), "of few photographs, every pair"
 
 
 def test_pairs_grow_with_the_photographs_not_with_their_square():
@@ -73,35 +76,28 @@ def test_names_that_are_numbered_in_a_row():
     assert not pairs.numbered_in_a_row(["a.jpg", "b.jpg", "c.jpg"])
 
 
-def placed(path, latitude=(55.0, 41.0, 53.4), longitude=(13.0, 11.0, 43.4), sides="NE"):
-    exif = Image.Exif()
-    exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: sides[0], 2: latitude, 3: sides[1], 4: longitude})
-    Image.new("RGB", (8, 6)).save(path, exif=exif.tobytes())
-    return path
+def test_positions_are_laid_out_in_metres(tmp_path):
+    """From COLMAP's database, which has EXIF's positions of photographs with an altitude."""
+    degrees, seconds = (55.0, 41.0, 53.4), (13.0, 11.0, 43.4)
+    tags = {
+        "north.jpg": {1: "N", 2: degrees, 3: "E", 4: seconds, 6: 10.0},
+        "south.jpg": {1: "S", 2: degrees, 3: "W", 4: seconds, 6: 10.0},
+        "without a fix.jpg": {1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0), 6: 10.0},
+        "none.jpg": {},
+    }
+    for name, values in tags.items():
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(values)
+        Image.effect_noise((160, 120), 64).convert("RGB").save(tmp_path / name, exif=exif.tobytes())
+    database = tmp_path / "database.db"
+    structure.extract_features(database, tmp_path, list(tags), lambda _: None, "SIMPLE_RADIAL", True, 1600, 100)
+    place = np.array([55 + 41 / 60 + 53.4 / 3600, 13 + 11 / 60 + 43.4 / 3600])
+    np.testing.assert_allclose(structure.positions(database, list(tags)), [place, -place, [np.nan] * 2, [np.nan] * 2])
 
-
-def test_positions_are_read_and_laid_out_in_metres(tmp_path):
-    place = 55 + 41 / 60 + 53.4 / 3600, 13 + 11 / 60 + 43.4 / 3600
-    assert read_position(placed(tmp_path / "a.jpg")) == pytest.approx(place, abs=1e-6)
-    southwest = read_position(placed(tmp_path / "b.jpg", sides="SW"))
-    assert southwest == pytest.approx((-place[0], -place[1]), abs=1e-6)
-    assert read_position(placed(tmp_path / "c.jpg", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))) is None
-    assert read_position(placed(tmp_path / "d.jpg", latitude=(91.0, 0.0, 0.0))) is None
-    Image.new("RGB", (8, 6)).save(tmp_path / "e.jpg")
-    assert read_position(tmp_path / "e.jpg") is None
-
-    laid = pairs.metres([(60.0, 10.0), None, (60.001, 10.0), (60.0, 10.002)])
+    unknown = (np.nan, np.nan)
+    laid = pairs.metres(np.array([(60.0, 10.0), unknown, (60.001, 10.0), (60.0, 10.002)]))
     assert np.isnan(laid[1]).all()
     # A degree is 111.2 km, and half of it to the east at 60 degrees north.
     assert np.linalg.norm(laid[0] - laid[2]) == pytest.approx(111.2, abs=0.1)
     assert np.linalg.norm(laid[0] - laid[3]) == pytest.approx(111.2, abs=0.1)
-    assert pairs.metres([None, (60.0, 10.0)]) is None
-
-
-def test_the_forecast_counts_pairs_and_pixels():
-    sizes = [(2000, 1000)] * 4
-    assert pairs.pixels_searched(sizes, 1000) == pytest.approx(4 * 0.5)
-    assert pairs.pixels_searched(sizes, 4000) == pytest.approx(4 * 2.0)
-    few = pairs.remaining_cost(sizes, [4000] * 4, [(0, 1)])
-    assert pairs.remaining_cost(sizes, [4000] * 4, pairs.every_pair(4)) - few == pytest.approx(5 * 16e6 * pairs.MATCH)
-    assert pairs.remaining_cost(sizes, [4000] * 4, []) < few
+    assert pairs.metres(np.array([unknown, (60.0, 10.0)])) is None
