@@ -9,7 +9,6 @@ Nothing here imports nerfstudio or gsplat.
 """
 
 from functools import cache
-from importlib import import_module
 from importlib.metadata import version
 
 NERFSTUDIO = "1.1.5"
@@ -56,14 +55,3 @@ PRIVATE = {
 def gsplat_version() -> tuple[int, ...]:
     """Of the installed gsplat, as (1, 4, 0)."""
     return tuple(int(part) for part in version("gsplat").split("+")[0].split(".")[:3])
-
-
-def missing() -> list[str]:
-    """Names of PRIVATE that the installed versions do not have."""
-    lost = []
-    for place, names in PRIVATE.items():
-        module, _, owner = place.partition(":")
-        found = import_module(module)
-        found = getattr(found, owner) if owner else found
-        lost += [f"{place}.{name}" for name in names if not hasattr(found, name)]
-    return lost

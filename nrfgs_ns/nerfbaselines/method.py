@@ -36,7 +36,6 @@ from nrfgs_ns.training.identity import leaves
 from nrfgs_ns.training.trainer import NrfgsTrainer
 from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, parse
 
-BACKGROUND = "pipeline.model.background_color"
 MODELS = "nerfstudio_models"
 
 
@@ -71,13 +70,11 @@ class Nrfgs:
             self.config = config.for_views(different_views(torch.from_numpy(train_dataset["cameras"].poses)))
             self.world = World.around(train_dataset["cameras"].poses, self.config.pipeline.datamanager.dataparser)
         else:
-            self.config = _read_config(self.checkpoint)
-            record = _read_record(self.checkpoint / "world.json")
-            self.world = World(torch.tensor(record["transform"], dtype=torch.float64), record["scale"])
+            self.config, self.record, self.file = _read_checkpoint(self.checkpoint)
+            self.world = World(torch.tensor(self.record["transform"], dtype=torch.float64), self.record["scale"])
         if train_dataset is None:
-            self.record = record
-            loaded = read_or_refuse(_checkpoint_file(self.checkpoint))
-            self.model = _build_model(copy.deepcopy(self.config), record, loaded)
+            loaded = read_or_refuse(self.file)
+            self.model = _build_model(copy.deepcopy(self.config), self.record, loaded)
             self.step = loaded["step"] + 1
         else:
             self._set_up_training(train_dataset)
@@ -89,7 +86,7 @@ class Nrfgs:
         self.folder = tempfile.TemporaryDirectory(prefix="nrfgs-")
         config.output_dir = Path(self.folder.name)
         if self.checkpoint is not None:
-            config.load_checkpoint = _checkpoint_file(self.checkpoint)
+            config.load_checkpoint = self.file
         _set_random_seed(config.machine.seed)
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
@@ -117,7 +114,8 @@ class Nrfgs:
         }
 
     def get_info(self) -> dict[str, Any]:
-        """Steps, checkpoint, and every option that is a number, a string or a truth value."""
+        """Steps, checkpoint, and options: dotted names and values that are numbers, strings, truth values or None."""
+        options = leaves(self.config)
         return {
             **self.get_method_info(),
             "num_iterations": self.config.max_num_iterations,
@@ -125,7 +123,7 @@ class Nrfgs:
             "loaded_checkpoint": None if self.checkpoint is None else str(self.checkpoint),
             "batch_size": 1,
             "eval_batch_size": 1,
-            "hparams": hparams_of(self.config),
+            "hparams": {name: value for name, value in options if isinstance(value, (int, float, str, type(None)))},
         }
 
     def train_iteration(self, step: int) -> dict[str, float]:
@@ -187,9 +185,8 @@ class Nrfgs:
         (folder / "config.yml").write_text(yaml.dump(self.config), encoding="utf-8")
         (folder / "world.json").write_text(json.dumps(self.record, indent=1) + "\n", encoding="utf-8")
         if self.trainer is None:
-            file = _checkpoint_file(self.checkpoint)
             with contextlib.suppress(shutil.SameFileError):
-                shutil.copyfile(file, models / file.name)  # nerfbaselines asks for the same bytes
+                shutil.copyfile(self.file, models / self.file.name)  # nerfbaselines asks for the same bytes
             return
         self.trainer.checkpoint_dir = models
         self.trainer.save_checkpoint(self.step - 1)
@@ -218,9 +215,7 @@ def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) 
         InputError: an option is unknown, or belongs to a loop that nerfbaselines does not run.
     """
     background = background_of(metadata)
-    if background is not None:
-        overrides = {BACKGROUND: background, **overrides}
-    words = []
+    words = [] if background is None else ["--pipeline.model.background_color", background]
     for name, value in overrides.items():
         values = value if isinstance(value, (list, tuple)) else [value]
         words += [f"--{name}", *map(str, values)]
@@ -235,33 +230,21 @@ def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) 
     return config
 
 
-def hparams_of(config: Any) -> dict[str, Any]:
-    """Dotted names and values of a configuration's fields that are numbers, strings, truth values or None."""
-    return {name: value for name, value in leaves(config) if value is None or isinstance(value, (int, float, str))}
-
-
-def _read_config(checkpoint: Path) -> NrfgsTrainerConfig:
-    """The configuration of a checkpoint, for this machine's device."""
-    if not (checkpoint / "config.yml").is_file() or not (checkpoint / "world.json").is_file():
-        raise InputError(f"{checkpoint} is not a checkpoint of nrfgs: it has no config.yml with a world.json.")
-    config = read_config(checkpoint / "config.yml")
-    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
-    return config
-
-
-def _read_record(file: Path) -> dict[str, Any]:
+def _read_checkpoint(folder: Path) -> tuple[NrfgsTrainerConfig, dict[str, Any], Path]:
+    """The configuration for this machine's device, the content of world.json, and the file of the parameters."""
+    files = list((folder / MODELS).glob("*.ckpt"))
     try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-        return {name: record[name] for name in ("transform", "scale", "scene_unit", "training_images")}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file} is not what nrfgs saved ({error!r}). Copy the checkpoint again.") from error
-
-
-def _checkpoint_file(checkpoint: Path) -> Path:
-    files = list((checkpoint / MODELS).glob("*.ckpt"))
-    if len(files) != 1:
-        raise InputError(f"{checkpoint / MODELS} holds {len(files)} checkpoints; it must hold one.")
-    return files[0]
+        record = json.loads((folder / "world.json").read_text(encoding="utf-8"))
+        record = {name: record[name] for name in ("transform", "scale", "scene_unit", "training_images")}
+        (file,) = files
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder} is not a whole checkpoint of nrfgs, a world.json and one file in {MODELS} ({error!r}). Copy it "
+            "again."
+        ) from error
+    config = read_config(folder / "config.yml")
+    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    return config, record, file
 
 
 def _build_model(config: NrfgsTrainerConfig, record: dict[str, Any], content: dict[str, Any]) -> NrfgsModel:
