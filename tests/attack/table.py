@@ -85,19 +85,15 @@ def main() -> None:
                 print(f"{area.AREA}: {ascii(name)}: {outcome.kind}: {ascii(outcome.said[:300])}", file=sys.stderr)
     print(table(found))
     if options.record:
-        record = {
+        areas_held = {
             area: {
-                "most calls": max(outcome.calls for _, outcome in outcomes),
-                "most bytes": max(outcome.size for _, outcome in outcomes),
-                "outcomes": Counter(outcome.kind for _, outcome in outcomes),
-                "did not hold": [[n, o.kind, o.said[:200]] for n, o in outcomes if o.kind not in ("refused", "read")],
+                "did not hold": [[n, o.kind, o.said[:200]] for n, o in outcomes if o.kind not in ("refused", "read")]
             }
             for area, outcomes in found.items()
         }
         path = Path(options.record[0])
         whole = json.loads(path.read_text()) if path.exists() else {}
-        whole[options.record[1]] = {"examples": options.examples, "table": table(found), "areas": record}
-        path.parent.mkdir(parents=True, exist_ok=True)
+        whole[options.record[1]] = {"examples": options.examples, "table": table(found), "areas": areas_held}
         path.write_text(json.dumps(whole, indent=1) + "\n")
 
 
