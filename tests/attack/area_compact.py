@@ -9,7 +9,7 @@ from pathlib import Path
 
 from attempt import Case
 from hypothesis import strategies as st
-from values import damage, damages, replace_in, replacements
+from values import damage, damages, put, replace_in, replacements
 
 AREA = "compact file"
 
@@ -147,10 +147,6 @@ def text(name: str, content: bytes) -> Case:
     return Case(f"header {name}", build)
 
 
-def config(name: str, value) -> Case:
-    return claiming(f"{name} {str(value)[:20]}", lambda header: header["head"]["config"].update({name: value}))
-
-
 def grid(table: str, part: str, value) -> Case:
     def change(header) -> None:
         count = len(header["grids"][table][part])
@@ -159,6 +155,24 @@ def grid(table: str, part: str, value) -> Case:
     return claiming(f"{part} of {table} {value}", change)
 
 
+CLAIMS = {
+    ("splats", "view"): (-1, 0, 61, 2**40, 2**63, 1.5, "60", None, []),
+    ("streams", 0, "shape"): ([2**40], [2**62, 4], [0, 2**62], [1] * 100 + [60], [-60], [60.0], None, [[60]]),
+    ("streams", 0, "bytes"): (-1, 0, 2**63, 1.5),
+    ("streams", 0, "coding"): ("xz", "zip", None, 3, ["rans"], {}),
+    ("streams",): ([],),
+    ("format",): ("x",),
+    ("grids",): (None,),
+    ("head", "name"): ("sh",),
+    ("head", "config", "latent_dim"): (0, -1, 9, 10**9, 2**63, 8.0, "8", None, [8], True),
+    ("head", "config", "hidden_width"): (0, 17, 10**9, 10**30, "16", None),
+    ("head", "config", "num_bands"): (0, 4, 10**9, "3", None),
+    ("head", "config", "color_scale"): (-1, float("nan"), float("inf"), "x", None),
+    ("head", "config", "split_bands"): (False, "yes", None, 3),
+    ("head", "config", "_target"): ("os.system",),
+    ("head", "config", "anything"): (1,),
+}
+"""Place in the header -> values that it cannot have."""
 CASES = [
     bomb(2**28, "uint8", "means"),
     bomb(2**25, "uint64", "latents"),
@@ -170,39 +184,17 @@ CASES = [
     coded("no body", "splats", [11, 60], lambda: b""),
     coded("a state too few", "means", [2, 60], lambda: table_of_zeros(2, 60)[:-4]),
     *(
-        claiming(f"{count} splats", lambda header, c=count: header["splats"].update(view=c))
-        for count in (-1, 0, 61, 2**40, 2**63, 1.5, "60", None, [])
-    ),
-    *(
-        claiming(f"shape {str(shape)[:20]}", lambda header, s=shape: header["streams"][0].update(shape=s))
-        for shape in ([2**40], [2**62, 4], [0, 2**62], [1] * 100 + [60], [-60], [60.0], None, [[60]])
-    ),
-    *(
-        claiming(f"{size} bytes", lambda header, s=size: header["streams"][0].update(bytes=s))
-        for size in (-1, 0, 2**63, 1.5)
+        claiming(f"{place} {str(value)[:20]}", partial(put, place=place, value=value))
+        for place, values in CLAIMS.items()
+        for value in values
     ),
     claiming("two streams of one name", lambda header: header["streams"][1].update(name=header["streams"][0]["name"])),
-    claiming("no streams", lambda header: header.update(streams=[])),
-    claiming("format of another", lambda header: header.update(format="x")),
     claiming("no format", lambda header: header.pop("format")),
     claiming("no head", lambda header: header.pop("head")),
-    claiming("another head", lambda header: header["head"].update(name="sh")),
-    claiming("no grids", lambda header: header.update(grids=None)),
-    *(config("latent_dim", value) for value in (0, -1, 9, 10**9, 2**63, 8.0, "8", None, [8], True)),
-    *(config("hidden_width", value) for value in (0, 17, 10**9, 10**30, "16", None)),
-    *(config("num_bands", value) for value in (0, 4, 10**9, "3", None)),
-    *(config("color_scale", value) for value in (-1, float("nan"), float("inf"), "x", None)),
-    *(config("split_bands", value) for value in (False, "yes", None, 3)),
-    config("_target", "os.system"),
-    config("anything", 1),
     *(
         grid(table, "step", value)
         for table in ("means", "latents")
         for value in (0.0, -1.0, float("nan"), float("inf"), 1e300, "x", None)
-    ),
-    *(
-        claiming(f"coding {str(coding)[:20]}", lambda header, c=coding: header["streams"][0].update(coding=c))
-        for coding in ("xz", "zip", None, 3, ["rans"], {})
     ),
     *(grid("scales", "low", value) for value in (float("nan"), 1e300, -1e39, [], None)),
     text("deep", b"[" * 200_000),

@@ -22,18 +22,6 @@ def test_refused(capture, change, words):
     assert not absent, f"{absent} not in: {error.value}"
 
 
-@pytest.mark.parametrize("options, word", [
-    ({"eval_interval": 1}, "--eval-mode"),
-    ({"eval_mode": "filename"}, "--eval-mode filename"),
-    ({"eval_mode": "fraction", "train_split_fraction": 1.5}, "--eval-mode fraction"),
-    ({"downscale_factor": 0}, "--downscale-factor"),
-    ({"downscale_factor": 4}, "--downscale-factor 4 leaves images of 3 x 2"),
-])  # fmt: skip
-def test_impossible_options_are_refused(capture, options, word):
-    with pytest.raises(InputError, match=word):
-        capture.parse(**options)
-
-
 def test_data_that_is_not_there(tmp_path, capture):
     with pytest.raises(InputError, match=r"nowhere: no such file or folder.*--data"):
         capture.parse(data=tmp_path / "nowhere")

@@ -30,17 +30,6 @@ def manager(capture, parser_options=None, **options) -> NrfgsDatamanager:
 # Images.
 
 
-def test_everything_loads_at_once(capture):
-    capture.add_masks()
-    data = manager(capture)
-    assert data.load_all_images() == (8, 2)
-    image, mask = data.cached_train[3]["image"], data.cached_train[3]["mask"]
-    assert image.shape == (9, 12, 3) and image.dtype == torch.uint8
-    assert mask.shape == (9, 12, 1) and mask.dtype == torch.bool
-    np.testing.assert_array_equal(image, Image.open(capture.folder / "images/004.png"))
-    np.testing.assert_array_equal(mask[..., 0], np.array(Image.open(capture.folder / "masks/004.png")) > 0)
-
-
 @pytest.mark.parametrize("cache_images", ["cpu", "gpu"])
 def test_no_pinned_memory_on_a_cpu(capture, monkeypatch, cache_images):
     """nerfstudio's cache for "cpu" pins memory, which fails without an accelerator's driver."""
@@ -100,14 +89,6 @@ def test_other_images_are_converted_to_colour(capture, mode, channels, tolerance
     data = NrfgsInputDataset(capture.parse()).get_data(1, "uint8")["image"]
     assert data.shape == (9, 12, channels)
     assert np.abs(data[..., :3].numpy().astype(int) - pixels).max() <= tolerance
-
-
-def test_a_file_that_another_parser_misses_is_named(tmp_path):
-    from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
-
-    config = NrfgsDatamanagerConfig(dataparser=BlenderDataParserConfig(data=tmp_path))
-    with pytest.raises(InputError, match="cannot be read .FileNotFoundError.*transforms_train.json"):
-        config.setup(device="cpu")
 
 
 def test_images_are_made_smaller_to_the_size_of_their_cameras(tmp_path):
@@ -175,13 +156,6 @@ def test_undistorted_images_can_be_read_again(capture):
     assert data.train_dataset[0]["image"].shape == (9, 12, 3)
 
 
-def test_two_managers_with_masks_on_the_device(capture):
-    """nerfstudio removes an entry from a list that all its datasets share: the second manager would find none."""
-    for _ in range(2):
-        assert manager(capture, masks_on_gpu=True).exclude_batch_keys_from_device == ["image"]
-    assert InputDataset.exclude_batch_keys_from_device == ["image", "mask"]
-
-
 # The order of cameras.
 
 
@@ -212,16 +186,6 @@ def test_order_continues_after_a_restore(capture, strategy, steps):
     second.load_sampling_state(state)
     assert next_cameras(second, 30) == expected
     assert len(set(expected)) > 3
-
-
-def test_a_state_is_not_changed_by_what_happens_later(capture):
-    data = manager(capture)
-    state = data.sampling_state()
-    expected = next_cameras(data, 20)
-    data.load_sampling_state(state)
-    next_cameras(data, 3)
-    data.load_sampling_state(state)
-    assert next_cameras(data, 20) == expected
 
 
 def test_states_of_other_runs_are_refused(capture):

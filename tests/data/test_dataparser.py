@@ -12,7 +12,6 @@ from nerfstudio.data.utils.colmap_parsing_utils import Point3D, write_points3D_b
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.views import interior_test_images
-from nrfgs_ns.errors import InputError
 
 
 def names(outputs) -> list[int]:
@@ -99,13 +98,6 @@ def test_without_eval_images_the_training_images_are_evaluated(capture, printed)
     capture.meta["train_filenames"] = [frame["file_path"] for frame in capture.meta["frames"][:4]]
     assert names(capture.parse("test")) == [6, 7, 8, 9]
     assert "no image is kept for test" in printed()
-
-
-def test_overlapping_splits_are_mentioned(capture, printed):
-    path = [frame["file_path"] for frame in capture.meta["frames"]]
-    capture.meta |= {"train_filenames": path, "test_filenames": path[:2]}
-    assert names(capture.parse("test")) == [8, 9]
-    assert "008.png" in (text := printed()) and "for training and for evaluation" in text
 
 
 def test_test_images_that_training_images_repeat_are_mentioned(capture, printed):
@@ -227,16 +219,6 @@ def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, 
 
     assert_points_stay_in_front_of_cameras(capture, outputs, xyz)
     np.testing.assert_array_equal(outputs.metadata["points3D_rgb"], rgb)
-
-
-def test_unreadable_colmap_points(capture):
-    folder = capture.folder / "colmap" / "sparse" / "0"
-    folder.mkdir(parents=True)
-    with pytest.raises(InputError, match=r"neither points3D.bin nor points3D.txt"):
-        capture.parse()
-    (folder / "points3D.bin").write_bytes(b"\x05\0\0\0\0\0\0\0half a point")
-    with pytest.raises(InputError, match=r"points3D.bin cannot be read"):
-        capture.parse()
 
 
 # The house around it.

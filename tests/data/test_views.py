@@ -2,7 +2,6 @@
 """Some views of many, and how many of them differ; and a scene must train alike whatever it is measured in."""
 
 import math
-from dataclasses import dataclass, replace
 
 import pytest
 import scipy.spatial
@@ -15,7 +14,6 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.views import different_views, evenly_spaced, repeated_views, scene_unit
-from nrfgs_ns.training.optimizers import in_world_units
 
 
 @pytest.mark.parametrize(
@@ -131,21 +129,6 @@ def test_a_head_sees_the_same_in_any_unit(config, unit):
     # The power of two is exact but for log(r unit) - log(unit): two roundings of numbers up to 12, seen by a network.
     for ours, theirs in zip(found, expected, strict=True):
         assert (ours - theirs).abs().max() < 1e-5
-
-
-def test_learning_rates_are_lengths():
-    @dataclass
-    class Config:
-        lr: float = 1.0
-        lr_final: float | None = 0.1
-        other: float = 3.0
-
-    group = {"optimizer": Config(), "scheduler": Config()}
-    assert in_world_units(group, 1.0) is group
-    scaled = in_world_units(group, 4.0)
-    assert (scaled["optimizer"].lr, scaled["scheduler"].lr_final, scaled["scheduler"].other) == (4.0, 0.4, 3.0)
-    assert in_world_units({"optimizer": Config(), "scheduler": replace(Config(), lr_final=None)}, 4.0)["scheduler"]
-    assert in_world_units({"optimizer": Config(), "scheduler": None}, 4.0)["scheduler"] is None
 
 
 def first_step(folder, factor, out, *options):

@@ -112,14 +112,6 @@ def test_points_of_hardly_any_spread_start_nothing(tmp_path, spread):
     assert len(capture.parse().metadata["points3D_xyz"]) == 40
 
 
-def test_some_points_far_away_are_left_out(tmp_path, printed):
-    capture, xyz = with_points(tmp_path / "scene")
-    xyz[:3] *= 1e8
-    capture.add_ply(xyz)
-    assert capture.parse().metadata["points3D_xyz"].shape == (37, 3)
-    assert "3 of 40 points are 100,000 times as far away" in printed()
-
-
 def test_a_camera_far_outside_is_named(tmp_path):
     capture, _ = with_points(tmp_path / "scene", images=24)
     matrix = np.array(capture.meta["frames"][5]["transform_matrix"])
@@ -196,10 +188,3 @@ def check_is_what_a_pinhole_sees(image, camera, side, focal, seen):
     as_pinhole = np.abs(image - seen(*((np.stack([u, v]) - side / 2) / focal)))[2:-2, 2:-2]
     assert as_pinhole.max() > 10
     assert camera.camera_type.item() == 1
-
-
-def test_raw_photographs_are_for_prepare(tmp_path):
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "IMG_1.JPG").touch()
-    with pytest.raises(InputError, match=r"photographs without poses: `nrfgs prepare .*photos SCENE`"):
-        NrfgsDataParserConfig(data=tmp_path / "photos").setup().get_dataparser_outputs()
