@@ -255,7 +255,8 @@ class Run:
         )
         for advice in self._advice(registered, total, error):
             self.screen.print(f"- {advice}", markup=False, soft_wrap=True)
-        self.screen.print(train_line(self.out), markup=False, highlight=False, soft_wrap=True)
+        command = shlex.join(["ns-train", "nrfgs", "--data", str(self.out)])
+        self.screen.print(f"Train with: {command}", markup=False, highlight=False, soft_wrap=True)
 
     def _advice(self, registered: int, total: int, error: float) -> Iterator[str]:
         """Faults of a reconstruction and their fixes."""
@@ -270,14 +271,3 @@ class Run:
             yield "Try --features 8192, or take more photographs, sharp and with more overlap."
         if error > GOOD_ERROR:
             yield "The error is large: try --camera-model OPENCV, or --camera per-image if the zoom was changed."
-
-
-def train_line(out: Path) -> str:
-    """The command to train with: without a CUDA device, one for the CPU."""
-    import torch
-
-    from nrfgs_ns.training.cpu_command import ten_minute_command
-
-    if torch.cuda.is_available():
-        return f"Train with: {shlex.join(['ns-train', 'nrfgs', '--data', str(out)])}"
-    return f"No CUDA device: the CPU trains. A result in ten minutes: {ten_minute_command(out)}"

@@ -2,8 +2,7 @@
 """Checkpoint files: written whole or not at all, and read only if they are what was written.
 
 torch's files are zip archives with a CRC of each record, which torch does not check: a flipped bit loads as another
-model. `read` checks every byte, in 0.3 s for 500 MB. For nerfstudio's own commands, which read the file themselves, the
-pipeline's part carries a checksum of its own (`seal`, `check_seal`).
+model. `read` checks every byte, in 0.3 s for 500 MB.
 """
 
 import os
@@ -12,15 +11,12 @@ import secrets
 import shutil
 import time
 import zipfile
-import zlib
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import ForTheUser, InputError
@@ -76,25 +72,18 @@ def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = 
     except (OSError, RuntimeError) as error:  # torch raises RuntimeError without the system's reason
         if isinstance(error, torch.OutOfMemoryError):
             raise
-        raise DiskFull(_not_written(folder, step, content, error)) from error
+        reason = getattr(error, "strerror", None) or "the disk is full or a limit reached"
+        free, kept = shutil.disk_usage(folder).free / 1e6, next(iter(find(folder).values()), "none")
+        raise DiskFull(
+            f"{folder}: the checkpoint of step {step} cannot be written: {reason}. {free:,.0f} MB are free. The last "
+            f"one: {kept}. Make room, or lift the quota or the limit on file sizes (ulimit -f)."
+        ) from error
     finally:
         unfinished.unlink(missing_ok=True)
     if only_latest:
         for older in list(find(folder).values())[KEPT:]:
             older.unlink(missing_ok=True)
     return final
-
-
-def _not_written(folder: Path, step: int, content: Mapping[str, Any], error: Exception) -> str:
-    size = sum(leaf.nbytes for _, leaf in _leaves(content) if isinstance(leaf, Tensor)) / 1e6
-    free = shutil.disk_usage(folder).free / 1e6
-    kept = next(iter(find(folder).values()), None)
-    fix = "Make room" if free < size + 1 else "Lift the limit on file sizes (ulimit -f) or the quota"
-    reason = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
-    return (
-        f"{folder}: the disk is full or a limit reached{reason}: the checkpoint of step {step} takes {size:,.0f} MB, "
-        f"and {free:,.0f} MB are free. {f'Kept: {kept}.' if kept else 'None has been written before.'} {fix}."
-    )
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -154,42 +143,6 @@ def checkpoints_in(folder: Path) -> dict[int, Path]:
     within = next((inner.parent for inner in sorted(folder.glob("*/step-*.ckpt"))), None)
     fix = f"They are in {within}." if within else "Give the folder nerfstudio_models of a training."
     raise InputError(f"{folder} holds no checkpoints (step-*.ckpt). {fix}")
-
-
-def seal(pipeline: dict[str, Any], step: int) -> None:
-    """Give the pipeline's part of a checkpoint a checksum of itself."""
-    pipeline["_extra_state"] = {**pipeline["_extra_state"], "checksum": _checksum(pipeline, step)}
-
-
-def check_seal(pipeline: Mapping[str, Any], step: int) -> None:
-    """Raise InputError where the pipeline's part of a checkpoint is not as it was written. Unsealed ones pass."""
-    written = pipeline.get("_extra_state", {}).get("checksum")
-    if written is not None and written != _checksum(pipeline, step):
-        raise InputError(f"The checkpoint of step {step} is damaged: its checksum is wrong. Restore or remove it.")
-
-
-def _checksum(pipeline: Mapping[str, Any], step: int) -> int:
-    """CRC32 of everything except the checksum itself."""
-    value = zlib.crc32(str(step).encode())
-    for path, leaf in _leaves(pipeline):
-        if path == "/_extra_state/checksum":
-            continue
-        if isinstance(leaf, Tensor):
-            data = leaf.detach().cpu().contiguous()
-            value = zlib.crc32(f"{path} {data.dtype} {list(data.shape)}".encode(), value)
-            value = zlib.crc32(data.reshape(-1).view(torch.uint8).numpy(), value) if data.numel() else value
-        else:
-            value = zlib.crc32(f"{path} {leaf!r}".encode(), value)
-    return value
-
-
-def _leaves(tree: Any, path: str = "") -> list[tuple[str, Any]]:
-    """The leaves of a tree of dictionaries, lists and tuples, each with its path."""
-    if isinstance(tree, Mapping):
-        return [leaf for key, value in tree.items() for leaf in _leaves(value, f"{path}/{key}")]
-    if isinstance(tree, (list, tuple)) and any(isinstance(value, (Tensor, Mapping, list, tuple)) for value in tree):
-        return [leaf for key, value in enumerate(tree) for leaf in _leaves(value, f"{path}/{key}")]
-    return [(path, tree)]
 
 
 def _sync(path: Path) -> None:

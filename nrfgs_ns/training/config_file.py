@@ -14,7 +14,6 @@ that is newer than the file has its default. Read in: nerfstudio 1.1.5, PyYAML 6
 
 import importlib
 import types
-from collections.abc import Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -28,8 +27,6 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from nrfgs_ns.errors import InputError
 
-LARGEST_FILE = 1 << 20
-"""Bytes; a config.yml has ten thousand."""
 OURS = "nrfgs_ns."
 PACKAGES = ("nerfstudio.", OURS, "torch.optim.")
 PATHS = {
@@ -43,8 +40,6 @@ def read_config(path: Path) -> TrainerConfig:
     docstring lists, or has a value of another type than its option."""
     if not path.is_file():
         raise InputError(f"{path}: no such file. {FIX}.")
-    if path.stat().st_size > LARGEST_FILE:
-        raise InputError(f"{path} is larger than {LARGEST_FILE} bytes. {FIX}.")
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:
@@ -60,25 +55,22 @@ def read_config(path: Path) -> TrainerConfig:
 
 
 def check_types(config: Any, source: str, prefix: str = "") -> None:
-    """Raise InputError, naming `source`, where an option's value has another type than the dataclass's field."""
-    for name, value, hint in _options(config, prefix):
+    """Raise InputError, naming `source`, where an option's value has another type than its dataclass's field, anywhere
+    in a configuration or a dictionary of such. A value that is its field's default passes."""
+    if isinstance(config, dict):
+        for key, value in config.items():
+            check_types(value, source, f"{prefix}{key}.")
+    if not is_dataclass(config) or isinstance(config, type):
+        return
+    hints = get_type_hints(type(config))
+    for field in fields(config):
+        value, name, hint = getattr(config, field.name), f"{prefix}{field.name}", hints[field.name]
+        if field.name.startswith("_") or (not is_dataclass(value) and value == _default(field)):
+            continue
         if not _is_a(value, hint):
             kind = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
             raise InputError(f"{source}: {name} is {value!r}, which is not of its type, {kind}. Correct it.")
-
-
-def _options(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Dotted names, values and types of a configuration's options. A value that is its field's default passes."""
-    hints = get_type_hints(type(config))
-    for field in fields(config):
-        value, name = getattr(config, field.name), f"{prefix}{field.name}"
-        if field.name.startswith("_") or (not is_dataclass(value) and value == _default(field)):
-            continue
-        yield name, value, hints[field.name]
-        for key, inner in value.items() if isinstance(value, dict) else [("", value)]:
-            for part, leaf in inner.items() if isinstance(inner, dict) else [("", inner)]:
-                if is_dataclass(leaf) and not isinstance(leaf, type):
-                    yield from _options(leaf, ".".join(filter(None, (name, key, part))) + ".")
+        check_types(value, source, f"{name}.")
 
 
 def _is_a(value: Any, hint: Any) -> bool:
@@ -148,8 +140,6 @@ def _object(loader: _Loader, suffix: str, node: yaml.Node):
     for name, value in values.items():
         if isinstance(value, type) and not (name == "_target" and _fits(kind, value)):
             raise _refuse(node, f"{value.__module__}.{value.__qualname__}")
-        if callable(getattr(kind, str(name), None)) and name != "_target":
-            raise _refuse(node, f"{suffix}.{name}")
     vars(config).update(values)
 
 

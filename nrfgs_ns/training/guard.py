@@ -34,8 +34,6 @@ PARAMETERS_EVERY = 100
 """Steps between two checks of the parameters."""
 PATIENCE = 100
 """Steps in a row without a visible splat after which the training stops."""
-SHOWN = 3
-"""Splats named in a message."""
 HUGE_BY_GROUP = {"scales": 20.0, "means": 1e6, "quats": math.inf}
 """Values (log-scales, scene units) that no training reaches with suitable learning rates. Quaternions are normalised,
 so theirs may have any length."""
@@ -44,6 +42,8 @@ HUGE = 1e3
 
 Origin = Literal["rendering", "gradient", "parameter", "elsewhere", "nothing visible", "memory"]
 """Cause of a stop; "rendering": a number in the image or a loss, "elsewhere": on another device."""
+Findings = list[tuple[str, float, Tensor]]
+"""Tensors that condemned a step: name, largest absolute value (NaN, infinite or too large), values."""
 
 
 class TrainingStopped(ForTheUser, RuntimeError):
@@ -65,11 +65,8 @@ class Watched:
     """A tensor that may condemn a step."""
 
     name: str
-    """of a gradient: its optimiser's"""
     origin: Origin
     tensor: Tensor
-    owner: Tensor | None = None
-    """of a gradient: its parameter"""
 
 
 @dataclass
@@ -80,15 +77,6 @@ class Verdict:
     watched: list[Watched]
     sizes: Tensor
     arrived: torch.cuda.Event | None = None
-
-
-@dataclass
-class Finding:
-    """A tensor that condemned a step, with its largest absolute value: NaN, infinite, or too large."""
-
-    name: str
-    size: float
-    tensor: Tensor
 
 
 class Guard:
@@ -130,7 +118,7 @@ class Guard:
         for name, optimizer in optimizers.optimizers.items() if not gradients_are_scaled else ():
             for parameter in parameters_of(optimizer):
                 if parameter.grad is not None and parameter.numel() > 0:
-                    watched.append(Watched(name, "gradient", parameter.grad, parameter))
+                    watched.append(Watched(f"the gradient of {name}", "gradient", parameter.grad))
         sizes = torch.stack(torch._foreach_norm([each.tensor for each in watched], math.inf))
         self._verdict = self._share(Verdict(self.step, watched, sizes))
         sizes = self._verdict.sizes
@@ -185,7 +173,7 @@ class Guard:
         pairs = zip(verdict.watched, self._read(verdict), strict=True)
         bad = [(each, size) for each, size in pairs if not size <= MAX_GRADIENT]
         if bad:
-            findings = [Finding(self._full_name(each), size, each.tensor) for each, size in bad]
+            findings = [(each.name, size, each.tensor) for each, size in bad]
             message = report(self.pipeline, verdict.step, findings, MAX_GRADIENT)
             message += (
                 f"\nThe update of step {verdict.step} was not made. The state before it is in that step's checkpoint; "
@@ -199,15 +187,6 @@ class Guard:
             verdict.arrived.synchronize()
         return verdict.sizes.tolist()
 
-    def _full_name(self, watched: Watched) -> str:
-        """The name of a gradient's parameter, given its optimiser's; other names stay."""
-        if watched.owner is None:
-            return watched.name
-        names = [name for name, parameter in self.pipeline.named_parameters() if parameter is watched.owner]
-        if not names and watched.name in self.model.gauss_params:  # densification has made new parameters since
-            names = [f"gauss_params.{watched.name}"]
-        return f"the gradient of {(names or [watched.name])[0].removeprefix('_model.')}"
-
     def check_parameters(self, optimizers: LeanOptimizers) -> None:
         """Check every parameter, and remove the splats that are not finite.
 
@@ -217,16 +196,17 @@ class Guard:
         named = {name: value for name, value in self.pipeline.named_parameters() if value.numel() > 0}
         sizes = torch.stack([size.float() for size in torch._foreach_norm(list(named.values()), math.inf)]).tolist()
         findings = [
-            Finding(name.removeprefix("_model."), size, named[name].detach())
+            (name.removeprefix("_model."), size, named[name].detach())
             for name, size in zip(named, sizes, strict=True)
             if not math.isfinite(size)
         ]
         if not findings:
             return
-        message = report(self.pipeline, self.step, findings, torch.finfo(torch.float32).max)
-        only_splats = all(finding.name.startswith("gauss_params.") for finding in findings)
+        largest = torch.finfo(torch.float32).max
+        message = report(self.pipeline, self.step, findings, largest)
+        only_splats = all(name.startswith("gauss_params.") for name, _, _ in findings)
         if only_splats:
-            good = torch.stack([_within(finding.tensor, torch.finfo(torch.float32).max) for finding in findings]).all(0)
+            good = torch.stack([_within(values, largest) for _, _, values in findings]).all(0)
             take_rows(self.model, optimizers.optimizers, good.nonzero()[:, 0])
             message += f"\nThe checkpoint of step {self.step} is this state without them; with --load-dir, it goes on."
         else:
@@ -261,19 +241,24 @@ class WatchedOptimizers(LeanOptimizers):
         super().load_optimizers(loaded_state)
 
 
-def report(pipeline, step: int, findings: list[Finding], limit: float) -> str:
+def report(pipeline, step: int, findings: Findings, limit: float) -> str:
     """The message of a stop: tensors, splats, and the likely cause."""
-    first, others = findings[0], ", ".join(finding.name for finding in findings[1:4])
-    what = f"reaches {first.size:.2g}, which Adam cannot square"
-    if not math.isfinite(first.size):
-        what = "has NaN" if math.isnan(first.size) else "is infinite"
-    lines = [f"Training stopped at step {step}: {first.name} {what}." + (f" Also: {others}." if others else "")]
-    per_splat = next((finding for finding in findings if "gauss_params." in finding.name), None)
-    if per_splat is not None:
-        rows = (~_within(per_splat.tensor, limit)).nonzero().flatten().tolist()
-        shown = ", ".join(map(str, rows[:SHOWN])) + (", ..." if len(rows) > SHOWN else "")
-        lines.append(f"{per_splat.name}: {len(rows)} of {len(per_splat.tensor)} splats, first {shown}.")
-    return "\n".join([*lines, f"Likely cause: {_cause(pipeline, [finding.name for finding in findings])}"])
+    (first, size, _), others = findings[0], ", ".join(name for name, _, _ in findings[1:4])
+    what = f"reaches {size:.2g}, which Adam cannot square"
+    if not math.isfinite(size):
+        what = "has NaN" if math.isnan(size) else "is infinite"
+    lines = [f"Training stopped at step {step}: {first} {what}." + (f" Also: {others}." if others else "")]
+    model, names = pipeline.model, [name for name, _, _ in findings]
+    for name, _, values in findings:
+        if name.removeprefix("the gradient of ").removeprefix("gauss_params.") in model.gauss_params:
+            rows = (~_within(values, limit)).nonzero().flatten().tolist()
+            shown = ", ".join(map(str, rows[:3])) + (", ..." if len(rows) > 3 else "")
+            lines.append(f"{name}: {len(rows)} of {len(values)} splats, first {shown}.")
+            break
+    image = "of this step"
+    if (index := getattr(model, "watched_image", None)) is not None:
+        image = pipeline.datamanager.train_dataset.image_filenames[index]
+    return "\n".join([*lines, f"Likely cause: {_cause(model, names, image)}"])
 
 
 def _within(tensor: Tensor, limit: float) -> Tensor:
@@ -281,23 +266,13 @@ def _within(tensor: Tensor, limit: float) -> Tensor:
     return (tensor.abs() <= limit).reshape(len(tensor), -1).all(dim=1)
 
 
-def _cause(pipeline, names: list[str]) -> str:
+def _cause(model, names: list[str], image: object) -> str:
     """The likeliest cause of non-finite tensors, and what to do about it."""
-    model = pipeline.model
-    index = getattr(model, "watched_image", None)
-    image = "of this step" if index is None else pipeline.datamanager.train_dataset.image_filenames[index]
-    for name, value in model.named_parameters():
-        if value.numel() and not bool(torch.isfinite(value).all()):
-            return (
-                f"the parameter {name} is not finite. It was loaded or edited so, or an update overflowed: go back to "
-                "an older checkpoint, and lower its learning rate if it happens again."
-            )
     if "loss main_loss" in names and "the rendered image" not in names:
         return f"the rendering is finite and its loss is not, so the image or mask is broken: {image}. Replace it."
-    sizes = [(name, value, HUGE_BY_GROUP.get(name, HUGE)) for name, value in model.gauss_params.items()]
-    sizes += [("field", weight, HUGE) for weight in model.head.parameters()]
-    for group, value, huge in sizes:
-        if value.numel() and (reached := float(value.abs().max())) > huge:
+    values = [*model.gauss_params.items(), *(("field", weight) for weight in model.head.parameters())]
+    for group, value in values:
+        if value.numel() and not (reached := float(value.abs().max())) <= HUGE_BY_GROUP.get(group, HUGE):  # or NaN
             return (
                 f"a learning rate that is too high: {group} have reached {reached:.2g}. Lower "
                 f"--optimizers.{group}.optimizer.lr and start from an older checkpoint."

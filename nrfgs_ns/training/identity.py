@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A checkpoint's data set and options, so that no other training goes on from it.
+"""A checkpoint's data set, and the options that say what its numbers mean, so that no other training goes on from it.
 
-Options are of two kinds. Some say what the stored numbers mean (the head's, where the world's centre is): with others
-the same numbers are another model, and the checkpoint is refused. The rest say how learning goes on (learning rates,
-thresholds, steps): they may change, and are named when they do.
+With another head or another origin of the world the same numbers are another model, and the checkpoint is refused.
+How learning goes on (learning rates, thresholds, steps) may change.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,34 +25,22 @@ MEANING = (
 )
 """Options, or groups of them, that say what the numbers mean."""
 NEUTRAL = (
-    "pipeline._target",
-    "pipeline.model._target",
     "pipeline.model.appearance.implementation",
-    "pipeline.datamanager._target",
-    "pipeline.datamanager.data",
     "pipeline.datamanager.dataparser.data",
     "pipeline.datamanager.dataparser.colmap_path",
     "pipeline.datamanager.dataparser.images_path",
-    "pipeline.datamanager.cache_images",
-    "pipeline.datamanager.images_on_gpu",
-    "pipeline.datamanager.masks_on_gpu",
-    "pipeline.compact",
-    "pipeline.sharding",
 )
-"""Those that change no number, or that are compared by what they lead to."""
+"""Those of the groups that change no number, or whose images and poses are compared instead."""
 FAR = 0.01
 """Distance between the same camera's centres, as a share of the cameras' extent, from which on it is another one."""
 
 
 def options_of(config: Any) -> dict[str, str]:
-    """Every option of a training that its numbers may depend on."""
-    parts = {"pipeline": config.pipeline, "optimizers": config.optimizers}
-    steps = ("schedule_steps", "time_budget", "average_steps", "max_num_iterations", "gradient_accumulation_steps")
-    parts |= {name: getattr(config, name) for name in steps}
+    """The options of a training that say what its numbers mean."""
     return {
         name: value.__name__ if isinstance(value, type) else value if isinstance(value, str) else repr(value)
-        for name, value in leaves(parts)
-        if not _is_among(name, NEUTRAL)
+        for name, value in leaves({"pipeline": config.pipeline})
+        if _is_among(name, MEANING) and not _is_among(name, NEUTRAL)
     }
 
 
@@ -66,10 +53,8 @@ def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: objec
     """Raise InputError where a checkpoint was trained on another data set."""
     fix = "Go on with the data set that it was trained on, or train anew."
     if sorted(written["images"]) != sorted(here["images"]):
-        gone = [name for name in written["images"] if name not in here["images"]]
-        new = [name for name in here["images"] if name not in written["images"]]
-        lists = (("missing", gone), ("new", new))
-        what = "; ".join(f"{kind}: {some(names)}" for kind, names in lists if names) or "other numbers of copies"
+        differ = sorted(set(written["images"]) ^ set(here["images"]))
+        what = some(differ) if differ else "in other numbers"
         raise InputError(f"{data}: the checkpoint was trained on other images ({what}). {fix}")
     centers, now = written["centers"].double(), here["centers"].double()
     extent = float((centers.amax(0) - centers.amin(0)).max())
@@ -79,25 +64,15 @@ def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: objec
         raise InputError(f"{data}: the checkpoint was trained on other poses ({which} elsewhere). {fix}")
 
 
-def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
-    """Compare a checkpoint's options with this training's, those that both have.
-
-    Returns:
-        Those that changed and may, as "--name old -> new".
-
-    Raises:
-        InputError: one changed that says what the stored numbers mean.
-    """
+def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> None:
+    """Raise InputError where a checkpoint's options differ from this training's, among those that both have."""
     changed = [name for name in written if name in here and written[name] != here[name]]
-    typed = {name: "--" + name.replace("_", "-") for name in changed}
-    meant = [name for name in changed if _is_among(name, MEANING)]
-    if meant:
-        was = "; ".join(f"{typed[name]} was {written[name]} and is {here[name]}" for name in meant[:3])
+    if changed:
+        was = (f"--{name.replace('_', '-')} was {written[name]} and is {here[name]}" for name in changed[:3])
         raise InputError(
-            f"The checkpoint's training had other options, without which its numbers mean something else: {was}. "
-            "Give the same ones, or train anew."
+            "The checkpoint's training had other options, without which its numbers mean something else: "
+            f"{'; '.join(was)}. Give the same ones, or train anew."
         )
-    return [f"{typed[name]} {written[name]} -> {here[name]}" for name in changed]
 
 
 def _is_among(name: str, groups: tuple[str, ...]) -> bool:

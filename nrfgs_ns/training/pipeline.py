@@ -27,7 +27,7 @@ from nrfgs_ns.kernels.trial import tried_meanwhile
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.rasterizer import load_kernels
 from nrfgs_ns.training import optimizers
-from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints, check_seal
+from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.training.config_file import check_types
 from nrfgs_ns.training.evaluation import print_evaluation
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
@@ -110,8 +110,7 @@ class NrfgsPipeline(VanillaPipeline):
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint, or the compact file that the configuration names; InputError where it cannot be this
-        model's, or is damaged."""
-        check_seal(loaded_state, step)
+        model's."""
         if self.config.compact is not None:
             state = model_state(self.model, self.config.compact)
             loaded_state = {f"_model.{name}": value for name, value in state.items()}

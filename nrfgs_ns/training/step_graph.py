@@ -61,11 +61,12 @@ class StepGraphs:
             return False
         if (obstacle := self._obstacle(batch)) is not None:
             if not self._has_said_why:
-                tell_why_not_recorded(obstacle)
+                CONSOLE.print(
+                    f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}.", soft_wrap=True
+                )
                 self._has_said_why = True
             return False
-        regularised = model.config.use_scale_regularization and step % 10 == 0
-        return not regularised
+        return not (model.config.use_scale_regularization and step % 10 == 0)
 
     def _obstacle(self, batch: Mapping[str, Any]) -> str | None:
         """What of the training's options a graph does not know, or of this photograph."""
@@ -185,11 +186,6 @@ class StepGraphs:
         if most < 0:
             raise RuntimeError("gsplat lists what tiles draw, and the host waits for its lists")
         return most
-
-
-def tell_why_not_recorded(why: str) -> None:
-    """Say that a training goes without graphs."""
-    CONSOLE.print(f"Steps are not recorded as a CUDA graph, so they take longer: {why}.", soft_wrap=True)
 
 
 def _kind(batch: Mapping[str, Any]) -> tuple:

@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a training ends before its last step: signals, memory that ran out, and what is said in the end.
+"""How a training ends before its last step: signals, and memory that ran out.
 
 A first Ctrl-C, SIGTERM or SIGHUP (a terminal that was closed) lets the step that is under way end, evaluation included,
 so that the state on disk is that of an unbroken training. A second Ctrl-C ends the process at once.
 """
 
 import os
-import shlex
 import signal
-import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from time import monotonic
 
 import torch
@@ -22,8 +19,6 @@ from torch.optim import Optimizer
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 PATIENCE = 0.5
 """Seconds within which a second Ctrl-C is the first one, heard twice: from the terminal and from a parent process."""
-TO_LOAD = ("--load-dir", "--load-checkpoint", "--load-step")
-"""Options of `ns-train` that say what it goes on from."""
 
 
 class StopRequest:
@@ -54,11 +49,6 @@ class StopRequest:
             _say("Stopped at once; what was not saved yet is lost.")
             os._exit(128 + number)
 
-    @property
-    def exit_status(self) -> int:
-        """As a shell reports the end of a process by a signal: 130 for SIGINT, 143 for SIGTERM."""
-        return 0 if self.signal is None else 128 + self.signal
-
 
 @contextmanager
 def heard_signals(request: StopRequest) -> Iterator[None]:
@@ -88,35 +78,13 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def rows_agree(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], counted: Iterable[object]) -> bool:
     """Whether a state that was interrupted anywhere is consistent: each splat has a row in every tensor, also in those
-    of densification's statistics, `counted`."""
-    counts = {len(value) for value in splats.values()}
-    counts |= {len(value) for value in counted if isinstance(value, Tensor) and value.dim() > 0}
-    pairs = [(parameter, optimizers[name]) for name, parameter in splats.items()]
-    same = all(optimizer.param_groups[0]["params"][0] is parameter for parameter, optimizer in pairs)
-    moments = all(
-        value.shape == parameter.shape
-        for parameter, optimizer in pairs
-        for value in optimizer.state.get(parameter, {}).values()
-        if isinstance(value, Tensor) and value.dim() > 0
-    )
-    return len(counts) == 1 and same and moments
-
-
-def command_to_go_on(folder: Path, method: str) -> str:
-    """The command that goes on from a folder's last checkpoint: this process's own with another --load-dir."""
-    words, load = sys.argv[1:], ["--load-dir", str(folder)]
-    program = "ns-train" if Path(sys.argv[0]).name != "launch.py" else "python -m nrfgs_ns.distributed.launch"
-    if words[:1] != [method]:  # a program of another kind
-        return f"{program} {shlex.join([method])} ... {shlex.join(load)}"
-    rest = iter(words[1:])
-    kept = []
-    for word in rest:
-        option, has_value, _ = word.partition("=")
-        if option.replace("_", "-") not in TO_LOAD:
-            kept.append(word)
-        elif not has_value:
-            next(rest, None)
-    return f"{program} {shlex.join([method, *load, *kept])}"
+    of the optimisers and of densification's statistics, `counted`."""
+    tensors = [*splats.values(), *counted]
+    for name, parameter in splats.items():
+        if optimizers[name].param_groups[0]["params"][0] is not parameter:
+            return False
+        tensors += optimizers[name].state.get(parameter, {}).values()
+    return len({len(value) for value in tensors if isinstance(value, Tensor) and value.dim() > 0}) == 1
 
 
 def _say(line: str) -> None:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's trainer with checkpoints that are whole or not there, a guard against numbers that are not finite, a
-time budget, a mean over the last steps, and an orderly end whatever causes it."""
+"""Nerfstudio's trainer with whole checkpoints, a guard against numbers that are not finite, a time budget, a mean over
+the last steps, and an orderly end whatever causes it."""
 
 import gc
 import math
@@ -34,9 +34,9 @@ from nrfgs_ns.training.identity import check_options, check_scene, options_of, s
 from nrfgs_ns.training.optimizers import in_world_units
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
-from nrfgs_ns.training.step_graph import StepGraphs, tell_why_not_recorded
-from nrfgs_ns.training.stopping import StopRequest, command_to_go_on, heard_signals, is_out_of_memory, rows_agree
-from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, nothing_left_where_refused, report_choices
+from nrfgs_ns.training.step_graph import StepGraphs
+from nrfgs_ns.training.stopping import StopRequest, heard_signals, is_out_of_memory, rows_agree
+from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, report_choices
 
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
 
@@ -82,8 +82,7 @@ class NrfgsTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
         try:
-            with nothing_left_where_refused(self.config):
-                super().setup(test_mode)
+            super().setup(test_mode)
         except KeyboardInterrupt:
             NrfgsTrainer._end(self, NOTHING_TO_SAVE, 130)
         writer.GLOBAL_BUFFER["max_iter"] = self.total_steps
@@ -92,19 +91,12 @@ class NrfgsTrainer(Trainer):
             self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last completed step"""
-        self._record_steps()
+        if self.world_size == 1 and not self.use_grad_scaler:
+            self.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
         if comms.is_main_process():
             report_choices(self.config, self.pipeline, self.steps_are_chosen)
         if self.config.average_steps > 0:  # after the callbacks that change parameters
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
-
-    def _record_steps(self) -> None:
-        """Let steps be CUDA graphs, where they can; where none can, say so."""
-        if self.world_size > 1 or self.use_grad_scaler:
-            if self.pipeline.model.device.type == "cuda" and comms.is_main_process():
-                tell_why_not_recorded("several devices share the splats" if self.world_size > 1 else "mixed precision")
-            return
-        self.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
 
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
@@ -135,7 +127,13 @@ class NrfgsTrainer(Trainer):
         training = content["training"]
         check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
         self.pipeline.load_pipeline(content["pipeline"], content["step"])
-        self._check_options(training["options"], path)
+        check_options(training["options"], options_of(config))
+        if config.time_budget is None and self._start_step >= self.total_steps:
+            schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
+            raise InputError(
+                f"{path} is the end of a training of {self.total_steps:,} steps: there is nothing left to do. "
+                f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more."
+            )
         self.optimizers.load_optimizers(content["optimizers"])
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
@@ -147,26 +145,12 @@ class NrfgsTrainer(Trainer):
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)
 
-    def _check_options(self, written: dict[str, str], path: Path) -> None:
-        """Raise InputError where the options do not fit the checkpoint; name those that changed."""
-        changed = check_options(written, options_of(self.config))
-        if changed:
-            shown = "; ".join(changed[:5]) + ("; ..." if len(changed) > 5 else "")
-            warn(f"Going on with other options than {path.name} was trained with: {shown}.")
-        if self.config.time_budget is None and self._start_step >= self.total_steps:
-            stretched = self.config.schedule_steps
-            schedules = "" if stretched is None else f" --schedule-steps {stretched}"
-            raise InputError(
-                f"{path} is the end of a training of {self.total_steps:,} steps: there is nothing left to do. "
-                f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more."
-            )
-
     def _scene(self) -> dict[str, Any]:
         data = self.pipeline.datamanager.train_dataset
         return scene_of([Path(name).name for name in data.image_filenames], data.cameras)
 
     def _follow(self, written: dict[str, Any] | None) -> None:
-        """Take the position of the checkpoint's pace, if it had one; the remaining steps walk through the rest."""
+        """Go on from the position of the checkpoint's pace; the remaining steps walk through the rest."""
         pace = self.pace
         if pace is None and written is not None:
             same = "a --time-budget" if "seconds" in written else f"--schedule-steps {written['length']}"
@@ -206,7 +190,7 @@ class NrfgsTrainer(Trainer):
             TrainingStopped: a number is not finite, or the memory has run out; what is good has been written.
             SystemExit: a signal has ended it, with that signal's status; the state has been written.
         """
-        with self._last_good_state_on_disk():  # the warm-up comes before the first step
+        with self._last_good_state_on_disk():
             self.guard.step = self._start_step
             self.guard.check_parameters(self.optimizers)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
@@ -323,13 +307,12 @@ class NrfgsTrainer(Trainer):
         if self._made >= self._start_step:
             if self._saved_step != self._made:
                 self.save_checkpoint(self._made)
-            outcome = f"Stopped at step {self._made}, {self._where_it_goes_on}"
+            outcome = f"Stopped at step {self._made}, saved. {self._how_to_go_on}"
         self._end(outcome, 128 + self._signal)
 
     @property
-    def _where_it_goes_on(self) -> str:
-        folder = self.checkpoint_dir
-        return f"saved in {folder}; go on with: {command_to_go_on(folder, self.config.method_name)}"
+    def _how_to_go_on(self) -> str:
+        return f"Go on with the same command and --load-dir {self.checkpoint_dir}"
 
     def _end(self, line: str, status: int) -> None:
         if comms.is_main_process():
@@ -386,7 +369,7 @@ class NrfgsTrainer(Trainer):
                 self.save_checkpoint(self._made)
         except (Exception, ForTheUser) as error:  # the first failure is the one to raise
             return f"The state could not be saved ({error}). {kept}"
-        return f"Step {self._made} is {self._where_it_goes_on}."
+        return f"Step {self._made} is saved. {self._how_to_go_on}."
 
     def take_the_mean(self) -> None:
         """Replace the parameters by their mean over the last steps, if there is one, and say so; TrainingStopped where
@@ -399,16 +382,15 @@ class NrfgsTrainer(Trainer):
         if mean.count == 0:
             self._report_no_mean("the time was up sooner than foreseen")
             return
-        steps = "the last step" if mean.count == 1 else f"the last {mean.count} steps"
         size = window(self.config.average_steps, self._made + 1)
         why = f", not {size}: until then splats were added, removed or reset" if mean.restarted else ""
-        CONSOLE.print(f"The trained model is the mean of its parameters over {steps}{why}.", soft_wrap=True)
+        steps = f"the last {mean.count} steps{why}"
+        CONSOLE.print(f"The trained model is the mean of its parameters over {steps}.", soft_wrap=True)
         with self.train_lock:
             mean.install()
 
     def _report_no_mean(self, why: str) -> None:
-        steps = self.config.average_steps
-        warn(f"average_steps is {steps}, but nothing was averaged: {why}. The model is the last step's.")
+        warn(f"Nothing was averaged, despite average_steps: {why}. The model is the last step's.")
 
     # Checkpoints.
 
@@ -441,14 +423,12 @@ class NrfgsTrainer(Trainer):
         """Write a checkpoint; DiskFull where there is no room."""
         content = self._checkpoint(step)
         if comms.is_main_process():
-            checkpoint_files.seal(content["pipeline"], step)
             checkpoint_files.write(self.checkpoint_dir, step, content, self.config.save_only_latest_checkpoint)
         self._saved_step = step
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
         """A checkpoint's content: nerfstudio's entries, and "training", which this class needs to resume."""
-        options = {**options_of(self.config), "max_num_iterations": str(self.total_steps)}
-        training: dict[str, Any] = {"scene": self._scene(), "options": options}
+        training: dict[str, Any] = {"scene": self._scene(), "options": options_of(self.config)}
         if self.pace is not None:
             training["pace"] = self.pace.state()
         if self.mean is not None and self.mean.count > 0:

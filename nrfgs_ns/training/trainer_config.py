@@ -2,8 +2,7 @@
 """The trainer's options: checks before anything is read or written, automatic values, a training's folder."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import shlex
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from pathlib import Path
@@ -17,7 +16,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
-from nrfgs_ns.training.cpu_command import ten_minute_command
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, STEPS_PER_VIEW, Pace, TimedPace, resolution_phases, steps_for
 
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
@@ -26,10 +24,10 @@ SEVERAL_DEVICES = "nrfgs_ns.distributed"
 """The package that trains on several devices; it imports this one."""
 AVERAGED = 200
 """Steps to average in the presets and where the steps are chosen by the views."""
-LARGEST_RATE = 100.0
-"""Largest learning rate: Adam moves a parameter by about this much in a step, and log-scales of 100 overflow."""
 MOST = 2**32
-"""Bound of all numbers that have no other; numpy takes no larger seed."""
+"""Bound of all numbers; numpy takes no larger seed."""
+LONGEST_SIDE = 240
+"""Pixels of photographs that two CPU cores train on in minutes."""
 FEW = 0.9
 """Trust in view dependence below which its reduction is worth a word on the terminal: 180 training views."""
 PLAIN = {"markup": False, "highlight": False, "soft_wrap": True}
@@ -63,24 +61,19 @@ class NrfgsTrainerConfig(TrainerConfig):
             InputError: as `check`.
         """
         devices, steps = kwargs.get("world_size", 1), self.max_num_iterations or STEPS
-        with nothing_left_where_refused(self):
-            self.check(devices)
-            if devices == 1:
-                return super().setup(**kwargs)
-            whole = replace(self, max_num_iterations=steps, average_steps=self.average_steps or 0)  # not stretched
-            return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
+        self.check(devices)
+        if devices == 1:
+            return super().setup(**kwargs)
+        whole = replace(self, max_num_iterations=steps, average_steps=self.average_steps or 0)  # not stretched
+        return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
 
     def check(self, devices: int) -> None:
         """Raise InputError where an option is out of range, is not for several devices, or names no checkpoint."""
-        for name in ("experiment_name", "timestamp", "relative_model_dir"):
-            part = getattr(self, name)
-            if part is not None and (Path(part).is_absolute() or ".." in Path(part).parts):
-                raise InputError(f"{name} is {str(part)!r}; it must be the name of a folder within --output-dir.")
         for path in (self.get_base_dir(), self.data):
             if path is not None and any("\udc80" <= letter <= "\udcff" for letter in str(path)):
                 raise InputError(f"{str(path)!r} has letters beyond this system's encoding. Set PYTHONUTF8=1.")
         data, positive = self.pipeline.datamanager, math.ulp(0.0)
-        for name, value, low in (
+        limits = [
             ("time_budget", self.time_budget, positive),
             ("schedule_steps", self.schedule_steps, positive),
             ("max_num_iterations", self.max_num_iterations, 0),
@@ -91,14 +84,21 @@ class NrfgsTrainerConfig(TrainerConfig):
             ("machine.seed", self.machine.seed, 0),
             ("machine.num_devices", self.machine.num_devices, 1),
             ("machine.num_machines", self.machine.num_machines, 1),
-        ):
+        ]
+        for name, group in self.optimizers.items():
+            least, schedule = 0, group.get("scheduler")
+            if isinstance(schedule, ExponentialDecaySchedulerConfig):
+                least = positive  # zero cannot fall exponentially
+                limits.append((f"optimizers.{name}.scheduler.lr_final", schedule.lr_final, least))
+                limits.append((f"optimizers.{name}.scheduler.max_steps", schedule.max_steps, schedule.warmup_steps + 1))
+            limits.append((f"optimizers.{name}.optimizer.lr", group["optimizer"].lr, least))
+        for name, value, low in limits:
             if value is not None and not low <= value < MOST:
                 least = "positive" if low == positive else f"at least {low}"
                 raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
         for name in ("time_budget", "schedule_steps"):
             if getattr(self, name) is not None and devices > 1:
                 raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
-        self._check_learning_rates()
         self.pipeline.model.check()
         length = self.schedule_steps or self.max_num_iterations or STEPS
         self.pipeline.model.densification.check_training(devices, length)
@@ -106,21 +106,6 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"load_step is {self.load_step}, but there is no --load-dir. Give the folder, too.")
         if self.load_dir is not None:
             checkpoint_files.checkpoints_in(self.load_dir)
-
-    def _check_learning_rates(self) -> None:
-        """Raise InputError where a learning rate or its schedule is out of range."""
-        for name, group in self.optimizers.items():
-            numbers, low, schedule = {"optimizer.lr": group["optimizer"].lr}, 0.0, group.get("scheduler")
-            if isinstance(schedule, ExponentialDecaySchedulerConfig):
-                low = math.ulp(0.0)  # zero cannot fall exponentially
-                numbers["scheduler.lr_final"] = schedule.lr_final
-                if schedule.max_steps <= schedule.warmup_steps:
-                    option = f"optimizers.{name}.scheduler.max_steps is {schedule.max_steps}"
-                    raise InputError(f"{option}; it must be more than the warmup_steps, {schedule.warmup_steps}.")
-            for option, value in numbers.items():
-                if value is not None and not low <= value <= LARGEST_RATE:
-                    bound = f"{'above' if low else 'from'} 0, and at most {LARGEST_RATE:g}"
-                    raise InputError(f"optimizers.{name}.{option} is {value}; it must be {bound}.")
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
         """The configuration with automatic values filled in: steps, schedules and mean of a training on one device."""
@@ -209,24 +194,6 @@ def _absolute(path: Path | None) -> Path | None:
     return None if path is None else Path(path).absolute()
 
 
-@contextmanager
-def nothing_left_where_refused(config: TrainerConfig) -> Iterator[None]:
-    """Remove the config.yml that ns-train saves before it reads the data, and the folders that this leaves empty, where
-    the training is refused before it has written anything else."""
-    try:
-        yield
-    except InputError:
-        folder = config.get_base_dir()
-        if [file.name for file in folder.glob("*")] == ["config.yml"]:
-            with suppress(OSError):  # another device was faster, or other trainings are there
-                (folder / "config.yml").unlink()
-                for empty in (folder, *folder.parents):
-                    empty.rmdir()
-                    if empty == config.output_dir:
-                        break
-        raise
-
-
 def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool) -> None:
     """Say what was chosen automatically, and write the numbers behind it to `NOTES`."""
     model = pipeline.model
@@ -254,7 +221,11 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
     is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS
     is_ours = isinstance(data.dataparser, NrfgsDataParserConfig)
     if config.machine.device_type == "cpu" and is_long and is_ours and data.camera_res_scale_factor == 1:
-        command = ten_minute_command(_absolute(data.dataparser.data))
+        cameras = pipeline.datamanager.train_dataset.cameras
+        scale = min(1.0, LONGEST_SIDE / int(max(cameras.width.max(), cameras.height.max())))
+        words = ["--data", str(_absolute(data.dataparser.data)), "--time-budget", "10"]
+        words += ["--pipeline.datamanager.camera-res-scale-factor", f"{scale:.2g}"]
+        command = shlex.join(["ns-train", "nrfgs-fast", *words])
         CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {command}", **PLAIN)
     folder = config.get_base_dir()
     if notes and folder.is_dir():

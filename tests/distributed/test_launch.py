@@ -159,7 +159,7 @@ def test_a_signal_stops_all_devices_with_one_checkpoint(to_all, tiny_scene, tmp_
     assert said.count("Stopped at step") == 1 and "Traceback" not in said, said
     (folder,) = tmp_path.rglob("nerfstudio_models")
     _, content = read_latest(folder)
-    assert f"Stopped at step {content['step']}, saved in {folder}; go on with: python -m" in said
+    assert f"Stopped at step {content['step']}, saved. Go on with the same command and --load-dir {folder}" in said
     assert len(content["pipeline"]["_extra_state"]["devices"]) == 2
 
 

@@ -242,16 +242,6 @@ def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, 
     assert errors.max() < 0.05 and angles.max() < 0.6  # see above
 
 
-@pytest.mark.parametrize("cuda", [True, False])
-def test_the_last_line_says_what_to_type(monkeypatch, cuda):
-    from nrfgs_ns.prepare.command import train_line
-
-    monkeypatch.setattr("torch.cuda.is_available", lambda: cuda)
-    said = train_line(Path("my scene"))
-    assert "ns-train nrfgs" in said and "--data 'my scene'" in said
-    assert ("--time-budget 10" in said and "No CUDA device" in said) is not cuda
-
-
 @pytest.mark.parametrize(
     ("make", "said"),
     [

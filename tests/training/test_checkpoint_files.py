@@ -18,14 +18,13 @@ from torch.testing import assert_close
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import checkpoint_files
-from nrfgs_ns.training.checkpoint_files import Damaged, check_seal, find, read, read_latest, read_or_refuse, seal, write
+from nrfgs_ns.training.checkpoint_files import Damaged, find, read, read_latest, read_or_refuse, write
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 
 
 def content(step: int, size: int = 500) -> dict:
     torch.manual_seed(step)
     pipeline = {"_model.means": torch.randn(size, 3), "_extra_state": {"head": "nrf", "list": [1, 2.5]}}
-    seal(pipeline, step)
     return {"step": step, "pipeline": pipeline, "optimizers": {"means": {"lr": 0.1, "m": torch.randn(size, 3)}}}
 
 
@@ -35,7 +34,6 @@ def test_what_is_written_is_read(tmp_path):
     found, state = read_latest(folder)
     assert found == path == folder / "step-000000007.ckpt"
     assert_close(state["pipeline"]["_model.means"], content(7)["pipeline"]["_model.means"], rtol=0, atol=0)
-    check_seal(state["pipeline"], 7)
     assert [file.name for file in tmp_path.iterdir()] == ["models"], "nothing is left beside the folder"
 
 
@@ -71,23 +69,6 @@ def test_no_flipped_bit_is_loaded_as_another_model(tmp_path):
         path.write_bytes(whole[:length])
         with pytest.raises(Damaged):
             read(path)
-
-
-def test_the_seal_of_the_pipelines_part_sees_every_number_and_word():
-    """What ns-eval hands over, which has read the file without a look at its CRCs."""
-    for spoil in (
-        lambda p: p["_model.means"].view(-1)[7].mul_(1.0000002),
-        lambda p: p["_extra_state"].update(head="sh"),
-        lambda p: p["_extra_state"]["list"].__setitem__(1, 2.25),
-        lambda p: p.update({"_model.meanz": p.pop("_model.means")}),
-    ):
-        state = content(3)["pipeline"]
-        check_seal(state, 3)
-        spoil(state)
-        with pytest.raises(InputError, match="step 3 is damaged"):
-            check_seal(state, 3)
-    with pytest.raises(InputError, match="damaged"):
-        check_seal(content(3)["pipeline"], 4)
 
 
 def test_a_damaged_newest_falls_back_to_the_one_before(tmp_path, capsys):
@@ -165,7 +146,7 @@ def test_a_limit_on_file_sizes_is_named_with_what_was_kept(tmp_path):
     folder = tmp_path / "models"
     run = subprocess.run([sys.executable, "-c", LIMITED, str(folder)], capture_output=True, text=True)
     assert run.returncode == 1 and "Traceback" not in run.stderr
-    assert re.search(r"checkpoint of step 2 takes 4 MB.* Kept: .*step-000000001.ckpt\. .*ulimit -f", run.stderr)
+    assert re.search(r"checkpoint of step 2 cannot be written: .*step-000000001.ckpt\. .*ulimit -f", run.stderr)
     assert list(find(folder)) == [1] and not list(tmp_path.glob("*.writing"))
 
 
@@ -225,8 +206,8 @@ def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0) -> dict:
 @pytest.mark.parametrize(
     ("here", "message"),
     [
-        (scene(("a.png", "x.png", "c.png")), r"other images \(missing: b.png; new: x.png\)"),
-        (scene(("a.png", "b.png")), r"other images \(missing: c.png\)"),
+        (scene(("a.png", "x.png", "c.png")), r"other images \(b.png, x.png\)"),
+        (scene(("a.png", "b.png")), r"other images \(c.png\)"),
         (scene(shift=0.1), r"other poses \(b.png elsewhere\)"),
     ],
 )
@@ -260,23 +241,15 @@ def test_an_option_that_changes_the_meaning_is_refused(name, value):
         check_options(options_of(nrfgs.config), changed(**{name: value}))
 
 
-def test_options_of_learning_may_change_and_are_named():
-    here = changed(
-        optimizers__means__optimizer__lr=1e-5, max_num_iterations=600, pipeline__model__densification__refine_every=50
+def test_options_of_learning_may_change_and_so_may_places():
+    check_options(
+        options_of(nrfgs.config),
+        changed(
+            optimizers__means__optimizer__lr=1e-5,
+            max_num_iterations=600,
+            pipeline__model__densification__refine_every=50,
+            pipeline__datamanager__cache_images="cpu",
+            pipeline__model__appearance__implementation="torch",
+            pipeline__datamanager__dataparser__data="elsewhere",
+        ),
     )
-    assert sorted(check_options(options_of(nrfgs.config), here)) == [
-        "--max-num-iterations 0 -> 600",
-        "--optimizers.means.optimizer.lr 0.00016 -> 1e-05",
-        "--pipeline.model.densification splatfacto -> splatfacto,refine_every=50",
-    ]
-
-
-def test_what_changes_no_number_is_not_compared():
-    here = changed(
-        pipeline__datamanager__cache_images="cpu",
-        pipeline__model__appearance__implementation="torch",
-        pipeline__datamanager__dataparser__data="elsewhere",
-        vis="tensorboard",
-        output_dir="elsewhere",
-    )
-    assert check_options(options_of(nrfgs.config), here) == []

@@ -9,7 +9,7 @@ import torch
 from short_trainings import command_line, set_up
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training.checkpoint_files import seal, write
+from nrfgs_ns.training.checkpoint_files import write
 from nrfgs_ns.training.guard import MAX_GRADIENT, PARAMETERS_EVERY, PATIENCE, Guard, TrainingStopped
 
 
@@ -110,11 +110,7 @@ def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fuse
         trainer.train()
     assert stopped.value.step == 3
     message, count = str(stopped.value), trainer.pipeline.model.num_points
-    parts = (
-        ("loss main_loss",)
-        if name == "loss"
-        else (f"the gradient of gauss_params.{name}", f"1 of {count} splats, first 7.")
-    )
+    parts = ("loss main_loss",) if name == "loss" else (f"the gradient of {name}", f"1 of {count} splats, first 7.")
     for part in (*parts, "Likely cause: ", "The update of step 3 was not made."):
         assert part in message, message
     ((step, state),) = checkpoints(trainer).items()
@@ -207,7 +203,6 @@ def test_a_checkpoint_that_is_not_finite_is_refused(start, name):
     trainer.train()
     ((step, state),) = checkpoints(trainer).items()
     state["pipeline"][f"_model.{name}"].view(-1)[4] = INF
-    seal(state["pipeline"], step)
     write(trainer.checkpoint_dir, step, state)
     with pytest.raises(InputError, match=f"'{name}'.*not finite"):
         start({"--load-dir": trainer.checkpoint_dir})

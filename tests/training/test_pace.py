@@ -321,6 +321,5 @@ def test_the_chosen_steps_are_made_and_an_interrupted_training_goes_on_to_their_
         trained(command_line("nrfgs", tiny_scene, tmp_path / "rest", 0, SMALL, last))
     with pytest.raises(InputError, match="Go on with --schedule-steps 30"):
         trained(command_line("nrfgs", tiny_scene, tmp_path / "rest", 24, SMALL, last))
-    assert not (tmp_path / "rest").exists()
     more = trained(command_line("nrfgs", tiny_scene, tmp_path / "more", 14, SMALL, last, {"--schedule-steps": 30}))
     assert checkpoint_of(more)["step"] == 13

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a record says of its version; the command for a CPU; an evaluation as a table."""
+"""What a record says of its version; an evaluation as a table."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 import nrfgs_ns
 from nrfgs_lab.training_run import digest_of, machine
-from nrfgs_ns.training.cpu_command import scale_for, ten_minute_command
 from nrfgs_ns.training.evaluation import far_below, print_evaluation
 
 
@@ -26,25 +24,6 @@ def test_the_digest_is_of_names_and_contents(tmp_path):
     assert {digest(each) for each in same} == {digest(files)}
     assert digest(files) not in [digest(each) for each in others]
     assert machine()["source"] == digest_of(Path(nrfgs_ns.__file__).parent)
-
-
-@pytest.mark.parametrize(
-    ("content", "scale"),
-    [
-        ({"w": 4032, "h": 3024, "frames": [{}]}, 0.06),
-        ({"frames": [{"w": 540, "h": 960}]}, 0.25),
-        ({"w": 48, "h": 36, "frames": [{}]}, 1.0),
-        ({"w": 0, "h": 0, "frames": [{}]}, 0.25),
-        ({"frames": []}, 0.25),
-        ([], 0.25),
-    ],
-)
-def test_the_scale_fits_the_photographs(content, scale, tmp_path):
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    assert scale_for(tmp_path) == scale_for(tmp_path / "transforms.json") == scale
-    assert ten_minute_command(tmp_path).endswith(
-        f"--data {tmp_path} --time-budget 10 --pipeline.datamanager.camera-res-scale-factor {scale:g}"
-    )
 
 
 def views(*psnrs: float | None) -> list[dict]:

@@ -9,7 +9,6 @@ from nerfstudio.engine.optimizers import Optimizers
 
 from nrfgs_lab.training_run import evaluate, parse, train
 from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs
-from nrfgs_ns.training.trainer import NrfgsTrainer
 
 gpu = [
     pytest.mark.gpu,
@@ -104,15 +103,6 @@ def test_what_is_not_recorded_is_said_once(build, option, capsys, monkeypatch):
     monkeypatch.setattr(type(pipeline.model), "device", torch.device("cuda"))
     assert not any(graphs._takes(step, batch) for step in (1, 2))
     assert capsys.readouterr().out.count("not recorded") == 1
-
-
-@pytest.mark.parametrize("devices, precision", [(2, False), (1, True)])
-def test_a_training_that_has_no_graph_says_so(devices, precision, capsys):
-    pipeline = SimpleNamespace(model=SimpleNamespace(device=torch.device("cuda")))
-    trainer = SimpleNamespace(world_size=devices, use_grad_scaler=precision, pipeline=pipeline, graphs=None)
-    NrfgsTrainer._record_steps(trainer)
-    assert trainer.graphs is None
-    assert capsys.readouterr().out.count("not recorded as a CUDA graph") == 1
 
 
 def test_a_cpu_makes_steps_as_ever(build):
