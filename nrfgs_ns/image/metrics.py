@@ -3,11 +3,10 @@
 
 Conventions, for every function of this module:
 
-- `pred` and `gt` are images [H, W, 3] in [0, 1] of a floating dtype; `mask` is [H, W, 1] bool, True inside, or None for
-  the whole image.
+- `pred` and `gt` are images [H, W, 3] in [0, 1] of a floating dtype; `mask` is [H, W, 1] bool, True inside, or None.
 - The result is a Python float, or None where the metric is undefined: an empty mask, or an image (or a mask) too small
-  for the metric's window. It is NaN only if the prediction is not finite, so that a diverged model is seen.
-- Without a mask the values are those that the host reports (torchmetrics, pytorch_msssim).
+  for the window. It is NaN only if the prediction is not finite, so that a diverged model is seen.
+- Without a mask the values are those of torchmetrics and pytorch_msssim.
 - Under a mask PSNR and L1 are means over the pixels inside. The windowed metrics first replace the prediction outside
   the mask by the truth; SSIM and MS-SSIM then average over the windows whose centre is inside. LPIPS cannot leave
   pixels out of its average: under a mask it is a lower bound.
@@ -55,31 +54,34 @@ LPIPS_MIN_SIDE = 31
 """Smallest image side that passes AlexNet's first convolution and pools."""
 
 
+@torch.no_grad()
 def psnr(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
     """Peak signal-to-noise ratio in dB for a peak of 1: -10 log10(mean squared error), at most 100."""
     error = _errors_inside(pred, gt, mask)
-    return None if error is None else -10.0 * error.square().mean().clamp_min(MIN_MSE).log10().item()
+    return -10.0 * error.square().mean().clamp_min(MIN_MSE).log10().item() if len(error) else None
 
 
+@torch.no_grad()
 def l1(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
     """Mean absolute error over pixels and channels, in [0, 1]."""
     error = _errors_inside(pred, gt, mask)
-    return None if error is None else error.abs().mean().item()
+    return error.abs().mean().item() if len(error) else None
 
 
+@torch.no_grad()
 def ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
     """Structural similarity (Wang et al. 2004), mean over channels and valid windows; 1 is identical.
 
     None if a side is shorter than 11 pixels, or if no valid window has its centre inside the mask.
     """
-    with torch.no_grad():
-        pred, gt, mask = _planes(pred, gt, mask)
-        if min(gt.shape[-2:]) < WINDOW_SIZE:
-            return None
-        per_channel = _mean_over_centres(ssim_maps(pred, gt)[0], mask)
-        return None if per_channel is None else per_channel.mean().item()
+    pred, gt, mask = _planes(pred, gt, mask)
+    if min(gt.shape[-2:]) < WINDOW_SIZE:
+        return None
+    per_channel = _mean_over_centres(ssim_maps(pred, gt)[0], mask)
+    return None if per_channel is None else per_channel.mean().item()
 
 
+@torch.no_grad()
 def ms_ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
     """Multi-scale SSIM (Wang et al. 2003) over five scales: prod_j cs_j^w_j, times ssim^w at the coarsest scale.
 
@@ -88,21 +90,22 @@ def ms_ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | Non
 
     None if a side is shorter than 161 pixels, or if at some scale no valid window has its centre inside the mask.
     """
-    with torch.no_grad():
-        pred, gt, mask = _planes(pred, gt, mask)
-        if min(gt.shape[-2:]) < MS_SSIM_MIN_SIDE:
+    pred, gt, mask = _planes(pred, gt, mask)
+    if min(gt.shape[-2:]) < MS_SSIM_MIN_SIDE:
+        return None
+    product = torch.ones(3, dtype=gt.dtype, device=gt.device)
+    for scale, weight in enumerate(MS_SSIM_WEIGHTS, start=1):
+        ssim_map, cs_map = ssim_maps(pred, gt)
+        coarsest = scale == len(MS_SSIM_WEIGHTS)
+        per_channel = _mean_over_centres(ssim_map if coarsest else cs_map, mask)
+        if per_channel is None:
             return None
-        product = torch.ones(3, dtype=gt.dtype, device=gt.device)
-        coarsest = len(MS_SSIM_WEIGHTS) - 1
-        for scale, weight in enumerate(MS_SSIM_WEIGHTS):
-            ssim_map, cs_map = ssim_maps(pred, gt)
-            per_channel = _mean_over_centres(ssim_map if scale == coarsest else cs_map, mask)
-            if per_channel is None:
-                return None
-            product = product * per_channel.relu() ** weight
-            if scale < coarsest:
-                pred, gt, mask = _halve(pred, gt, mask)
-        return product.mean().item()
+        product = product * per_channel.relu() ** weight
+        # Odd sides are padded with one zero at either end, as in pytorch_msssim.
+        padding = [side % 2 for side in gt.shape[-2:]]
+        pred, gt = (F.avg_pool2d(image[None], 2, padding=padding)[0] for image in (pred, gt))
+        mask = None if mask is None else F.max_pool2d(mask[None].float(), 2, padding=padding)[0] > 0
+    return product.mean().item()
 
 
 def ssim_maps(pred: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
@@ -120,14 +123,18 @@ def ssim_maps(pred: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
     taps = torch.arange(WINDOW_SIZE, dtype=gt.dtype, device=gt.device) - WINDOW_SIZE // 2
     gauss = torch.exp(-taps.square() / (2 * WINDOW_SIGMA**2))
     gauss = gauss / gauss.sum()
-    # Five images of three channels blurred as fifteen channels of one image: along the rows, then along the columns.
-    moments = torch.cat([pred, gt, pred * pred, gt * gt, pred * gt])
-    for shape in ((-1, 1), (1, -1)):
-        moments = F.conv2d(moments, gauss.view(1, 1, *shape).expand(len(moments), -1, -1, -1), groups=len(moments))
+    moments = blur(torch.cat([pred, gt, pred * pred, gt * gt, pred * gt]), gauss)
     mu_p, mu_g, square_p, square_g, cross = moments.split(3)
     cs_map = (2 * (cross - mu_p * mu_g) + SSIM_C2) / (square_p - mu_p**2 + square_g - mu_g**2 + SSIM_C2)
     ssim_map = cs_map * (2 * mu_p * mu_g + SSIM_C1) / (mu_p**2 + mu_g**2 + SSIM_C1)
     return ssim_map, cs_map
+
+
+def blur(planes: Tensor, window: Tensor) -> Tensor:
+    """Weighted means over all whole windows, the same window [11] on either axis: [P, H, W] -> [P, H - 10, W - 10]."""
+    for shape in ((-1, 1), (1, -1)):
+        planes = F.conv2d(planes, window.view(1, 1, *shape).expand(len(planes), -1, -1, -1), groups=len(planes))
+    return planes
 
 
 def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[str, float | None]:
@@ -143,19 +150,15 @@ def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[
     mask = None if mask is None else mask.to(pred.device)
     every = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "l1": l1, "lpips": _lpips}
     corrected = fit_colors(pred, gt, mask)
-    return {
-        **{name: metric(pred, gt, mask) for name, metric in every.items()},
-        **{f"cc_{name}": metric(corrected, gt, mask) for name, metric in every.items()},
-    }
+    values = {name: metric(pred, gt, mask) for name, metric in every.items()}
+    return values | {f"cc_{name}": metric(corrected, gt, mask) for name, metric in every.items()}
 
 
 @torch.no_grad()
 def fit_colors(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The prediction after the affine map of colours, 12 numbers, that takes it nearest to the truth, clamped to [0,
-    1].
+    """The prediction after the affine map of colours that takes it nearest to the truth, clamped to [0, 1].
 
-    Least squares over the pixels inside the mask. A prediction that is not finite, or has nothing inside, comes back as
-    it is.
+    Least squares over the pixels inside the mask. Returned as it is: a prediction not finite, or with nothing inside.
     """
     colors = torch.cat([pred.double(), torch.ones_like(pred[..., :1], dtype=torch.float64)], dim=-1)
     inside, target = (
@@ -168,17 +171,43 @@ def fit_colors(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> Tensor:
     return (colors @ affine).clamp(0.0, 1.0).to(pred.dtype)
 
 
+@torch.no_grad()
 def _lpips(pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
     net = _lpips_net()
-    if isinstance(net, str):
+    pred, gt, mask = _planes(pred, gt, mask)
+    if isinstance(net, str) or min(gt.shape[-2:]) < LPIPS_MIN_SIDE or (mask is not None and not mask.any()):
         return None
-    with torch.no_grad():
-        pred, gt, mask = _planes(pred, gt, mask)
-        if min(gt.shape[-2:]) < LPIPS_MIN_SIDE or (mask is not None and not mask.any()):
-            return None
-        # The network was trained on images in range; a rasterizer can overshoot.
-        pred, gt = (image.clamp(0.0, 1.0).float()[None] for image in (pred, gt))
-        return net.to(gt.device)(pred, gt, normalize=True).item()
+    # The network was trained on images in range; a rasterizer can overshoot.
+    pred, gt = (image.clamp(0.0, 1.0).float()[None] for image in (pred, gt))
+    return net.to(gt.device)(pred, gt, normalize=True).item()
+
+
+@functools.cache
+def _lpips_net() -> torch.nn.Module | str:
+    """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else how to get them."""
+    # Both imports cost seconds, and only evaluation needs them.
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+    from torchvision.models import AlexNet_Weights
+
+    url = AlexNet_Weights.DEFAULT.url
+    path = os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
+    problem = f"{path} is missing"
+    if os.path.isfile(path):
+        try:
+            # The bare network: the metric around it would keep every score it ever gave.
+            return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).net
+        except (OSError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
+            problem = f"{path} cannot be loaded ({type(error).__name__}): delete it"
+    return (
+        f"LPIPS is not reported: {problem}. To get it, run this on a connected machine, and copy the file here if that "
+        f'is another one:\n  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"'
+    )
+
+
+def lpips_advice() -> str | None:
+    """Why LPIPS is not reported, and how to change that; None if it is."""
+    net = _lpips_net()
+    return net if isinstance(net, str) else None
 
 
 def _precise(image: Tensor) -> Tensor:
@@ -186,13 +215,10 @@ def _precise(image: Tensor) -> Tensor:
     return image.to(torch.promote_types(image.dtype, torch.float64 if image.is_cuda else torch.float32))
 
 
-def _errors_inside(pred: Tensor, gt: Tensor, mask: Tensor | None) -> Tensor | None:
-    """Pred - gt of the pixels inside, [N, 3], without gradient; None if there are none."""
-    error = _precise(pred.detach()) - _precise(gt.detach())
-    if mask is None:
-        return error.reshape(-1, 3)
-    inside = error[mask[..., 0]]
-    return inside if len(inside) else None
+def _errors_inside(pred: Tensor, gt: Tensor, mask: Tensor | None) -> Tensor:
+    """Pred - gt of the N pixels inside, [N, 3]."""
+    error = _precise(pred) - _precise(gt)
+    return error.reshape(-1, 3) if mask is None else error[mask[..., 0]]
 
 
 def _planes(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -205,49 +231,8 @@ def _planes(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tens
 
 
 def _mean_over_centres(maps: Tensor, mask: Tensor | None) -> Tensor | None:
-    """Mean per channel [3] of maps [3, H - 10, W - 10] over the windows centred inside mask [H, W]; None if none is."""
+    """Mean per channel [3] of maps [3, H - 10, W - 10] over windows centred inside mask [H, W]; None without any."""
     if mask is None:
         return maps.mean((-2, -1))
     inside = maps[:, mask[REACH:-REACH, REACH:-REACH]]
     return inside.mean(-1) if inside.shape[-1] else None
-
-
-def _halve(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The next coarser scale. Odd sides are padded with one zero at either end, as in pytorch_msssim."""
-    padding = [side % 2 for side in gt.shape[-2:]]
-    pred, gt = (F.avg_pool2d(image[None], 2, padding=padding)[0] for image in (pred, gt))
-    if mask is not None:
-        mask = F.max_pool2d(mask[None].float(), 2, padding=padding)[0] > 0
-    return pred, gt, mask
-
-
-@functools.cache
-def _lpips_net() -> torch.nn.Module | str:
-    """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else how to get them."""
-    # Both imports cost seconds, and only evaluation needs them.
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-    from torchvision.models import AlexNet_Weights
-
-    url = AlexNet_Weights.DEFAULT.url
-    path = os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
-    if not os.path.isfile(path):
-        return _advice(f"{path} is missing", url)
-    try:
-        metric = LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
-    except (OSError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
-        return _advice(f"{path} cannot be loaded ({type(error).__name__}): delete it", url)
-    # The bare network: the metric around it would keep every score it ever gave.
-    return metric.net
-
-
-def lpips_advice() -> str | None:
-    """Why LPIPS is not reported, and how to change that; None if it is."""
-    net = _lpips_net()
-    return net if isinstance(net, str) else None
-
-
-def _advice(problem: str, url: str) -> str:
-    return (
-        f"LPIPS is not reported: {problem}. To get it, run this on a connected machine, and copy the file here if that "
-        f'is another one:\n  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"'
-    )

@@ -9,6 +9,7 @@ So an image is divided into regions. The shift of a pair of photographs is the m
 noise is the spread of the regions. Differences that the camera positions explain do not count (`estimate`).
 """
 
+import itertools
 import math
 import os
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ from nrfgs_ns.image.photograph import GAMMA, TOE
 LONGEST_SIDE = 400
 """Pixels of the longest side after averaging around each point: its position is not exact to the pixel."""
 MOST_POINTS = 20_000
-"""Points of the reconstruction; of more, this number is drawn."""
+"""Points of the reconstruction; a larger one is sampled."""
 CELL, NEARER = 8, 0.02
 """Side of a cell in averaged pixels; a point is hidden if another in its cell is nearer by more than this share."""
 DARKEST, BRIGHTEST = 0.06, 0.94
@@ -82,7 +83,7 @@ class Sighting(NamedTuple):
 
 
 def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tensor | None = None) -> Sighting:
-    """Look points [N, 3] up in a photograph; the result is on the host.
+    """Sample a photograph at points [N, 3]; the result is on the host.
 
     Args:
         viewmat: world to camera, x right, y down, z forward. [4, 4]
@@ -121,7 +122,7 @@ def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tenso
 
 
 def drawn(points: Tensor) -> Tensor:
-    """Draw at most MOST_POINTS of the points [N, 3], the same ones each time."""
+    """At most MOST_POINTS of the points [N, 3], the same ones each time."""
     if len(points) <= MOST_POINTS:
         return points
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
@@ -132,57 +133,50 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
     """Compare photographs, from their sightings [V] and camera centres [V, 3], with those taken next to them."""
     distance = torch.cdist(centers.double(), centers.double())
     distance.fill_diagonal_(torch.inf)
-    nearest = distance.argsort(dim=1)[:, :CANDIDATES]
+    nearest = distance.argsort(dim=1)[:, : min(CANDIDATES, len(centers) - 1)].tolist() if len(centers) > 1 else []
 
     def shift_of(pair: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
-        return _shift(sightings[pair[0]], sightings[pair[1]])
+        return _shift(*(sightings[photograph] for photograph in pair))
 
     # In parallel: the pairs needed below, except where one of them has too few common points.
-    near = sorted(
-        {(min(a, b), max(a, b)) for a, row in enumerate(nearest[:, :NEIGHBOURS].tolist()) for b in row if a != b}
-    )
+    near = sorted({(min(a, b), max(a, b)) for a, row in enumerate(nearest) for b in row[:NEIGHBOURS]})
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         shifts = dict(zip(near, pool.map(shift_of, near), strict=True))
-    done: set[tuple[int, int]] = set()
-    compared: list[tuple[int, int, Tensor, Tensor]] = []
-    for one, candidates in enumerate(nearest.tolist()):
+    compared: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
+    for a, candidates in enumerate(nearest):
         neighbours = 0
-        for other in candidates:
-            if neighbours == NEIGHBOURS or other == one:
+        for pair in ((min(a, b), max(a, b)) for b in candidates):
+            if neighbours == NEIGHBOURS:
                 break
-            pair = min(one, other), max(one, other)
-            shift = None if pair in done else shifts[pair] if pair in shifts else shift_of(pair)
-            neighbours += shift is not None or pair in done
-            if shift is not None:
-                done.add(pair)
-                compared.append((*pair, *shift))
+            if pair not in shifts:
+                shifts[pair] = shift_of(pair)
+            if shifts[pair] is not None:
+                compared[pair] = shifts[pair]
+                neighbours += 1
     if not compared:
         return Pairs(*torch.zeros(2, 0, dtype=torch.int64), *torch.zeros(2, 0, 3))
-    first, second, shift, spread = zip(*compared, strict=True)
-    return Pairs(torch.tensor(first), torch.tensor(second), torch.stack(shift), torch.stack(spread))
+    return Pairs(*torch.tensor(list(compared)).T, *map(torch.stack, zip(*compared.values(), strict=True)))
 
 
 def _shift(first: Sighting, second: Sighting) -> tuple[Tensor, Tensor] | None:
     """Shift from the first to the second and disagreement of the regions, [3] each; None: too few common points."""
-    place = torch.searchsorted(second.points, first.points).clamp_max(max(len(second.points) - 1, 0))
     if len(second.points) == 0 or len(first.points) == 0:
         return None
+    place = torch.searchsorted(second.points, first.points).clamp_max(len(second.points) - 1)
     common = second.points[place] == first.points
     if int(common.sum()) < FEWEST_POINTS * FEWEST_REGIONS:
         return None
     light = second.light[place[common]] - first.light[common]
     red, green, blue = light.unbind(dim=-1)
     columns = torch.stack([light.mean(dim=-1), red - green, blue - green], dim=-1)
-    region, medians = first.region[common], []
-    for number in region.unique().tolist():
-        inside = columns[region == number]
-        if len(inside) >= FEWEST_POINTS:
-            medians.append(inside.median(dim=0).values)
+    region = first.region[common]
+    inside = [columns[region == number] for number in region.unique()]
+    medians = [lights.median(dim=0).values for lights in inside if len(lights) >= FEWEST_POINTS]
     if len(medians) < FEWEST_REGIONS:
         return None
     regions = torch.stack(medians)
     shift = regions.median(dim=0).values
-    return shift.cpu(), 1.4826 * (regions - shift).abs().median(dim=0).values.cpu()
+    return shift, 1.4826 * (regions - shift).abs().median(dim=0).values
 
 
 def spread(known: Tensor) -> float:
@@ -243,36 +237,29 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
     if there.any():
         factor, _ = slope(pairs, known)
         expected[there, 0] = factor * (known[there] - known[there].mean()).double()
-    rows = torch.arange(len(pairs.first))
-    difference = torch.zeros(len(rows), count, dtype=torch.float64)
-    difference[rows, pairs.second], difference[rows, pairs.first] = 1.0, -1.0
-    usual_stops, places, known_spread = USUAL_STOPS, None, False
+    usual, random, places = USUAL_STOPS, [0.0, 0.0, 0.0], None
     if count > MOST_PHOTOGRAPHS:
         first = (pairs.first < MOST_PHOTOGRAPHS) & (pairs.second < MOST_PHOTOGRAPHS)
         part = Pairs(*(value[first] for value in pairs))
-        of_part = estimate(part, known[:MOST_PHOTOGRAPHS], centers[:MOST_PHOTOGRAPHS])
-        if known_spread := any(of_part.random):
-            usual_stops = of_part.random
-    elif len(rows) >= FEWEST_PAIRS:
+        random = list(estimate(part, known[:MOST_PHOTOGRAPHS], centers[:MOST_PHOTOGRAPHS]).random)
+        usual = random if any(random) else usual
+    elif len(pairs.first) >= FEWEST_PAIRS:
         places = _places(centers)
-    stops, held, random = torch.empty_like(expected), [], []
-    for column, usual in enumerate(usual_stops):
+    eye = torch.eye(count, dtype=torch.float64)
+    difference = eye[pairs.second] - eye[pairs.first]
+    stops, held = torch.empty_like(expected), []
+    for column in range(3):
         weight = pairs.spread[:, column].double().clamp_min(SMALLEST_SPREAD) ** -2
         missing = pairs.shift[:, column].double() - difference @ expected[:, column]
         precision = difference.T @ (weight[:, None] * difference)
         seen = difference.T @ (weight * missing)
-        if places is None:
-            own, patterns = usual**2 * torch.eye(count, dtype=torch.float64), _constant(count)
-            size = usual if known_spread else 0.0
-            total = own
-        else:
-            own, total, patterns, size = _split(places, precision, seen)
+        variance, total, patterns = usual[column] ** 2, usual[column] ** 2 * eye, _constant(count)
+        if places is not None:
+            variance, total, patterns = _split(places, precision, seen)
+            random[column] = math.sqrt(variance)
         # mean of s given the pairs: cov(s, d) (cov(d) + precision^-1)^-1, written without inverting the precision
-        eye = torch.eye(count, dtype=torch.float64)
-        correction = own @ torch.linalg.solve(eye + precision @ total, seen)
-        stops[:, column] = expected[:, column] + correction
+        stops[:, column] = expected[:, column] + variance * torch.linalg.solve(eye + precision @ total, seen)
         held.append(patterns.float())
-        random.append(size)
     stops -= stops.mean(dim=0)
     return Looks(stops.float(), tuple(held), tuple(random))
 
@@ -294,10 +281,8 @@ def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
     return bases
 
 
-def _split(
-    places: list[tuple[Tensor, Tensor]], precision: Tensor, seen: Tensor
-) -> tuple[Tensor, Tensor, Tensor, float]:
-    """Covariance of s and of d, patterns that belong to g, standard deviation of s.
+def _split(places: list[tuple[Tensor, Tensor]], precision: Tensor, seen: Tensor) -> tuple[float, Tensor, Tensor]:
+    """Variance of s, covariance of d, and patterns that belong to g.
 
     Args:
         places: of `_places`.
@@ -308,26 +293,15 @@ def _split(
     own_precision = precision.diagonal().clamp_min(1e-9)
     brightness = torch.linalg.solve(precision + 1e-6 * own_precision.mean() * eye, seen)
     noise = float((1.0 / own_precision).median())
-    best = None
+    best, highest = None, -math.inf
     for shares, basis in places:
         squares = (basis.T @ brightness).square()
-        for own in SIZES:
-            for place in (0.0, *SIZES):
-                variance = place**2 * shares + own**2 + noise
-                likelihood = -float((variance.log() + squares / variance)[:-1].sum())
-                likelihood -= 2 * math.log(count) * (place > 0.0)
-                if best is None or likelihood > best[0]:
-                    best = likelihood, own, place, shares, basis
-    _, own, place, shares, basis = best
-    slow = (place**2 * shares > own**2).nonzero()[:MOST_PATTERNS, 0]
-    patterns = torch.cat([_constant(count), basis[:, slow]], dim=1)
-    patterns = torch.linalg.qr(patterns).Q
-    total = own**2 * eye + place**2 * (basis * shares) @ basis.T
-    return own**2 * eye, total, patterns, own
-
-
-def channels(stops: Tensor) -> Tensor:
-    """Stops of red, green and blue [V, 3] from exposure, log2(R/G) and log2(B/G) [V, 3]."""
-    exposure, red, blue = stops.unbind(dim=-1)
-    rgb = exposure + (2 * red - blue) / 3, exposure - (red + blue) / 3, exposure + (2 * blue - red) / 3
-    return torch.stack(rgb, dim=-1)
+        for own, place in itertools.product(SIZES, (0.0, *SIZES)):
+            variance = place**2 * shares + own**2 + noise
+            likelihood = -float((variance.log() + squares / variance)[:-1].sum())
+            likelihood -= 2 * math.log(count) * (place > 0.0)
+            if likelihood > highest:
+                best, highest = (own**2, place**2 * shares, basis), likelihood
+    own, slow, basis = best
+    patterns = torch.cat([_constant(count), basis[:, (slow > own).nonzero()[:MOST_PATTERNS, 0]]], dim=1)
+    return own, own * eye + (basis * slow) @ basis.T, torch.linalg.qr(patterns).Q

@@ -36,9 +36,9 @@ class PhotographModel(nn.Module):
 
     Args:
         names: of the photographs. [P]
-        start: initial stops of red, green and blue; None: 0. [P, 3]
-        held: for exposure, log2(R/G) and log2(B/G), orthonormal patterns over the photographs that keep their initial
-            values, the constant among them; None: the constants alone. [P, K] each
+        start: initial numbers, of any mean; None: 0. [P, 3]
+        held: for each number, orthonormal patterns over the photographs that keep their initial values, the constant
+            among them; None: the constants alone. [P, K] each
     """
 
     def __init__(self, names: Sequence[str], start: Tensor | None = None, held: Sequence[Tensor] | None = None):
@@ -47,17 +47,13 @@ class PhotographModel(nn.Module):
         basis = torch.tensor(BASIS)
         self.register_buffer("basis", basis, persistent=False)
         self.register_buffer("exponents", (basis.T / GAMMA).contiguous(), persistent=False)
-        stops = torch.zeros(len(names), 3) if start is None else start.float()
-        self.shots = Parameter((stops - stops.mean(dim=0)) @ torch.linalg.pinv(basis))
+        start = torch.zeros(len(names), 3) if start is None else start.float()
+        self.shots = Parameter(start - start.mean(dim=0))
         """exposure, log2(R/G) and log2(B/G) of each photograph, in stops. [P, 3]"""
         if held is None:
-            held = [torch.full((len(names), 1), max(len(names), 1) ** -0.5)] * 3
-        rows = torch.zeros(sum(pattern.shape[1] for pattern in held), len(names), 3)
-        first = 0
-        for column, pattern in enumerate(held):
-            rows[first : first + pattern.shape[1], :, column] = pattern.T
-            first += pattern.shape[1]
-        self.register_buffer("held", rows.flatten(1))
+            held = [torch.full((len(names), 1), len(names) ** -0.5)] * 3
+        patterns = torch.block_diag(*(of_number.T for of_number in held))
+        self.register_buffer("held", patterns.view(-1, 3, len(names)).transpose(1, 2).flatten(1))
         self.register_buffer("kept", self.held @ self.shots.detach().flatten())
 
     def forward(self, image: Tensor, index: int) -> Tensor:

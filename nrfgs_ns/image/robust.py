@@ -31,16 +31,10 @@ FADE_STEPS = 1500
 
 
 class Trimming(nn.Module):
-    """Remembers how large residuals are, and trims the largest; at most a `share` of the pixels, in (0, 1).
-
-    Raises:
-        ValueError: the share is out of range.
-    """
+    """Remembers how large residuals are, and trims the largest; at most a `share` of the pixels, in (0, 1)."""
 
     def __init__(self, share: float):
         super().__init__()
-        if not 0.0 < share < 1.0:
-            raise ValueError(f"{share} is not above 0 and below 1")
         self.share = share
         self.register_buffer("histogram", torch.zeros(BINS))
 

@@ -8,11 +8,7 @@ places where the window lies within the image, mean over places and channels. Wi
                         C = E[x]^2 + E[y]^2 + C1    D = (E[xx] - E[x]^2) + (E[yy] - E[y]^2) + C2
 
 The window is symmetric, so the gradient by x is blur(dS/dE[x]) + 2 x blur(dS/dE[xx]) + y blur(dS/dE[xy]): forward keeps
-those three slopes and no moments. On CUDA one Triton kernel does each direction, in float32 (`ssim_triton.py`);
-elsewhere PyTorch does, all moments in one convolution.
-
-Images are [H, W, 3] in [0, 1], of one floating dtype and on one device. The truth gets no gradient. Images with a side
-shorter than the window go to pytorch_msssim, which warns and leaves that side unblurred.
+those three slopes and no moments. On CUDA one Triton kernel does each direction, in float32 (`ssim_triton.py`).
 """
 
 import torch
@@ -20,35 +16,26 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.image.metrics import LIBRARY, SSIM_C1, SSIM_C2, WEIGHTS, WINDOW_SIZE
+from nrfgs_ns.image.metrics import LIBRARY, SSIM_C1, SSIM_C2, WEIGHTS, WINDOW_SIZE, blur
 from nrfgs_ns.kernels.trial import Gate
-
-MAX_NUMBERS = 2**31
-"""The kernels index slopes with 32 bits: three slopes of an image must have fewer numbers."""
-
-
-def ssim(prediction: Tensor, truth: Tensor) -> Tensor:
-    """Mean structural similarity of images [H, W, 3], a scalar in [-1, 1]; 1 is identical."""
-    return _weighted_sum(prediction, truth, 0.0, 1.0, 0.0)
 
 
 def photometric_loss(prediction: Tensor, truth: Tensor, ssim_lambda: float) -> Tensor:
-    """(1 - ssim_lambda) mean |prediction - truth| + ssim_lambda (1 - SSIM), a scalar; ssim_lambda in [0, 1]."""
-    return _weighted_sum(prediction, truth, 1.0 - ssim_lambda, -ssim_lambda, ssim_lambda)
+    """(1 - ssim_lambda) mean |prediction - truth| + ssim_lambda (1 - SSIM), a scalar; ssim_lambda in [0, 1].
 
-
-def _weighted_sum(prediction: Tensor, truth: Tensor, l1_weight: float, ssim_weight: float, constant: float) -> Tensor:
-    """l1_weight mean |prediction - truth| + ssim_weight SSIM + constant."""
+    Images are [H, W, 3] in [0, 1], of one floating dtype and on one device. The truth gets no gradient. Images with a
+    side shorter than the window go to pytorch_msssim, which warns and leaves that side unblurred.
+    """
     if min(prediction.shape[:2]) < WINDOW_SIZE:
         similarity = LIBRARY(prediction.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None])
-    elif _kernels_take(prediction, truth):
+    elif prediction.is_cuda and prediction.dtype == torch.float32 and kernels_run_on(prediction.device):
         from nrfgs_ns.image.ssim_triton import WeightedSum
 
-        return WeightedSum.apply(prediction, truth, l1_weight, ssim_weight, constant)
+        return WeightedSum.apply(prediction, truth, 1.0 - ssim_lambda, -ssim_lambda, ssim_lambda)
     else:
         similarity = SsimInTorch.apply(prediction, truth)
-    total = ssim_weight * similarity + constant
-    return total if l1_weight == 0.0 else total + l1_weight * (prediction - truth).abs().mean()
+    total = -ssim_lambda * similarity + ssim_lambda
+    return total if ssim_lambda == 1.0 else total + (1.0 - ssim_lambda) * (prediction - truth).abs().mean()
 
 
 class SsimInTorch(torch.autograd.Function):
@@ -57,7 +44,7 @@ class SsimInTorch(torch.autograd.Function):
     @staticmethod
     def forward(ctx, prediction: Tensor, truth: Tensor) -> Tensor:
         x, y = (image.detach().permute(2, 0, 1).contiguous() for image in (prediction, truth))
-        moments = _blur(torch.cat([x, y, x * x, y * y, x * y])).split(3)
+        moments = blur(torch.cat([x, y, x * x, y * y, x * y]), x.new_tensor(WEIGHTS)).split(3)
         similarity, *slopes = _similarity(*moments, slopes=ctx.needs_input_grad[0])
         ctx.save_for_backward(x, y, *slopes)
         return similarity.mean()
@@ -67,7 +54,8 @@ class SsimInTorch(torch.autograd.Function):
     def backward(ctx, d_mean: Tensor) -> tuple[Tensor, None]:
         x, y, *slopes = ctx.saved_tensors
         # With zeros around, every pixel lies in whole windows: the gradient is as large as the image.
-        by_x, by_xx, by_xy = _blur(F.pad(torch.cat(slopes), (WINDOW_SIZE - 1,) * 4)).split(3)
+        padded = F.pad(torch.cat(slopes), (WINDOW_SIZE - 1,) * 4)
+        by_x, by_xx, by_xy = blur(padded, x.new_tensor(WEIGHTS)).split(3)
         gradient = by_x.addcmul(x, by_xx, value=2.0).addcmul_(y, by_xy).mul_(d_mean / slopes[0].numel())
         return gradient.permute(1, 2, 0), None
 
@@ -84,24 +72,6 @@ def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor, slopes
     by_xx, by_xy = -S / D, 2 * A * scale
     by_x = 2 * (y * B * scale - x * (S / C + by_xx)) - y * by_xy
     return S, by_x, by_xx, by_xy
-
-
-def _blur(planes: Tensor) -> Tensor:
-    """Weighted means over all whole windows: [P, H, W] -> [P, H - 10, W - 10]."""
-    window = planes.new_tensor(WEIGHTS).expand(len(planes), 1, 1, -1)
-    down = F.conv2d(planes[None], window.transpose(2, 3), groups=len(planes))
-    return F.conv2d(down, window, groups=len(planes))[0]
-
-
-def _kernels_take(prediction: Tensor, truth: Tensor) -> bool:
-    """Whether the kernels can compute this pair."""
-    return (
-        prediction.is_cuda
-        and truth.is_cuda
-        and prediction.dtype == truth.dtype == torch.float32
-        and 3 * prediction.numel() < MAX_NUMBERS
-        and kernels_run_on(prediction.device)
-    )
 
 
 _GATE = Gate("SSIM")

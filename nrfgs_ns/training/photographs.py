@@ -19,7 +19,7 @@ from torch import Tensor
 from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import overlap
-from nrfgs_ns.image.overlap import ENOUGH_STOPS, Looks, Pairs, channels, estimate, slope, spread, varies
+from nrfgs_ns.image.overlap import ENOUGH_STOPS, Looks, Pairs, estimate, slope, spread, varies
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.pinhole import world_to_camera
 
@@ -95,7 +95,7 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
         return None, notes
     looks = estimate(known.pairs, known.exif, known.centers) if torch.isfinite(known.exif).any() else known.seen
     names = [path.name for path in datamanager.train_dataset.image_filenames]
-    return PhotographModel(names, channels(looks.stops), looks.held), notes
+    return PhotographModel(names, looks.stops, looks.held), notes
 
 
 def verdict(choice: Choice, known: Evidence) -> tuple[bool, str]:

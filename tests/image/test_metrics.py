@@ -113,14 +113,10 @@ def test_a_diverged_prediction_shows():
     assert all(math.isnan(metric(pred, gt)) for metric in SCALARS)
 
 
-def test_an_empty_mask_gives_none():
-    pred, gt = pair(170, 165)
-    assert set(image_metrics(pred, gt, torch.zeros(170, 165, 1, dtype=torch.bool)).values()) == {None}
-
-
-def test_a_mask_at_the_border_has_pixels_but_no_window():
+def test_an_empty_mask_gives_none_and_one_without_a_window_no_ssim():
     pred, gt = pair(170, 165)
     mask = torch.zeros(170, 165, 1, dtype=torch.bool)
+    assert set(image_metrics(pred, gt, mask).values()) == {None}
     mask[:5] = True
     assert psnr(pred, gt, mask) is not None and l1(pred, gt, mask) is not None
     assert ssim(pred, gt, mask) is None and ms_ssim(pred, gt, mask) is None
@@ -133,16 +129,7 @@ def test_what_lies_outside_the_mask_does_not_count():
     garbage[0, 0] = float("nan")
     for metric in SCALARS:
         assert metric(garbage, gt, mask) == metric(pred, gt, mask)
-
-
-def test_what_lies_inside_the_mask_counts_alone():
-    """Errors inside cost what they cost, however small the mask: no dilution by the pixels around."""
-    _, gt = pair(170, 180)
-    pred = gt + 0.1
-    for radius in (20, 60):
-        mask = disc(170, 180, radius)
-        assert psnr(pred, gt, mask) == pytest.approx(20.0, abs=1e-4)  # -10 log10(0.1^2)
-        assert l1(pred, gt, mask) == pytest.approx(0.1, rel=1e-5)
+    assert psnr(torch.where(mask, gt + 0.1, gt), gt, mask) == pytest.approx(20.0, abs=1e-4)  # -10 log10(0.1^2)
 
 
 def test_masked_ssim_is_the_mean_over_centres_inside():
@@ -152,12 +139,6 @@ def test_masked_ssim_is_the_mean_over_centres_inside():
     ssim_map = ssim_maps(*(image.movedim(-1, 0) for image in (filled, gt)))[0]
     expected = np.mean([ssim_map[:, i - 5, j - 5].mean() for i, j, _ in mask.nonzero().tolist()])
     assert ssim(pred, gt, mask) == pytest.approx(expected, abs=1e-12)
-    # Far inside no window reaches the outside: filling does nothing there.
-    core = disc(60, 70, 6)
-    raw = ssim_maps(*(image.movedim(-1, 0) for image in (pred, gt)))[0].movedim(0, -1)
-    kept = ssim_map.movedim(0, -1)
-    inner = core[5:-5, 5:-5, 0]
-    torch.testing.assert_close(raw[inner], kept[inner])
 
 
 def test_a_thin_mask_survives_the_coarse_scales():
@@ -199,12 +180,8 @@ def weights(hub):
     return path
 
 
-def test_lpips_without_weights_is_none_and_says_how_to_get_them(hub, capsys):
-    pred, gt = pair(40, 40)
-    for _ in range(2):
-        values = image_metrics(pred, gt)
-        assert values["lpips"] is None and values["psnr"] is not None
-    assert capsys.readouterr().out == "", "a training evaluates often; the advice is its last evaluation's"
+def test_lpips_without_weights_is_none_and_says_how_to_get_them(hub):
+    assert image_metrics(*pair(40, 40))["lpips"] is None
     advice = lpips_advice()
     assert str(hub / "alexnet-owt-7be5be79.pth") in advice and "load_state_dict_from_url" in advice
 
@@ -237,13 +214,7 @@ def test_lpips_with_weights(weights):
 
     reference = LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
     assert lpips(pred, gt) == reference(batch(pred), batch(gt)).item()
-
-    # The smallest image is where the network's own limit is.
-    assert lpips(*pair(LPIPS_MIN_SIDE - 1, 64)) is None
-    assert math.isfinite(lpips(*pair(LPIPS_MIN_SIDE, 64)))
-    small = batch(pair(LPIPS_MIN_SIDE - 1, 64)[0])
-    with pytest.raises(RuntimeError):
-        reference(small, small)
+    assert lpips(*pair(LPIPS_MIN_SIDE - 1, 64)) is None and math.isfinite(lpips(*pair(LPIPS_MIN_SIDE, 64)))
 
 
 def test_undoes_an_affine_change_of_colours():
@@ -252,17 +223,7 @@ def test_undoes_an_affine_change_of_colours():
     torch.testing.assert_close(fit_colors(pred, truth), truth, atol=1e-5, rtol=0)
 
 
-def test_no_other_map_is_nearer():
-    torch.manual_seed(0)
-    truth, pred = torch.rand(16, 16, 3), torch.rand(16, 16, 3)
-    best = (fit_colors(pred, truth) - truth).square().mean()
-    assert best <= (pred - truth).square().mean()
-    for _ in range(20):
-        other = (pred @ (torch.eye(3) * 0.1 + 0.05 * torch.randn(3, 3)) + 0.45 + 0.05 * torch.randn(3)).clamp(0, 1)
-        assert best <= (other - truth).square().mean()
-
-
-def test_only_what_is_inside_the_mask_counts():
+def test_a_fit_is_to_what_is_inside_the_mask():
     truth = torch.rand(12, 12, 3) * 0.5 + 0.25
     pred, mask = truth * 0.5 + 0.1, torch.zeros(12, 12, 1, dtype=torch.bool)
     mask[3:9, 3:9] = True

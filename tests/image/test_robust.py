@@ -79,9 +79,3 @@ def test_what_is_outside_the_mask_is_not_remembered():
     other(spoilt, truth, END, mask)
     assert torch.equal(one.histogram, other.histogram)
     assert one.histogram.sum() == 32
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0, -0.1])
-def test_share_out_of_range(share):
-    with pytest.raises(ValueError, match="above 0"):
-        Trimming(share)
