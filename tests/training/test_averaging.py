@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import relocation
@@ -167,32 +167,6 @@ def test_the_window_of_a_training_that_goes_on(trainer):
         assert counts(trainer, range(8, 8 + more)) == expected
 
 
-def walk(trainer, budget: float, length: int, window: int, cost) -> list[int]:
-    """The counts of a timed training whose step s takes cost(s) seconds."""
-    now = [0.0]
-    pace = trainer.pace = TimedPace(length, budget, clock=lambda: now[0])
-    trainer.config.average_steps = window
-    pace.start()
-    found = []
-    while not pace.is_spent:
-        pace.begin_step()
-        now[0] += cost(len(found))
-        pace.advance()
-        found += counts(trainer, range(len(found), len(found) + 1))
-    return found
-
-
-def test_the_window_of_a_timed_training(trainer):
-    """At a constant pace it has as many steps as were asked for, but for one: the pace's last position is the last
-    step's. At a changing pace it has about as many, and none is left out once it has begun."""
-    even = walk(trainer, 300.0, 3000, 40, lambda step: 1.0)
-    assert len(even) == 300 and abs(even[-1] - 40) <= 1
-    trainer.mean.forget()
-    uneven = walk(trainer, 300.0, 3000, 40, lambda step: 1.0 if step < 262 else 0.5)
-    begun = uneven.index(1)
-    assert uneven[begun:] == list(range(1, len(uneven) - begun + 1)) and 60 < uneven[-1] < 80
-
-
 @pytest.fixture(scope="module")
 def averaged(tiny_scene, tmp_path_factory, any_share):
     """Trainings of 12 steps that average over the last 6, with their parameters after each step, what they have said,
@@ -267,16 +241,6 @@ def test_a_mean_continues_to_the_bit(name, more, averaged, tiny_scene, tmp_path)
     one, other = checkpoint_of(training.config), checkpoint_of(rest)
     assert one["step"] == 11
     assert_same_training(one, other, rtol=0, atol=0)
-
-
-def test_checkpoints_with_and_without_a_mean_load(averaged, tiny_scene, tmp_path):
-    """In a training that does not average; and one without, where it does."""
-    training = averaged("calm")
-    loaded = calm(tiny_scene, tmp_path, {"--load-dir": training.kept})
-    assert loaded._start_step == 8 and loaded.mean is None
-    assert_close(loaded.pipeline.model.means.detach(), training.after[7]["gauss_params.means"], rtol=0, atol=0)
-    loaded = calm(tiny_scene, tmp_path, {"--load-dir": models_of(training.config), "--average-steps": 6}, steps=13)
-    assert loaded._start_step == 12 and loaded.mean.count == 0
 
 
 def test_averaging_changes_no_step(averaged, tiny_scene, tmp_path):

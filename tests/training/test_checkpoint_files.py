@@ -97,20 +97,6 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path):
     assert not (tmp_path / "owned").exists()
 
 
-@pytest.mark.parametrize(
-    ("file", "message"),
-    [
-        ("notes.txt", "holds no checkpoints .* Give the folder nerfstudio_models"),
-        ("nerfstudio_models/step-000000009.ckpt", "holds no checkpoints .* They are in .*nerfstudio_models"),
-    ],
-)
-def test_a_folder_without_checkpoints_is_refused_in_one_sentence(file, message, tmp_path):
-    (tmp_path / file).parent.mkdir(exist_ok=True)
-    (tmp_path / file).touch()
-    with pytest.raises(InputError, match=message):
-        read_latest(tmp_path)
-
-
 def test_a_step_that_is_not_there_and_a_folder_in_place_of_a_file_are_refused(tmp_path):
     write(tmp_path, 1, content(1))
     with pytest.raises(InputError, match="no checkpoint of step 5, only of 1"):

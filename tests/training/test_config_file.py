@@ -7,9 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 import yaml
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
 from nrfgs_ns import method_config
 from nrfgs_ns.errors import InputError
@@ -42,15 +40,6 @@ def test_enums_as_early_versions_of_python_3_11_write_them(saved):
     )
     assert count == 1 or sys.version_info < (3, 11, 4)
     assert read_config(saved(text)) == method_config.nrfgs.config
-
-
-def test_nerfstudios_colmap_parser_is_read_back(saved):
-    config = method_config.nrfgs.config
-    datamanager = replace(config.pipeline.datamanager, dataparser=ColmapDataParserConfig(colmap_path=Path("sparse/0")))
-    config = replace(config, pipeline=replace(config.pipeline, datamanager=datamanager))
-    read = read_config(saved(yaml.dump(config)))
-    assert read == config and read.pipeline.datamanager.dataparser.setup is not None
-    assert read.optimizers["field"]["optimizer"]._target is torch.optim.Adam
 
 
 WHOLE = yaml.dump(method_config.nrfgs.config)

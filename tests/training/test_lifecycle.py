@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train, evaluate, render, resume, refuse: nerfstudio's own commands on a tiny scene, with CUDA out of reach."""
 
-import gc
 import json
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import torch
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender
-from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
@@ -178,33 +175,3 @@ def test_checkpoint_of_another_head_is_refused(method, more, says, finished, tin
     with pytest.raises(InputError, match=says) as error:
         set_up(args)
     assert "--load-config" in str(error.value)
-
-
-def test_a_training_writes_into_no_log_of_an_earlier_one(tiny_scene, tmp_path):
-    earlier = []
-    for name in ("first", "second"):
-        set_up(options(tiny_scene, tmp_path / name, steps=1))
-        assert "lost" not in [event["name"] for event in writer.EVENT_STORAGE]
-        writer.put_scalar(name="lost", scalar=1.0, step=0)
-        assert writer.EVENT_WRITERS and not set(map(id, earlier)) & set(map(id, writer.EVENT_WRITERS))
-        earlier = list(writer.EVENT_WRITERS)
-
-
-@pytest.mark.parametrize("ends", [True, False])
-def test_the_collector_is_held_off_while_training_and_no_longer(ends, tiny_scene, tmp_path, monkeypatch):
-    trainer = set_up(options(tiny_scene, tmp_path, steps=1))
-    calls = []
-    for name in ("collect", "freeze", "unfreeze"):
-        monkeypatch.setattr(gc, name, lambda name=name: calls.append(name))
-    step = trainer.train_iteration
-
-    def train_iteration(number: int):
-        calls.append("step")
-        if not ends:
-            raise KeyboardInterrupt
-        return step(number)
-
-    monkeypatch.setattr(trainer, "train_iteration", train_iteration)
-    with nullcontext() if ends else pytest.raises(KeyboardInterrupt):
-        trainer.train()
-    assert calls == ["collect", "freeze", "step", "unfreeze"]

@@ -20,7 +20,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import pace, trainer_config
 from nrfgs_ns.training.optimizers import LeanOptimizers
-from nrfgs_ns.training.pace import STEPS_BEFORE_PLANNING, Pace, TimedPace, resolution_phases, steps_for
+from nrfgs_ns.training.pace import Pace, TimedPace, resolution_phases, steps_for
 
 LENGTH = 30_000
 
@@ -49,17 +49,6 @@ def walk(budget, cost, phases=None, limit=200_000):
         if pace.is_spent:
             return pace, clock.now - 100.0, positions
     raise AssertionError("training did not end")
-
-
-def test_constant_speed_is_an_even_walk():
-    """1 s a step, 1,010 s: the first ten at rate 1, then (30,000 - 10) / 1,000 a step. It ends at the end of both."""
-    pace, seconds, positions = walk(1010.0, lambda position, step: 1.0)
-    assert abs(seconds - 1010.0) <= 1.0 and len(positions) == 1010
-    rates = [b - a for a, b in zip(positions, positions[1:], strict=False)]
-    assert rates[:STEPS_BEFORE_PLANNING] == [1.0] * STEPS_BEFORE_PLANNING
-    # A step's duration is known when the next begins, so the rate is that of a walk one step longer or shorter.
-    assert rates[20:-20] == pytest.approx([29.99] * (len(rates) - 40), rel=0.01)
-    assert pace.position == pytest.approx(LENGTH, rel=0.002)
 
 
 @given(
@@ -99,31 +88,6 @@ def test_what_steps_cost_decides_how_evenly_they_are_spread():
     assert early(walk(3000.0, cost, phases)[2]) == pytest.approx(0.5, abs=0.01)
     assert early(walk(3000.0, cost)[2]) > 0.55
     assert resolution_phases(2, 3000) == [(3000.0, 0.25), (6000.0, 0.5), (math.inf, 1.0)]
-
-
-def test_a_timed_training_goes_on_where_it_was():
-    """Interrupted after 300 s of 1,000: 700 s are left, for the rest of the schedules."""
-    clock = Clock()
-    pace = TimedPace(LENGTH, 1000.0, None, clock)
-
-    def steps(pace, count):
-        for _ in range(count):
-            pace.begin_step()
-            clock.now += 1.0
-            pace.advance()
-
-    pace.start()
-    steps(pace, 300)
-    clock.now += 12345.0
-    again = TimedPace(7, 1000.0, None, clock)
-    state = pace.state()
-    again.load_state({**state, "seconds": 300.0})
-    again.start()
-    assert again.length == LENGTH and again.position == pace.position and again.elapsed == 300.0
-    steps(again, 699)
-    assert not again.is_spent
-    steps(again, 1)
-    assert again.is_spent and again.position == pytest.approx(LENGTH, rel=0.005)
 
 
 def test_steps_of_positions():
@@ -212,13 +176,6 @@ def test_a_stretched_training_continues_to_the_bit(tiny_scene, tmp_path, monkeyp
     assert one["schedulers"] == other["schedulers"]
     with pytest.raises(InputError, match="schedule-steps"):
         train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 20, SH, {"--load-dir": kept}))
-
-
-@pytest.mark.usefixtures("no_cuda")
-def test_mcmc_begins_and_ends_with_the_pace(tiny_scene, tmp_path):
-    record = train(options(tiny_scene, tmp_path, "nrfgs", 20, MCMC, {"--schedule-steps": 40}))
-    # Relocations at steps 6 and 8, between 8 / 2 and 20 / 2: 300, 315, 330.
-    assert record.splats[-1] == [19, 330]
 
 
 class SecondsAStep(TimedPace):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The progress line, and that it changes no number."""
+"""What is shown: the progress line, which changes no number, and views far below the rest."""
 
 import io
 import re
@@ -9,8 +9,7 @@ from rich.console import Console
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_ns.training import pipeline, progress
-from nrfgs_ns.training.progress import ProgressLine, ProgressLineConfig
-from nrfgs_ns.training.trainer import writer
+from nrfgs_ns.training.evaluation import far_below
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -63,17 +62,20 @@ def test_on_a_terminal_the_line_makes_room_for_an_evaluation(screen, tiny_scene,
     assert text.index("Evaluating") < text.index("step 5 of 6") < text.index("step 6 of 6 (100 %)")
 
 
-@pytest.mark.parametrize("seconds_a_step", [0.01, 7.0])
-def test_in_a_file_there_is_a_line_each_minute(seconds_a_step, screen, monkeypatch):
-    said, now = screen(terminal=False), [0.0]
-    line = ProgressLine(ProgressLineConfig(), clock=lambda: now[0])
-    monkeypatch.setitem(writer.GLOBAL_BUFFER, "max_iter", 1_000_000)
-    written, printed = [], 0
-    for step in range(round(600 / seconds_a_step)):
-        now[0] += seconds_a_step
-        line.write_stats_log(step)
-        if len(said.getvalue()) > printed:
-            printed = len(said.getvalue())
-            written.append(now[0])
-    gaps = [after - before for before, after in zip(written, written[1:], strict=False)]
-    assert max(gaps) <= 60 and min(gaps) >= progress.SECONDS_BETWEEN_LINES - 1e-6 and written[0] == seconds_a_step
+def views(*psnrs: float | None) -> list[dict]:
+    return [
+        {"image": f"{index}.png", **({} if value is None else {"psnr": value})} for index, value in enumerate(psnrs)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "names"),
+    [
+        ((25.0, 26.0, 12.0, 25.5, 26.5, 8.0, 25.2, 25.8, None), ["5.png", "2.png"]),
+        ((20.0, 22.0, 24.0, 26.0, 28.0, 30.0), []),  # spread widely
+        ((25.0, 25.1, 25.0, 25.1, 25.0, 23.0), []),  # spread little: 2 dB are not far
+        ((25.0, 25.0, 25.0, 5.0), []),  # too few
+    ],
+)
+def test_views_far_below_the_rest_are_named_the_worst_first(psnrs, names):
+    assert [name for name, *_ in far_below(views(*psnrs))] == names

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """A step as one CUDA graph computes what its kernels compute one after the other. `pytest -m gpu`."""
 
+import sys
 from types import SimpleNamespace
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
+from short_trainings import command_line, set_up
 
 from nrfgs_lab.training_run import evaluate, parse, train
+from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.training.photographs import compare_photographs
 from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs
 
 gpu = [
@@ -105,11 +110,6 @@ def test_what_is_not_recorded_is_said_once(build, option, capsys, monkeypatch):
     assert capsys.readouterr().out.count("not recorded") == 1
 
 
-def test_a_cpu_makes_steps_as_ever(build):
-    pipeline, graphs = build("cpu")
-    assert not graphs._takes(5, pipeline.datamanager.train_view(0)[1])
-
-
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-best"])
 @pytest.mark.parametrize("step", [10, 100, 20_000], ids=["head rests", "growing", "at rest"])
 class TestOnCuda:
@@ -180,3 +180,31 @@ def test_a_training_learns_the_same(tiny_scene, tmp_path, monkeypatch):
             record = train(args)
             psnr.append(evaluate(record.config_path, tmp_path / "eval.json")["psnr"])
     assert abs(psnr[0] - psnr[1]) < 0.7  # two trainings of one seed differ by a few tenths
+
+
+def tried(model) -> dict[str, set]:
+    """What has been found out about kernels, by their name; of the field's, those of this model."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("nrfgs_ns.")]
+    gates = [value for module in modules for value in vars(module).values() if type(value) is Gate]
+    return {gate.what: set(gate) for gate in (*gates, model.head.fused.ready) if gate}
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_no_kernel_is_left_to_the_first_steps(tiny_scene, tmp_path):
+    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, 3))
+    before = tried(trainer.pipeline.model)
+    assert {"The field", "SSIM"} <= before.keys()
+    trainer.train()
+    assert tried(trainer.pipeline.model) == before
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_photographs_are_compared_without_memory_that_stays():
+    """cuBLAS keeps 32 MiB of an H100 for each thread that multiplies matrices."""
+    cameras = Cameras(torch.eye(4)[:3].repeat(8, 1, 1), 30.0, 30.0, 16.0, 16.0, 32, 32)
+    images = [{"image": torch.zeros(32, 32, 3, dtype=torch.uint8, device="cuda")} for _ in range(8)]
+    before = torch.cuda.memory_allocated()
+    compare_photographs(torch.rand(100, 3) - torch.tensor([0.5, 0.5, 2.0]), cameras, images)
+    assert torch.cuda.memory_allocated() == before
