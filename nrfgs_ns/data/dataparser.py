@@ -28,7 +28,6 @@ from nrfgs_ns.data.checks import (
     number,
     read_transforms,
     shown,
-    some,
     warn,
 )
 from nrfgs_ns.data.lenses import SMALLEST, cameras_of, read_lenses
@@ -36,7 +35,6 @@ from nrfgs_ns.data.pictures import read_size, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
-from nrfgs_ns.data.views import repeated_views
 from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.start import with_data_parsers
@@ -165,7 +163,6 @@ class NrfgsDataParser(DataParser):
                 f"{source}: --downscale-factor {factor} leaves images of {cameras.width.min()} x "
                 f"{cameras.height.min()} pixels. Give a smaller one."
             )
-        _warn_of_repeated(cameras.camera_to_worlds, splits, frames, source)
         return Scene(meta, source, splits, factor, lenses, cameras, transform, self._to_frames(meta), scale)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
@@ -344,18 +341,6 @@ class NrfgsDataParser(DataParser):
         if self._colmap.is_dir():
             return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
         return None
-
-
-def _warn_of_repeated(poses: torch.Tensor, splits: Rows, frames: list[dict[str, Any]], source: Path) -> None:
-    """Warn of evaluation images taken from where a training image was."""
-    evaluated = np.setdiff1d(np.union1d(splits["val"], splits["test"]), splits["train"])
-    repeated = repeated_views(poses, evaluated, splits["train"])
-    if repeated:
-        warn(
-            f"{source}: {some([Path(frames[row]['file_path']).name for row in repeated])}, for evaluation, show what "
-            "training images show from the same place, which flatters the results. Remove copies, and frames of a "
-            "camera that stands still."
-        )
 
 
 nrfgs_dataparser = DataParserSpecification(

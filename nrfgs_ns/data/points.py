@@ -21,8 +21,6 @@ GREY = 127
 """Colour of points that have none."""
 LONGEST_HEADER = 2**16
 """Bytes in which the header of a .ply must end."""
-COARSE = 1e-4
-"""Rounding of coordinates that deserves a warning, in extents of the middle four fifths of the points."""
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -41,10 +39,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not has_colors:
         warn(f"{path} has no colours; its points start in mid grey.")
     rgb = rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0)
-    xyz, rgb = _finite(stored.astype(np.float64), rgb, path)
-    if stored.dtype.kind == "f" and len(xyz):
-        _warn_of_rounding(xyz, stored.dtype, path)
-    return xyz, rgb
+    return _finite(stored.astype(np.float64), rgb, path)
 
 
 def _columns(vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -53,17 +48,6 @@ def _columns(vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
     if table.dtype.kind not in "iuf":  # lists: NumPy before 2.2 takes lists of one for numbers
         raise ValueError(f"{', '.join(names)} are not numbers")
     return table
-
-
-def _warn_of_rounding(xyz: np.ndarray, stored: np.dtype, path: Path) -> None:
-    size = np.median(np.abs(xyz), axis=0).max()
-    step = np.spacing(size.astype(stored))
-    extent = np.ptp(np.quantile(xyz, (0.1, 0.9), axis=0), axis=0).max()
-    if step > COARSE * extent > 0:
-        warn(
-            f"{path}: coordinates of {size:,.0f} in {8 * stored.itemsize} bits are rounded to {step:g}, where the "
-            f"points extend over {extent:.3g}. Store them as double, or nearer to the origin (with the poses)."
-        )
 
 
 def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,17 +52,6 @@ def different_views(poses: Tensor) -> int:
     """Number of views among camera-to-world poses [V, 3 or 4, 4]: those with the place and the direction of an earlier
     one (copies, frames of a camera that stands still) do not count."""
     return len(_first_of_each(_places_and_directions(poses)))
-
-
-def repeated_views(poses: Tensor, rows: Sequence[int], of: Sequence[int]) -> list[int]:
-    """The `rows` of camera-to-world poses [V, 3 or 4, 4] that share place and direction with one of the rows `of`."""
-    from scipy.spatial import cKDTree
-
-    if not (len(rows) and len(of)):
-        return []
-    places = _places_and_directions(poses)
-    distances, _ = cKDTree(np.unique(places[list(of)], axis=0)).query(places[list(rows)])
-    return [int(row) for row, distance in zip(rows, distances, strict=True) if distance <= SAME_PLACE]
 
 
 def distinct_places(centers: Tensor) -> Tensor:

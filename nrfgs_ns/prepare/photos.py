@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import shutil
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -59,14 +58,14 @@ def find_inputs(source: Path) -> list[Path]:
     suffixes = (*PHOTOS, *HEIF) if reads_heif() else PHOTOS
     files = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
     photos = [path for path in files if path.suffix.lower() in suffixes]
-    if not photos:
-        raise InputError(f"{source} holds no photographs ({', '.join(PHOTOS)}). {_nearby(source, files)}")
     if len(photos) < FEWEST:
-        hint = f" {CONVERT}" if any(path.suffix.lower() in HEIF for path in files) else ""
+        kinds = {path.suffix.lower() for path in files if path not in photos}
+        hint = (
+            CONVERT if kinds & set(HEIF) else "It holds a video: name that file itself." if kinds & set(VIDEOS) else ""
+        )
         raise InputError(
-            f"{source} holds {len(photos)} photograph{'s' if len(photos) > 1 else ''}; at least {FEWEST} are needed, "
-            "better 30 or more. Take them from different places, each seeing most of what the one before it sees."
-            + hint
+            f"{source} directly holds {len(photos)} photographs ({', '.join(PHOTOS)}); at least {FEWEST} are needed, "
+            f"better 30 or more, from different places, each seeing most of what the one before it sees. {hint}"
         )
     return photos
 
@@ -74,22 +73,9 @@ def find_inputs(source: Path) -> list[Path]:
 def left_out(source: Path, photos: list[Path]) -> str:
     """A sentence about other contents of a folder, by suffix; "" without any."""
     others = [path for path in source.iterdir() if not path.name.startswith(".") and path not in set(photos)]
-    kinds = Counter("folders" if path.is_dir() else path.suffix.lower() or "no suffix" for path in others)
-    if not kinds:
-        return ""
-    listed = ", ".join(f"{kind} ({number})" for kind, number in sorted(kinds.items()))
-    return f"Left out, since they are not read here: {listed}.{f' {CONVERT}' if kinds.keys() & set(HEIF) else ''}"
-
-
-def _nearby(source: Path, files: list[Path]) -> str:
-    """Next step for a folder without photographs."""
-    if any(path.suffix.lower() in HEIF for path in files):
-        return CONVERT
-    if any(path.suffix.lower() in VIDEOS for path in files):
-        return "It holds a video: name that file itself."
-    if any(path.is_dir() for path in source.iterdir()):
-        return "Name the subfolder that has them."
-    return "Convert other formats to JPEG or PNG."
+    kinds = {"folders" if path.is_dir() else path.suffix.lower() or "no suffix" for path in others}
+    hint = CONVERT if kinds & set(HEIF) else ""
+    return f"Left out, since they are not read here: {', '.join(sorted(kinds))}. {hint}" if kinds else ""
 
 
 def digest(paths: list[Path]) -> str:

@@ -100,17 +100,6 @@ def test_without_eval_images_the_training_images_are_evaluated(capture, printed)
     assert "no image is kept for test" in printed()
 
 
-def test_test_images_that_training_images_repeat_are_mentioned(capture, printed):
-    """A copy of a photograph beside it, or a video whose camera stands still."""
-    assert names(capture.parse("test")) == [4] and "flatters" not in printed()
-    frames = {Path(frame["file_path"]).stem: frame for frame in capture.meta["frames"]}
-    frames["003"]["transform_matrix"] = frames["004"]["transform_matrix"]
-    capture.parse("test")
-    assert "flatters" in (text := printed()) and "004" in text and "003" not in text
-    capture.parse("test", eval_mode="all")  # where that is asked for
-    assert "flatters" not in printed()
-
-
 @pytest.mark.parametrize("orientation", ["pca", "up", "vertical", "none"])
 @pytest.mark.parametrize("center", ["poses", "focus", "none"])
 @pytest.mark.parametrize("mode", ["interior", "interval", "fraction", "all"])
@@ -153,20 +142,6 @@ def test_double_precision_points_far_from_the_origin(capture):
     # Stored as float32 at 1,000: a spacing of 2^-14; float32 on the way (spacing 2^-4 at 10^6) would be 60 times that.
     error = points.metadata["points3D_xyz"].double().numpy() - (xyz.astype(np.float64) + 1e6) * 1e-3
     assert np.abs(error).max() <= 2**-14
-
-
-@pytest.mark.parametrize("dtype, warned", [(np.float32, True), (np.float64, False)])
-def test_rounded_coordinates_are_mentioned(capture, printed, dtype, warned):
-    """UTM: 5,600,000 m north in float32 is rounded to half a metre."""
-    offset = np.array([500_000.0, 5_600_000.0, 100.0])
-    xyz, rgb = cloud()
-    capture.add_ply((xyz + offset).astype(dtype), rgb)
-    for frame in capture.meta["frames"]:
-        for row in range(3):
-            frame["transform_matrix"][row][3] += offset[row]
-    capture.parse()
-    assert ("points.ply: coordinates of 5,600,0" in (text := printed())) == warned
-    assert ("in 32 bits are rounded to 0.5" in text) == warned
 
 
 def test_points_that_are_not_finite_are_dropped_and_counted(capture, printed):

@@ -13,7 +13,7 @@ from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.data.views import different_views, evenly_spaced, repeated_views, scene_unit
+from nrfgs_ns.data.views import different_views, evenly_spaced, scene_unit
 
 
 @pytest.mark.parametrize(
@@ -70,8 +70,8 @@ def test_a_view_that_another_one_is_does_not_count():
     assert different_views(far) == 44
 
 
-@pytest.mark.parametrize("kind, repeats", [("copies", 625), ("different", 0), ("one place", 7)])
-def test_the_work_for_many_views_is_linear(monkeypatch, kind, repeats):
+@pytest.mark.parametrize("kind", ["copies", "different", "one place"])
+def test_the_work_for_many_views_is_linear(monkeypatch, kind):
     """Rows that the tree returns, a constant number for each view: not one for each pair."""
     rows = []
 
@@ -91,7 +91,6 @@ def test_the_work_for_many_views_is_linear(monkeypatch, kind, repeats):
     different = different_views(poses)
     assert different == 1 if kind == "copies" else different > count / 2
     assert len(rows) <= 4 * count
-    assert len(repeated_views(poses, range(0, count, 8), range(1, count, 8))) == repeats
 
 
 def test_views_from_one_place_in_other_directions_count():
