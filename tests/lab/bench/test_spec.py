@@ -26,8 +26,8 @@ from nrfgs_lab.bench.spec import (
     settings,
     steps_of,
 )
+from nrfgs_lab.pages.methods import HEADS, best_trial
 from nrfgs_lab.pages.options import methods
-from nrfgs_lab.pages.tables.methods import HEADS, best_trial
 from nrfgs_ns.densification import Mcmc, Original, Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.trainer_config import parse

@@ -114,7 +114,7 @@ DOCS = ROOT / "docs"
 def test_the_page_has_the_commands_that_were_run():
     page = (DOCS / "own-data.md").read_text(encoding="utf-8")
     shown = " ".join(re.sub(r" +#.*", "", page).replace("\\\n", " ").split())
-    record = json.loads((ROOT / "results" / "newcomer.json").read_text(encoding="utf-8"))["records"]["newcomer"]
+    record = json.loads((ROOT / "results" / "prepare.json").read_text(encoding="utf-8"))["records"]["newcomer"]
     assert [step["step"] for step in record["commands"]] == ["prepare", "train", "look", "eval", "export"]
     for step in record["commands"]:
         assert re.sub(r"\d{4}-\d\d-\d\d_\d{6}", "DATE", step["command"]) in shown

@@ -4,7 +4,7 @@
 from collections.abc import Iterable, Mapping
 from statistics import fmean, median
 
-from nrfgs_lab.pages.tables.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
+from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
 
 FIELD, HOST = "nrfgs", "splatfacto"
 SHRUNK = "harmonics, same steps and shrinkage"

@@ -7,7 +7,7 @@ from statistics import fmean, median
 from typing import Any
 
 from nrfgs_lab.bench.table import BY_NAME, Row
-from nrfgs_lab.pages.tables.runs import VIEWS, bench_rows, grid, mean_of, signed, span, table
+from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, signed, span, table
 
 SITTING = timedelta(minutes=10)
 """Trainings that began within it were made on one machine, one after the other."""

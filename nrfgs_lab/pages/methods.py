@@ -3,7 +3,7 @@
 
 from statistics import fmean, median
 
-from nrfgs_lab.pages.tables.runs import (
+from nrfgs_lab.pages.runs import (
     ORIGINAL,
     VIEWS,
     Trainings,
@@ -28,7 +28,7 @@ BUDGETS = "mcmc@150000", "mcmc@75000"
 
 def half(scene: str, run: str, rule: str = ORIGINAL) -> Trainings:
     """A run of the plan `methods`, or of `budgets`."""
-    return trainings("methods" if rule == ORIGINAL else "budgets", scene, run, rule)
+    return trainings("methods", scene, run, rule)
 
 
 def gain(ours: Trainings, theirs: Trainings, metric: str) -> float:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blocks of docs/compact-format.md, docs/export.md and docs/web.md: what files of a model cost and lose.
 
-python -m nrfgs_lab.pages.tables.files        # writes docs/images/compact-trade.png
+python -m nrfgs_lab.pages.files        # writes docs/images/compact-trade.png
 """
 
 import re
 from statistics import fmean
 from typing import Any
 
-from nrfgs_lab.pages.tables.few_views import SHRUNK, runs_of
-from nrfgs_lab.pages.tables.runs import ROOT, records, signed, table
+from nrfgs_lab.pages.few_views import SHRUNK, runs_of
+from nrfgs_lab.pages.runs import ROOT, records, signed, table
 from nrfgs_ns.files import whole
 
 CAPTURES = "bonsai", "goldcape", "fox"

@@ -1,19 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The blocks that numbers.yaml declares: texts and tables with numbers of records."""
+"""The numbers of the pages, from the records in results/.
+
+    python -m nrfgs_lab.pages.tables            # names the pages whose numbers are not those of the records
+    python -m nrfgs_lab.pages.tables --write    # writes them anew
+
+Between `<!-- table NAME -->` and `<!-- end -->` a page has the block of that name: a table on lines of its own, or a
+number within a sentence; `NAME(bonsai, NRF-GS)` gives it arguments. `numbers.yaml` declares blocks that are numbers of
+records; `BLOCKS` of the modules beside this one compute the others. A test holds pages and records together, and asks
+that a number of decibels in the prose of such a page stands in one of its blocks.
+"""
 
 import operator
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from functools import cache
-from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
 import yaml
 
-from nrfgs_lab.pages.tables.runs import grid, records, signed
+from nrfgs_lab.pages import few_views, files, methods, others, speed
+from nrfgs_lab.pages.runs import ROOT, grid, records, signed
 
-SHEET = Path(__file__).resolve().parents[1] / "numbers.yaml"
+OPENING = "<!-- table "
+BLOCK = re.compile(r"<!-- table (\w+\.\w+)(\([^\n]*?\))? -->(.*?)<!-- end -->", re.DOTALL)
+BLOCKS = few_views.BLOCKS | files.BLOCKS | methods.BLOCKS | others.BLOCKS | speed.BLOCKS
+SHEET = ROOT / "nrfgs_lab" / "pages" / "numbers.yaml"
 UNITS = {"k": 1e3, "M": 1e6, "G": 1e9}
 AGGREGATES: dict[str, Callable] = {"min": min, "max": max, "mean": fmean, "median": median, "sum": sum}
 OPERATORS = {"+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv}
@@ -25,6 +38,41 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "±": lambda row: f"{row['mean']:.2f}" + (f"±{row['deviation']:.2f}" if row["deviation"] is not None else ""),
 }
 """Forms beside Python's. The last two are of a mean with a deviation."""
+
+
+def pages():
+    """The pages of this repository."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def written(text: str) -> str:
+    """A page's text with its blocks as the records have them."""
+    if text.count(OPENING) != len(BLOCK.findall(text)):
+        raise ValueError("A block has no end, or its name is not PAGE.NAME.")
+    return BLOCK.sub(_block, text)
+
+
+def _block(match: re.Match) -> str:
+    name, words, old = match.groups(default="")
+    if name + words in declared():
+        new = rendered(declared()[name + words])
+    else:
+        new = BLOCKS[name](*(words[1:-1].split(", ") if words else []))
+    new = f"\n\n{new.strip()}\n\n" if old.startswith("\n") else new
+    return f"{OPENING}{name}{words} -->{new}<!-- end -->"
+
+
+def loose_decibels(text: str) -> Iterator[str]:
+    """Numbers of decibels in a page's prose that stand in none of its blocks."""
+    inside = " ".join(content for *_, content in BLOCK.findall(text))
+    known = set(re.findall(r"\d+(?:\.\d+)?", inside))
+    prose = re.sub(r"```.*?```|`[^`\n]*`", "", BLOCK.sub("", text), flags=re.DOTALL)
+    for number in re.findall(r"(?<![\d.])(\d+(?:\.\d+)?) dB", prose):
+        if number not in known:
+            yield number
+
+
+# Blocks that numbers.yaml declares.
 
 
 @cache
@@ -116,3 +164,17 @@ def formatted(value: Any, form: str) -> str:
         return FORMS[form](value)
     unit = UNITS.get(form[-1:])
     return format(value / unit, form[:-1]) if unit else format(value, form)
+
+
+def main(write: bool) -> None:
+    """Check the pages, or write them; ends with status 1 if one differs."""
+    stale = [page for page in pages() if written(page.read_text(encoding="utf-8")) != page.read_text(encoding="utf-8")]
+    for page in stale:
+        if write:
+            page.write_text(written(page.read_text(encoding="utf-8")), encoding="utf-8")
+        print(page.relative_to(ROOT), "written" if write else "differs from the records; --write writes it")
+    sys.exit(1 if stale and not write else 0)
+
+
+if __name__ == "__main__":
+    main("--write" in sys.argv[1:])
