@@ -18,12 +18,14 @@ INSTEAD = (
 """Label, trial, and the trial of the default that it is compared with."""
 BY_ERROR = {
     "`original`": "3DGS",
+    "the same, prune below 0.05": "3DGS, prune 0.05",
     "by error": "error",
     "wide splats stay": "error: any width",
-    "the same, prune below 0.05": "error: any width, prune 0.05",
+    "wide splats are split, no noise, prune below 0.1": "error: wide split, no noise, prune 0.1",
+    "the same, threshold 0.0035": "error: wide split, no noise, prune 0.1, threshold 0.0035",
+    "the same, prune below 0.06": "error: wide split, no noise, prune 0.06",
     "residual on the logit": "error: logit",
     "faster growth": "error: fast all",
-    "the same, resets": "error: fast all, reset",
 }
 """Label -> trial in results/error-guided.json."""
 COPIES = {"added": "added", "on the logit": "logit", "the same, stored": "logit, base"}
