@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nrfgs_ns.data.pictures import read_size, share_of_size
+from nrfgs_ns.data.pictures import read_picture, read_size, share_of_size
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.prepare.pairs import Advance, Pairs
 
@@ -159,9 +159,28 @@ def find_cameras(database: Path, photos: Path, folder: Path, enough: float, adva
         if _size(others)[0] > _size(models)[0]:
             models, mapping = others, "global"
     if models:
-        folder.mkdir(parents=True)
-        max(models, key=lambda model: _size([model])).write(folder)
+        write_model(max(models, key=lambda model: _size([model])), folder)
     return len(models), mapping
+
+
+def write_model(model: Any, folder: Path) -> None:
+    """Write a reconstruction into a new folder; InputError if that fails, which COLMAP does not report."""
+    folder.mkdir(parents=True)
+    model.write(folder)
+    _check_model(folder, model)
+
+
+def _check_model(folder: Path, model: Any) -> None:
+    try:
+        written = _size([colmap().Reconstruction(folder)])
+    except Exception:  # whatever cut files lead to
+        written = None
+    if written != _size([model]):
+        raise _not_whole(folder)
+
+
+def _not_whole(path: Path) -> InputError:
+    return InputError(f"{path} was not written whole: the disk may be full. Make room, and run this again.")
 
 
 def _size(models: list[Any]) -> tuple[int, int]:
@@ -208,8 +227,18 @@ def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
 
 
 def undistort(model: Path, photos: Path, folder: Path, advance: Advance) -> None:
-    """Write undistorted photographs to folder/images and their pinhole model to folder/sparse."""
+    """Write undistorted photographs to folder/images and their pinhole model to folder/sparse; InputError if that
+    fails, which COLMAP does not report."""
+    pycolmap = colmap()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    colmap().undistort_images(folder, model, photos, output_type="COLMAP", jpeg_quality=97)
+    pycolmap.undistort_images(folder, model, photos, output_type="COLMAP", jpeg_quality=97)
+    distorted = pycolmap.Reconstruction(model)
+    _check_model(folder / "sparse", distorted)
+    for number in distorted.reg_image_ids():
+        path = folder / "images" / distorted.images[number].name
+        try:
+            read_picture(path)
+        except InputError as error:
+            raise _not_whole(path) from error
     advance(1)
