@@ -192,8 +192,11 @@ def load_spec(path: Path, plan: str = "") -> dict[str, Any]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
     plans = content.get("plans", {"": content}) if isinstance(content, dict) else {"": content}
+    _require(isinstance(plans, dict), f"{path}: plans must be a mapping, of names to plans. See docs/bench.md.")
+    if plan not in plans and "" in plans:
+        raise InputError(f"{path} has no plans. Leave out --plan.")
     if plan not in plans:
-        raise InputError(f"{path} has {', '.join(filter(None, plans)) or 'no plans'}. Give --plan one of them.")
+        raise InputError(f"{path} has {', '.join(plans)}. Give --plan one of them.")
     _require(isinstance(plans[plan], dict), f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md.")
     return plans[plan]
 

@@ -18,7 +18,6 @@ INSTEAD = (
 """Label, trial, and the trial of the default that it is compared with."""
 BY_ERROR = {
     "`original`": "3DGS",
-    "the same, prune below 0.05": "3DGS, prune 0.05",
     "by error": "error",
     "wide splats stay": "error: any width",
     "wide splats are split, no noise, prune below 0.1": "error: wide split, no noise, prune 0.1",
