@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from area_transforms import broken, capture_in, load
+from area_transforms import add_points, broken, capture_in, load
 from attempt import Case
 from hypothesis import strategies as st
 from values import damage, damages
@@ -65,10 +65,7 @@ def inputs() -> st.SearchStrategy[Case]:
     def case(text: bool, chosen) -> Case:
         def build(folder: Path):
             capture = capture_in(folder)
-            rng = np.random.default_rng(1)
-            path = capture.add_ply(
-                rng.normal((5, 6, 7), 0.5, (40, 3)), rng.integers(0, 256, (40, 3), dtype=np.uint8), text
-            )
+            path = add_points(capture, text=text)
             path.write_bytes(damage(path.read_bytes(), chosen))
             capture.save()
             return partial(load, capture.folder)

@@ -12,25 +12,30 @@ from hypothesis import strategies as st
 from small_capture import Capture
 from values import replace_in, replacements
 
+from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+
 AREA = "transforms.json"
 
 
-def load(data: Path, manager: dict | None = None, **options) -> None:
+def load(data: Path, parser=NrfgsDataParserConfig, manager: dict | None = None, **options) -> None:
     """What a training does before its first step."""
-    from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
-    from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-
-    parser = NrfgsDataParserConfig(data=data, **options)
-    NrfgsDatamanagerConfig(dataparser=parser, **(manager or {})).setup(device="cpu").load_all_images()
+    config = NrfgsDatamanagerConfig(dataparser=parser(data=data, **options), **(manager or {}))
+    config.setup(device="cpu").load_all_images()
 
 
-def capture_in(folder: Path, points: bool = True) -> Capture:
-    """A capture whose points are amid its cameras, with masks."""
+def add_points(capture: Capture, change=lambda xyz: xyz, text: bool = False) -> Path:
+    """Points amid the cameras."""
+    rng = np.random.default_rng(1)
+    xyz, rgb = rng.normal((5, 6, 7), 0.5, (40, 3)), rng.integers(0, 256, (40, 3), dtype=np.uint8)
+    return capture.add_ply(change(xyz), rgb, text)
+
+
+def capture_in(folder: Path) -> Capture:
+    """A capture with masks and points."""
     capture = Capture(folder / "capture", images=10)
     capture.add_masks()
-    if points:
-        rng = np.random.default_rng(1)
-        capture.add_ply(rng.normal((5, 6, 7), 0.5, (40, 3)), rng.integers(0, 256, (40, 3), dtype=np.uint8))
+    add_points(capture)
     return capture
 
 
@@ -71,18 +76,6 @@ def move(capture: Capture, factor: float) -> None:
     matrix = capture.meta["frames"][4]["transform_matrix"]
     for row, middle in enumerate((5.0, 6.0, 7.0)):
         matrix[row][3] = middle + factor * (matrix[row][3] - middle)
-
-
-def points(capture: Capture, change) -> None:
-    rng = np.random.default_rng(1)
-    capture.add_ply(change(rng.normal((5, 6, 7), 0.5, (40, 3))))
-
-
-def blacken(capture: Capture) -> None:
-    from PIL import Image
-
-    for one in capture.meta["frames"]:
-        Image.new("L", (12, 9)).save(capture.folder / one["mask_path"])
 
 
 def large_file(folder: Path):
@@ -137,14 +130,11 @@ CASES = [
     broken("20,000 copies of a frame", lambda c: c.meta.update(frames=c.meta["frames"][:1] * 20_000)),
     meta("fisheye of 1e9", camera_model="OPENCV_FISHEYE", k1=1e9),
     broken("one camera a thousand times as far", lambda c: move(c, 1e3)),
-    broken("one camera ten thousand times as far", lambda c: move(c, 1e4)),
     broken("one camera 1e30 away", lambda c: move(c, 1e30)),
-    broken("all masks empty", blacken),
-    broken("points at 1e30", lambda c: points(c, lambda xyz: xyz * 1e30)),
-    broken("points at 1e6", lambda c: points(c, lambda xyz: xyz * 1e6)),
-    broken("points of another world", lambda c: points(c, lambda xyz: xyz + 300)),
-    broken("points of another unit", lambda c: points(c, lambda xyz: xyz * 100)),
-    broken("points behind the cameras", lambda c: points(c, lambda xyz: xyz + (0, 0, 1000))),
+    broken("points at 1e30", lambda c: add_points(c, lambda xyz: xyz * 1e30)),
+    broken("points of another unit", lambda c: add_points(c, lambda xyz: xyz * 100)),
+    broken("points of another world", lambda c: add_points(c, lambda xyz: xyz + 300)),
+    broken("points behind the cameras", lambda c: add_points(c, lambda xyz: xyz + (0, 0, 1000))),
     text("empty", b""),
     text("a number", b"3"),
     text("a word", b'"frames"'),

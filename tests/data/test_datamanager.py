@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from small_capture import Capture
@@ -38,19 +37,6 @@ def test_no_pinned_memory_on_a_cpu(capture, monkeypatch, cache_images):
     data.load_all_images()
     camera, batch = data.next_train(0)
     assert camera.device.type == batch["image"].device.type == "cpu"
-
-
-def test_dataset_type_survives_subclassing_and_yaml(capture):
-    class Derived(NrfgsDatamanager):
-        pass
-
-    config = manager(capture).config
-    restored = yaml.load(yaml.dump(config), Loader=yaml.Loader)
-    assert restored == config
-    data = restored.setup(device="cpu")
-    assert type(data) is NrfgsDatamanager
-    for one in (data, Derived(config, device="cpu")):
-        assert type(one.train_dataset) is type(one.eval_dataset) is NrfgsInputDataset
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
