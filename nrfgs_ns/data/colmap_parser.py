@@ -53,11 +53,8 @@ class NrfgsColmapDataParser(NrfgsDataParser):
             if config.masks_path is not None:
                 frame["mask_path"] = view.name
             frames.append(frame)
-        meta = {"frames": frames, "camera_model": kinds.pop()}
-        if config.assume_colmap_world_coordinate_convention:
-            meta["applied_transform"] = UPRIGHT[:3].tolist()
         check_frames(frames, source)
-        return meta, source
+        return {"frames": frames, "camera_model": kinds.pop(), "applied_transform": upright[:3].tolist()}, source
 
     @property
     def _colmap(self) -> Path:
@@ -75,9 +72,6 @@ class NrfgsColmapDataParser(NrfgsDataParser):
 
     def _order(self, frames: list[dict[str, Any]]) -> list[int]:
         return list(range(len(frames)))  # by COLMAP's numbers
-
-    def _to_frames(self, meta: dict[str, Any]) -> torch.Tensor | None:
-        return torch.tensor(meta["applied_transform"]) if "applied_transform" in meta else None
 
     def _named_splits(self, meta: dict[str, Any]) -> Named:
         named = {}

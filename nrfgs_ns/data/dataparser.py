@@ -115,7 +115,7 @@ class NrfgsDataParser(DataParser):
         frames = [scene.meta["frames"][row] for row in rows]
         images, masks = (self._files(frames, key, scene.factor) for key in FOLDERS)
         cameras = scene.cameras[torch.from_numpy(rows)]
-        if self._images_needed:
+        if self.downscale_factor is None:
             self._check_sizes(scene, rows, images, masks, cameras)
         copies = all(self._has_copies(key, scene.factor) for key in FOLDERS if key in frames[0])
         box = self.config.scene_scale * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -131,13 +131,9 @@ class NrfgsDataParser(DataParser):
                 "downscale": 1 if copies else scene.factor,
             },
         )
-        if self.config.load_3D_points and self._images_needed:
+        if self.config.load_3D_points and self.downscale_factor is None:
             outputs.metadata |= self._placed_points
         return outputs
-
-    @property
-    def _images_needed(self) -> bool:
-        return self.downscale_factor is None
 
     @cached_property
     def _scene(self) -> Scene:
@@ -149,7 +145,7 @@ class NrfgsDataParser(DataParser):
         lenses = read_lenses(meta, source)
         check_applied(meta, source)
         poses = check_poses(frames, source, need_spread=config.auto_scale_poses and len(frames) > 1)
-        factor = self._factor(frames, source) if self._images_needed else self.downscale_factor
+        factor = self._factor(frames, source) if self.downscale_factor is None else self.downscale_factor
         order = self._order(frames)
         frames = meta["frames"] = [frames[row] for row in order]
         lenses, poses = lenses[order], poses[order]
@@ -163,7 +159,10 @@ class NrfgsDataParser(DataParser):
                 f"{source}: --downscale-factor {factor} leaves images of {cameras.width.min()} x "
                 f"{cameras.height.min()} pixels. Give a smaller one."
             )
-        return Scene(meta, source, splits, factor, lenses, cameras, transform, self._to_frames(meta), scale)
+        to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
+        if "applied_transform" in meta:
+            to_frames = torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
+        return Scene(meta, source, splits, factor, lenses, cameras, transform, to_frames, scale)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
         """The downscale factor; every file is there at it."""
@@ -183,10 +182,10 @@ class NrfgsDataParser(DataParser):
     def _splits(self, meta: dict[str, Any], source: Path) -> Rows:
         """Rows of the training and the evaluation images, by the data set's own lists or by rule."""
         paths = [self._file(frame["file_path"]) for frame in meta["frames"]]
-        named = self._named_splits(meta)
-        splits = (
-            split_by_names(named, paths, self._file, source) if named else split_by_rule(self.config, paths, source)
-        )
+        if named := self._named_splits(meta):
+            splits = split_by_names(named, paths, self._file, source)
+        else:
+            splits = split_by_rule(self.config, paths, source)
         if named and "train" not in named:
             there = next(iter(named.values()))[0]  # test_filenames, test_list.txt
             raise InputError(
@@ -316,19 +315,10 @@ class NrfgsDataParser(DataParser):
         parts = [self._file(frame["file_path"]).parts for frame in frames]
         return sorted(range(len(frames)), key=parts.__getitem__)
 
-    def _to_frames(self, meta: dict[str, Any]) -> torch.Tensor | None:
-        """The transform [3, 4] already applied to the frames' poses, if there is one."""
-        if "applied_transform" in meta:
-            return torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
-        return COLMAP_TO_FRAMES if self._colmap.exists() else None
-
     def _named_splits(self, meta: dict[str, Any]) -> Named:
         """Splits listed by the data set itself."""
-        return {
-            split: (f"{split}_filenames", meta[f"{split}_filenames"])
-            for split in SPLITS
-            if f"{split}_filenames" in meta
-        }
+        fields = {split: f"{split}_filenames" for split in SPLITS}
+        return {split: (name, meta[name]) for split, name in fields.items() if name in meta}
 
     def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor] | None:
         """Positions [N, 3] and colours [N, 3] as stored, and the transform [3, 4] from their world to the cameras'
