@@ -132,11 +132,12 @@ def table_of_zeros(columns: int, rows: int) -> bytes:
     return _coded(Table(np.zeros((columns, rows), dtype=np.int64)))[1]
 
 
-def large_model(count: int, unpacked: int) -> bytes:
+def model(count: int, size: int | None = None, unpacked: int = 0) -> bytes:
+    """The model of a coded table, which says that it has so many numbers in so many bytes; None: as many as it has."""
     from nrfgs_ns.compact.format import MODEL
 
     packed = zeros(unpacked)
-    return MODEL.pack(count, len(packed)) + packed + bytes(400)
+    return MODEL.pack(count, len(packed) if size is None else size) + packed + bytes(400)
 
 
 def text(name: str, content: bytes) -> Case:
@@ -160,10 +161,15 @@ CLAIMS = {
     ("streams", 0, "shape"): ([2**40], [2**62, 4], [0, 2**62], [1] * 100 + [60], [-60], [60.0], None, [[60]]),
     ("streams", 0, "bytes"): (-1, 0, 2**63, 1.5),
     ("streams", 0, "coding"): ("xz", "zip", None, 3, ["rans"], {}),
-    ("streams",): ([],),
+    ("streams", 0, "dtype"): ("float16", "int16", "quad", None),
+    ("streams", 0, "crc32"): (1,),
+    ("streams", 0, "name"): ("x",),
+    ("streams",): ([], 3),
     ("format",): ("x",),
     ("grids",): (None,),
+    ("grids", "means", "low"): ([[0.0]] * 3,),
     ("head", "name"): ("sh",),
+    ("head", "scene_unit"): (0, -1, float("nan"), "1"),
     ("head", "config", "latent_dim"): (0, -1, 9, 10**9, 2**63, 8.0, "8", None, [8], True),
     ("head", "config", "hidden_width"): (0, 17, 10**9, 10**30, "16", None),
     ("head", "config", "num_bands"): (0, 4, 10**9, "3", None),
@@ -179,8 +185,12 @@ CASES = [
     coded("many rows of zeros", "latents", [8, 10**6], lambda: table_of_zeros(8, 10**6)),
     coded("many columns of zeros", "latents", [1000, 2000], lambda: table_of_zeros(1000, 2000)),
     coded("more columns than rows", "splats", [10**6, 1], lambda: table_of_zeros(11, 60)),
-    coded("a model of 4 GB", "splats", [11, 60], lambda: large_model(2**30, 2**28)),
-    coded("a model of 16 MB", "splats", [11, 60], lambda: large_model(2**22, 2**24)),
+    coded("a model of 4 GB", "splats", [11, 60], lambda: model(2**30, unpacked=2**28)),
+    coded("a model of 16 MB", "splats", [11, 60], lambda: model(2**22, unpacked=2**24)),
+    *(
+        coded(f"a model of {count} numbers in {size} bytes", "splats", [11, 60], lambda n=count, s=size: model(n, s))
+        for count, size in ((2**32 - 1, 10), (5, 2**32 - 1), (0, 0), (5, 3))
+    ),
     coded("no body", "splats", [11, 60], lambda: b""),
     coded("a state too few", "means", [2, 60], lambda: table_of_zeros(2, 60)[:-4]),
     *(
@@ -191,6 +201,7 @@ CASES = [
     claiming("two streams of one name", lambda header: header["streams"][1].update(name=header["streams"][0]["name"])),
     claiming("no format", lambda header: header.pop("format")),
     claiming("no head", lambda header: header.pop("head")),
+    claiming("a stream less", lambda header: header["streams"].pop()),
     *(
         grid(table, "step", value)
         for table in ("means", "latents")

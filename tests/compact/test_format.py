@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The container: what goes in comes out, and what is damaged is refused."""
+"""The container: what goes in comes out, and what is damaged is refused. tests/attack has headers that mislead."""
 
 import json
 import struct
@@ -10,17 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.compact.format import (
-    CHECKSUM,
-    DTYPES,
-    MAGIC,
-    MODEL,
-    PREAMBLE,
-    SMALL,
-    Table,
-    read_container,
-    write_container,
-)
+from nrfgs_ns.compact.format import DTYPES, Table, read_container, write_container
 from nrfgs_ns.errors import InputError
 
 
@@ -42,13 +32,6 @@ TABLES = {
     "signed": Table(np.random.default_rng(1).integers(-99, 99, (3, 300))),
     "not signed": Table(np.random.default_rng(2).integers(0, 2**32, (2, 100)), signed=False),
 }
-
-
-@pytest.fixture(scope="module")
-def coded(arrays, tmp_path_factory):
-    path = tmp_path_factory.mktemp("compact") / "coded.nrf"
-    write_container(path, {}, {**TABLES, "half": arrays["half"]})
-    return path
 
 
 def test_what_goes_in_comes_out(arrays, written):
@@ -75,8 +58,9 @@ def test_layout_is_as_documented(written):
     assert first == len(data)
 
 
-def test_tables_are_coded(arrays, coded):
-    header, streams = read_container(coded)
+def test_tables_are_coded(arrays, tmp_path):
+    write_container(tmp_path / "coded.nrf", {}, {**TABLES, "half": arrays["half"]})
+    header, streams = read_container(tmp_path / "coded.nrf")
     assert [entry["coding"] for entry in header["streams"]] == ["rans", "rans", "xz"]
     for name, table in TABLES.items():
         assert (streams[name] == table.numbers).all()
@@ -111,64 +95,9 @@ def test_a_cut_or_longer_file_is_noticed(data, written):
         read_container(cut)
 
 
-def rewritten(path, change) -> None:
-    """Change a file's header, or the version that `change` returns, and fix its checksum and length."""
-    data = path.read_bytes()
-    _, version, length, _ = PREAMBLE.unpack_from(data)
-    header = json.loads(data[PREAMBLE.size : PREAMBLE.size + length])
-    version = change(header) or version
-    text, body = json.dumps(header).encode(), path.read_bytes()[PREAMBLE.size + length + CHECKSUM.size :]
-    start = PREAMBLE.pack(MAGIC, version, len(text), PREAMBLE.size + len(text) + CHECKSUM.size + len(body)) + text
-    path.write_bytes(start + CHECKSUM.pack(zlib.crc32(start)) + body)
-
-
-@pytest.mark.parametrize(
-    "file, change, says",
-    [
-        ("written", lambda header: 3, "is of version 3 of the format"),
-        ("written", lambda header: header["streams"][0].update(shape=[3, 18]), "does not hold 54 numbers"),
-        ("written", lambda header: header["streams"][0].update(shape=[2**40]), "would unpack to"),
-        ("written", lambda header: header["streams"][0].update(shape=[0, 2**62]), "would unpack to"),
-        ("written", lambda header: header["streams"][0].update(crc32=1), "checksum of its stream"),
-        ("written", lambda header: header["streams"].pop() and None, "after its last stream"),
-        ("written", lambda header: header.update(streams=3), "int"),
-        ("coded", lambda header: header["streams"][0].update(coding="zip"), "zip"),
-        ("coded", lambda header: header["streams"][0].update(dtype="float16"), "the stream .*'float16'"),
-        ("coded", lambda header: header["streams"][0].update(dtype="uint32"), "no uint32"),
-        ("coded", lambda header: header["streams"][0].update(shape=[3, 301]), "cut short"),
-        ("coded", lambda header: header["streams"][0].update(shape=[10**6, 1]), "too large"),
-        ("coded", lambda header: header["streams"][0].update(shape=[3, 10**9]), "would unpack to"),
-    ],
-)
-def test_a_misleading_header_is_refused(file, change, says, request, tmp_path):
-    path = tmp_path / "made.nrf"
-    path.write_bytes(request.getfixturevalue(file).read_bytes())
-    rewritten(path, change)
-    with pytest.raises(InputError, match=f"made.nrf.*{says}"):
-        read_container(path)
-
-
-@pytest.mark.parametrize("count, size", [(2**32 - 1, 10), (SMALL // 4 + 1, 10), (5, 2**32 - 1), (0, 0), (5, 3)])
-def test_a_misleading_model_of_a_table_is_refused(count, size, coded, tmp_path):
-    path = tmp_path / "made.nrf"
-    path.write_bytes(coded.read_bytes())
-
-    def change(header):
-        data = bytearray(path.read_bytes())
-        _, _, length, _ = PREAMBLE.unpack_from(data)
-        first, entry = PREAMBLE.size + length + CHECKSUM.size, header["streams"][0]
-        MODEL.pack_into(data, first, count, size)
-        entry["crc32"] = zlib.crc32(data[first : first + entry["bytes"]])
-        path.write_bytes(data)
-
-    rewritten(path, change)
-    with pytest.raises(InputError, match="made.nrf cannot be read"):
-        read_container(path)
-
-
-def test_other_files_are_refused(tmp_path):
-    with pytest.raises(InputError, match="it is no file"):
-        read_container(tmp_path / "none.nrf")
-    (tmp_path / "text.nrf").write_text("ply\nformat binary_little_endian 1.0\n" * 9)
-    with pytest.raises(InputError, match="it begins with"):
-        read_container(tmp_path / "text.nrf")
+def test_another_version_is_told(written, tmp_path):
+    data = bytearray(written.read_bytes())
+    data[8] = 3
+    (tmp_path / "new.nrf").write_bytes(data)
+    with pytest.raises(InputError, match="new.nrf .*is of version 3 of the format"):
+        read_container(tmp_path / "new.nrf")
