@@ -11,7 +11,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.utils.colmap_parsing_utils import Point3D, write_points3D_binary, write_points3D_text
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.data.views import interior_test_images
+from nrfgs_ns.data.views import different_views, interior_test_images
 
 
 def names(outputs) -> list[int]:
@@ -218,7 +218,7 @@ def test_nerfstudio_finds_the_plugin_whichever_is_imported_first(first):
 def test_real_captures(captures, name, train, test, points, masks):
     parser = NrfgsDataParserConfig(data=captures / name).setup()
     outputs = parser.get_dataparser_outputs("train")
-    assert len(outputs.image_filenames) == train
+    assert len(outputs.image_filenames) == different_views(outputs.cameras.camera_to_worlds) == train
     assert len(parser.get_dataparser_outputs("test").image_filenames) == test
     assert outputs.metadata["points3D_xyz"].shape == outputs.metadata["points3D_rgb"].shape == (points, 3)
     assert (outputs.mask_filenames is not None) == masks

@@ -12,7 +12,6 @@ from short_trainings import set_up
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.views import different_views, evenly_spaced, scene_unit
 
 
@@ -101,15 +100,6 @@ def test_views_from_one_place_in_other_directions_count():
     beside = ring.clone()
     beside[:, :, 3] += 0.1 * ring[:, :, 0]  # a stereo rig, a seventh of the spacing wide
     assert different_views(torch.cat([ring, beside])) == 88
-
-
-@pytest.mark.parametrize("capture", ["bonsai", "caliterra", "castle", "fern", "fox", "goldcape", "kitchen"])
-def test_all_views_of_ordinary_captures_differ(capture, captures):
-    if not (captures / capture).is_dir():
-        pytest.skip(f"no {capture} in {captures}")
-    parser = NrfgsDataParserConfig(data=captures / capture, load_3D_points=False).setup()
-    poses = parser.get_dataparser_outputs("train").cameras.camera_to_worlds
-    assert different_views(poses) == len(poses)
 
 
 @pytest.mark.parametrize("config", [NrfConfig(output_init="default"), VdgsConfig()], ids=["nrf", "vdgs"])

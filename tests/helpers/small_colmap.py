@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from small_capture import Capture
 
 MODEL = Path("colmap/sparse/0")
@@ -20,9 +21,8 @@ class Model:
         self.images = []
         for i in range(10):
             world_to_camera = np.linalg.inv(Capture.pose(2 * np.pi * i / 10) * [1, -1, -1, 1])
-            self.images.append(
-                (i + 1, quaternion(world_to_camera[:3, :3]), tuple(world_to_camera[:3, 3]), 1, f"{i:03d}.png")
-            )
+            x, y, z, w = Rotation.from_matrix(world_to_camera[:3, :3]).as_quat()
+            self.images.append((i + 1, (w, x, y, z), tuple(world_to_camera[:3, 3]), 1, f"{i:03d}.png"))
         rng = np.random.default_rng(1)
         self.points = [(i, tuple(xyz), (9, 99, 199)) for i, xyz in enumerate(rng.normal((5, 6, 7), 0.5, (40, 3)))]
         self.tracks = 2
@@ -67,17 +67,3 @@ class Model:
             pixels = rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)
             Image.fromarray(pixels).save(folder / "images" / f"{i:03d}.png")
         return folder
-
-
-def quaternion(rotation: np.ndarray) -> tuple[float, ...]:
-    """(w, x, y, z) of a rotation: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    K = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, d + b, g + c],
-            [c - g, d + b, e - a - i, h + f],
-            [d - b, g + c, h + f, i - a - e],
-        ]
-    )
-    return tuple(np.linalg.eigh(K)[1][:, -1])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The colour fit: exact where the truth is an affine map of the prediction, the best of all maps otherwise."""
+"""Metrics against other libraries, under masks and at their edges; LPIPS with and without weights; the colour fit."""
 
 import functools
 import json

@@ -33,6 +33,12 @@ def photo(path: Path, size: tuple[int, int] = (40, 30), colour: str = "grey", **
     return path
 
 
+@pytest.fixture
+def three(tmp_path) -> Path:
+    """A folder of three photographs."""
+    return [photo(tmp_path / "in" / f"{i}.png") for i in range(3)][0].parent
+
+
 # Two textured walls, one before the other, seen by cameras that step sideways and turn a little.
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
@@ -115,6 +121,8 @@ def aligned(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def test_recovered_cameras_are_those_that_rendered(prepared):
     meta = json.loads((prepared / "transforms.json").read_text())
     assert len(meta["frames"]) == 6
+    for i, frame in enumerate(meta["frames"]):
+        assert frame["exif"] == {"exposure_time": pytest.approx(1 / (100 + i))}
     assert meta["fl_x"] / meta["w"] == pytest.approx(FOCAL / WIDTH, rel=0.03)
     opencv = np.diag([1, -1, -1, 1])
     found = np.array([frame["transform_matrix"] for frame in meta["frames"]]) @ opencv
@@ -139,11 +147,6 @@ def test_the_scene_is_read_by_the_data_parser(prepared):
         with Image.open(smaller.image_filenames[0]) as image:
             assert image.size == (int(smaller.cameras.width[0]), int(smaller.cameras.height[0]))
             assert f"images_{factor}" in str(smaller.image_filenames[0])
-
-
-def test_how_a_photograph_was_taken_stays_with_it(prepared):
-    for i, frame in enumerate(json.loads((prepared / "transforms.json").read_text())["frames"]):
-        assert frame["exif"] == {"exposure_time": pytest.approx(1 / (100 + i))}
 
 
 def test_points_are_where_the_cameras_see_them(prepared):
@@ -261,24 +264,18 @@ def test_inputs_that_cannot_do_are_refused(make, said, tmp_path):
         photos.find_inputs(tmp_path / "in")
 
 
-def test_foreign_folders_and_small_numbers_are_refused(tmp_path):
-    folder = tmp_path / "in"
-    for i in range(3):
-        photo(folder / f"{i}.jpg")
+def test_what_is_refused_before_any_work(three, tmp_path, monkeypatch):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "precious.txt").touch()
     with pytest.raises(InputError, match="was not made by"):
-        Run(Prepare(folder, tmp_path / "mine"))
+        Run(Prepare(three, tmp_path / "mine"))
     with pytest.raises(InputError, match="--features is 1"):
-        Run(Prepare(folder, tmp_path / "out", features=1))
-
-
-def test_a_missing_package_is_told_with_its_fix(tmp_path, monkeypatch):
-    for i in range(3):
-        photo(tmp_path / "in" / f"{i}.jpg")
+        Run(Prepare(three, tmp_path / "out", features=1))
+    with pytest.raises(InputError, match="precious.txt/out.*: Not a directory"):
+        Prepare(three, tmp_path / "mine" / "precious.txt" / "out").main()
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match="pip install pycolmap"):
-        Run(Prepare(tmp_path / "in", tmp_path / "out"))
+        Run(Prepare(three, tmp_path / "out"))
 
 
 def test_a_wrong_path_is_answered_before_anything_slow_is_imported(tmp_path):
@@ -422,45 +419,40 @@ EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 50 50\nshowpage\n"
         (lambda path: path.write_bytes(b""), "not a readable image"),
     ],
 )
-def test_what_is_no_photograph_is_named(tmp_path, make, said):
-    for i in range(3):
-        photo(tmp_path / "in" / f"{i}.png")
-    make(tmp_path / "in" / "1.png")
+def test_what_is_no_photograph_is_named(three, tmp_path, make, said):
+    make(three / "1.png")
     with pytest.raises(InputError, match=f"1.png.*{said}"):
-        Run(Prepare(tmp_path / "in", tmp_path / "out"), Console(quiet=True)).import_input()
+        Run(Prepare(three, tmp_path / "out"), Console(quiet=True)).import_input()
 
 
-def test_photographs_of_several_sizes_have_no_single_camera(tmp_path):
-    for i in range(3):
-        photo(tmp_path / "in" / f"{i}.jpg", (40, 30 + i))
-    run = Run(Prepare(tmp_path / "in", tmp_path / "out", camera="single"), Console(quiet=True))
+def test_photographs_of_several_sizes_have_no_single_camera(three, tmp_path):
+    photo(three / "1.png", (40, 31))
+    run = Run(Prepare(three, tmp_path / "out", camera="single"), Console(quiet=True))
     run.import_input()
-    with pytest.raises(InputError, match="--camera is single, but .*in has photographs of 3 sizes"):
+    with pytest.raises(InputError, match="--camera is single, but .*in has photographs of 2 sizes"):
         run.find_features()
 
 
-def test_what_is_left_out_is_counted(tmp_path):
-    for i in range(3):
-        photo(tmp_path / "in" / f"{i}.jpg")
+def test_what_is_left_out_is_counted(three, tmp_path):
     for name in ("a.HEIC", "b.heic", "notes", "._a.jpg"):
-        (tmp_path / "in" / name).touch()
-    photo(tmp_path / "in" / "more" / "c.jpg")
+        (three / name).touch()
+    photo(three / "more" / "c.jpg")
     screen = Console(record=True, width=200, file=io.StringIO())
-    Run(Prepare(tmp_path / "in", tmp_path / "out"), screen).import_input()
+    Run(Prepare(three, tmp_path / "out"), screen).import_input()
     said = screen.export_text()
     assert "Left out, since they are not read here: .heic, folders, no suffix. To read HEIC" in said
     assert "Warning: 3 photographs are few" in said
 
 
-def test_heic_is_read_where_pillow_heif_is_installed(tmp_path, monkeypatch):
+def test_heic_is_read_where_pillow_heif_is_installed(three, tmp_path, monkeypatch):
     def register() -> None:
         Image.register_open("HEIF", PngImageFile, lambda prefix: prefix.startswith(b"\x89PNG"))
 
     monkeypatch.setitem(sys.modules, "pillow_heif", SimpleNamespace(register_heif_opener=register))
-    for i in range(3):
-        photo(tmp_path / "in" / f"{i}.png").rename(tmp_path / "in" / f"{i}.HEIC")
+    for path in list(three.iterdir()):
+        path.rename(path.with_suffix(".HEIC"))
     try:
-        run = Run(Prepare(tmp_path / "in", tmp_path / "out"), Console(quiet=True))
+        run = Run(Prepare(three, tmp_path / "out"), Console(quiet=True))
         run.import_input()
     finally:
         Image.OPEN.pop("HEIF", None)
@@ -473,14 +465,6 @@ def test_damaged_exif_is_no_reason_to_refuse_a_photograph(tmp_path):
     paths = [photo(tmp_path / "in" / f"{i}.jpg", exif=exif) for i in range(3)]
     photos.import_photos(paths, tmp_path / "stored", lambda _: None)
     assert photos.same_camera(tmp_path / "stored", ["0.jpg", "1.jpg", "2.jpg"])
-
-
-def test_a_file_that_may_not_be_written_is_told_in_one_line(tmp_path):
-    for i in range(3):
-        photo(tmp_path / "in" / f"{i}.jpg")
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="file/out.*: Not a directory"):
-        Prepare(tmp_path / "in", tmp_path / "file" / "out").main()
 
 
 def test_one_camera_only_where_everything_agrees(tmp_path):
