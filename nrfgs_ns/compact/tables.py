@@ -62,34 +62,20 @@ class Grid(NamedTuple):
 
 def morton(codes: Array) -> Array:
     """Interleaved bits of three coordinates [N, 3] of up to 21 bits, uint64 [N]: bit 3 k + a is bit k of axis a."""
-    spread = np.zeros(len(codes), dtype=np.uint64)
-    for axis in range(3):
-        x = codes[:, axis].astype(np.uint64)
-        for shift, mask in _SPREADS:
-            x = (x | (x << np.uint64(shift))) & np.uint64(mask)
-        spread |= x << np.uint64(axis)
-    return spread
+    interleaved = np.zeros(len(codes), dtype=np.uint64)
+    for axis, column in enumerate(codes.astype(np.uint64).T):
+        for bit in range(MOST_BITS):
+            interleaved |= ((column >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return interleaved
 
 
 def from_morton(interleaved: Array) -> Array:
     """The coordinates [N, 3], int64, of `morton`'s numbers [N]."""
-    columns = []
-    for axis in range(3):
-        x = (interleaved >> np.uint64(axis)) & np.uint64(_SPREADS[-1][1])
-        for (shift, _), (_, mask) in zip(_SPREADS[::-1], [*_SPREADS[-2::-1], (0, 0x1FFFFF)], strict=True):
-            x = (x | (x >> np.uint64(shift))) & np.uint64(mask)
-        columns.append(x.astype(np.int64))
-    return np.stack(columns, axis=1)
-
-
-_SPREADS = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
-"""Shifts and masks that pull 21 bits apart, two zeros between neighbours."""
+    codes = np.zeros((3, len(interleaved)), dtype=np.uint64)
+    for axis, column in enumerate(codes):
+        for bit in range(MOST_BITS):
+            column |= ((interleaved >> np.uint64(3 * bit + axis)) & np.uint64(1)) << np.uint64(bit)
+    return codes.T.astype(np.int64, order="C")
 
 
 GROUP = Rotation.create_group("O")
