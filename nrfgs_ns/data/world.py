@@ -5,8 +5,6 @@ Numbers of ten million are a metre apart in float32. So cameras far from the ori
 moved there in float64 before anything else, and the way back is float64, too.
 """
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 import torch
 from nerfstudio.cameras import camera_utils
@@ -16,34 +14,6 @@ from torch import Tensor
 FAR = 100.0
 """Distance of the cameras' mean from the origin, in their extents, above which they are moved in float64. Nearer ones
 lose less than a hundredth of a pixel to float32, and stay to the bit where nerfstudio puts them."""
-
-
-@dataclass(frozen=True)
-class CaptureFrame:
-    """The world of the original reconstruction, before an `applied_transform`: x_training = scale (R x_capture + t)."""
-
-    rotation: np.ndarray
-    """R, float64 [3, 3]"""
-    translation: np.ndarray
-    """t, float64 [3]"""
-    scale: float
-    """> 0"""
-    origin: np.ndarray
-    """a point of the capture's world amid the cameras, float64 [3], to subtract before rounding to float32; 0 where
-    float32 is enough"""
-
-    @classmethod
-    def of(cls, outputs: DataparserOutputs) -> "CaptureFrame":
-        """The frame of a data set, such as `pipeline.datamanager.train_dataparser_outputs`."""
-        transform, scale = outputs.dataparser_transform.double().numpy(), float(outputs.dataparser_scale)
-        frame = cls(transform[:, :3], transform[:, 3], scale, np.zeros(3))
-        if outputs.dataparser_transform.dtype != torch.float64:
-            return frame
-        return replace(frame, origin=_rounded(frame.to_capture(np.zeros((1, 3)))[0], 1 / scale))
-
-    def to_capture(self, points: np.ndarray) -> np.ndarray:
-        """Points [N, 3] of the training world in the capture's, float64 [N, 3]."""
-        return (np.asarray(points, dtype=np.float64) / self.scale - self.translation) @ self.rotation
 
 
 class PlacedOutputs(DataparserOutputs):
@@ -68,7 +38,7 @@ def place(
     positions = poses[:, :3, 3]
     center, extent = positions.mean(axis=0), np.ptp(positions, axis=0).max()
     far = centering != "none" and np.abs(center).max() > FAR * extent > 0
-    offset = _rounded(center, extent) if far else np.zeros(3)
+    offset = rounded(center, extent) if far else np.zeros(3)
     near = poses.copy()
     near[:, :3, 3] -= offset
     placed, transform = camera_utils.auto_orient_and_center_poses(
@@ -85,7 +55,7 @@ def place(
     return placed[:, :3, :4], transform, scale
 
 
-def _rounded(place: np.ndarray, extent: float) -> np.ndarray:
+def rounded(place: np.ndarray, extent: float) -> np.ndarray:
     """A place rounded to units, or to a power of two of the extent if that is less."""
     step = min(1.0, 2.0 ** np.floor(np.log2(extent)))
     return np.round(place / step) * step

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from nrfgs_ns.appearance.sh import sh_bases
-from nrfgs_ns.data.world import CaptureFrame
+from nrfgs_ns.data.world import rounded
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 
 
@@ -31,6 +32,10 @@ class Similarity:
         back = self.rotation.T / self.scale
         return Similarity(self.rotation.T, 1.0 / self.scale, -back @ self.translation)
 
+    def places(self, points: Tensor) -> Tensor:
+        """Where points [N, 3] go, float64."""
+        return self.scale * points.double() @ self.rotation.to(points.device).T + self.translation.to(points.device)
+
     def moved(self, splats: PlainSplats) -> PlainSplats:
         """The splats, seen from a camera that moves with them, look the same."""
         if self is NOWHERE:  # to the bit
@@ -41,9 +46,8 @@ class Similarity:
         quats[undrawn] = 1.0
         turned = (Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(quats)).as_quat()
         turned[undrawn] = np.nan
-        means = self.scale * splats.means.double() @ rotation.T + self.translation.to(rotation)
         return splats._replace(
-            means=means.to(splats.means.dtype),
+            means=self.places(splats.means).to(splats.means.dtype),
             quats=torch.from_numpy(np.roll(turned, 1, axis=1)).to(splats.quats),
             scales=splats.scales + torch.tensor(self.scale).log().item(),
             features_rest=torch.einsum(
@@ -63,11 +67,17 @@ Y_DOWN = turn((1, 0, 0), (0, 0, -1), (0, 1, 0))
 """From nerfstudio's world, whose z points up, to that of 3DGS's viewers, whose y points down."""
 
 
-def to_capture(frame: CaptureFrame) -> Similarity:
-    """From the training's world to the capture's own, less `frame.origin`."""
-    rotation = torch.from_numpy(frame.rotation).T
-    translation = -rotation @ torch.from_numpy(frame.translation) - torch.from_numpy(frame.origin)
-    return Similarity(rotation, 1.0 / frame.scale, translation)
+def to_capture(outputs: DataparserOutputs) -> tuple[Similarity, np.ndarray]:
+    """From the training's world to that of the original reconstruction, before an `applied_transform`, less an origin.
+
+    The origin, float64 [3], is a point amid the cameras, to be subtracted before rounding to float32; 0 where float32
+    is enough.
+    """
+    transform, scale = outputs.dataparser_transform, float(outputs.dataparser_scale)
+    rotation = transform[:, :3].double().T
+    back = -rotation @ transform[:, 3].double()
+    origin = rounded(back.numpy(), 1 / scale) if transform.dtype == torch.float64 else np.zeros(3)
+    return Similarity(rotation, 1.0 / scale, back - torch.from_numpy(origin)), origin
 
 
 def _turned_harmonics(rotation: Tensor) -> Tensor:

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.sh import ShConfig
-from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.options import PlyOptions
@@ -66,8 +65,7 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
         origin = None
         placed = {"viewers": Y_DOWN, "training": NOWHERE}.get(options.world)
         if placed is None:
-            frame = CaptureFrame.of(pipeline.datamanager.train_dataparser_outputs)
-            placed, origin = to_capture(frame), frame.origin
+            placed, origin = to_capture(pipeline.datamanager.train_dataparser_outputs)
             comments.append(f"origin {' '.join(f'{number:.17g}' for number in origin)}")
         written = write_splats(placed.moved(splats), output, comments)
         report = {

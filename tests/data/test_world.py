@@ -10,8 +10,8 @@ from small_capture import Capture
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.frames import to_capture
 
 UTM = np.array([448_262.3, 5_412_345.6, 311.2])
 
@@ -39,11 +39,10 @@ def test_coordinates_of_the_earth_lose_nothing(tmp_path, orientation, center):
     torch.testing.assert_close(far.metadata["points3D_xyz"], near.metadata["points3D_xyz"], atol=1e-5, rtol=0)
     assert far.dataparser_scale == pytest.approx(near.dataparser_scale, rel=1e-6)
     # The way back: float32 numbers below 2 in units of three metres, and float64 at 5,000,000.
-    frame = CaptureFrame.of(far)
-    points = far.metadata["points3D_xyz"].numpy()
-    np.testing.assert_allclose(frame.to_capture(points), xyz, atol=1e-5, rtol=0)
-    assert np.abs(frame.origin - UTM - (5, 6, 7)).max() < 4 and (frame.origin == np.round(frame.origin)).all()
-    assert (CaptureFrame.of(near).origin == 0).all()
+    back, origin = to_capture(far)
+    np.testing.assert_allclose(back.places(far.metadata["points3D_xyz"]) + origin, xyz, atol=1e-5, rtol=0)
+    assert np.abs(origin - UTM - (5, 6, 7)).max() < 4 and (origin == np.round(origin)).all()
+    assert (to_capture(near)[1] == 0).all()
 
 
 def test_what_nerfstudio_writes_beside_the_checkpoints_leads_back(tmp_path):
@@ -72,8 +71,9 @@ def test_an_applied_transform_is_part_of_the_way_back(tmp_path):
     far, xyz = with_points(tmp_path / "far", UTM)
     far.meta["applied_transform"] = [[0, 0, 1, 3], [1, 0, 0, 4], [0, 1, 0, 5]]
     outputs = far.parse()
-    back = CaptureFrame.of(outputs).to_capture(outputs.metadata["points3D_xyz"].numpy())
-    np.testing.assert_allclose(back, (xyz - (3, 4, 5)) @ np.array(far.meta["applied_transform"])[:, :3], atol=1e-5)
+    back, origin = to_capture(outputs)
+    found = back.places(outputs.metadata["points3D_xyz"]) + origin
+    np.testing.assert_allclose(found, (xyz - (3, 4, 5)) @ np.array(far.meta["applied_transform"])[:, :3], atol=1e-5)
 
 
 # What the cameras see.

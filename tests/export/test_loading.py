@@ -7,7 +7,6 @@ import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -15,7 +14,6 @@ from nerfstudio.scripts.viewer import run_viewer
 from short_trainings import command_line, models_of, trained
 from torch.testing import assert_close
 
-from nrfgs_ns.data.world import CaptureFrame
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
@@ -147,13 +145,14 @@ def test_nowhere_is_to_the_bit():
 
 def test_coordinates_of_the_earth_keep_their_precision():
     """Less the frame's origin, which the file's header tells."""
-    rotation = random_rotation(3).numpy()
-    center = np.array([448_262.3, 5_412_345.6, 311.2])
-    frame = CaptureFrame(rotation, -rotation @ center, 0.25, np.round(center))
+    rotation, center = random_rotation(3), torch.tensor([448_262.3, 5_412_345.6, 311.2], dtype=torch.float64)
+    transform = torch.cat([rotation, -(rotation @ center)[:, None]], dim=1)
+    frame, origin = to_capture(SimpleNamespace(dataparser_transform=transform, dataparser_scale=0.25))
+    assert (origin == center.round().numpy()).all()
     original = splats()
-    found = to_capture(frame).moved(original).means.double().numpy() + frame.origin
+    found = frame.moved(original).means.double() + torch.from_numpy(origin)
     # Float32 numbers below 20.
-    np.testing.assert_allclose(found, frame.to_capture(original.means.numpy()), rtol=0, atol=2e-6)
+    assert_close(found, (original.means.double() / 0.25) @ rotation + center, rtol=0, atol=2e-6)
 
 
 def test_on_screen_is_what_sparks_shader_keeps():
