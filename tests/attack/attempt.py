@@ -20,6 +20,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from small_capture import Capture, listing
+
 CALLS = 1_000_000
 """Calls of functions, Python's and C's, that an input may take: some tenths of a second."""
 PATIENCE = 300.0
@@ -95,8 +97,6 @@ def attempts(cases: Sequence[Case]) -> list[Outcome]:
 @functools.cache
 def _warm_up() -> None:
     """Import what reading imports, once and not in every child, whose calls are counted."""
-    from small_capture import Capture
-
     import nrfgs_ns.compact.decode  # noqa: F401
     from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
     from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
@@ -167,7 +167,7 @@ def _read(case: Case, folder: Path) -> Outcome:
     except Exception as error:
         return Outcome("broken case", f"{type(error).__name__}: {error}")
     os.chdir(work)
-    before, largest = _listing(folder), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before, largest = listing(folder), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     kind, said = "read", ""
     try:
         with _Counter() as counter:
@@ -186,10 +186,6 @@ def _read(case: Case, folder: Path) -> Outcome:
             kind = "silent"
         elif size > BYTES:
             kind, said = "large", f"{size / 2**20:.0f} MiB; {said}"
-        elif _listing(folder) != before:
+        elif listing(folder) != before:
             kind = "wrote"
     return Outcome(kind, said.replace(str(folder), "FOLDER")[: 2 * LONGEST], counter.calls, size)
-
-
-def _listing(folder: Path) -> dict[str, tuple[int, int]]:
-    return {str(path): (status.st_size, status.st_mtime_ns) for path in folder.rglob("*") for status in (path.lstat(),)}

@@ -9,11 +9,6 @@ def capture(tmp_path) -> Capture:
 
 
 @pytest.fixture
-def single(tmp_path) -> Capture:
-    return Capture(tmp_path / "single", images=1)
-
-
-@pytest.fixture
 def printed(capsys):
     """A function: what was printed since it was last called, in one line."""
     return lambda: " ".join(capsys.readouterr().out.split())

@@ -5,17 +5,13 @@ import numpy as np
 import pytest
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import ExifTags, Image
-from small_capture import Capture
+from small_capture import Capture, listing
 from small_colmap import Model
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.pictures import exif_of_copy, read_exif
 from nrfgs_ns.errors import InputError
-
-
-def files(folder):
-    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("layout", ["transforms.json", "COLMAP"])
@@ -27,10 +23,10 @@ def test_images_are_resized_where_there_is_no_folder_of_them(tmp_path, layout):
         capture.add_masks()
         capture.save()
         config = NrfgsDataParserConfig(data=capture.folder, downscale_factor=2, eval_mode="interval")
-    before = files(tmp_path / "scene")
+    before = listing(tmp_path / "scene")
     manager = NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
     assert manager.load_all_images() == (8, 2)
-    assert files(tmp_path / "scene") == before
+    assert listing(tmp_path / "scene") == before
     image, cameras = manager.cached_train[0], manager.train_dataset.cameras
     assert image["image"].shape == (4, 6, 3)  # 9 / 2 rounded down
     assert (cameras.width == 6).all() and (cameras.height == 4).all() and (cameras.fx == 5.0).all()

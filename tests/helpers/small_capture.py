@@ -11,6 +11,11 @@ from plyfile import PlyData, PlyElement
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 
 
+def listing(folder: Path) -> dict[Path, tuple[int, int]]:
+    """Size and time of change of all that is in a folder."""
+    return {path: (status.st_size, status.st_mtime_ns) for path in folder.rglob("*") for status in (path.lstat(),)}
+
+
 class Capture:
     """A small data set on disk, to be broken in one way at a time: change `meta` or the files, then `parse`."""
 
