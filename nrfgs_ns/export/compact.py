@@ -9,6 +9,7 @@ from typing import Any
 import torch
 import yaml
 
+from nrfgs_ns.appearance.head import AppearanceHead
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
@@ -64,15 +65,19 @@ def export_compact(
     finish(lines, numbers, report)
 
 
+def check_head(head: AppearanceHead, load_config: Path) -> None:
+    if not isinstance(head, NeuralResidualField):
+        raise InputError(
+            f"{load_config}: compact files and pages hold a neural residual field, and this model has the "
+            f"{head.name!r} head. Use nrfgs export ply."
+        )
+
+
 def packed(pipeline, load_config: Path, options: CompactOptions) -> tuple[dict, dict, dict[str, Any]]:
     """The header and streams of a model's compact file, fine-tuned or slimmed within the budget, and their numbers for
     a report."""
     model, data = pipeline.model, pipeline.datamanager
-    if not isinstance(model.head, NeuralResidualField):
-        raise InputError(
-            f"{load_config}: a compact file holds a neural residual field, and this model has the {model.head.name!r} "
-            "head. Use nrfgs export ply."
-        )
+    check_head(model.head, load_config)
     images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
     cameras = data.train_dataset.cameras
     with progress(f"Looking at the splats from {len(cameras)} training views"):

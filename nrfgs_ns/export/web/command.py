@@ -10,12 +10,12 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
-from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
+from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import input_columns
 from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.compact import measure_file, packed, write_config
+from nrfgs_ns.export.compact import check_head, measure_file, packed, write_config
 from nrfgs_ns.export.options import CompactOptions, WebOptions
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import whole
@@ -42,7 +42,12 @@ def export_web(
     with few_threads() as threads:
         pipeline = load_model(load_config, "test")
         threads.suit_to(pipeline)
-        check_model(pipeline.model, load_config)
+        check_head(pipeline.model.head, load_config)
+        if (vectors := weight_vectors(pipeline.model.head.config)) > MOST_WEIGHTS:
+            raise InputError(
+                f"{load_config}: the field's weights fill {vectors} vectors of a shader, and some phones have room for "
+                f"{MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
+            )
         header, streams, numbers = packed(pipeline, load_config, options)
         about, poster = surroundings(pipeline)
         with TemporaryDirectory() as temporary:
@@ -67,20 +72,6 @@ def export_web(
     lines += [lost(losses)] if measure else []
     lines.append("Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md.")
     finish(lines, numbers | {"bytes": size, "scene_bytes": scene_bytes, "start": name, **losses}, report)
-
-
-def check_model(model, load_config: Path) -> None:
-    """Raise InputError where no page can run a model."""
-    if not isinstance(model.head, NeuralResidualField):
-        raise InputError(
-            f"{load_config}: a page runs a neural residual field, and this model has the {model.head.name!r} head. Use "
-            "nrfgs export ply, and a viewer of such files."
-        )
-    if (vectors := weight_vectors(model.head.config)) > MOST_WEIGHTS:
-        raise InputError(
-            f"{load_config}: the field's weights fill {vectors} vectors of a shader, and some phones have room for "
-            f"{MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
-        )
 
 
 def weight_vectors(config: NrfConfig) -> int:
