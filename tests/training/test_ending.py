@@ -52,9 +52,15 @@ def at_step(trainer: NrfgsTrainer, step: int, then) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tiny_scene, tmp_path_factory) -> dict:
+def finished(tiny_scene, tmp_path_factory) -> Path:
+    """config.yml of the unbroken training."""
+    return trained(command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("whole"), STEPS, BUSY))
+
+
+@pytest.fixture
+def whole(finished) -> dict:
     """The checkpoint of the unbroken training."""
-    return checkpoint_of(trained(command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("whole"), STEPS, BUSY)))
+    return checkpoint_of(finished)
 
 
 @pytest.mark.parametrize(
@@ -182,9 +188,8 @@ def test_a_full_disk_is_survived_until_the_end(tiny_scene, tmp_path, monkeypatch
     assert list(find(trainer.checkpoint_dir)) == [3]
 
 
-def test_a_finished_training_says_so_and_how_to_extend_it(whole, tiny_scene, tmp_path):
-    out = tmp_path / "a"
-    folder = models_of(trained(command_line("nrfgs", tiny_scene, out, STEPS, BUSY)))
+def test_a_finished_training_says_so_and_how_to_extend_it(finished, tiny_scene, tmp_path):
+    folder = models_of(finished)
     with pytest.raises(InputError, match="is the end of a training of 12 steps: .* --max-num-iterations 24 makes"):
         ready(tiny_scene, tmp_path / "b", {"--load-dir": folder})
     longer = ready(tiny_scene, tmp_path / "c", {"--load-dir": folder}, steps=STEPS + 2)
@@ -247,16 +252,15 @@ def test_a_folder_that_cannot_be_written_is_refused(tiny_scene):
         ready(tiny_scene, tiny_scene / "transforms.json")
 
 
-def test_another_scene_and_other_options_are_refused(whole, tiny_scene, tmp_path):
+def test_another_scene_and_other_options_are_refused(finished, tiny_scene, tmp_path):
     from nrfgs_lab.scenes import SceneConfig, write_scene
 
-    folder = models_of(trained(command_line("nrfgs", tiny_scene, tmp_path / "a", 1, BUSY)))
     other = write_scene(SceneConfig(views=10, width=48, height=36, points=300, samples=1, seed=5), tmp_path / "other")
-    resumed = {"--load-dir": folder}
+    resumed = {"--load-dir": models_of(finished)}
     with pytest.raises(InputError, match="trained on other (poses|images)"):
-        ready(other, tmp_path / "b", resumed)
+        ready(other, tmp_path / "b", resumed, steps=STEPS + 2)
     with pytest.raises(InputError, match="--pipeline.model.appearance.color-scale was 0.2 and is 0.3"):
-        ready(tiny_scene, tmp_path / "c", resumed, {"--pipeline.model.appearance.color-scale": 0.3})
+        ready(tiny_scene, tmp_path / "c", resumed, {"--pipeline.model.appearance.color-scale": 0.3}, steps=STEPS + 2)
 
 
 def test_two_trainings_of_one_second_have_a_folder_each(tiny_scene, tmp_path):

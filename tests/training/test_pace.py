@@ -21,6 +21,7 @@ from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import pace, trainer_config
 from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import Pace, TimedPace, resolution_phases, steps_for
+from nrfgs_ns.training.trainer import NrfgsTrainer
 
 LENGTH = 30_000
 
@@ -140,36 +141,42 @@ def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> lis
     return command_line(method, scene, out, steps, SCHEDULES, *more)
 
 
+STRETCHED = {"--schedule-steps": 40, "--steps-per-save": 9}
+
+
+@pytest.fixture(scope="module")
+def stretched(tiny_scene, tmp_path_factory) -> tuple[Path, Path]:
+    """config.yml of 20 steps of the 40, and a folder with the checkpoint of step 9."""
+    out, original = tmp_path_factory.mktemp("stretched"), NrfgsTrainer._write_checkpoint
+
+    def keep(trainer, step):
+        original(trainer, step)
+        if step == 9:
+            shutil.copytree(trainer.checkpoint_dir, out / "kept")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.cuda, "is_available", lambda: False)  # as where it goes on
+        patch.setattr(NrfgsTrainer, "_write_checkpoint", keep)
+        return trained(options(tiny_scene, out, "nrfgs-sh", 20, SH, STRETCHED)), out / "kept"
+
+
 @pytest.mark.usefixtures("no_cuda")
-def test_a_stretched_training(tiny_scene, tmp_path):
-    """20 steps of the 40: degree 3 is reached at step 15, and its harmonics are there when it is evaluated; splats
-    come only before step 15."""
-    whole = trained(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, SH, {"--schedule-steps": 40}))
-    _, pipeline, _, step = eval_setup(whole)
+def test_a_stretched_training(stretched, tiny_scene, tmp_path):
+    """Degree 3 is reached at step 15, and its harmonics are there when it is evaluated; splats come only before it."""
+    _, pipeline, _, step = eval_setup(stretched[0])
     assert step == 19 and pipeline.model.head.active_degree == 3
     assert pipeline.model.schedule_step == 40
     # 8 training images hold densification back for 8 + 2 steps after the reset at 0: it acts at steps 10, 12 and 14.
     short = train(options(tiny_scene, tmp_path / "short", "nrfgs-sh", 12, SH, {"--schedule-steps": 24}))
     assert short.splats[-1][1] > short.splats[0][1] and short.splats[-1][1] < pipeline.model.num_points
-    state = checkpoint_of(whole)
+    state = checkpoint_of(stretched[0])
     assert state["training"]["pace"] == {"length": 40, "rate": 2.0, "position": 40.0}
 
 
 @pytest.mark.usefixtures("no_cuda")
-def test_a_stretched_training_continues_to_the_bit(tiny_scene, tmp_path, monkeypatch):
-    from nrfgs_ns.training.trainer import NrfgsTrainer
-
-    original, kept = NrfgsTrainer._write_checkpoint, tmp_path / "kept"
-
-    def keep(trainer, step):
-        original(trainer, step)
-        if step == 9:
-            shutil.copytree(trainer.checkpoint_dir, kept)
-
-    monkeypatch.setattr(NrfgsTrainer, "_write_checkpoint", keep)
-    stretched = {"--schedule-steps": 40, "--steps-per-save": 9}
-    whole = trained(options(tiny_scene, tmp_path / "whole", "nrfgs-sh", 20, SH, stretched))
-    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 20, SH, stretched, {"--load-dir": kept}))
+def test_a_stretched_training_continues_to_the_bit(stretched, tiny_scene, tmp_path):
+    whole, kept = stretched
+    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 20, SH, STRETCHED, {"--load-dir": kept}))
     one, other = checkpoint_of(whole), checkpoint_of(rest)
     assert one["step"] == 19
     assert_same_training(one, other, rtol=0, atol=0)
@@ -252,14 +259,11 @@ def short(monkeypatch):
 def test_the_chosen_steps_are_made_and_an_interrupted_training_goes_on_to_their_end(
     short, tiny_scene, tmp_path, no_cuda, capsys
 ):
-    whole = trained(command_line("nrfgs", tiny_scene, tmp_path / "whole", 0, SMALL))
-    assert checkpoint_of(whole)["step"] == 11
+    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path / "half", 0, SMALL, {"--steps-per-save": 5}))
     said = " ".join(capsys.readouterr().out.split())
     assert f"{VIEWS} training views: 12 steps, view dependence reduced" in said
-    notes = next((tmp_path / "whole").rglob("choices.txt")).read_text()
+    notes = next((tmp_path / "half").rglob("choices.txt")).read_text()
     assert f"{0.5 * (VIEWS + 20) / VIEWS:.2g} times the distance between neighbouring" in notes
-
-    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path / "half", 0, SMALL, {"--steps-per-save": 5}))
     step_of = trainer.train_iteration
 
     def interrupted(step):
