@@ -48,46 +48,12 @@ def trained(monkeypatch):
     return calls
 
 
-def test_a_training_goes_on_from_its_last_checkpoint(tmp_path, trained):
-    interrupted(tmp_path, 20, 40, reached=60)
-    train_or_continue(job_in(tmp_path), tmp_path)
-    ((args, earlier),) = trained
-    models = tmp_path / "scene/nrfgs/2000-01-01/nerfstudio_models"
-    assert args[:3] == ["nrfgs", "--load-dir", str(models)]
-    assert args[args.index("--max-num-iterations") + 1] == "100"
-    assert (earlier.steps, earlier.seconds) == (41, 4.0)
-    assert earlier.splats[-1] == [40, 50] and earlier.saved == [[20, 2.0], [40, 4.0]]
-
-
 def test_the_record_fits_the_checkpoint_that_is_there(tmp_path):
     """The kill came after the note about a checkpoint and before the checkpoint."""
     interrupted(tmp_path, 20, reached=40)
     earlier = record_until(tmp_path / "train.json", last_checkpoint(tmp_path))
     assert (earlier.steps, earlier.seconds, earlier.splats[-1]) == (21, 2.0, [20, 30])
     assert earlier.saved == [[20, 2.0]]
-
-
-def test_killed_in_the_middle_of_ns_eval(tmp_path, monkeypatch, trained):
-    """The training is finished and some pictures are written; the next attempt evaluates, and trains no more."""
-    job = job_in(tmp_path, steps=41)
-    evaluated = []
-
-    def evaluate(config, path, pictures):
-        evaluated.append(config.relative_to(tmp_path).as_posix())
-        if len(evaluated) == 1:
-            raise KeyboardInterrupt
-        return {"psnr": 20.0}
-
-    forget_other_arguments(tmp_path, job.identity)
-    interrupted(tmp_path, 40, reached=40)
-    monkeypatch.setattr(bench_run, "evaluate", evaluate)
-    monkeypatch.setattr("nrfgs_lab.bench.measure.measure", lambda config, views, timed: {"test": {}})
-    with pytest.raises(KeyboardInterrupt):
-        bench_run.run(job)
-    assert not Path(job.record).exists()
-    bench_run.run(job)
-    assert not trained and evaluated == ["scene/nrfgs/2000-01-01/config.yml"] * 2
-    assert json.loads(Path(job.record).read_text())["train"]["steps"] == 41
 
 
 @pytest.mark.parametrize(
