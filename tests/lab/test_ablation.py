@@ -25,11 +25,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
-CONFIGS = {
-    "default": NrfConfig(latent_dim=8, hidden_width=16),
-    "one branch": NrfConfig(latent_dim=8, hidden_width=16, split_bands=False),
-    "low only": NrfConfig(latent_dim=8, hidden_width=16, num_bands=1, use_distance=False, opacity_residual=False),
-}
+SPLIT = NrfConfig(latent_dim=8, hidden_width=16)
 FLOAT32 = {"rtol": 0, "atol": 2e-5}
 """Sums of up to 60 products of numbers of order 1 to 10, rounded at 2^-24 each, behind slopes of at most 0.2."""
 LOUD = {
@@ -70,9 +66,9 @@ def test_the_head_is_timed_with_diffuse_splats_last():
     assert diffuse_last({}, visible) is visible
 
 
-@pytest.fixture(params=CONFIGS)
-def case(request):
-    head = awake(CONFIGS[request.param], torch.float32).requires_grad_(False)
+def random_field(config: NrfConfig = SPLIT):
+    """A field of 40 splats, the visible ones, and a camera centre for each."""
+    head = awake(config, torch.float32).requires_grad_(False)
     splats, visible, centers = scene(head, count=40, dtype=torch.float32)
     return Field(head, splats), visible, centers
 
@@ -85,38 +81,36 @@ def assert_same(field: Field, other: Field, visible, centers, **tolerance) -> No
 
 
 def test_without_the_high_branch_its_gate_is_shut():
-    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
-    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
-    small = without_high_branch(Field(head, splats))
-    shut = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
-    shut.load_state_dict(head.state_dict())
+    whole, visible, centers = random_field()
+    small = without_high_branch(whole)
+    shut = awake(SPLIT, torch.float32).requires_grad_(False)
+    shut.load_state_dict(whole.head.state_dict())
     shut.high[2].weight[3], shut.high[2].bias[3] = 0.0, -1e4
-    assert small.head.high is None and small.bytes < Field(head, splats).bytes
-    assert_same(small, Field(shut, splats), visible, centers, **FLOAT32)
+    assert small.head.high is None and small.bytes < whole.bytes
+    assert_same(small, Field(shut, whole.splats), visible, centers, **FLOAT32)
 
 
 def test_without_the_low_branch_colours_are_the_high_ones():
-    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
-    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
-    small = without_low_branch(Field(head, splats))
+    whole, visible, centers = random_field()
+    head, splats = whole.head, whole.splats
+    small = without_low_branch(whole)
     parts = small.head.components(splats, visible, centers)
     assert (parts["low branch"].values == 0).all() and parts["high branch"].values.abs().max() > 1e-3
     assert (small.head(splats, visible, centers).opacities == head(splats, visible, centers).opacities).all()
 
 
 def test_without_opacitys_residual_only_colours_change():
-    head = awake(CONFIGS["default"], torch.float32).requires_grad_(False)
-    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
-    small = without_opacity_residual(Field(head, splats))
+    whole, visible, centers = random_field()
+    head, splats = whole.head, whole.splats
+    small = without_opacity_residual(whole)
     found = small.head(splats, visible, centers)
     assert (found.opacities == head.base_appearance(splats, visible).opacities).all()
     assert_close(found.colors, head(splats, visible, centers).colors, **FLOAT32)
 
 
-def test_a_constant_distance_is_what_the_field_sees(case):
-    field, visible, _ = case
-    if not field.head.config.use_distance:
-        pytest.skip("this field sees no distance")
+@pytest.mark.parametrize("config", [SPLIT, NrfConfig(latent_dim=8, hidden_width=16, split_bands=False)])
+def test_a_constant_distance_is_what_the_field_sees(config):
+    field, visible, _ = random_field(config)
     # From cameras that are all as far away from their splats.
     torch.manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(len(visible), 3), dim=-1)
