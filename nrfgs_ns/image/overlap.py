@@ -7,7 +7,7 @@ surfaces shine, points are occluded or the sun has moved, it varies.
 
 So an image is divided into regions. The shift of a pair of photographs is the median over the regions' medians, and its
 noise is the spread of the regions. Differences that the camera positions explain do not count (`estimate`): with them
-six of the seven captures of docs/exposure.md that do not vary would seem to, by 0.17 to 0.58 stops.
+most captures of docs/exposure.md that do not vary would seem to.
 """
 
 import itertools
