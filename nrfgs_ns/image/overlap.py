@@ -6,8 +6,7 @@ light differs by a shift, in stops. If exposure or white balance changed, the sh
 surfaces shine, points are occluded or the sun has moved, it varies.
 
 So an image is divided into regions. The shift of a pair of photographs is the median over the regions' medians, and its
-noise is the spread of the regions. Differences that the camera positions explain do not count (`estimate`): with them
-most captures of docs/exposure.md that do not vary would seem to.
+noise is the spread of the regions. Differences that the camera positions explain do not count (`estimate`).
 """
 
 import itertools

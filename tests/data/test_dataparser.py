@@ -195,6 +195,14 @@ def test_rendering_from_a_checkpoint_needs_no_files(capture):
         assert len(parser.get_dataparser_outputs(split).cameras) > 0
 
 
+def test_the_users_configuration_is_left_alone(tmp_path):
+    config = NrfgsDataParserConfig(data=Capture(tmp_path, images=1).save(), orientation_method="vertical")
+    before = repr(config)
+    parser = config.setup()
+    parser.get_dataparser_outputs("train")
+    assert parser.config is config and repr(config) == before
+
+
 @pytest.mark.parametrize("first", ["nrfgs_ns.data.dataparser", "nerfstudio.configs.dataparser_configs"])
 def test_nerfstudio_finds_the_plugin_whichever_is_imported_first(first):
     """nerfstudio loads plugins while it imports itself: a circle of imports would show in one of the two orders."""
