@@ -71,6 +71,10 @@ class ShardedModel(NrfgsModel):
         rows = rows_of(comm.rank(), total, comm.world())
         return {name: value[rows].clone() for name, value in whole.items()}
 
+    def start_from(self, seed_points: tuple[Tensor, Tensor]) -> None:
+        """Start from other points, the main device's: others may round differently."""
+        super().start_from(comm.gather_objects(tuple(table.cpu() for table in seed_points))[0])
+
     def learn_photographs(self, photographs: PhotographModel | None) -> None:
         """Let each photograph's look be learnt, from where the main device starts: others may round differently."""
         states = comm.gather_objects(None if photographs is None else photographs.state_dict())

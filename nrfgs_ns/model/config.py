@@ -43,6 +43,8 @@ class NrfgsModelConfig(ModelConfig):
     shrinkage: float = 0.0
     """weight in the loss of the splats' mean opacity and mean size, in percent, halved for every 12 training views
     (docs/captures.md). mcmc has its own instead"""
+    dense_start: Literal["auto", "off"] = "off"
+    """start with points from the photographs, too. auto: the more, the fewer views there are (docs/captures.md)"""
     warmup_steps: int | None = None
     """steps before training in which a head that starts with a residual unlearns it. None: one for each training
     view"""
@@ -102,6 +104,7 @@ class NrfgsModelConfig(ModelConfig):
         self.densification.check()
         for name, choices in (
             ("few_views", ("auto", "off")),
+            ("dense_start", ("auto", "off")),
             ("rasterize_mode", ("classic", "antialiased")),
             ("background_color", ("random", "black", "white")),
         ):

@@ -79,7 +79,7 @@ class NrfgsModel(SplatfactoModel):
         self.reduced_head = differences(config.appearance, appearance) or None
         self.head = appearance.setup(self.scene_unit)
         config.sh_degree = self.head.sh_degree
-        self.gauss_params = ParameterDict({name: Parameter(value) for name, value in self._initial_splats().items()})
+        self.gauss_params = self._splats_to_start_from()
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         if config.use_bilateral_grid:
             self.bil_grids = BilateralGrid(self.num_train_data, *config.grid_shape)
@@ -110,6 +110,14 @@ class NrfgsModel(SplatfactoModel):
     def _initial_splats(self) -> dict[str, Tensor]:
         """The table of splats to start from."""
         return initial_splats(self.config, self.head, self.seed_points, self.scene_unit)
+
+    def _splats_to_start_from(self) -> ParameterDict:
+        return ParameterDict({name: Parameter(value) for name, value in self._initial_splats().items()})
+
+    def start_from(self, seed_points: tuple[Tensor, Tensor]) -> None:
+        """Before a training: start from other points, positions [P, 3] and colours [P, 3] in 0..255."""
+        self.seed_points = seed_points
+        self.gauss_params = self._splats_to_start_from().to(self.device)
 
     def _strategy(self) -> Densification:
         """What makes splats come and go."""

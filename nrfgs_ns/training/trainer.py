@@ -28,6 +28,7 @@ from nrfgs_ns.errors import ForTheUser, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, window
 from nrfgs_ns.training.checkpoint_files import DiskFull
+from nrfgs_ns.training.dense_start import start_with_dense_points
 from nrfgs_ns.training.evaluation import track
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
@@ -103,6 +104,9 @@ class NrfgsTrainer(Trainer):
         self.steps_are_chosen = self.config.max_num_iterations == 0 and self.config.time_budget is None
         self.config = self.config.for_views(self.pipeline.model.num_views)
         self.total_steps = self.config.max_num_iterations
+        if self.config.load_dir is None and self.config.load_checkpoint is None:
+            notes = start_with_dense_points(self.pipeline.model, self.pipeline.datamanager)
+            self.pipeline.notes = [*self.pipeline.notes, *notes]
         self.guard = Guard(self.pipeline)
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self.config.pace()
