@@ -93,7 +93,7 @@ nrfgs = preset(
     "nrfgs",
     method("nrfgs", NrfConfig(), "", latents=adam(0.0025), field=adam(5e-3, lr_final=5e-4)),
     "Gaussian splatting with a neural residual field for view-dependent colour and opacity.",
-    model={"view_noise": HALF_A_SPACING, "few_views": "auto", "shrinkage": SHRINKAGE, "dense_start": "auto"},
+    model={"view_noise": HALF_A_SPACING, "few_views": "auto", "shrinkage": SHRINKAGE},
     max_num_iterations=0,
 )
 

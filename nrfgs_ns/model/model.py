@@ -79,6 +79,7 @@ class NrfgsModel(SplatfactoModel):
         self.reduced_head = differences(config.appearance, appearance) or None
         self.head = appearance.setup(self.scene_unit)
         config.sh_degree = self.head.sh_degree
+        self._seed = torch.initial_seed()
         self.gauss_params = self._splats_to_start_from()
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         if config.use_bilateral_grid:
@@ -117,7 +118,9 @@ class NrfgsModel(SplatfactoModel):
     def start_from(self, seed_points: tuple[Tensor, Tensor]) -> None:
         """Before a training: start from other points, positions [P, 3] and colours [P, 3] in 0..255."""
         self.seed_points = seed_points
-        self.gauss_params = self._splats_to_start_from().to(self.device)
+        with torch.random.fork_rng(devices=[]):  # as on a single device, whatever generators a device has by now
+            torch.default_generator.manual_seed(self._seed)
+            self.gauss_params = self._splats_to_start_from().to(self.device)
 
     def _strategy(self) -> Densification:
         """What makes splats come and go."""

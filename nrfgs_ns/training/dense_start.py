@@ -28,8 +28,9 @@ def start_with_dense_points(model: Any, datamanager: Any) -> list[str]:
         return []
     cameras, images = datamanager.train_dataset.cameras.to(model.device), datamanager.cached_train
     poses = world_to_camera(cameras.camera_to_worlds)
+    intrinsics = cameras.get_intrinsics_matrices().to(poses)  # nerfstudio makes them on the CPU
     masks = [batch.get("mask") for batch in images]
-    views = small_views((batch["image"] for batch in images), masks, cameras.get_intrinsics_matrices(), poses)
+    views = small_views((batch["image"] for batch in images), masks, intrinsics, poses)
     progress = partial(track, description="Points from photographs", console=CONSOLE, transient=True)
     xyz, rgb = dense_points(views, own[0].to(poses), share, progress)
     model.start_from((torch.cat([own[0], xyz.to(own[0])]), torch.cat([own[1], (255 * rgb).to(own[1])])))

@@ -3,10 +3,14 @@
 
 import math
 
+from types import SimpleNamespace
+
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 
 from nrfgs_ns.data.plane_sweep import KEPT, Views, dense_points, share_kept, small_views
+from nrfgs_ns.training.dense_start import start_with_dense_points
 
 SIZE, FOCAL, DISTANCE = 48, 60.0, 4.0
 
@@ -88,3 +92,30 @@ def test_the_share_falls_smoothly_to_nothing():
     again, _ = dense_points(*plane(AROUND), share=0.25)
     every, _ = dense_points(*plane(AROUND), share=1.0)
     assert len(few) == pytest.approx(len(every) / 4, rel=0.2) and torch.equal(few, again)
+
+
+def test_a_training_starts_with_them_if_asked_to():
+    views, own = plane(AROUND)
+    poses = torch.linalg.inv(views.world_to_camera)[:, :3] * torch.tensor([1.0, -1.0, -1.0, 1.0])
+    images = [{"image": (255 * image).round().to(torch.uint8)} for image in views.rgb]
+    dataset = SimpleNamespace(cameras=Cameras(poses, FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE))
+    started = []
+    model = SimpleNamespace(
+        config=SimpleNamespace(dense_start="auto", random_init=False),
+        seed_points=(own, torch.full_like(own, 9.0)),
+        num_views=len(AROUND),
+        device=torch.device("cpu"),
+        start_from=started.append,
+    )
+    datamanager = SimpleNamespace(train_dataset=dataset, cached_train=images)
+    (note,) = start_with_dense_points(model, datamanager)
+    (xyz, rgb), count = started[0], len(own)
+    assert torch.equal(xyz[:count], own) and (rgb[:count] == 9).all()
+    assert (
+        len(xyz) > count + 200
+        and note == f"start: {count} points of the capture, {len(xyz) - count} from the photographs"
+    )
+    assert ((xyz[:, 2] - DISTANCE - xyz[:, 0] / 4).abs().median() / DISTANCE) < 0.003 and 20 < rgb[count:].mean() < 235
+    for config in ({"dense_start": "off", "random_init": False}, {"dense_start": "auto", "random_init": True}):
+        model.config = SimpleNamespace(**config)
+        assert start_with_dense_points(model, datamanager) == [] and len(started) == 1
