@@ -2,7 +2,6 @@
 """The plane sweep, on views of a textured plane, computed exactly."""
 
 import math
-
 from types import SimpleNamespace
 
 import pytest
