@@ -22,7 +22,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.densification import Original
+from nrfgs_ns.densification import ErrorGuided, Original
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.start import with_methods
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS
@@ -93,7 +93,14 @@ nrfgs = preset(
     "nrfgs",
     method("nrfgs", NrfConfig(), "", latents=adam(0.0025), field=adam(5e-3, lr_final=5e-4)),
     "Gaussian splatting with a neural residual field for view-dependent colour and opacity.",
-    model={"view_noise": HALF_A_SPACING, "few_views": "auto", "shrinkage": SHRINKAGE},
+    model={
+        "densification": ErrorGuided(),
+        "dense_start": "auto",
+        "near_plane": "auto",
+        "view_noise": HALF_A_SPACING,
+        "few_views": "auto",
+        "shrinkage": SHRINKAGE,
+    },
     max_num_iterations=0,
 )
 

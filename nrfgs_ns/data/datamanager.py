@@ -25,7 +25,7 @@ from nrfgs_ns.data.colmap_parser import checked
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.pictures import cache_folder, free_memory, in_parallel, read_mask, read_picture
 from nrfgs_ns.data.pixels import from_files, look_through, undistorted
-from nrfgs_ns.data.views import different_views, scene_unit
+from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
 from nrfgs_ns.errors import InputError
 
 LARGEST_SCALE = 16.0
@@ -53,6 +53,8 @@ class NrfgsInputDataset(InputDataset):
         self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
         self.metadata["scene_unit"] = scene_unit(self.cameras.camera_to_worlds[:, :3, 3])
         self.metadata["different_views"] = different_views(self.cameras.camera_to_worlds)
+        if (points := self.metadata.get("points3D_xyz")) is not None:
+            self.metadata["nearest_depth"] = nearest_depth(points, self.cameras)
         # Undistortion crops the cameras while it loads the images.
         self._sizes = torch.cat([self.cameras.width, self.cameras.height], dim=-1).tolist()
         self.downscale = self.metadata.get("downscale", 1)

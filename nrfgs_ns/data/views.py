@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choices of views: evenly spaced, for testing, different from each other; and a capture's unit of length."""
+"""Choices of views: evenly spaced, for testing, different from each other; a capture's unit of length, and how near it
+comes."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:  # `nrfgs prepare` does without torch
+    from nerfstudio.cameras.cameras import Cameras
     from torch import Tensor
 
 
@@ -52,6 +54,31 @@ def different_views(poses: Tensor) -> int:
     """Number of views among camera-to-world poses [V, 3 or 4, 4]: those with the place and the direction of an earlier
     one (copies, frames of a camera that stands still) do not count."""
     return len(_first_of_each(_places_and_directions(poses)))
+
+
+NEAREST_SHARE = 0.01
+"""Share of the points in an image that may be nearer than what counts as its nearest."""
+FEWEST_POINTS = 20
+"""Points in an image below which it says nothing about what is near."""
+
+
+def nearest_depth(points: Tensor, cameras: Cameras) -> float:
+    """Depth at which the nearest training camera sees the nearest points, in world units; 0 if no camera sees enough.
+
+    Args:
+        points: of the capture, [P, 3].
+        cameras: pinhole cameras of the training, [V].
+    """
+    points = points[:: max(len(points) // 10_000, 1)].float()
+    nearest = math.inf
+    for camera in cameras:
+        rotation, position = camera.camera_to_worlds[:3, :3], camera.camera_to_worlds[:3, 3]
+        x, y, z = ((points - position) @ rotation).unbind(-1)
+        u, v = camera.fx * x / -z + camera.cx, camera.cy - camera.fy * y / -z
+        depths = -z[(z < 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)]
+        if len(depths) > FEWEST_POINTS:
+            nearest = min(nearest, depths.quantile(NEAREST_SHARE).item())
+    return nearest if nearest < math.inf else 0.0
 
 
 def distinct_places(centers: Tensor) -> Tensor:

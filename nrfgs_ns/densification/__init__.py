@@ -4,6 +4,7 @@
 - `splatfacto`: nerfstudio's rules and thresholds.
 - `original`: 3DGS (Kerbl et al. 2023): mean screen-space gradients above 2e-4 grow, opacities below 0.005 go, sizes are
   measured against the extent of the cameras.
+- `error-guided`: brush's and LichtFeld's growth by error; opacities decay and are not reset.
 - `mcmc`: 3DGS-MCMC (Kheradmand et al. 2024): nothing is deleted. Dead splats move to live ones, noise explores, and
   the count grows to a budget and stays there.
 
@@ -15,6 +16,7 @@ table, whichever head it belongs to, and to the optimisers' moments. The model n
 """
 
 from nrfgs_ns.densification.choice import STRATEGIES, DensificationChoice, strategy_from
+from nrfgs_ns.densification.error_guided import ErrorGuided
 from nrfgs_ns.densification.gradient import Original, Splatfacto
 from nrfgs_ns.densification.mcmc import Mcmc
 from nrfgs_ns.densification.strategy import (
@@ -33,6 +35,7 @@ __all__ = [
     "Densification",
     "DensificationChoice",
     "DensificationConfig",
+    "ErrorGuided",
     "Mcmc",
     "OpacitySeen",
     "Original",

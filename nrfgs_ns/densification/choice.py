@@ -10,12 +10,15 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from tyro.constructors import PrimitiveConstructorSpec
 
+from nrfgs_ns.densification.error_guided import ErrorGuided
 from nrfgs_ns.densification.gradient import Original, Splatfacto
 from nrfgs_ns.densification.mcmc import Mcmc
 from nrfgs_ns.densification.strategy import DensificationConfig
 from nrfgs_ns.errors import InputError
 
-STRATEGIES: dict[str, type[DensificationConfig]] = {config.name: config for config in (Splatfacto, Original, Mcmc)}
+STRATEGIES: dict[str, type[DensificationConfig]] = {
+    config.name: config for config in (Splatfacto, Original, Mcmc, ErrorGuided)
+}
 
 
 def strategy_from(text: str) -> DensificationConfig:

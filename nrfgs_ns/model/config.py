@@ -45,6 +45,9 @@ class NrfgsModelConfig(ModelConfig):
     (docs/captures.md). mcmc has its own instead"""
     dense_start: Literal["auto", "off"] = "off"
     """start with points from the photographs, too. auto: the more, the fewer views there are (docs/captures.md)"""
+    near_plane: Literal["auto", "off"] = "off"
+    """auto: splats are drawn from half the depth on at which training cameras see the capture's nearest points
+    (docs/captures.md). off: from splatfacto's 0.01 scene units on"""
     warmup_steps: int | None = None
     """steps before training in which a head that starts with a residual unlearns it. None: one for each training
     view"""
@@ -105,6 +108,7 @@ class NrfgsModelConfig(ModelConfig):
         for name, choices in (
             ("few_views", ("auto", "off")),
             ("dense_start", ("auto", "off")),
+            ("near_plane", ("auto", "off")),
             ("rasterize_mode", ("classic", "antialiased")),
             ("background_color", ("random", "black", "white")),
         ):

@@ -41,6 +41,8 @@ from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.rasterizer import ProjectionOptions
 
+NEAR_SHARE = 0.5
+"""Near plane of `near_plane` auto, in nearest depths."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What a training with random backgrounds is evaluated on: viser's default grey, as in splatfacto."""
 
@@ -74,6 +76,8 @@ class NrfgsModel(SplatfactoModel):
         """World units in a scene unit; lengths in the configuration are in scene units."""
         self.num_views: int = metadata.get("different_views", self.num_train_data)
         """Training views that differ (`data.views.different_views`), or as many as a checkpoint's training counted."""
+        self.nearest_depth: float = metadata.get("nearest_depth", 0.0)
+        """Depth at which training cameras see the nearest points (`data.views.nearest_depth`), or a checkpoint's."""
         config.appearance.validate()
         appearance = config.suited_appearance(self.num_views)
         self.reduced_head = differences(config.appearance, appearance) or None
@@ -174,8 +178,9 @@ class NrfgsModel(SplatfactoModel):
     @property
     def projection_options(self) -> ProjectionOptions:
         """How this model projects its splats."""
+        near = NEAR_SHARE * self.nearest_depth if self.config.near_plane == "auto" else 0.0
         # In training the guard looks for what is not finite.
-        return projection_options(self.config.rasterize_mode, self.scene_unit, assume_finite=self.training)
+        return projection_options(self.config.rasterize_mode, self.scene_unit, near, assume_finite=self.training)
 
     def project(self, camera: Cameras, splats: Mapping[str, Tensor] | None = None) -> View:
         """Project splats into a camera (`project_view`): the field's, or another table."""
@@ -491,6 +496,8 @@ class NrfgsModel(SplatfactoModel):
             state["capacity"] = {"head": self.reduced_head}
         if self.num_views != self.num_train_data:
             state["views"] = self.num_views
+        if self.nearest_depth > 0:
+            state["nearest_depth"] = self.nearest_depth
         return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -501,6 +508,7 @@ class NrfgsModel(SplatfactoModel):
             )
         self.densification.load_state(state["strategy"], self.device)
         self.num_views = state.get("views", self.num_train_data)
+        self.nearest_depth = state.get("nearest_depth", 0.0)
         if "schedule_step" in state:
             self.schedule_at(state["schedule_step"])
             self.head.set_step(self.schedule_step)

@@ -23,12 +23,12 @@ NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 
 
 def projection_options(
-    rasterize_mode: RasterizeMode, scene_unit: float, *, assume_finite: bool = False
+    rasterize_mode: RasterizeMode, scene_unit: float, near: float = 0.0, *, assume_finite: bool = False
 ) -> ProjectionOptions:
-    """Options of a projection whose planes are splatfacto's, in scene units of `scene_unit` world units."""
-    return ProjectionOptions(
-        rasterize_mode, NEAR_PLANE * scene_unit, FAR_PLANE * scene_unit, assume_finite=assume_finite
-    )
+    """Options of a projection whose planes are splatfacto's, in scene units of `scene_unit` world units, or whose near
+    plane is farther, `near` world units away."""
+    planes = max(NEAR_PLANE * scene_unit, near), FAR_PLANE * scene_unit
+    return ProjectionOptions(rasterize_mode, *planes, assume_finite=assume_finite)
 
 
 class View(NamedTuple):

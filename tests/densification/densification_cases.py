@@ -102,6 +102,8 @@ def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **rul
     rules = {"warmup_length": 2, "refine_every": 4, **rules}
     if densification == "splatfacto":
         rules = {"densify_grad_thresh": 1e-6, "reset_alpha_every": 6, **rules}
+    if densification == "error-guided":
+        rules = {"threshold": 1e-4, **rules}
     options = {
         "--pipeline.model.densification": str(CONFIGS[densification](**rules)),
         "--pipeline.model.num-downscales": 0,

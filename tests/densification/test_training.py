@@ -34,7 +34,9 @@ def test_the_extent_is_that_of_the_training_cameras(tiny_scene, tmp_path):
     assert trainer.pipeline.model.densification.state["scene_scale"] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("densification, seen", [("splatfacto", "peak"), ("original", "base"), ("mcmc", "peak")])
+@pytest.mark.parametrize(
+    "densification, seen", [("splatfacto", "peak"), ("original", "base"), ("mcmc", "peak"), ("error-guided", "peak")]
+)
 def test_resumed_training_is_the_unbroken_one(densification, seen, tiny_scene, tmp_path):
     """26 steps at once, against 14 and 12 more: the checkpoint lies between two refinements, with statistics in flight.
 

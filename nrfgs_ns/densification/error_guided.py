@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Growth where the error is, to a number of splats that the capture decides.
+
+The recipe follows brush (Arthur Brussee, Apache-2.0, `crates/brush-train`) and LichtFeld-Studio's default:
+
+- A splat's *error* is the sum over pixels of |dL/dmean2d|, with lengths in images; a window of views counts with the
+  largest. It does not depend on the size of the images, the number of views or the unit of the scene.
+- Each refinement splits a share of the splats whose error is above a threshold, drawn in proportion to the error, and
+  every splat wider than three quarters of the image.
+- A splat is dead if no view of the last two windows shows it at `DEAD` or more. It is replaced by half of a live one,
+  drawn in proportion to opacity.
+- Opacities are never reset. Each refinement takes a little from all of them, which the loss gives back where it counts.
+
+Differences from both, because they harm captures of few views (docs/captures.md): `DEAD` is 0.1 where they have 1/255,
+wide splats are split and not replaced, and no noise moves the means.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from gsplat.strategy.ops import _update_param_with_optimizer
+from gsplat.utils import normalized_quat_to_rotmat
+from torch import Tensor
+from torch.nn import Parameter
+
+from nrfgs_ns.densification.mcmc import CHANGE_BEFORE
+from nrfgs_ns.densification.relocation import Optimizers, Splats
+from nrfgs_ns.densification.strategy import (
+    CHANGE,
+    UNSEEN,
+    Densification,
+    DensificationConfig,
+    OpacitySeen,
+    Shown,
+    change_of,
+    seen_with,
+)
+
+ERROR = "error"
+"""Name in `state`: the largest error of each splat in a view of this window, [N]."""
+FIRST = "first_count"
+"""Name in `state`: splats at the first refinement, where a budget's course starts."""
+WIDTH = "width"
+"""Name in `state`: the largest radius of each splat in this window, in longer sides of the image, [N]; 0: not seen."""
+DEAD = 0.1
+"""Splats that no view of two windows shows at this opacity or more are replaced."""
+SHARE = 0.25
+"""Share of the splats above the threshold that a refinement splits."""
+DECAY = 0.004
+"""Opacity that the first refinement takes from each splat; the amount falls linearly to 0 over the training."""
+LAYOUT = 30_000
+"""Steps of the training that the options' steps belong to."""
+WIDEST = 0.75
+"""Radius from which a splat is split whatever its error: three standard deviations, in longer sides of the image."""
+
+
+@dataclass
+class ErrorGuided(DensificationConfig):
+    """Growth where the error is: the number of splats follows from the capture."""
+
+    name: ClassVar[str] = "error-guided"
+    steps: ClassVar[tuple[str, ...]] = (*DensificationConfig.steps, "grow_until", "stop_at")
+    opacity_seen: OpacitySeen = "peak"
+    """opacity by which splats are dead (docs/opacity.md). base: stored. peak: largest shown in two windows"""
+    refine_every: int = 200
+    """steps between refinements; the views of these are a window"""
+    threshold: float = 0.0025
+    """error above which a splat may be split: the smaller, the more splats and detail"""
+    budget: int = 0
+    """number of splats to grow to, whatever their error (arXiv 2605.16158). 0: the threshold decides"""
+    most_splats: int = 2_000_000
+    """upper bound; growth usually ends below it by itself"""
+    grow_until: int = 15_000
+    """step after which splats are only replaced"""
+    stop_at: int = 25_000
+    """step after which nothing changes any more"""
+
+    def check(self) -> None:
+        super().check()
+        self.require(self.most_splats >= 1, "most_splats", "at least 1")
+
+    def share_of(self, rank: int, devices: int) -> "ErrorGuided":
+        shares = {name: len(range(rank, getattr(self, name), devices)) for name in ("budget", "most_splats")}
+        return replace(self, **shares)
+
+    def build(self, num_train_images: int, scene_unit: float) -> "ErrorGuidedDensification":
+        return ErrorGuidedDensification(self)
+
+
+class ErrorGuidedDensification(Densification):
+    """Splits by error, replacement by opacity, decay of opacity."""
+
+    name = ErrorGuided.name
+    takes_all_rows = True
+
+    def __init__(self, config: ErrorGuided):
+        super().__init__(config.opacity_seen)
+        self.state |= {ERROR: None, WIDTH: None}
+        if config.budget:
+            self.state[FIRST] = None
+        if config.opacity_seen == "peak":
+            self.state[CHANGE_BEFORE] = None
+        self.config = config
+        self.reschedule(round)
+
+    def reschedule(self, step_at: Callable[[float], int]) -> None:
+        config = self.config
+        self.start, self.grow_until = step_at(config.warmup_length), step_at(config.grow_until)
+        self.stop, self.end = step_at(config.stop_at), step_at(LAYOUT)
+
+    def needs_absgrad(self, step: int) -> bool:
+        return step < self.grow_until
+
+    def rests_at(self, step: int) -> bool:
+        return step >= self.grow_until
+
+    # What a step shows.
+
+    def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
+        """See `Densification`. What a view shows is left in `info`: a recorded step fills it anew each time."""
+        rows = info["gaussian_ids"]
+        self.shown = Shown(rows, opacities, info.get("n_cameras", 1))
+        if self.opacity_seen == "peak":
+            # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
+            stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
+            change = change_of(stored, opacities.detach().to(stored.dtype))
+            info["change"] = torch.where(info["radii"] > 0, change, UNSEEN)
+        if step < self.grow_until:
+            info["means2d"].retain_grad()
+
+    @torch.no_grad()
+    def post_backward(self, step, info, splats, optimizers) -> None:
+        self.shown = None
+        if step >= self.stop:
+            return
+        self._take_statistics(step, info, len(splats["means"]))
+        if step > self.start and step % self.config.refine_every == 0:
+            self._refine(step, splats, optimizers)
+            self._begin_another_window()
+
+    def _take_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
+        """Let the window's maxima be at least the step's."""
+        rows, radii = info["gaussian_ids"], info["radii"]
+        for name in self.state.keys() & {ERROR, WIDTH, CHANGE, CHANGE_BEFORE}:
+            if self.state[name] is None:
+                empty = UNSEEN if name in (CHANGE, CHANGE_BEFORE) else 0.0
+                self.state[name] = torch.full((count,), empty, device=radii.device)
+        values = {WIDTH: radii / float(max(info["width"], info["height"]))}
+        if self.opacity_seen == "peak":
+            values[CHANGE] = info["change"]
+        if step < self.grow_until:
+            x, y = info["means2d"].absgrad.unbind(dim=-1)
+            cameras = info["n_cameras"]  # over which the loss is a mean
+            values[ERROR] = torch.hypot(x * (info["width"] * cameras), y * (info["height"] * cameras)) * (radii > 0)
+        for name, value in values.items():
+            if _is_whole(info, count):
+                torch.maximum(self.state[name], value, out=self.state[name])
+            else:
+                self.state[name].scatter_reduce_(0, rows, value, "amax")
+
+    def _begin_another_window(self) -> None:
+        if CHANGE in self.state:
+            self.state[CHANGE_BEFORE] = self.state[CHANGE]
+            self.state[CHANGE] = torch.full_like(self.state[CHANGE], UNSEEN)
+        self.state[ERROR].zero_()
+        self.state[WIDTH].zero_()
+
+    def seen_opacity(self, opacities: Tensor) -> Tensor:
+        """Stored opacities [N] with the largest change by a view of this window or the one before."""
+        stored = torch.sigmoid(opacities.detach().flatten())
+        changes = [self.state[name] for name in (CHANGE, CHANGE_BEFORE) if self.state.get(name) is not None]
+        return seen_with(stored, torch.stack(changes).amax(dim=0)) if changes else stored
+
+    # What a refinement does.
+
+    def _refine(self, step: int, splats: Splats, optimizers: Optimizers) -> None:
+        """Replace the dead, split where the error is, and take a little from all opacities."""
+        state, count = self.state, len(splats["means"])
+        opacities, wide = self.seen_opacity(splats["opacities"]), state[WIDTH] > WIDEST
+        dead = opacities < DEAD
+        parents = draw((opacities * (state[WIDTH] > 0)).masked_fill(dead, 0.0), int(dead.sum()))
+        places = dead.nonzero()[:, 0][: len(parents)]
+        grown = parents[:0]
+        if step < self.grow_until:
+            weights, wanted = self._candidates(step, count, dead, wide, len(places))
+            grown = draw(weights.index_fill(0, parents, 0.0), min(wanted, self.config.most_splats - count))
+        split(splats, optimizers, torch.cat([parents, grown]), places)
+        source = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
+        for name in state.keys() & {ERROR, WIDTH, CHANGE, CHANGE_BEFORE}:
+            state[name] = state[name][source]
+        stored = torch.sigmoid(splats["opacities"].detach()) - DECAY * (1 - min(step / self.end, 1.0))
+        splats["opacities"].data.copy_(torch.logit(stored.clamp(1e-6, 1 - torch.finfo(stored.dtype).eps)))
+        if self.verbose:
+            print(
+                f"Step {step}: {len(places)} GSs replaced, {len(grown)} split. Now having {len(splats['means'])} GSs."
+            )
+
+    def _candidates(self, step: int, count: int, dead: Tensor, wide: Tensor, replaced: int) -> tuple[Tensor, int]:
+        """Weights [N] by which splats are drawn to be split, and how many are wanted.
+
+        Without a budget: `SHARE` of the splats above the threshold, less those that replace dead ones, and all wide
+        ones. With one, as many as the number lacks of its course N0 + (2x - x^2) (budget - N0), x being the share of
+        growth that is over.
+        """
+        error, budget = self.state[ERROR].masked_fill(dead, 0.0), self.config.budget
+        wide = wide & ~dead
+        if budget:
+            self.state[FIRST] = first = self.state[FIRST] or count
+            x = min((step - self.start) / max(self.grow_until - self.start - self.config.refine_every, 1), 1.0)
+            return error.masked_fill(wide, math.inf), round(first + (2 * x - x * x) * (budget - first)) - count
+        weights = error * (error > self.config.threshold)
+        wanted = max(round(SHARE * int((weights > 0).sum())) - replaced, int(wide.sum()))
+        return weights.masked_fill(wide, math.inf), wanted
+
+
+def _is_whole(info: Mapping[str, Any], count: int) -> bool:
+    """Whether a step's rows are the table's, in its order."""
+    return info["n_cameras"] == 1 and len(info["gaussian_ids"]) == count
+
+
+def draw(weights: Tensor, count: int) -> Tensor:
+    """Draw different rows in proportion to their weights: at most `count`, and as many as have a positive weight.
+
+    Args:
+        weights: [N], not negative.
+
+    Returns:
+        rows, int64 [at most count].
+    """
+    possible = weights.nonzero()[:, 0]
+    count = min(max(count, 0), len(possible))
+    if count == 0:
+        return possible[:0]
+    # The largest of u^(1/w) (Efraimidis and Spirakis 2006): `torch.multinomial` takes no more than 2^24 rows.
+    keys = torch.rand(len(possible), device=weights.device, dtype=torch.float64).log() / weights[possible].double()
+    return possible[keys.topk(count).indices]
+
+
+def halves(splats: Mapping[str, Tensor], rows: Tensor, signs: Tensor) -> dict[str, Tensor]:
+    """What each of two splats has that take the place of one: variances as before along each axis, the longest axis
+    shortened most, and together about as opaque.
+
+    Args:
+        splats: the table.
+        rows: splats to be split, int64 [M].
+        signs: -1 or 1 for each axis, [M, 3].
+
+    Returns:
+        "scales" (log) [M, 3] and "opacities" (logits) [M, 1] of both, "offset" [M, 3] of one's mean, and the other's is
+        its negative.
+    """
+    log_scales = splats["scales"].detach()[rows]
+    scales = log_scales.exp()
+    shrunk = 1 - (1 - math.sqrt(0.5)) * (scales / scales.amax(dim=-1, keepdim=True)) ** 2
+    axes = normalized_quat_to_rotmat(F.normalize(splats["quats"].detach()[rows], dim=-1))
+    local = signs * (1 - shrunk**2).sqrt() * scales
+    logits = splats["opacities"].detach()[rows].double()
+    # log(1 - o') = log(1 - o) / sqrt 2
+    clear = F.logsigmoid(-logits) * math.sqrt(0.5)
+    return {
+        "scales": log_scales + shrunk.log(),
+        "opacities": (torch.log(-torch.expm1(clear)) - clear).to(log_scales.dtype),
+        "offset": torch.einsum("nij,nj->ni", axes, local),
+    }
+
+
+@torch.no_grad()
+def split(splats: Splats, optimizers: Optimizers, rows: Tensor, places: Tensor) -> None:
+    """Split splats in two: one half stays in its row, the other takes one of `places`, or a new row at the end.
+
+    Moments of both are zero. The table's tensors are replaced only if it grows.
+
+    Args:
+        splats: the table.
+        optimizers: of each entry, by its name.
+        rows: different rows, int64 [M].
+        places: rows to be overwritten by the first of them, int64 [at most M], none of them in `rows`.
+    """
+    signs = torch.randint(0, 2, (len(rows), 3), device=rows.device) * 2.0 - 1.0
+    half = halves(splats, rows, signs)
+    taken, new = len(places), len(rows) - len(places)
+
+    def values(name: str, old: Tensor, sign: float) -> Tensor:
+        if name == "means":
+            return old[rows] + sign * half["offset"]
+        return half[name] if name in half else old[rows]
+
+    def overwrite(name: str, table: Tensor) -> None:
+        first, second = values(name, table, 1.0), values(name, table, -1.0)
+        table[rows] = first
+        table[places] = second[:taken]
+        return second[taken:]
+
+    def clear(table: Tensor) -> None:
+        table[rows] = 0.0
+        table[places] = 0.0
+
+    if new == 0:
+        for name, parameter in splats.items():
+            overwrite(name, parameter.data)
+            for value in optimizers[name].state.get(parameter, {}).values():
+                if value.dim() > 0:
+                    clear(value)
+        return
+
+    def grown(name: str, old: Tensor) -> Parameter:
+        table = old.detach().clone()
+        return Parameter(torch.cat([table, overwrite(name, table)]))
+
+    def moments(_: str, old: Tensor) -> Tensor:
+        table = old.clone()
+        clear(table)
+        return torch.cat([table, old.new_zeros(new, *old.shape[1:])])
+
+    _update_param_with_optimizer(grown, moments, splats, optimizers)
