@@ -22,7 +22,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.densification import ErrorGuided, Original
+from nrfgs_ns.densification import ErrorGuided
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.start import with_methods
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS
@@ -117,8 +117,8 @@ nrfgs_fast = preset(
 nrfgs_best = preset(
     "nrfgs-best",
     nrfgs,
-    "nrfgs in 30,000 steps with 3DGS's densification: more splats, time and detail (docs/trade-off.md).",
-    model={"densification": Original()},
+    "nrfgs in 30,000 steps with a finer threshold: more splats, time and detail (docs/trade-off.md).",
+    model={"densification": ErrorGuided(threshold=0.0016)},
     max_num_iterations=STEPS,
     average_steps=AVERAGED,
 )

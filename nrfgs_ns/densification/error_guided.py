@@ -54,6 +54,8 @@ DECAY = 0.004
 """Opacity that the first refinement takes from each splat; the amount falls linearly to 0 over the training."""
 LAYOUT = 30_000
 """Steps of the training that the options' steps belong to."""
+MANY_VIEWS = 210
+"""Training views that double the threshold: their trainings are longer, and more splats would cost them much time."""
 WIDEST = 0.75
 """Radius from which a splat is split whatever its error: three standard deviations, in longer sides of the image."""
 
@@ -69,7 +71,8 @@ class ErrorGuided(DensificationConfig):
     refine_every: int = 200
     """steps between refinements; the views of these are a window"""
     threshold: float = 0.0025
-    """error above which a splat may be split: the smaller, the more splats and detail"""
+    """error above which a splat may be split: the smaller, the more splats and detail. V training views raise it by the
+    factor 1 + (V / 210)^2"""
     budget: int = 0
     """number of splats to grow to, whatever their error (arXiv 2605.16158). 0: the threshold decides"""
     most_splats: int = 2_000_000
@@ -88,7 +91,8 @@ class ErrorGuided(DensificationConfig):
         return replace(self, **shares)
 
     def build(self, num_train_images: int, scene_unit: float) -> "ErrorGuidedDensification":
-        return ErrorGuidedDensification(self)
+        raised = self.threshold * (1 + (num_train_images / MANY_VIEWS) ** 2)
+        return ErrorGuidedDensification(replace(self, threshold=raised))
 
 
 class ErrorGuidedDensification(Densification):

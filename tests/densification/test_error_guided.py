@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
 def rules(**options):
-    strategy = ErrorGuided(**options).build(8, 1.0)
+    strategy = ErrorGuided(**options).build(0, 1.0)
     strategy.verbose = False
     return strategy
 
@@ -59,6 +59,11 @@ def test_the_error_does_not_depend_on_the_unit_of_the_scene():
 def test_the_error_is_the_largest_of_a_view_however_many_there_are():
     assert (errors(64, views=4) >= errors(64, views=2) - 1e-7).all()
     assert_close(errors(64, views=2, cameras_at_once=True), errors(64, views=2), rtol=1e-4, atol=1e-7)
+
+
+def test_many_views_raise_the_threshold():
+    thresholds = [ErrorGuided(threshold=0.001).build(views, 1.0).config.threshold for views in (1, 21, 210, 420)]
+    assert thresholds == pytest.approx([0.001, 0.00101, 0.002, 0.005], rel=1e-3)
 
 
 def test_rows_that_no_camera_sees_change_nothing():
