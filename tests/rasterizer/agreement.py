@@ -19,16 +19,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import pytest
 import reference
 import torch
 from make_gsplat_fixtures import PARAMETERS, Case
 from torch import Tensor
 
+from nrfgs_ns.host import gsplat_version
+
 FLOAT32 = 2.0**-24
-FLOAT64 = (
-    2.0**-45
-)  # the twin works in float64 too, and its plain matrix products lose up to 8 bits on huge or flat splats
+# The twin works in float64 too, and its plain matrix products lose up to 8 bits on huge or flat splats.
+FLOAT64 = 2.0**-45
 RUNS = 6
+BOUNDS = {"cpu": "square", "cuda": "rectangle" if gsplat_version() >= (1, 5) else "square"}
+"""What cuts a splat off on a device; see `reference.project`."""
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+devices = pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, needs_cuda])])
 
 
 @dataclass

@@ -3,6 +3,7 @@
 
 import pytest
 import torch
+from agreement import devices
 from make_gsplat_fixtures import CASES, Case
 from torch.testing import assert_close
 
@@ -25,7 +26,9 @@ def generator(device: str) -> torch.Generator:
     return torch.Generator(device).manual_seed(5)
 
 
-def check(name: str, device: str) -> None:
+@devices
+@pytest.mark.parametrize("name", ["ordinary", "several_cameras", "antialiased"])
+def test_an_image_without_the_splat(name, device):
     """At one pixel and channel the estimate is exact, whatever the sign; over all it is so in the mean."""
     projection, colors, opacities = projected(CASES[name](), device)
     behind = BEHIND.to(device).repeat(projection.n_cameras, 1)
@@ -48,16 +51,3 @@ def check(name: str, device: str) -> None:
     # row's share of it is small.
     assert_close(many[rows], gone.sum(dim=(1, 2, 3, 4)), rtol=0.3, atol=1e-4)
     assert not many.requires_grad and (many >= 0).all()
-
-
-@pytest.mark.parametrize("name", ["ordinary", "several_cameras", "antialiased"])
-def test_an_image_without_the_splat(name):
-    check(name, "cpu")
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("name", ["ordinary", "several_cameras", "antialiased"])
-def test_an_image_without_the_splat_on_the_gpu(name):
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
-    check(name, "cuda")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tiles: which splats can touch which pixels, sorted front to back.
+"""Tiles: the splats that can touch each tile of pixels, front to back.
 
 gsplat lets a splat touch exactly the `tile_size` tiles that its radius square meets. That rule is part of its image (it
 truncates tails at tile borders), so it is kept. Inside these tiles the splats are listed per *sub-tile* of 8 x 8
@@ -48,7 +48,7 @@ class Block(NamedTuple):
 
 @dataclass
 class Footprints:
-    """The splats that can leave a mark, in depth order, and the sub-tiles around them; F of the M projected rows."""
+    """The F of M projected splats that can be seen, in depth order, and the sub-tiles around them."""
 
     tiles_x: int
     tiles_y: int
@@ -64,7 +64,7 @@ class Footprints:
     def whole(self) -> Block:
         """All rows that any splat meets, all columns."""
         if self.rows.numel() == 0:
-            return Block(0, 0, 0, self.tiles_x)
+            return Block(0, 0, 0, 0)
         return Block(int(self.spans[0].min()), int(self.spans[1].max()), 0, self.tiles_x)
 
 
@@ -73,9 +73,9 @@ class TileLists:
     """The (sub-tile, splat) pairs of a block; K pairs."""
 
     tiles: Tensor
-    """Sub-tiles that have splats, as indices into all [C * tiles_y * tiles_x]. [L], int64"""
+    """Sub-tiles that have splats, as indices into all C * tiles_y * tiles_x. [L], int64"""
     start: Tensor
-    """First pair of each of these sub-tiles. [L], int64"""
+    """First pair of each sub-tile. [L], int64"""
     count: Tensor
     """Number of its pairs. [L], int64"""
     splat: Tensor
@@ -105,7 +105,7 @@ def _square_range(centre: Tensor, radius: Tensor, n_tiles: int) -> tuple[Tensor,
 
 
 def footprints(projection: Projection, opacities: Tensor) -> Footprints:
-    """Bound every splat: where gsplat's tiles and its own 1/255 ellipse allow it to be seen. Opacities: [M]."""
+    """Bound every splat, with opacities [M], by gsplat's tiles and by its own 1/255 ellipse."""
     per_tile = TILE_SIZE // SUB_TILE
     width, height = projection.width, projection.height
     tiles_x, tiles_y = -(-width // SUB_TILE), -(-height // SUB_TILE)
@@ -155,7 +155,7 @@ def _clip(spans: Tensor, block: Block) -> Tensor:
 
 
 def split_into_blocks(prints: Footprints, max_pairs: int) -> list[Block]:
-    """Cut the sub-tiles into blocks of at most `max_pairs` pairs (by bounding boxes), or of one sub-tile."""
+    """Blocks of at most `max_pairs` pairs (by bounding boxes), or of one sub-tile, that cover all splats."""
 
     def split(block: Block) -> list[Block]:
         row0, row1, col0, col1 = block
