@@ -8,15 +8,11 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 
 LOOK = "NRFGS_LOOK"
-"""Environment variable: the training photograph whose exposure and colour renderings have; the mean look without it."""
+"""Environment variable: a training photograph's file name; without it, renderings have the photographs' mean look."""
 
 
 def look_asked_for(photograph: PhotographModel) -> int | None:
-    """The photograph that LOOK names; None: the mean look.
-
-    Raises:
-        InputError: it names none of the photographs.
-    """
+    """The index of the photograph that LOOK names, if it is set; InputError if there is no such photograph."""
     name = os.environ.get(LOOK)
     if not name:
         return None
@@ -26,6 +22,6 @@ def look_asked_for(photograph: PhotographModel) -> int | None:
 
 
 def warn_if_asked() -> None:
-    """Say so where a photograph's look is asked for and the model has learnt none."""
+    """Warn if LOOK is set but the model has learnt no photograph's exposure."""
     if name := os.environ.get(LOOK):
         warn(f"{LOOK} is {name!r}, but this model has learnt no photograph's exposure: all renderings have one look.")

@@ -17,7 +17,7 @@ from pytorch_msssim import SSIM
 from torch.testing import assert_close
 
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.pinhole import FixedPinholes, pinhole, world_to_camera
+from nrfgs_ns.model.pinhole import Pinholes, pinhole, world_to_camera
 from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -202,7 +202,7 @@ def test_a_fixed_camera_is_what_a_camera_is(batched):
     camera = Cameras(pose[None], fx=100.5, fy=90.25, cx=50.0, cy=31.0, width=101, height=63)[
         slice(0, 1) if batched else 0
     ]
-    expected, got = pinhole(camera, pose[None], 1), FixedPinholes(torch.device("cpu"))(camera)
+    expected, got = pinhole(camera, pose[None], 1), Pinholes().fixed(camera, torch.device("cpu"))
     assert (got.width, got.height) == (101, 63)
     for mine, theirs in zip(
         (got.viewmat, got.K, got.center), (expected.viewmat, expected.K, expected.center), strict=True
@@ -212,10 +212,10 @@ def test_a_fixed_camera_is_what_a_camera_is(batched):
 
 def test_another_camera_than_a_pinhole_is_drawn_as_one_and_that_is_said_once(capsys):
     """`ns-render camera-path` and the viewer's Render tab offer fisheyes and panoramas."""
-    pinholes = FixedPinholes(torch.device("cpu"))
+    pinholes, cpu = Pinholes(), torch.device("cpu")
     for kind, said in (("PERSPECTIVE", ""), ("EQUIRECTANGULAR", "drawn as pinholes"), ("EQUIRECTANGULAR", "")):
         pose = torch.eye(4)[None, :3]
-        pinholes(Cameras(pose, 50.0, 50.0, 8.0, 8.0, 16, 16, camera_type=CameraType[kind])[0:1])
+        pinholes.fixed(Cameras(pose, 50.0, 50.0, 8.0, 8.0, 16, 16, camera_type=CameraType[kind])[0:1], cpu)
         out = capsys.readouterr().out
         assert said in out and bool(said) == ("Warning" in out)
 
@@ -223,12 +223,12 @@ def test_another_camera_than_a_pinhole_is_drawn_as_one_and_that_is_said_once(cap
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
-    pinholes = FixedPinholes(torch.device("cuda"))
+    pinholes, gpu = Pinholes(), torch.device("cuda")
     camera = Cameras(torch.eye(4)[None, :3], fx=100.0, fy=90.0, cx=50.0, cy=31.0, width=101, height=63)[0:1].to("cuda")
-    first = pinholes(camera)
-    assert pinholes(camera) is first
+    first = pinholes.fixed(camera, gpu)
+    assert pinholes.fixed(camera, gpu) is first
     camera.camera_to_worlds[0, 0, 3] = 7.0
-    assert pinholes(camera).center.tolist() == [7.0, 0.0, 0.0]
+    assert pinholes.fixed(camera, gpu).center.tolist() == [7.0, 0.0, 0.0]
 
 
 def test_world_to_camera_inverts_the_pose_and_flips_y_and_z():
