@@ -156,7 +156,7 @@ def fine_tune(
     """
     model, next_view = pipeline.model, pipeline.datamanager.next_train
     centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
-    noise = ViewNoise.as_long_as(model.noise_factor * camera_spacing(centers), torch.initial_seed())
+    noise = ViewNoise(model.noise_factor * camera_spacing(centers), torch.initial_seed())
     # Latents begin as their own principal components.
     field = with_rank(field, latent_basis(field, weight), field.head.config.latent_dim)
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()

@@ -285,7 +285,7 @@ class NrfgsModel(SplatfactoModel):
         views = TrainingPictures(self, attributes.pipeline.datamanager)
         self.densification.begin(centers, views, self.num_points)
         self.camera_spacing = camera_spacing(centers)
-        self.view_noise = ViewNoise.as_long_as(self.noise_factor * self.camera_spacing, self.view_noise.seed)
+        self.view_noise = ViewNoise(self.noise_factor * self.camera_spacing, self.view_noise.seed)
 
         steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
@@ -451,11 +451,10 @@ class NrfgsModel(SplatfactoModel):
             "head": self.head.name,
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
+            "views": self.num_views,
         }
         if reduced := self.reduced_head:
             state["capacity"] = {"head": reduced}
-        if self.num_views != self.num_train_data:
-            state["views"] = self.num_views
         return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:

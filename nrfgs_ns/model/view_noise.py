@@ -50,18 +50,13 @@ class ViewNoise:
     The noise depends on the seed and the step alone: a resumed training draws the same as the unbroken one.
 
     Args:
-        sigma: standard deviation of each coordinate, world units; 0 for no noise.
+        length: root mean square, world units; 0 for no noise.
         seed: the training's; devices that hold different splats need different ones.
     """
 
-    def __init__(self, sigma: float, seed: int):
-        self.sigma, self.seed = sigma, seed
+    def __init__(self, length: float, seed: int):
+        self.sigma, self.seed = length / math.sqrt(3.0), seed
         self._generators: dict[torch.device, torch.Generator] = {}
-
-    @classmethod
-    def as_long_as(cls, length: float, seed: int) -> "ViewNoise":
-        """Noise of this root mean square length, in world units."""
-        return cls(length / math.sqrt(3.0), seed)
 
     def moved(self, splats: Mapping[str, Tensor], step: int) -> Mapping[str, Tensor]:
         """A table as the head sees it in a training step: with other "means" [N, 3]."""

@@ -10,14 +10,17 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from pytorch_msssim import SSIM
 from torch.testing import assert_close
 
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import Pinholes, pinhole, world_to_camera
+from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -168,17 +171,6 @@ def test_metrics_count_only_what_is_inside_the_mask(build, masked_scene, tiny_sc
     assert masked.model.get_metrics_dict(outputs, batch)["psnr"].item() == pytest.approx(metrics["psnr"], abs=1e-3)
 
 
-def test_loss_counts_only_what_is_inside_the_mask(build, masked_scene):
-    pipeline = build(data=masked_scene)
-    begin_step(pipeline.model, 10**6)  # at full resolution
-    camera, batch = pipeline.datamanager.next_train(0)
-    outputs = pipeline.model(camera)
-    loss = pipeline.model.get_loss_dict(outputs, batch)["main_loss"]
-    outputs["rgb"] = outputs["rgb"].detach().clone()
-    outputs["rgb"][:, :16] = 0.123
-    assert_close(pipeline.model.get_loss_dict(outputs, batch)["main_loss"], loss.detach())
-
-
 def test_training_resolution_follows_the_schedule(build):
     pipeline = build()
     for step, size in ((0, (9, 12)), (3000, (18, 24)), (6000, (36, 48))):
@@ -297,3 +289,44 @@ def test_losses_are_splatfactos(build, masked, regularised):
     for name, gradient in gradients.items():
         error = (gradient - expected_gradients[name]).norm() / expected_gradients[name].norm()
         assert error < 1e-3, (name, error)
+
+
+def residual(model, cameras) -> float:
+    """Root mean square residual over all cameras."""
+    views = [model.project(cameras[index : index + 1]) for index in range(len(cameras))]
+    losses = [model.head.neutral_loss(model.field.splats, view.visible, view.center) for view in views]
+    return torch.stack(losses).mean().sqrt().item()
+
+
+def test_warm_up_quiets_a_loud_field_and_moves_nothing_else(build):
+    pipeline = build("nrfgs", "--pipeline.model.appearance.output-init", "default")
+    model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
+    splats = {name: value.detach().clone() for name, value in model.gauss_params.items()}
+    before = residual(model, cameras)
+    warm_up(model, cameras, steps=50)
+    assert before > 0.01 and residual(model, cameras) < before / 3
+    for name, value in model.gauss_params.items():
+        assert torch.equal(value, splats[name]) and value.grad is None
+    assert all(weight.grad is None for weight in model.head.parameters())
+
+
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+def test_warm_up_leaves_alone_zero_outputs_and_heads_without_weights(build, method):
+    pipeline = build(method)
+    weights = [weight.detach().clone() for weight in pipeline.model.head.parameters()]
+    with CONSOLE.capture() as log:
+        warm_up(pipeline.model, pipeline.datamanager.train_dataset.cameras, steps=50)
+    assert log.get() == ""
+    assert all(torch.equal(a, b) for a, b in zip(weights, pipeline.model.head.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("option, steps", [((), 8), (("--pipeline.model.warmup-steps", "3"), 3)])
+def test_training_starts_with_one_warm_up_step_per_view_or_as_many_as_asked(build, monkeypatch, option, steps):
+    taken = []
+    monkeypatch.setattr("nrfgs_ns.model.model.warm_up", lambda model, cameras, steps: taken.append(steps))
+    pipeline = build("nrfgs", *option)
+    attributes = TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=pipeline, trainer=None)
+    first = pipeline.get_training_callbacks(attributes)[0]
+    for step in range(3):
+        first.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+    assert taken == [steps], "once, before step 0"
