@@ -11,17 +11,18 @@ LOOK = "NRFGS_LOOK"
 """Environment variable: a training photograph's file name; without it, renderings have the photographs' mean look."""
 
 
-def look_asked_for(photograph: PhotographModel) -> int | None:
-    """The index of the photograph that LOOK names, if it is set; InputError if there is no such photograph."""
+def look_asked_for(photograph: PhotographModel | None) -> int | None:
+    """The index of the photograph that LOOK names; None, with a warning, if no exposures have been learnt.
+
+    Raises:
+        InputError: there is no such photograph.
+    """
     name = os.environ.get(LOOK)
     if not name:
+        return None
+    if photograph is None:
+        warn(f"{LOOK} is {name!r}, but this model has learnt no photograph's exposure: all renderings have one look.")
         return None
     if name not in photograph.names:
         raise InputError(f"{LOOK} is {name!r}, which is not a training photograph, such as {photograph.names[0]!r}.")
     return photograph.names.index(name)
-
-
-def warn_if_asked() -> None:
-    """Warn if LOOK is set but the model has learnt no photograph's exposure."""
-    if name := os.environ.get(LOOK):
-        warn(f"{LOOK} is {name!r}, but this model has learnt no photograph's exposure: all renderings have one look.")

@@ -33,7 +33,7 @@ from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.model.initial_splats import initial_splats
-from nrfgs_ns.model.look import look_asked_for, warn_if_asked
+from nrfgs_ns.model.look import look_asked_for
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.pinhole import Pinhole, Pinholes
 from nrfgs_ns.model.renderer import View, composite_view, project_view, projection_options
@@ -85,11 +85,8 @@ class NrfgsModel(SplatfactoModel):
         self.step = 0
         self.crop_box = None
         self.pinholes = Pinholes()
-        self.background_color = (
-            torch.tensor(VISER_BACKGROUND)
-            if config.background_color == "random"
-            else get_color(config.background_color)
-        )
+        is_random = config.background_color == "random"
+        self.background_color = torch.tensor(VISER_BACKGROUND) if is_random else get_color(config.background_color)
         self.densification = self._strategy()
         self.view_noise = ViewNoise(0.0, self._seed)  # until the training cameras are known
 
@@ -480,11 +477,9 @@ class NrfgsModel(SplatfactoModel):
         """
         self._match_head(reduced_config(self.config.appearance, state))
         photographs = photographs_of(state)
-        if photographs is None:
-            self.photograph = None
-            warn_if_asked()
-        elif self.photograph is None:  # a training's optimisers hold it already
-            self.photograph = photographs.to(self.device)
+        if photographs is None or self.photograph is None:  # a training's optimisers hold its own
+            self.photograph = None if photographs is None else photographs.to(self.device)
+        look_asked_for(self.photograph)
         check_compatible(self, state)
         for name, parameter in self.gauss_params.items():
             parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)

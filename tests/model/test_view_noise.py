@@ -52,11 +52,12 @@ def test_duplicates_pairs_and_strays_do_not_decide():
 
 
 def test_noise_has_the_length_that_was_asked_for_and_moves_nothing_else():
-    splats = {"means": torch.zeros(20_000, 3), "latents": torch.ones(20_000, 4)}
+    splats = {"means": torch.zeros(20_000, 3, requires_grad=True), "latents": torch.ones(20_000, 4)}
     moved = ViewNoise(0.3, 42).moved(splats, 7)
     assert moved["means"].square().sum(dim=-1).mean().sqrt().item() == pytest.approx(0.3, rel=0.02)
     assert moved["means"].mean(dim=0).abs().max() < 0.01
     assert moved["latents"] is splats["latents"] and not splats["means"].any()
+    assert (torch.autograd.grad(moved["means"].sum(), splats["means"])[0] == 1).all()
     assert ViewNoise(0.0, 42).moved(splats, 7) is splats
 
 

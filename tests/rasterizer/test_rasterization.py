@@ -3,7 +3,6 @@
 
 import subprocess
 import sys
-from dataclasses import replace
 
 import pytest
 import torch
@@ -31,21 +30,6 @@ def test_background_shines_through_and_has_a_gradient():
     torch.testing.assert_close(render, black + (1 - alphas) * background[:, None, None])
     render.sum().backward()
     torch.testing.assert_close(background.grad, (1 - alphas).sum((1, 2)).expand(1, 3))
-
-
-def test_alpha_is_capped_without_gradient_to_the_shape():
-    """A splat much wider than the image has alpha = o everywhere: 0.999 at most, and then only colour has gradients."""
-    case = replace(CASES["one_splat"](), scales=torch.full((1, 3), 1e3), opacities=torch.tensor([1.0]))
-    leaves = [t.clone().requires_grad_() for t in case.arguments()[:5]]
-    render, alphas, _ = rasterization(*leaves, *case.arguments()[5:])
-    torch.testing.assert_close(alphas, torch.full_like(alphas, 0.999))
-    render.sum().backward()
-    assert all((leaf.grad == 0).all() for leaf in leaves[:4])
-    torch.testing.assert_close(leaves[4].grad, torch.full((1, 3), 0.999 * case.width * case.height))
-    # Just below the cap, the gradient is there.
-    below = torch.tensor([0.9985], requires_grad=True)
-    rasterization(*case.arguments()[:3], below, *case.arguments()[4:])[1].sum().backward()
-    torch.testing.assert_close(below.grad, torch.full((1,), 1.0 * case.width * case.height))
 
 
 def test_other_devices_are_refused():

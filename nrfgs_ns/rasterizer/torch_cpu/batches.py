@@ -58,10 +58,8 @@ class Sheet:
         y, x = (grid.flatten() for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
         self.basis = torch.stack([torch.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])  # [6, P]
 
-        inside_x = (torch.arange(prints.tiles_x * edge) < width).view(1, 1, prints.tiles_x, 1, edge)
-        inside_y = (torch.arange(prints.tiles_y * edge) < height).view(1, prints.tiles_y, 1, edge, 1)
-        inside = (inside_x & inside_y).expand(n_cameras, -1, -1, -1, -1)
-        self.inside = inside.reshape(self.n_tiles, edge * edge).to(dtype)  # 1 in pixels of the image. [C * tiles, P]
+        # 1 in pixels of the images. [C * tiles, P]
+        self.inside = self.tiled(torch.ones(n_cameras, height, width, 1, dtype=dtype)).squeeze(1)
         self.scratch = Scratch(max(batch_elements(), (SLAB + 1) * edge * edge), dtype)
         # The largest number below MIN_ALPHA: threshold_ keeps what is strictly greater.
         self.too_faint = torch.tensor(MIN_ALPHA, dtype=dtype).nextafter(torch.zeros((), dtype=dtype)).item()
