@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a checkpoint's state of the model says about the model, and whether the model can hold it."""
+"""A checkpoint's head and photographs, and whether a model can load it."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -49,25 +49,22 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
         f"{same if written_by == model.head.name else other} Use the config.yml that was saved beside the checkpoint "
         "(--load-config), or the same method and --pipeline.model options as in that training."
     )
-    expected, given = (
-        {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
-        for tensors in (model.state_dict(), state)
-    )
-    for name in sorted(expected, key=lambda name: not name.startswith("gauss_params.")):
-        if name not in given:
-            raise InputError(f"The checkpoint has no '{name}'. {fix}")
-        first = 1 if name.startswith("gauss_params.") else 0
-        if given[name].shape[first:] != expected[name].shape[first:]:
-            raise InputError(
-                f"The checkpoint's '{name}' is of shape {list(given[name].shape)}, this model's of shape "
-                f"{list(expected[name].shape)}. {fix}"
-            )
-    for name, value in given.items():
-        if name not in expected:
-            raise InputError(f"The checkpoint has '{name}', which this model does not know. {fix}")
+    tensors = {name: value for name, value in state.items() if isinstance(value, Tensor)}
+    given, expected = _shapes(tensors), _shapes(model.state_dict())
+    for name in sorted(expected | given, key=lambda name: not name.startswith("gauss_params.")):
+        if given.get(name) != expected.get(name):
+            theirs, ours = given.get(name, "missing"), expected.get(name, "missing")
+            raise InputError(f"'{name}' is {theirs} in the checkpoint and {ours} in this model. {fix}")
+    for name, value in tensors.items():
         if value.numel() > 0 and not torch.isfinite(value).all():
             rows = (~torch.isfinite(value)).reshape(len(value), -1).any(dim=1).nonzero().flatten().tolist()
             raise InputError(
                 f"The checkpoint's '{name}' is not finite in {len(rows)} of {len(value)} rows, first row {rows[0]}. "
                 "Go on from an older one (ns-train --load-step); other commands take it where this one is removed."
             )
+
+
+def _shapes(tensors: Mapping[str, Any]) -> dict[str, list[int]]:
+    """Shapes by name, the splats' without their number."""
+    shapes = {name: list(value.shape) for name, value in tensors.items() if isinstance(value, Tensor)}
+    return {name: shape[1:] if name.startswith("gauss_params.") else shape for name, shape in shapes.items()}

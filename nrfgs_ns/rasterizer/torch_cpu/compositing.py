@@ -212,14 +212,14 @@ def _backward_batch(
 def _backward_block(
     sheet: Sheet, lists: TileLists, work: list[Batch], grad: Tensor, behind: Tensor, absgrad: bool, n_columns: int
 ) -> Tensor:
-    """Gradients of one block with respect to its footprints, in the columns of `_backward_batch`. [F, columns]
+    """Gradients of one block by its footprints, in the columns of `_backward_batch`. [F, columns]
 
     Args:
         work: the batches of its sweep.
         grad: dL/dC. [C * tiles, D, P]
         behind: U behind the last splat; afterwards U in front of the first one. [C * tiles, P]
     """
-    # Gradients in the order of work, and the row of each slot; pairs that no batch reached share a row of 0.
+    # Gradients in the order of work, and the row of each slot; pairs beyond all batches share a row of 0.
     end = sum(batch.pairs.numel() for batch in work)
     gradients = grad.new_empty(end + 1, n_columns)
     gradients[end] = 0
@@ -252,7 +252,7 @@ class _Composite(torch.autograd.Function):
         for block in blocks:
             lists = list_tiles(prints, block)
             work = _sweep(sheet, lists, final, render)
-            # With several blocks, keeping the record of each would undo the bound on memory: they are swept again.
+            # Records of several blocks would undo the bound on memory: the blocks are swept again instead.
             records.append((lists, work) if len(blocks) == 1 else None)
         ctx.save_for_backward(means2d, conics, opacities, colors)
         ctx.sheet, ctx.blocks, ctx.records, ctx.absgrad = sheet, blocks, records, absgrad

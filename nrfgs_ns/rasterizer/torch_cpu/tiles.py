@@ -38,7 +38,7 @@ REACH_SLACK = 1e-3  # added to s: covers the rounding of sigma in float32 (below
 
 
 class Block(NamedTuple):
-    """A rectangle of sub-tiles. Rows of all cameras are stacked: row = camera * tiles_y + y."""
+    """A rectangle of sub-tiles. All cameras' rows are stacked: row = camera * tiles_y + y."""
 
     row0: int
     row1: int
@@ -50,15 +50,11 @@ class Block(NamedTuple):
 class Footprints:
     """The F of M projected splats that can be seen, in depth order, and the sub-tiles around them."""
 
-    tiles_x: int
-    tiles_y: int
-    """Sub-tiles per image row and column."""
-    rows: Tensor
-    """Row of the projection. [F], int64"""
-    shape: Tensor
-    """Centre x, y (from the top of the first of the stacked images), conic a, b, c, ln(opacity). [6, F], float64"""
-    spans: Tensor
-    """Bounding box in sub-tiles of the stacked images: first and end row, first and end column. [4, F], int64"""
+    tiles_x: int  # sub-tiles per image row
+    tiles_y: int  # and column
+    rows: Tensor  # rows of the projection. [F], int64
+    shape: Tensor  # centre x, y (from the top of the stacked images), conic a, b, c, ln(opacity). [6, F], float64
+    spans: Tensor  # first and end row, first and end column in sub-tiles of the stacked images. [4, F], int64
 
     @property
     def whole(self) -> Block:
@@ -70,32 +66,23 @@ class Footprints:
 
 @dataclass
 class TileLists:
-    """The (sub-tile, splat) pairs of a block; K pairs."""
+    """The K (sub-tile, splat) pairs of a block."""
 
-    tiles: Tensor
-    """Sub-tiles that have splats, as indices into all C * tiles_y * tiles_x. [L], int64"""
-    start: Tensor
-    """First pair of each sub-tile. [L], int64"""
-    count: Tensor
-    """Number of its pairs. [L], int64"""
-    splat: Tensor
-    """Footprint of each pair, sorted by sub-tile, then depth; last F, for a pair K to pad lists with. [K + 1], int64"""
-    slot: Tensor
-    """Position of each pair when sorted by splat instead: where its gradient is collected; then K. [K + 1], int64"""
-    splat_start: Tensor
-    """First slot of each footprint. [F], int64"""
+    tiles: Tensor  # sub-tiles that have splats, as indices into all C * tiles_y * tiles_x. [L], int64
+    start: Tensor  # first pair of each sub-tile. [L], int64
+    count: Tensor  # number of its pairs. [L], int64
+    splat: Tensor  # footprint of each pair, sorted by sub-tile, then depth; F for pair K, the padding. [K + 1], int64
+    slot: Tensor  # place of each pair when sorted by splat, where its gradient is collected; then K. [K + 1], int64
+    splat_start: Tensor  # first slot of each footprint. [F], int64
 
     @property
     def n_pairs(self) -> int:
-        """K."""
         return self.splat.numel() - 1
 
 
 def _inclusive_range(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """Sub-tiles [first, end) that have a pixel centre in [low, high] (pixels, float64). Centres lie at +0.5."""
-    first = torch.ceil((low - (SUB_TILE - 0.5)) / SUB_TILE)
-    end = torch.floor((high - 0.5) / SUB_TILE) + 1
-    return first, end
+    return torch.ceil((low - (SUB_TILE - 0.5)) / SUB_TILE), torch.floor((high - 0.5) / SUB_TILE) + 1
 
 
 def _square_range(centre: Tensor, radius: Tensor, n_tiles: int) -> tuple[Tensor, Tensor]:
@@ -147,7 +134,7 @@ def footprints(projection: Projection, opacities: Tensor) -> Footprints:
 
 
 def _clip(spans: Tensor, block: Block) -> Tensor:
-    """Spans within a block; a splat outside gets an empty row range. [4, F]"""
+    """Spans within a block, with an empty range of rows for splats outside. [4, F]"""
     row0, row1 = spans[0].clamp(min=block.row0), spans[1].clamp(max=block.row1)
     col0, col1 = spans[2].clamp(min=block.col0), spans[3].clamp(max=block.col1)
     row1 = torch.where(col0 < col1, row1.maximum(row0), row0)
@@ -185,8 +172,8 @@ def list_tiles(prints: Footprints, block: Block) -> TileLists:
     splat = torch.repeat_interleave(n_rows, output_size=total)
     row = torch.arange(total) + (row0 - row_end + n_rows).index_select(0, splat)
 
-    # The interval of columns that the ellipse covers on the pixel rows [y0, y1] of each: on the line dy of a splat,
-    # dx = slope dy -+ sqrt(widest - narrowing dy^2).
+    # The columns that the ellipse covers on the pixel rows [y0, y1]: on the line dy, dx = slope dy -+ sqrt(widest -
+    # narrowing dy^2).
     x, y, a, b, c, log_opacity = prints.shape
     det = a * c - b * b
     reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
