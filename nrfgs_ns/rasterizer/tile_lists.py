@@ -222,15 +222,13 @@ class FixedRoom:
         try:
             yield
         finally:
-            rooms.pop(device)
-            if usual is not None:
-                rooms[device] = usual
+            rooms[device] = usual
 
 
 def room_on(device: torch.device) -> Room | FixedRoom:
     """The room on a GPU for the images of this thread."""
     rooms = _ROOMS.__dict__
-    if device not in rooms:
+    if rooms.get(device) is None:
         rooms[device] = Room()
     return rooms[device]
 
