@@ -148,7 +148,7 @@ def list_kernel(
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
     left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
     left_over = tl.where(real, at - begin, -1).to(tl.int32)  # tiles of the splat before the pair's, in rows to come
-    # In one tile, what is not real would keep that tile's threads busy for longer than the image takes.
+    # Spread over a row: in a single tile, spare pairs would keep its threads busy for longer than the image takes.
     tile = width * height + at % width
     row = top
     while tl.max(tl.where(row < bottom, left_over, -1), axis=0) >= 0:

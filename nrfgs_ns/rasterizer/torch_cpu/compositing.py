@@ -5,7 +5,7 @@ Forward. Splat k (nearest first) covers a pixel centre x with
 
     alpha_k = min(0.999, exp(l_k)),    l_k = ln o_k - sigma_k,    sigma_k = (x - m_k)^T Q_k (x - m_k) / 2,
 
-counted as 0 below 1/255. What is left of the light behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat
+counted as 0 below 1/255. The light that is left behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat
 that would push T_k to 1e-4 or below ends the pixel: it and all behind it are not drawn, as if their alpha were 0. Then
 
     C = sum_k w_k c_k,    A = 1 - T_n,    w_k = alpha_k T_{k-1}.
