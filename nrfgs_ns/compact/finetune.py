@@ -18,6 +18,7 @@ from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
+from nrfgs_ns.model.loss import photometric
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 
 EVERY = 4
@@ -134,7 +135,7 @@ def without_them(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]
         (of_signs,) = torch.autograd.grad((off * signs).sum(), gates)
         growth += of_signs.square() - of_error
         error += squared.detach()
-        loss += (model.photometric_loss(outputs, batch).detach() - loss) / number
+        loss += (photometric(model, outputs, batch).detach() - loss) / number
     return growth / error, float(loss)
 
 
@@ -155,7 +156,7 @@ def fine_tune(
     """
     model, next_view = pipeline.model, pipeline.datamanager.next_train
     centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
-    noise = ViewNoise.as_long_as(model.noise_factor * camera_spacing(centers), torch.initial_seed())
+    noise = ViewNoise(model.noise_factor * camera_spacing(centers), torch.initial_seed())
     # Latents begin as their own principal components.
     field = with_rank(field, latent_basis(field, weight), field.head.config.latent_dim)
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
@@ -192,7 +193,7 @@ def fine_tune(
         tables = coded(rounded=step >= NOISY * steps)
         splats = coded.splats(tables)
         outputs, _ = model.render(Field(head, splats), camera, Field(head, noise.moved(splats, step)))
-        loss = model.photometric_loss(outputs, batch)
+        loss = photometric(model, outputs, batch)
         if step % EVERY == 0:
             bits = coded.bits(tables).sum()
             loss = loss + EVERY * of_bits * bits

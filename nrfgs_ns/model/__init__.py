@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model: nerfstudio's hooks, how a camera is rendered, the loss, what a checkpoint holds."""
+"""The model: nerfstudio's hooks, rendering, the loss, checkpoints."""

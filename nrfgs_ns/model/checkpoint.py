@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a checkpoint must satisfy before it is loaded."""
+"""A checkpoint's head and photographs, and whether a model can load it."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -10,24 +10,27 @@ from torch import Tensor, nn
 
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.photograph import PhotographModel
 
 
 def reduced_config(config: AppearanceHeadConfig, state: Mapping[str, Any]) -> AppearanceHeadConfig:
-    """The configuration of the head that a checkpoint was written with.
-
-    Args:
-        config: the model's.
-        state: the checkpoint's state of the model; its "capacity" says in which options its head differs, if it does.
-    """
-    found = state.get("_extra_state", {}).get("capacity", {}).get("head", {})
-    is_this_head = found.keys() <= {one.name for one in fields(config)}
-    return replace(config, **found) if is_this_head else config
+    """A head's configuration with the options that a checkpoint's head has set differently ("capacity")."""
+    reduced = state.get("_extra_state", {}).get("capacity", {}).get("head", {})
+    is_this_head = reduced.keys() <= {field.name for field in fields(config)}
+    return replace(config, **reduced) if is_this_head else config
 
 
 def differences(config: AppearanceHeadConfig, other: AppearanceHeadConfig) -> dict[str, Any]:
-    """The options in which another configuration of the same head differs from one, as `reduced_config` wants them."""
-    names = [one.name for one in fields(config)]
+    """The options by which `other`, of the same head, differs from `config`, as `reduced_config` takes them."""
+    names = [field.name for field in fields(config)]
     return {name: getattr(other, name) for name in names if getattr(other, name) != getattr(config, name)}
+
+
+def photographs_of(state: Mapping[str, Any]) -> PhotographModel | None:
+    """The photographs' exposures in a checkpoint, if they were learnt."""
+    prefix = "photograph."
+    known = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    return PhotographModel.from_state(known) if known else None
 
 
 def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
@@ -46,25 +49,22 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
         f"{same if written_by == model.head.name else other} Use the config.yml that was saved beside the checkpoint "
         "(--load-config), or the same method and --pipeline.model options as in that training."
     )
-    expected = {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
-    given = {name: value for name, value in state.items() if isinstance(value, Tensor)}
-    splats_first = sorted(expected, key=lambda name: not name.startswith("gauss_params."))
-    for name in splats_first:
-        if name not in given:
-            raise InputError(f"The checkpoint has no '{name}'. {fix}")
-        rows = 1 if name.startswith("gauss_params.") else 0
-        if given[name].shape[rows:] != expected[name].shape[rows:]:
-            raise InputError(
-                f"The checkpoint's '{name}' is of shape {list(given[name].shape)}, this model's of shape "
-                f"{list(expected[name].shape)}. {fix}"
-            )
-    for name in given:
-        if name not in expected:
-            raise InputError(f"The checkpoint has '{name}', which this model does not know. {fix}")
-    for name, value in given.items():
+    tensors = {name: value for name, value in state.items() if isinstance(value, Tensor)}
+    given, expected = _shapes(tensors), _shapes(model.state_dict())
+    for name in sorted(expected | given, key=lambda name: not name.startswith("gauss_params.")):
+        if given.get(name) != expected.get(name):
+            theirs, ours = given.get(name, "missing"), expected.get(name, "missing")
+            raise InputError(f"'{name}' is {theirs} in the checkpoint and {ours} in this model. {fix}")
+    for name, value in tensors.items():
         if value.numel() > 0 and not torch.isfinite(value).all():
             rows = (~torch.isfinite(value)).reshape(len(value), -1).any(dim=1).nonzero().flatten().tolist()
             raise InputError(
                 f"The checkpoint's '{name}' is not finite in {len(rows)} of {len(value)} rows, first row {rows[0]}. "
                 "Go on from an older one (ns-train --load-step); other commands take it where this one is removed."
             )
+
+
+def _shapes(tensors: Mapping[str, Any]) -> dict[str, list[int]]:
+    """Shapes by name, the splats' without their number."""
+    shapes = {name: list(value.shape) for name, value in tensors.items() if isinstance(value, Tensor)}
+    return {name: shape[1:] if name.startswith("gauss_params.") else shape for name, shape in shapes.items()}

@@ -12,17 +12,17 @@ from nerfstudio.models.base_model import ModelConfig
 
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.densification import DensificationChoice, DensificationConfig, Splatfacto
+from nrfgs_ns.densification import DensificationChoice, Splatfacto
 from nrfgs_ns.errors import InputError
 
 MODEL = "nrfgs_ns.model.model:NrfgsModel"
-"""The class that these are the options of, which imports them."""
+"""The model's class, which imports this module."""
 PRIOR_VIEWS = 20
-"""Training views with which `few_views` trusts the head by a half."""
+"""Training views with which `few_views` halves the trust in the head."""
 HALVING_VIEWS = 12
 """Training views that halve `shrinkage`."""
 NEGLIGIBLE = 1e-6
-"""Weights of shrinkage below it are treated as zero: Adam makes whole steps of any for splats that no view sees."""
+"""Weights of shrinkage below this are zero: Adam makes whole steps of any for splats that no view sees."""
 EPSILON = math.ulp(1.0)
 
 
@@ -93,41 +93,17 @@ class NrfgsModelConfig(ModelConfig):
     sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
     def check(self) -> None:
-        """Raise InputError where an option is out of range. The head checks its own when it is built."""
-        if not isinstance(self.appearance, AppearanceHeadConfig):
-            raise InputError(
-                f"pipeline.model.appearance is {self.appearance!r}, which is not the configuration of an appearance "
-                "head. Use one from nrfgs_ns.appearance, such as NrfConfig or ShConfig."
-            )
-        if not isinstance(self.densification, DensificationConfig):
-            raise InputError(
-                f"pipeline.model.densification is {self.densification!r}, which is not a strategy's configuration. Use "
-                "one from nrfgs_ns.densification, such as Splatfacto or Mcmc."
-            )
+        """Raise InputError where a number is out of range. The head checks its own options when it is built; types and
+        choices are checked where a configuration is read (`training/config_file.py`)."""
         self.densification.check()
-        for name, choices in (
-            ("few_views", ("auto", "off")),
-            ("dense_start", ("auto", "off")),
-            ("near_plane", ("auto", "off")),
-            ("rasterize_mode", ("classic", "antialiased")),
-            ("background_color", ("random", "black", "white")),
-        ):
-            if getattr(self, name) not in choices:
-                fix = " or ".join(map(repr, choices))
-                raise InputError(f"pipeline.model.{name} is {getattr(self, name)!r}; use {fix}.")
         for names, low, high, needed in (
-            (
-                ("view_noise", "shrinkage", "warmup_steps", "num_downscales", "max_gauss_ratio"),
-                0,
-                math.inf,
-                "zero or positive",
-            ),
-            (("ssim_lambda",), 0, 1 + EPSILON, "from 0 to 1"),
-            (("robust_loss",), 0, 1, "at least 0 and below 1"),
-            (("random_scale",), EPSILON, math.inf, "positive"),
-            (("resolution_schedule", "num_random"), 1, math.inf, "at least 1"),
+            ("view_noise shrinkage warmup_steps num_downscales max_gauss_ratio", 0, math.inf, "zero or positive"),
+            ("ssim_lambda", 0, 1 + EPSILON, "from 0 to 1"),
+            ("robust_loss", 0, 1, "at least 0 and below 1"),
+            ("random_scale", EPSILON, math.inf, "positive"),
+            ("resolution_schedule num_random", 1, math.inf, "at least 1"),
         ):
-            for name in names:
+            for name in names.split():
                 value = getattr(self, name)
                 if value is not None and not low <= value < high:
                     raise InputError(f"pipeline.model.{name} is {value}; it must be {needed}.")

@@ -1,29 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Any appearance head as spherical harmonics of degree 3, the only view dependence that a 3DGS file can hold.
+r"""Spherical harmonics of degree 3, all that a 3DGS file can hold, fitted to any appearance head.
 
-Training view v sees splat i from the unit direction d_v with the colour y_v that the head gives it there. How much of
-the picture it is, is the weight
+Training view v sees splat i from the unit direction d_v with the head's colour y_v. Its weight is the splat's
+contribution to the picture,
 
     w_v = sum over pixels of alpha T,
 
-the splat's own share of each pixel times the light that reaches it: exactly what the rasterizer multiplies its colour
-with, so it comes from the rasterizer's derivative with respect to that colour. With base colour c, harmonics Y(d) (16)
-and coefficients k (16 for each channel), which start from the base colour, k = k_c + delta,
+from the rasterizer's derivative with respect to the colour. With base colour c, harmonics Y(d) (16) and coefficients k
+(16 for each channel), which start from the base colour, k = k_c + delta,
 
     minimise over delta    sum_v (n w_v / W) |y_v - c - Y(d_v) delta|^2 + strength |delta|^2,
 
     W = sum_v w_v,    n = W^2 / sum_v w_v^2.
 
-n is the number of equal views that would tell as much (Kish's effective sample size), so the data term counts views,
-and `strength` is in views too: seen once, a splat moves 16 / (4 pi) / (16 / (4 pi) + strength) of the way from its base
-colour to what was seen; never seen, it keeps its base colour. In Bayes' terms strength = (variance of what degree 3
-cannot show) / (variance of a coefficient), and the right one depends on the scene. It is not set but found: every
-eighth view is held out, the others are fitted with each of `STRENGTHS`, and the one is taken that predicts the held-out
-colours, weighted as above, with the least squared error. All views are then fitted with it. For a head that is
-harmonics already the smallest strength wins and the fit is exact to 1e-8 of the coefficients.
+n is Kish's effective sample size, so the data term counts views, and `strength` is in views, too: seen once, a splat
+moves 16 / (4 pi) / (16 / (4 pi) + strength) of the way from its base colour to the seen one; never seen, it keeps its
+base colour. In Bayes' terms strength = (variance that degree 3 cannot show) / (variance of a coefficient), which
+depends on the scene. So every eighth view is held out, the others are fitted with each of `STRENGTHS`, and the one with
+the least weighted squared error on the held-out colours is used for all views. For a head that is harmonics in disguise
+the smallest strength wins and the fit is exact to 1e-8 of the coefficients.
 
-Opacity is the mean of the head's over the views whose picture the splat is in, each counted once. With the weights w_v,
-views in which the splat is all but transparent would not count, and a file would show it there.
+Opacity is the mean of the head's over the views that see the splat, unweighted. With the weights w_v, views in which
+the splat is all but transparent would not count, and a file would show it there.
 """
 
 import math
@@ -46,28 +44,25 @@ BASES = num_bases(DEGREE)
 STRENGTHS = tuple(10.0**power for power in range(-8, 3))
 """Ridges to choose from, in views. The lowest is far above float64's rounding, the highest leaves the base colour."""
 LONE_STRENGTH = 1.0
-"""Ridge where no view can be held out, in views: the base colour counts like one view."""
+"""Ridge where no view can be held out, in views."""
 HOLD_OUT_EVERY = 8
-"""Every eighth view is held out while the strength is chosen, as in the split into training and test images."""
 TUNING_SPLATS = 1 << 14
-"""Splats, evenly spread over the table, on which the strength is chosen: enough for a sum, and 60 MB."""
+"""Splats, evenly spread over the table, on which the strength is chosen: 60 MB."""
 LONGEST_SIDE = 1600
-"""Views are halved until no side is longer, pixels: nerfstudio does that to its training images by default."""
-SPLATS_AT_ONCE = 1 << 20
-"""Splats whose sums are held in memory, at 1.6 GB; the views are rendered again for the next as many."""
+"""Views are halved until no side is longer, in pixels, as nerfstudio's training images are by default."""
 ROWS_AT_ONCE = 1 << 15
-"""Rows of a view, or splats of a solution, that are worked on together: a few hundred MB."""
+"""Rows of a view, or splats of a solution, that are computed together: a few hundred MB."""
 OPAQUE = 1.0 - 1e-6
-"""Largest opacity that is written. Its logit is finite; the rasterizer caps alpha at 0.999."""
+"""Largest opacity that is written: its logit is finite."""
 
 
 class PlainSplats(NamedTuple):
-    """N splats as a 3DGS file holds them. The names are those of the model's tables."""
+    """N splats as in a 3DGS file, under the names of the model's tables."""
 
     means: Tensor
     """[N, 3], world units"""
     quats: Tensor
-    """rotations (w, x, y, z) of unit length; NaN where there was none. [N, 4]"""
+    """rotations (w, x, y, z) of unit length, or NaN. [N, 4]"""
     scales: Tensor
     """logarithms of the standard deviations. [N, 3]"""
     opacities: Tensor
@@ -83,22 +78,22 @@ class Fit(NamedTuple):
 
     splats: PlainSplats
     exact: bool
-    """nothing was fitted: the head is harmonics"""
+    """the head is harmonics, which are copied"""
     strength: float | None
     """the chosen ridge, in views; None if exact"""
     views: int
-    """training views that were looked through"""
+    """number of training views"""
     unseen: int
-    """splats that no training view sees: they have their base colour"""
+    """splats that no training view sees, which keep their base colour"""
 
 
 class Observations(NamedTuple):
-    """What one view tells of M splats."""
+    """M splats as seen in one view."""
 
     rows: Tensor
-    """of the table, ascending. [M]"""
+    """rows of the table, ascending. [M]"""
     weights: Tensor
-    """w of the module's docstring, pixels; 0 of what is hidden or transparent. [M]"""
+    """w of the module's docstring, pixels; 0 if hidden or transparent. [M]"""
     bases: Tensor
     """harmonics of the direction from camera to splat. [M, 16]"""
     residuals: Tensor
@@ -107,15 +102,15 @@ class Observations(NamedTuple):
     """the head's opacity. [M]"""
 
     def where(self, keep: Tensor, rows: Tensor) -> "Observations":
-        """Those with `keep` [M] True, for other rows [M] of another table."""
+        """Those with `keep` [M] True, under other row numbers [M]."""
         return Observations(rows[keep], *(value[keep] for value in self[1:]))
 
 
 class Moments:
-    """Weighted sums over views from which the fit of `count` splats follows, in float64.
+    """Weighted sums over views that determine the fit of `count` splats, in float64: 1.6 GB for a million.
 
-    The gram matrix of directions in a narrow cone is nearly singular: in float32 its rounding would have to be covered
-    by a ridge of 1e-6 views, which is 1e-3 of the coefficients in the picture.
+    The gram matrix of directions in a narrow cone is nearly singular: float32 would need a ridge of 1e-6 views, which
+    changes the coefficients by 1e-3.
     """
 
     def __init__(self, count: int, device: torch.device):
@@ -132,7 +127,7 @@ class Moments:
         self.views = zeros()
 
     def add(self, seen: Observations) -> None:
-        """Add a view. No row may occur twice in it."""
+        """Add a view, in which no row occurs twice."""
         self.opacity.index_add_(0, seen.rows, seen.opacities.double())
         self.views.index_add_(0, seen.rows, torch.ones_like(seen.opacities, dtype=torch.float64))
         seen = seen.where(seen.weights > 0, seen.rows)
@@ -147,7 +142,7 @@ class Moments:
             self.weight_squared.index_add_(0, part.rows, weights.square())
 
     def full_gram(self, rows: slice) -> Tensor:
-        """Both triangles of some splats' gram matrices, [count, 16, 16]."""
+        """Gram matrices of some splats, [count, 16, 16]."""
         gram = self.gram[rows]
         full = gram.new_zeros(len(gram), BASES, BASES)
         full[:, self.upper[0], self.upper[1]] = gram
@@ -155,7 +150,7 @@ class Moments:
         return full
 
     def solve(self, strength: float) -> Tensor:
-        """Delta of the module's docstring, [count, 16, 3]; 0 for what was not seen."""
+        """Delta of the module's docstring, [count, 16, 3]; 0 for unseen splats."""
         views_per_weight = self.weight / self.weight_squared.clamp_min(torch.finfo(torch.float64).tiny)  # n / W
         ridge = strength * torch.eye(BASES, dtype=torch.float64, device=self.gram.device)
         solution = torch.empty_like(self.target)
@@ -174,15 +169,13 @@ class Moments:
 
 @torch.no_grad()
 def fit_harmonics(model, cameras: Cameras) -> Fit:
-    """Fit harmonics of degree 3 and one opacity to each splat of a model.
+    """Fit harmonics of degree 3 and one opacity to each splat of a model, on its device.
+
+    The coefficients of a head that is harmonics are copied, with zeros for the degrees that it does not have.
 
     Args:
         model: an NrfgsModel in evaluation mode.
         cameras: the training cameras, [V].
-
-    Returns:
-        On the model's device. A head that is harmonics is not fitted: its coefficients are handed through, with zeros
-        for the degrees that it does not have.
     """
     splats = {name: value.detach() for name, value in model.gauss_params.items()}
     plain = PlainSplats(
@@ -198,46 +191,39 @@ def fit_harmonics(model, cameras: Cameras) -> Fit:
         plain.features_rest[:, : rest.shape[1]] = rest
         return Fit(plain, exact=True, strength=None, views=0, unseen=0)
 
-    count = len(plain.means)
-    plain = plain._replace(opacities=plain.opacities.clone(), features_dc=plain.features_dc.clone())
+    count, device = len(plain.means), model.device
     stride = -(-count // TUNING_SPLATS)
-    kept, held_out = (Moments(-(-count // stride), model.device) for _ in range(2))
+    moments, kept, held_out = (Moments(size, device) for size in (count, -(-count // stride), -(-count // stride)))
     hold_out_every = min(HOLD_OUT_EVERY, len(cameras))
-    groups = range(0, count, SPLATS_AT_ONCE)
-    unseen, strength = 0, LONE_STRENGTH
-    with progress("Fitting harmonics", len(groups) * len(cameras)) as advance:
-        for first in groups:
-            last = min(first + SPLATS_AT_ONCE, count)
-            moments = Moments(last - first, model.device)
-            for index in range(len(cameras)):
-                seen = observe(model, cameras[index : index + 1])
-                moments.add(seen.where((seen.rows >= first) & (seen.rows < last), seen.rows - first))
-                if first == 0:
-                    tuning = held_out if index % hold_out_every == hold_out_every - 1 else kept
-                    tuning.add(seen.where(seen.rows % stride == 0, seen.rows // stride))
-                advance()
-            if first == 0:
-                strength = choose_strength(kept, held_out)
-            delta = moments.solve(strength).to(plain.means.dtype)
-            plain.features_dc[first:last] += delta[:, 0]
-            plain.features_rest[first:last] = delta[:, 1:]
-            unseen += int((moments.weight == 0).sum())
-            mean = moments.opacity / moments.views.clamp_min(1.0)
-            logits = torch.logit(mean.clamp(1.0 - OPAQUE, OPAQUE)).to(plain.means.dtype)[:, None]
-            in_a_picture = moments.views[:, None] > 0
-            plain.opacities[first:last] = torch.where(in_a_picture, logits, plain.opacities[first:last])
+    with progress("Fitting harmonics", len(cameras)) as advance:
+        for index in range(len(cameras)):
+            seen = observe(model, cameras[index : index + 1])
+            moments.add(seen)
+            tuning = held_out if index % hold_out_every == hold_out_every - 1 else kept
+            tuning.add(seen.where(seen.rows % stride == 0, seen.rows // stride))
+            advance()
+    strength = choose_strength(kept, held_out)
+    delta = moments.solve(strength).to(plain.means.dtype)
+    mean = moments.opacity / moments.views.clamp_min(1.0)
+    logits = torch.logit(mean.clamp(1.0 - OPAQUE, OPAQUE)).to(plain.means.dtype)[:, None]
+    plain = plain._replace(
+        opacities=torch.where(moments.views[:, None] > 0, logits, plain.opacities),
+        features_dc=plain.features_dc + delta[:, 0],
+        features_rest=delta[:, 1:].contiguous(),
+    )
+    unseen = int((moments.weight == 0).sum())
     return Fit(plain, exact=False, strength=strength, views=len(cameras), unseen=unseen)
 
 
 def choose_strength(kept: Moments, held_out: Moments) -> float:
-    """The ridge with which a fit of the kept views predicts the held-out ones best; see the module's docstring."""
+    """The ridge with which a fit of the kept views predicts the held-out ones best."""
     if not (bool((kept.weight > 0).any()) and bool((held_out.weight > 0).any())):
         return LONE_STRENGTH
     return min(STRENGTHS, key=lambda strength: held_out.squared_error(kept.solve(strength)))
 
 
 def observe(model, camera: Cameras) -> Observations:
-    """What one training view tells of the splats that can be seen in it."""
+    """The visible splats of one training view."""
     field = model.field
     view, appearance, weights = look_through(model, field, camera)
     towards = field.splats["means"].index_select(0, view.visible) - view.center
@@ -251,10 +237,10 @@ def observe(model, camera: Cameras) -> Observations:
 
 
 def look_through(model, field: Field, camera: Cameras) -> tuple[View, SplatAppearance, Tensor]:
-    """What one training view sees of a model's field: its M splats, their looks, and what they contribute [M].
+    """The M splats that a training view sees, their appearance, and their contributions to the picture, [M].
 
     Args:
-        camera: a batch of one, [1]; halved until it is small enough.
+        camera: a batch of one, [1]; halved as by `no_larger`.
     """
     view = model.project(no_larger(camera.to(model.device)), field.splats)
     appearance = field.seen_from(view)
@@ -262,7 +248,7 @@ def look_through(model, field: Field, camera: Cameras) -> tuple[View, SplatAppea
 
 
 def no_larger(camera: Cameras) -> Cameras:
-    """A camera [1] halved until no side is longer than LONGEST_SIDE pixels; it is changed itself."""
+    """Halve a camera [1], in place, until no side is longer than LONGEST_SIDE pixels."""
     longest = max(int(camera.width.max()), int(camera.height.max()))
     halvings = max(math.ceil(math.log2(longest / LONGEST_SIDE)), 0)
     if halvings > 0:

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fitted harmonics (`harmonics_fit.py`), trained for some steps to draw what the model draws.
+"""Fine-tuning of fitted harmonics (`harmonics_fit.py`), so that a file's pictures are closer to the model's.
 
-The fit asks each splat alone. A splat whose opacity changes with the view has one opacity in a file, which is right for
-few of them; its colour and its neighbours' can make up for much of that. So opacities and harmonics descend the squared
-difference between the file's picture and the model's, one view a step. Means, rotations and scales stay, and no
-photograph is asked for: each picture is taken from beside where a photograph was, because the model can be asked there,
-and a file that only knows the photographs' places is worse between them.
+The fit treats each splat alone, and gives it one opacity even if the model's changes with the view; its colour and its
+neighbours' can make up for much of that. So opacities and harmonics descend the squared difference between the file's
+picture and the model's, one view a step. Means, rotations and scales stay, and no photographs are needed: pictures are
+taken beside the training cameras, since a file tuned at these alone is worse between them.
 """
 
 import math
@@ -24,18 +23,18 @@ from nrfgs_ns.progress import progress
 STEPS, STEPS_ON_A_CPU, STEPS_OF_A_VIEW = 2500, 400, 10
 """Steps, of one view each. A GPU takes seconds; a CPU makes STEPS_OF_A_VIEW for each view, at most STEPS_ON_A_CPU."""
 RATES = {"opacities": 3.0, "features_dc": 0.15, "features_rest": 0.15}
-"""Learning rates to begin with, where pictures are off by 1 (root of the mean square), and in proportion where they are
-off by less: Adam's steps are no shorter there. They fall to 0 by half a cosine."""
+"""Initial learning rates, times the root mean square difference of the pictures: Adam's steps do not shrink with it.
+They fall to 0 by half a cosine."""
 MOVED = 0.5
-"""How far from a photograph's place a picture is taken, in distances between such places; root of the mean square."""
+"""Root mean square distance of a picture from a training camera, in the cameras' spacing."""
 
 
 def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = None) -> PlainSplats:
-    """Splats as a file holds them whose pictures are nearer to a model's.
+    """Change splats so that their pictures are closer to a model's.
 
     Args:
         model: an NrfgsModel in evaluation mode.
-        splats: one for each of the model's, with its means, rotations and scales. On its device.
+        splats: the fit of the model's own, on its device.
         cameras: the training cameras, [V].
         steps: number of steps; None: as the device allows. 0 leaves the splats as they are.
     """
@@ -52,12 +51,12 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
         return composite_view(view, of.seen_from(view), background, with_depth=False)[0]["rgb"]
 
     def off_by(index: int, sigma: float) -> torch.Tensor:
-        """The mean squared difference at a training view, or beside it."""
+        """Mean squared difference of the pictures `sigma` beside a training view."""
         camera = no_larger(cameras[index : index + 1].to(model.device))
         moved = sigma * torch.randn(3, 1, generator=generator)
         camera.camera_to_worlds = camera.camera_to_worlds + pad(moved, (3, 0)).to(model.device)
         with torch.no_grad():
-            view = model.project(camera, file.splats)  # of both: nothing of the geometry is trained
+            view = model.project(camera, file.splats)  # the same for both: geometry is not trained
             target = picture(field, view)
         return (picture(file, view) - target).square().mean()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The splats that a training starts from: splatfacto's."""
+"""The splats that a training starts from, as in splatfacto."""
 
 import torch
 from nerfstudio.models.splatfacto import random_quat_tensor
@@ -11,23 +11,20 @@ from nrfgs_ns.model.config import NrfgsModelConfig
 
 OPACITY = 0.1
 ALONE = 0.01
-"""Standard deviation of a splat that is the only one, in scene units."""
+"""Standard deviation of a single splat, in scene units."""
 NARROWEST = 1e-7
-"""Standard deviation of a splat whose neighbours are where it is, in scene units."""
+"""Smallest standard deviation, in scene units, for points that coincide."""
 
 
 def initial_splats(
     config: NrfgsModelConfig, head: AppearanceHead, seed_points: tuple[Tensor, Tensor] | None, scene_unit: float
 ) -> dict[str, Tensor]:
-    """A round splat at each seed point, as wide as its neighbours are far; or at random points.
+    """The initial table: a round splat at each seed point, as wide as the mean distance of its neighbours.
 
     Args:
-        head: adds what it stores for each splat.
+        head: adds its own tensors.
         seed_points: positions [N, 3] in world units and colours [N, 3] in 0..255; None: random ones.
         scene_unit: world units in a scene unit.
-
-    Returns:
-        The table of splats.
     """
     if seed_points is not None and not config.random_init:
         means, rgb = seed_points[0].float().clone(), seed_points[1].float() / 255.0
@@ -46,8 +43,8 @@ def initial_splats(
 
 
 def mean_distance(means: Tensor) -> Tensor:
-    """Mean distance of each of several points [N, 3] to the three nearest others, [N, 1]."""
-    # The distances of splatfacto's scikit-learn to the last bit, without a second to import it.
+    """Mean distance of each point [N, 3] to the three nearest others, [N, 1]."""
+    # Equal to scikit-learn's distances in splatfacto to the last bit, without its second of import.
     points = means.cpu().numpy()
     distances, _ = cKDTree(points).query(points, k=min(4, len(points)), workers=-1)
     return torch.from_numpy(distances[:, 1:]).float().mean(dim=-1, keepdim=True)

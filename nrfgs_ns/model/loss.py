@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loss, as functions that the eager step, the recorded step (`training/step_graph.py`) and each of several
-devices (`distributed/model.py`) share."""
+"""The training loss, shared by the eager step, the recorded step (`training/step_graph.py`) and each of several devices
+(`distributed/model.py`)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,18 +13,15 @@ from nrfgs_ns.image.ssim import photometric_loss
 
 
 def loss_of(model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], batch: Mapping[str, Any]):
-    """The terms of the loss of one rendered camera, by name; a step descends their sum.
+    """The terms of one rendered camera's loss, scalars by name; a step descends their sum.
 
     Terms that are zero in this step are left out. Nothing waits for the GPU.
 
     Args:
-        model: an NrfgsModel. In evaluation the photometric term, and scale regularisation, stand alone.
-        splats: the table that was rendered, whose tensors get gradients.
+        model: an NrfgsModel. In evaluation there are only the photometric term and scale regularisation.
+        splats: the rendered table, whose tensors get gradients.
         outputs: "rgb" [H, W, 3] in [0, 1] and "background" [3], as rendered.
-        batch: "image", and "mask" if there is one, as the datamanager gives them.
-
-    Returns:
-        Scalars by name.
+        batch: the datamanager's "image", and "mask" if there is one.
     """
     config = model.config
     losses = {"main_loss": photometric(model, outputs, batch)}
@@ -45,7 +42,7 @@ def photometric(model, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> 
     truth = model.truth_of(batch, outputs["background"])
     rgb = outputs["rgb"]
     mask = None
-    if "mask" in batch:  # what is outside is black in both
+    if "mask" in batch:  # pixels outside are black in both
         mask = model._downscale_if_required(batch["mask"]).to(model.device)
         truth, rgb = truth * mask, rgb * mask
     if model.trimming is not None and model.training and model.schedule_step >= robust.FIRST_STEP:
@@ -55,7 +52,7 @@ def photometric(model, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> 
 
 
 def shrinkage(model, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Terms for the splats' mean opacity, and mean size in scene units; none where their weight is zero."""
+    """Terms for the splats' mean opacity, and mean size in scene units, unless their weight is zero."""
     weight = model.config.shrinkage_weight(model.num_views)
     if weight == 0.0:
         return {}

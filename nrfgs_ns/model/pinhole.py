@@ -3,7 +3,7 @@
 
 from collections import OrderedDict
 from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
@@ -12,9 +12,12 @@ from torch import Tensor
 
 from nrfgs_ns.data.checks import warn
 
+REMEMBERED = 64
+"""Cameras on a GPU whose conversion is remembered."""
+
 
 class Pinhole(NamedTuple):
-    """One camera: gsplat's matrices, and sizes that the host knows without asking the GPU."""
+    """One camera: gsplat's matrices, and its size on the host."""
 
     viewmat: Tensor
     """world-to-camera, x right, y down, z forward. [1, 4, 4]"""
@@ -32,8 +35,8 @@ def pinhole(camera: Cameras, camera_to_world: Tensor, downscale: int) -> Pinhole
     """One camera, at 1 / downscale of its size, rounded down as its image is.
 
     Args:
-        camera: a batch of one, [1] or without batch dimension. Reading its size waits for the GPU if it lies there.
-        camera_to_world: its pose, [1, 3, 4], with y up and z backwards (OpenGL); perhaps with a learnt correction.
+        camera: a batch of one, [1] or without batch dimension. If it is on a GPU, its size is waited for.
+        camera_to_world: its pose, [1, 3, 4], with y up and z backwards (OpenGL), and any learnt correction.
     """
     K = camera.get_intrinsics_matrices().reshape(1, 3, 3).to(camera_to_world.device)
     K = K / K.new_tensor([[downscale], [downscale], [1.0]])
@@ -47,16 +50,17 @@ class Pinholes:
 
     def __init__(self):
         self._of_training: dict[tuple[int, int], Pinhole] = {}  # by index and downscale
-        self._fixed: FixedPinholes | None = None  # all others
+        # Cameras on a GPU, by the identity and version of their tensors, which stay alive.
+        self._on_gpu: OrderedDict[tuple, tuple[list[Tensor], Pinhole]] = OrderedDict()
+        self._has_warned = False
 
     def of_training(self, camera: Cameras, downscale: int, optimizer: CameraOptimizer | None) -> Pinhole:
         """A training camera at 1 / downscale of its size.
 
         Args:
-            camera: a batch of one, [1]; "cam_idx" in its metadata says which it is.
+            camera: a batch of one, [1], with its index "cam_idx" in its metadata, if it has one.
             optimizer: has its learnt pose; None: the pose is fixed, and the camera is converted once.
         """
-        assert camera.shape[0] == 1, "Only one camera at a time"
         index = (camera.metadata or {}).get("cam_idx")
         if optimizer is not None:
             return pinhole(camera, optimizer.apply_to_camera(camera), downscale)
@@ -67,67 +71,42 @@ class Pinholes:
         return self._of_training[index, downscale]
 
     def fixed(self, camera: Cameras, device: torch.device) -> Pinhole:
-        """A camera of full size that is not trained with, on a device."""
-        if self._fixed is None or self._fixed.device != device:
-            self._fixed = FixedPinholes(device)
-        return self._fixed(camera)
+        """A camera of full size, a batch of one, [1] or without batch dimension, for a device.
 
-
-class FixedPinholes:
-    """Cameras whose poses are not learnt, converted on the host and sent to the device in one piece.
-
-    A camera in host memory costs no wait. To read one on the GPU the host waits for all work there, so the last ones
-    are remembered until something writes to them.
-    """
-
-    REMEMBERED: ClassVar[int] = 64
-    """Cameras on a GPU that are remembered."""
-
-    def __init__(self, device: torch.device):
-        self.device = device
-        # By what tells a tensor that is alive, and has not been written to, from all others; the tensors stay alive.
-        self._known: OrderedDict[tuple, tuple[list[Tensor], Pinhole]] = OrderedDict()
-        self._has_said_so = False
-
-    def __call__(self, camera: Cameras) -> Pinhole:
-        """The pinhole of a camera, which is a batch of one, [1] or without batch dimension."""
+        A camera in host memory costs no wait. To read one on the GPU the host waits for all work there, so the last
+        `REMEMBERED` ones are kept until something writes to them.
+        """
         sizes = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         fields = [camera.camera_to_worlds, *sizes, camera.camera_type]
         if not fields[0].is_cuda or any(field.is_inference() for field in fields):
-            return self._convert(fields)
-        key = tuple((id(field), field._version) for field in fields)
-        if key not in self._known:
-            self._known[key] = fields, self._convert(fields)
-            if len(self._known) > self.REMEMBERED:
-                self._known.popitem(last=False)
-        return self._known[key][1]
+            return self._converted(fields, device)
+        key = device, *((id(field), field._version) for field in fields)
+        if key not in self._on_gpu:
+            self._on_gpu[key] = fields, self._converted(fields, device)
+            if len(self._on_gpu) > REMEMBERED:
+                self._on_gpu.popitem(last=False)
+        return self._on_gpu[key][1]
 
-    def _convert(self, fields: list[Tensor]) -> Pinhole:
+    def _converted(self, fields: list[Tensor], device: torch.device) -> Pinhole:
+        """A pinhole computed on the host and sent to a device in one piece."""
         # float64 holds sizes and float32 alike.
         pose, sizes = torch.cat([field.reshape(-1).double() for field in fields]).cpu().split([12, 7])
         fx, fy, cx, cy, width, height, kind = sizes.tolist()
-        if kind != CameraType.PERSPECTIVE.value and not self._has_said_so:
+        if kind != CameraType.PERSPECTIVE.value and not self._has_warned:
             warn(f"Cameras of the type {CameraType(int(kind)).name.lower()} are drawn as pinholes.")
-            self._has_said_so = True
+            self._has_warned = True
         pose = pose.float().view(1, 3, 4)
-        with torch.inference_mode(False):  # what is remembered outlives a rendering that records nothing
+        with torch.inference_mode(False):  # it outlives a rendering that records nothing
             whole = torch.zeros(32)  # each part at a multiple of 16 bytes, as Triton's kernels like it
             whole[:16] = world_to_camera(pose).flatten()
             whole[16:25] = torch.tensor([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
             whole[28:31] = pose[0, :, 3]
-            whole = whole.to(self.device, non_blocking=True)
+            whole = whole.to(device, non_blocking=True)
             return Pinhole(whole[:16].view(1, 4, 4), whole[16:25].view(1, 3, 3), int(width), int(height), whole[28:31])
 
 
 def world_to_camera(camera_to_world: Tensor) -> Tensor:
-    """World-to-camera matrices from nerfstudio's poses.
-
-    Args:
-        camera_to_world: [C, 3, 4], with y up and z backwards (OpenGL).
-
-    Returns:
-        [C, 4, 4], with y down and z forwards (OpenCV, gsplat).
-    """
+    """World-to-camera matrices [C, 4, 4] (OpenCV: y down, z forwards) from nerfstudio's poses [C, 3, 4] (OpenGL)."""
     flip, last = _constants(camera_to_world.device, camera_to_world.dtype)
     rotation = (camera_to_world[:, :3, :3] * flip).transpose(1, 2)
     translation = -rotation @ camera_to_world[:, :3, 3:4]
@@ -136,7 +115,7 @@ def world_to_camera(camera_to_world: Tensor) -> Tensor:
 
 @lru_cache
 def _constants(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """The flip of y and z, and a matrix's last row; made once, since a copy to the GPU waits for it."""
+    """The flip of y and z, and a matrix's last row; made once, since copying them to a GPU waits for it."""
     with torch.inference_mode(False):  # they outlive a rendering that records nothing
         flip = torch.tensor([1.0, -1.0, -1.0], device=device, dtype=dtype)
         return flip, torch.tensor([0.0, 0.0, 0.0, 1.0], device=device, dtype=dtype)

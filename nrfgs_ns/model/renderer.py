@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a camera is rendered, as functions of values: geometry -> appearance -> rasterizer -> image.
+"""Rendering as functions of values: geometry -> appearance -> rasterizer -> image.
 
-    view = project_view(field.splats, pinhole, options)            # which splats, and where
-    appearance = field.seen_from(view)                             # their colours and opacities (`appearance/field.py`)
-    outputs, info = composite_view(view, appearance, background)   # the image
-
-Nothing here needs CUDA.
+view = project_view(field.splats, pinhole, options)            # which splats, and where
+appearance = field.seen_from(view)                             # their colours and opacities (`appearance/field.py`)
+outputs, info = composite_view(view, appearance, background)   # the image
 """
 
 from collections.abc import Callable, Mapping
@@ -25,14 +23,14 @@ NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 def projection_options(
     rasterize_mode: RasterizeMode, scene_unit: float, near: float = 0.0, *, assume_finite: bool = False
 ) -> ProjectionOptions:
-    """Options of a projection whose planes are splatfacto's, in scene units of `scene_unit` world units, or whose near
-    plane is farther, `near` world units away."""
+    """Options of a projection with splatfacto's planes, where a scene unit is `scene_unit` world units; the near plane is
+    at least `near` world units away."""
     planes = max(NEAR_PLANE * scene_unit, near), FAR_PLANE * scene_unit
     return ProjectionOptions(rasterize_mode, *planes, assume_finite=assume_finite)
 
 
 class View(NamedTuple):
-    """One camera, and what it sees of a table of splats."""
+    """Splats seen by one camera."""
 
     projection: Projection
     """the visible splats on the image plane, M of them"""
@@ -46,26 +44,17 @@ class View(NamedTuple):
 
 
 def project_splats(
-    splats: Mapping[str, Tensor],
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    options: ProjectionOptions = ProjectionOptions(),  # noqa: B008
+    splats: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor, width: int, height: int, options: ProjectionOptions
 ) -> Projection:
     """Project a table of splats ("scales" are logarithms) into cameras [C, 4, 4], [C, 3, 3] of one size."""
     geometry = splats["means"], splats["quats"], splats["scales"].exp()
     return project(*geometry, viewmats, Ks, width, height, options)
 
 
-def project_view(
-    splats: Mapping[str, Tensor],
-    pinhole: Pinhole,
-    options: ProjectionOptions = ProjectionOptions(),  # noqa: B008
-) -> View:
+def project_view(splats: Mapping[str, Tensor], pinhole: Pinhole, options: ProjectionOptions) -> View:
     """Project a table of splats into one camera."""
-    projection = project_splats(splats, pinhole.viewmat, pinhole.K, pinhole.width, pinhole.height, options)
-    return View(projection, pinhole.center)
+    *camera, center = pinhole
+    return View(project_splats(splats, *camera, options), center)
 
 
 def composite_view(
@@ -81,13 +70,12 @@ def composite_view(
     """Composite the visible splats over a background.
 
     Args:
-        view: what one camera sees.
-        appearance: colours and opacities of the M visible splats.
+        view: M visible splats.
+        appearance: their colours and opacities.
         background: a colour [3].
-        with_depth: whether depth is wanted, too.
-        absgrad: as in `rasterizer.composite`.
-        assume_finite: colours and opacities that are not finite need not be looked for.
-        look: what a photograph makes of the picture [H, W, 3], whose colours are not cut off; in [0, 1].
+        with_depth: return depth, too.
+        absgrad, assume_finite: as in `rasterizer.composite`.
+        look: the photograph's exposure model, applied to the rendered image [H, W, 3]; None: clamp it to [0, 1].
 
     Returns:
         "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1] if wanted;

@@ -12,6 +12,7 @@ The device of the means picks the back end: gsplat's kernels on CUDA, `torch_cpu
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -33,15 +34,9 @@ __all__ = [
 
 def _backend(device: torch.device):
     """The module that projects and composites on a device. Imported late: the CPU path must never load CUDA code."""
-    if device.type == "cuda":
-        from . import gsplat_cuda
-
-        return gsplat_cuda
-    if device.type == "cpu":
-        from . import torch_cpu
-
-        return torch_cpu
-    raise NotImplementedError(f"splats are on device {device}; the rasterizer runs on 'cuda' and 'cpu'")
+    if device.type not in ("cuda", "cpu"):
+        raise NotImplementedError(f"splats are on device {device}; the rasterizer runs on 'cuda' and 'cpu'")
+    return import_module(f"{__name__}.{'gsplat_cuda' if device.type == 'cuda' else 'torch_cpu'}")
 
 
 def load_kernels(device: torch.device) -> None:
@@ -65,15 +60,12 @@ def project(
     projection is finite: no NaN or infinity in its mean or scales, no zero quaternion.
 
     Args:
-        means: centres in world units. [N, 3]
+        means: centres in world units, on a CUDA device or the CPU. [N, 3]
         quats: rotations (w, x, y, z), not necessarily of unit length. [N, 4]
         scales: standard deviations along the splat's axes, in world units (not their logarithms). [N, 3]
         viewmats: world-to-camera transforms, x right, y down, z forward. [C, 4, 4]
         Ks: pinhole intrinsics in pixels, without skew. [C, 3, 3]
         width, height: image size in pixels.
-
-    Raises:
-        NotImplementedError: the device is neither CUDA nor CPU.
     """
     return _backend(means.device).project((means, quats, scales), (viewmats, Ks, width, height), options)
 
@@ -94,26 +86,18 @@ def composite(
         projection: the result of `project`, M rows.
         colors: any number of channels D per row. [M, D]
         opacities: opacity per row, before antialiasing compensation. [M]
-            Nothing is drawn of a row below 1/255, or whose colour or opacity is not finite. Both are converted to the
+            Rows below 1/255, or whose colour or opacity is not finite, are not drawn. Both tensors are converted to the
             projection's precision: under autocast a head computes in half precision.
         backgrounds: colour behind the splats. [C, D]
         with_depth: append expected depth, sum(w z) / sum(w), to the colours: gsplat's mode "RGB+ED".
         absgrad: leave sum |dL/dmean2d| over pixels in `projection.means2d.absgrad` when going backward. [M, 2]
-        assume_finite: do not look for rows that are not finite.
+        assume_finite: do not check that rows are finite.
 
     Returns:
         render [C, H, W, D or D + 1], alphas [C, H, W, 1], and gsplat's `info`: camera_ids, gaussian_ids, radii,
         means2d, depths, conics, opacities (compensated), width, height, tile_size, tile_width, tile_height, n_cameras;
         on CUDA also flatten_ids and isect_offsets, the lists of the splats that each tile draws.
-
-    Raises:
-        ValueError: a head's colours or opacities have the wrong shape.
     """
-    m = len(projection.gaussian_ids)
-    for name, tensor, shape in (("opacities", opacities, [m]), ("colors", colors, [m, colors.shape[-1]])):
-        if list(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {list(tensor.shape)}")
-
     colors, opacities = colors.to(projection.depths.dtype), opacities.to(projection.depths.dtype)
     backend = _backend(colors.device)
     leave_out = not assume_finite and backend.leaves_out(projection, colors, opacities)
@@ -140,8 +124,8 @@ def composite(
 def contributions(projection: Projection, opacities: Tensor) -> Tensor:
     """Contribution of each projected splat to the image: the sum of w_i(p) over its pixels p, [M], in pixels.
 
-    w_i(p) = alpha_i(p) T_i(p) is the share of the pixel's light that comes from splat i, and so the derivative of the
-    image with respect to its colour: one forward and one backward pass. No gradient flows through it.
+    w_i(p) = alpha_i(p) T_i(p) is splat i's share of the pixel's light, and so the image's derivative with respect to
+    the splat's colour: one forward and one backward pass. The result has no gradient.
 
     Args:
         projection: the result of `project`, M rows.
@@ -165,20 +149,22 @@ def changes_without(
     backgrounds: Tensor | None = None,
     passes: int = 1,
 ) -> Tensor:
-    """Unbiased estimate of how much the images would change without each projected splat: the sum over pixels and
-    channels of the squared change, [M], at least 0.
+    """Unbiased estimate of the images' squared change without each projected splat, summed over pixels and channels.
 
-    An image I is linear in the opacity o_i of each row, so that without that row alone it changes by -o_i dI/do_i. With
-    random signs r for each pixel and channel, the mean of (o_i d(r I)/do_i)^2 is that sum (Hutchinson), for all rows
+    An image I is linear in the opacity o_i of each row: without that row alone it changes by -o_i dI/do_i. With random
+    signs r for each pixel and channel, the mean of (o_i d(r I)/do_i)^2 is the sum of squares (Hutchinson), for all rows
     from one backward pass. The variance is at most twice its square, divided by the number of passes. At pixels where a
     row's alpha is capped or below 1/255, the change is taken as 0.
 
     Args:
         projection: the result of `project`, M rows.
         colors, opacities, backgrounds: as for `composite`. [M, D], [M], [C, D]
-        counted: which pixels count, 0 or 1. [C, H, W, 1]
+        counted: weight of each pixel, 0 or 1. [C, H, W, 1]
         generator: of the signs, on the device of the projection.
         passes: number of backward passes.
+
+    Returns:
+        Numbers >= 0, [M].
     """
     opacities = opacities.detach().requires_grad_()
     with torch.enable_grad():

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The CUDA back end: gsplat's kernels, called stage by stage as its packed rasterization calls them.
 
-gsplat 1.4.0 and 1.5.3 differ here, and nothing outside this file sees it. 1.5.3 has batches; bounds a splat by a
-rectangle of 3.33 standard deviations along each axis of the image, where 1.4.0 has a square of 3 along the longest one;
-names images, not cameras; and in the packed layout takes no backgrounds of several images.
+The differences between gsplat 1.4.0 and 1.5.3 stay in this file. 1.5.3 has batches; bounds a splat by a rectangle of
+3.33 standard deviations along each axis of the image, where 1.4.0 has a square of 3 along the longest one; names
+images, not cameras; and in the packed layout takes no backgrounds of several images.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ HAS_BATCHES = gsplat_version() >= (1, 5)
 if HAS_BATCHES and gsplat_version() < (1, 5, 3):
     raise ImportError(f"gsplat {'.'.join(map(str, gsplat_version()))} is not known here; use {' or '.join(GSPLAT)}.")
 
-MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` look through
-MOST_TILES = 2**15  # those beyond have no 16-bit number, as `tile_lists.py` wants
+MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` check for finite numbers
+MOST_TILES = 2**15  # tiles with a 16-bit number, as `tile_lists.py` needs
 
 
 def load_kernels(device: torch.device) -> None:
@@ -40,7 +40,7 @@ def project(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOpt
     """See `nrfgs_ns.rasterizer.project`: means, quats, scales; viewmats, Ks, width, height.
 
     gsplat lets NaN pass its tests for visibility: a head would turn such a row into NaN gradients of shared weights.
-    Then the projection is repeated without those splats. The look costs three sums and one wait, right after gsplat's.
+    Then the projection is repeated without those splats. The check costs three sums and one wait, right after gsplat's.
     """
     if options.every_row:
         return _every_row(geometry, cameras, options)
@@ -97,8 +97,7 @@ def _finite(rows: tuple) -> bool:
 
 
 def _visible_rows(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> tuple:
-    """Packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, and extents, which
-    gsplat 1.4 does not have."""
+    """Packed rows: camera_ids, gaussian_ids, radii, means2d, depths, conics, compensations, gsplat 1.5's extents."""
     means, _, scales = geometry
     if len(means) == 0:  # gsplat 1.5.3 divides by the number of splats, which ends the process
         ids = torch.empty(0, dtype=torch.int64, device=means.device)
@@ -125,6 +124,11 @@ def composite(
     Args:
         leave_out: do not draw rows that are not finite; only if `leaves_out` allows it.
     """
+    behind = backgrounds
+    if HAS_BATCHES and behind is not None:  # its check knows one image only, and sends that one no gradient
+        behind = behind[0] if len(behind) == 1 and not behind.requires_grad else None
+    shape = projection.width, projection.height, TILE_SIZE
+    tables = projection.means2d, projection.conics, colors, opacities
     room = None
     if len(opacities) > 0 and _kernels_take(projection, opacities):
         from .tile_lists import room_on
@@ -132,29 +136,11 @@ def composite(
         room = room_on(opacities.device)
     while True:
         lists = _lists(projection, opacities, room, colors if leave_out else None)
-        render, alphas = _blend(projection, colors, opacities, backgrounds, absgrad, lists)
+        render, alphas = rasterize_to_pixels(*tables, *shape, *lists, backgrounds=behind, packed=True, absgrad=absgrad)
+        if backgrounds is not None and behind is None:
+            render = render + (1.0 - alphas) * backgrounds[:, None, None]
         if room is None or room.was_enough():
             return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1]}
-
-
-def _blend(
-    projection: Projection,
-    colors: Tensor,
-    opacities: Tensor,
-    backgrounds: Tensor | None,
-    absgrad: bool,
-    lists: tuple[Tensor, Tensor],
-) -> tuple[Tensor, Tensor]:
-    """Render and alphas from the tiles' lists, as for `composite`."""
-    behind = backgrounds
-    if HAS_BATCHES and behind is not None:  # its check knows one image only, and sends that one no gradient
-        behind = behind[0] if len(behind) == 1 and not behind.requires_grad else None
-    shape = projection.width, projection.height, TILE_SIZE
-    tables = projection.means2d, projection.conics, colors, opacities
-    render, alphas = rasterize_to_pixels(*tables, *shape, *lists, backgrounds=behind, packed=True, absgrad=absgrad)
-    if backgrounds is not None and behind is None:
-        render = render + (1.0 - alphas) * backgrounds[:, None, None]
-    return render, alphas
 
 
 def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
@@ -170,7 +156,7 @@ def _lists(
 
     Args:
         room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
-        finite: leave out the rows of which one of these, [M, D], or another number is not finite.
+        finite: colours [M, D]; rows that are not finite, in these or otherwise, are left out.
     """
     tile_width, tile_height = -(-projection.width // TILE_SIZE), -(-projection.height // TILE_SIZE)
     bounds = projection.radii
@@ -213,7 +199,7 @@ def _kernels_run_on(device: torch.device) -> bool:
 
 
 def _try_kernels(device: torch.device) -> None:
-    """Compile and run both kernels on one splat; raise whatever goes wrong."""
+    """Compile and run both kernels on one splat."""
     from .tile_lists import tile_lists
 
     ones = torch.ones(1, 3, device=device)

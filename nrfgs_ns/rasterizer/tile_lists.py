@@ -6,8 +6,7 @@ gsplat lists a splat in every tile of the square of three standard deviations ar
     opacity exp(-sigma) < 1 / 255        sigma = 1/2 (a dx^2 + c dy^2) + b dx dy,  (a, b, c) the conic.
 
 Here a splat is listed in those tiles of its square that have a pixel's centre in that ellipse (Feng et al., FlashGS,
-and Hanson et al., Speedy-Splat, 2024). What is left out draws nothing and has no gradient: images and gradients are
-gsplat's.
+and Hanson et al., Speedy-Splat, 2024). Images and gradients are gsplat's.
 
 An ellipse meets a row of tiles in one interval of columns, which ends at the ellipse's own leftmost and rightmost
 points, or, where these lie outside the row's band, on the band's nearer edge.
@@ -22,7 +21,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import ClassVar
 
 import torch
 import triton
@@ -32,12 +30,12 @@ from torch import Tensor
 from nrfgs_ns.kernels.launch import Launcher
 
 SPLATS = 64
-"""Splats that a program counts the tiles of; a power of two."""
+"""Splats whose tiles one program counts; a power of two."""
 PAIRS = 256
-"""Pairs of a splat and a tile that a program lists; a power of two."""
+"""Pairs of a splat and a tile that one program lists; a power of two."""
 
 SLACK = tl.constexpr(0.02)
-"""Excess of sigma over its bound that is allowed for: the drawing kernels' exponential and sigma are rounded."""
+"""Added to the bound of sigma, for the rounding of the drawing kernels."""
 MARGIN = tl.constexpr(1e-3)
 """Share, and pixels, by which the ellipse's half axes are lengthened, for the rounding here."""
 
@@ -76,7 +74,7 @@ def _columns(row, x, y, a, b, c, bound, det, left, right, SIDE: tl.constexpr):
     # Centres of the row's pixels, from the splat's.
     above = row.to(tl.float32) * SIDE + 0.5 - y
     below = above + (SIDE - 1.0)
-    # Where there is no ellipse to be sure of, the whole box: what is not finite must be seen in the image.
+    # Without a sure ellipse, the whole box: numbers that are not finite must show in the image.
     flat = ~(det > 0.0) | ~(tl.abs(bound) < float("inf"))
     det = tl.where(flat, 1.0, det)
     reach_x = tl.sqrt(bound * c / det)
@@ -150,7 +148,7 @@ def list_kernel(
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
     left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
     left_over = tl.where(real, at - begin, -1).to(tl.int32)  # tiles of the splat before the pair's, in rows to come
-    # In one tile, what is not real would keep that tile's threads busy for longer than the image takes.
+    # Spread over a row: in a single tile, spare pairs would keep its threads busy for longer than the image takes.
     tile = width * height + at % width
     row = top
     while tl.max(tl.where(row < bottom, left_over, -1), axis=0) >= 0:
@@ -166,17 +164,19 @@ def list_kernel(
 launch_count, launch_list = Launcher(count_kernel), Launcher(list_kernel)
 
 
+MORE = 1.25
+"""Room for each recent pair."""
+KEPT = 0.99
+"""Share of the room that remains for the next image, if it needs less."""
+_ROOMS = threading.local()  # by device; a viewer's thread draws other images than a training's
+
+
 class Room:
-    """Number of pairs of splats and tiles that there is room for on a GPU.
+    """Room on a GPU for the pairs of splats and tiles of an image.
 
     Only the GPU knows how many pairs an image has, and asking it first would leave it idle. So the host makes room for
-    a little more than lately, goes on, and looks whether that was enough when the image is on its way.
+    a little more than in recent images, goes on, and checks whether that was enough once the image is on its way.
     """
-
-    MORE: ClassVar[float] = 1.25
-    """Room for each recent pair."""
-    KEPT: ClassVar[float] = 0.99
-    """Share of the room that remains for the next image, if it needs less."""
 
     def __init__(self):
         self.pairs = 0
@@ -185,32 +185,25 @@ class Room:
         self._arrived = torch.cuda.Event()
 
     def send(self, total: Tensor) -> None:
-        """Send the number of pairs [1] home."""
+        """Send the number of pairs [1] to the host."""
         self._counted.copy_(total, non_blocking=True)
         self._arrived.record()
 
-    def needed(self) -> int:
-        """The number that was sent; the host waits for it."""
-        self._arrived.synchronize()
-        return int(self._counted[0])
-
     def was_enough(self) -> bool:
-        """Whether there was room for all pairs; then, and next time, there is."""
-        pairs, room = self.needed(), self.pairs
-        self.pairs = max(int(self.MORE * pairs), int(self.KEPT * room))
+        """Whether there was room for all pairs; makes room for them and for the next image. Waits for the number."""
+        self._arrived.synchronize()
+        pairs, room = int(self._counted[0]), self.pairs
+        self.pairs = max(int(MORE * pairs), int(KEPT * room))
         return pairs <= room
 
 
-_ROOMS = threading.local()
-
-
 class FixedRoom:
-    """Constant room for `pairs` on a device, for a CUDA graph; looked at after the graph has run."""
+    """Constant room for `pairs` on a device, for a CUDA graph; its owner checks it after the graph has run."""
 
     def __init__(self, pairs: int, device: torch.device):
         self.pairs = pairs
         self.counted = torch.full((2,), -1, dtype=torch.int64, device=device)
-        """of the last image, and the most of any; -1: none yet"""
+        """pairs of the last image, and the most of any; -1 before the first"""
 
     def send(self, total: Tensor) -> None:
         """Keep the number of pairs [1], on the GPU."""
@@ -218,27 +211,24 @@ class FixedRoom:
         torch.maximum(self.counted[1:], total, out=self.counted[1:])
 
     def was_enough(self) -> bool:
-        """Nobody asks yet."""
         return True
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Let this be the room for the images of this thread."""
+        """Use this room for the images of this thread."""
         rooms, device = _ROOMS.__dict__, self.counted.device
         usual = rooms.get(device)
         rooms[device] = self
         try:
             yield
         finally:
-            rooms.pop(device)
-            if usual is not None:
-                rooms[device] = usual
+            rooms[device] = usual
 
 
 def room_on(device: torch.device) -> Room | FixedRoom:
-    """The room on a GPU for the images of this thread: a viewer's are other images than a training's."""
+    """The room on a GPU for the images of this thread."""
     rooms = _ROOMS.__dict__
-    if device not in rooms:
+    if rooms.get(device) is None:
         rooms[device] = Room()
     return rooms[device]
 
@@ -255,16 +245,16 @@ def tile_lists(
     colors: Tensor | None = None,
     room: Room | FixedRoom | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Lists of one camera's tiles. All tensors are dense, of M splats that are all visible.
+    """Lists of one camera's tiles. All tensors are contiguous.
 
     Args:
-        means2d, depths, conics: of a `Projection`.
+        means2d, depths, conics: a `Projection`'s, M >= 1 rows.
         radii: half the sides, in pixels, of the boxes that bound the splats: of squares [M] or of rectangles [M, 2].
-        opacities: that the splats are drawn with, [M].
-        width, height: of the image, in tiles; with the row below it has at most 2^15.
-        side: of a tile, in pixels.
-        colors: leave out the splats of which one of these, [M, D], or another number is not finite.
-        room: make room for its number of pairs, and send home the actual one; None: wait for the number.
+        opacities: as composited, compensation included, [M].
+        width, height: image size in tiles; with the row below, at most 2^15 tiles.
+        side: side of a tile in pixels.
+        colors: [M, D]; splats that are not finite, in these or otherwise, are left out. None: no check.
+        room: makes room for its number of pairs and is sent the actual one; None: wait for the number.
 
     Returns:
         Where each tile's splats begin, int32 [1, height + 1, width], the last row for tiles below the image; rows of
@@ -274,16 +264,12 @@ def tile_lists(
     order = torch.sort(depths, stable=True).indices
     counts = torch.empty(count, dtype=torch.int32, device=device)
     splats = means2d, conics, opacities, radii, order
-    if count > 0:
-        launch_count(
-            (-(-count // SPLATS), 1, 1), *splats, counts, conics if colors is None else colors, count, width, height,
-            SPLATS=SPLATS, SIDE=side, RADII=axes, CHANNELS=0 if colors is None else colors.shape[1],
-            num_warps=max(SPLATS // 32, 1),
-        )  # fmt: skip
+    launch_count(
+        (-(-count // SPLATS), 1, 1), *splats, counts, conics if colors is None else colors, count, width, height,
+        SPLATS=SPLATS, SIDE=side, RADII=axes, CHANNELS=0 if colors is None else colors.shape[1], num_warps=2,
+    )  # fmt: skip
     ends = counts.cumsum(0)
-    if count == 0:
-        pairs = 0
-    elif room is None:
+    if room is None:
         pairs = int(ends[-1])
     else:
         room.send(ends[-1:])
@@ -303,6 +289,6 @@ def tile_lists(
 
 @lru_cache(maxsize=16)
 def _numbers(count: int, device: torch.device) -> Tensor:
-    """0 to count - 1; made once for each size of image."""
+    """0 to count - 1."""
     with torch.inference_mode(False):  # they outlive a rendering that records nothing
         return torch.arange(count, dtype=torch.int16, device=device)

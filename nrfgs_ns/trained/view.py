@@ -55,7 +55,7 @@ def view_file(path: Path, config):
     from nrfgs_ns.viewer.panel import ViewerPanel
 
     model = load_file(path)
-    model.show_by(ViewerPanel(model))
+    model.viewer_panel = ViewerPanel(model)
     pipeline = SimpleNamespace(model=model, datamanager=SimpleNamespace(includes_time=False))
     viewer = Viewer(config, path.parent / "viewer.log", datapath=path.parent, pipeline=pipeline)
     viewer.camera_handles, viewer.original_c2w = {}, {}

@@ -86,7 +86,7 @@ class NrfgsPipeline(VanillaPipeline):
         wake = [partial(torch.empty, 1, device=device)] if on_cuda else []
         with tried_meanwhile(wake, torch.device(device)):  # CUDA starts while the data set is checked
             super().__init__(config, device, test_mode, **kwargs)
-        self.model.show_by(ViewerPanel(self.model))
+        self.model.viewer_panel = ViewerPanel(self.model)
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             kernels = load_kernels, self.model.head.try_kernels, ssim.kernels_run_on, statistics.try_kernel
             trials = [partial(trial, self.model.device) for trial in (*kernels, optimizers.try_kernel) if on_cuda]

@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
+from nrfgs_ns.training.config_file import check_types
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, STEPS_PER_VIEW, Pace, TimedPace, resolution_phases, steps_for
 
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
@@ -99,6 +100,7 @@ class NrfgsTrainerConfig(TrainerConfig):
         for name in ("time_budget", "schedule_steps"):
             if getattr(self, name) is not None and devices > 1:
                 raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
+        check_types(self.pipeline, "config.yml", "pipeline.")
         self.pipeline.model.check()
         length = self.schedule_steps or self.max_num_iterations or STEPS
         self.pipeline.model.densification.check_training(devices, length)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controls of the appearance head's pictures in nerfstudio's viewer.
 
-A model with a panel (`show_by`) follows it only in the viewer's render threads (`is_asking`): what a browser sets
+A model with a panel (`viewer_panel`) follows it only in the viewer's render threads (`is_asking`): what a browser sets
 cannot reach a training, an evaluation or ns-render.
 """
 

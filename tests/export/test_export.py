@@ -202,7 +202,6 @@ def test_a_ridge_counts_in_views():
 def test_work_in_pieces_gives_the_same_fit(tiny_scene, tmp_path, monkeypatch):
     model, cameras = model_on(tiny_scene, tmp_path, "nrfgs", "--pipeline.model.appearance.output-init", "default")
     whole = fit_harmonics(model, cameras)
-    monkeypatch.setattr(harmonics_fit, "SPLATS_AT_ONCE", 70)
     monkeypatch.setattr(harmonics_fit, "ROWS_AT_ONCE", 13)
     pieces = fit_harmonics(model, cameras)
     assert pieces[1:] == whole[1:]

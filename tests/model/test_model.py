@@ -10,14 +10,17 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from pytorch_msssim import SSIM
 from torch.testing import assert_close
 
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.pinhole import FixedPinholes, pinhole, world_to_camera
+from nrfgs_ns.model.pinhole import Pinholes, pinhole, world_to_camera
+from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -57,20 +60,6 @@ def test_outputs_are_images(build):
     assert all(torch.isfinite(value).all() for value in outputs.values())
 
 
-@pytest.mark.parametrize("training", [True, False])
-def test_background_shows_where_splats_let_it(build, training):
-    """Over a colour: what black gives, and the colour times what is not covered. Three roundings of terms below 1."""
-    model = build().model.train(training)
-    pose = torch.eye(3, 4)[None] + torch.tensor([0.0, 0.0, 0.0, 1.0])
-    view = model.project(Cameras(pose, fx=40.0, fy=40.0, cx=24.0, cy=18.0, width=48, height=36))
-    appearance = model.field.seen_from(view)
-    color = torch.tensor([0.9, 0.5, 0.1])
-    black, over = (model.composite(view, appearance, behind)[0] for behind in (torch.zeros(3), color))
-    assert 0.01 < over["accumulation"].mean() < 0.99
-    expected = (black["rgb"] + (1 - over["accumulation"]) * color).clamp(0, 1)
-    assert_close(over["rgb"], expected, rtol=0, atol=3 * 2.0**-23)
-
-
 def test_densification_over_asks_for_no_more_gradients(build):
     """Gradients on the screen are kept until the last refinement, and no longer."""
     pipeline = build("nrfgs", "--pipeline.model.densification", "splatfacto,stop_split_at=5")
@@ -96,20 +85,14 @@ def test_a_field_that_adds_nothing_renders_its_base_colour(build):
 
 def test_the_head_sees_only_what_the_camera_sees(build, monkeypatch):
     pipeline = build()
-    model = pipeline.model
-    model.eval()
-    asked = []
-    forward = model.head.forward
-    monkeypatch.setattr(
-        model.head,
-        "forward",
-        lambda splats, visible, centers: asked.append(visible) or forward(splats, visible, centers),
-    )
+    model = pipeline.model.eval()
+    rows, forward = [], model.head.forward
+    monkeypatch.setattr(model.head, "forward", lambda *args: rows.append(args[1]) or forward(*args))
     camera, _ = first_view(pipeline)
     model.get_outputs_for_camera(camera)
     to_camera = world_to_camera(camera.camera_to_worlds)[0]
     z = model.means.detach() @ to_camera[2, :3] + to_camera[2, 3]
-    (visible,) = asked
+    (visible,) = rows
     assert 0 < len(visible) < model.num_points
     assert (z[visible] >= 0.01).all()
 
@@ -168,17 +151,6 @@ def test_metrics_count_only_what_is_inside_the_mask(build, masked_scene, tiny_sc
     assert masked.model.get_metrics_dict(outputs, batch)["psnr"].item() == pytest.approx(metrics["psnr"], abs=1e-3)
 
 
-def test_loss_counts_only_what_is_inside_the_mask(build, masked_scene):
-    pipeline = build(data=masked_scene)
-    begin_step(pipeline.model, 10**6)  # at full resolution
-    camera, batch = pipeline.datamanager.next_train(0)
-    outputs = pipeline.model(camera)
-    loss = pipeline.model.get_loss_dict(outputs, batch)["main_loss"]
-    outputs["rgb"] = outputs["rgb"].detach().clone()
-    outputs["rgb"][:, :16] = 0.123
-    assert_close(pipeline.model.get_loss_dict(outputs, batch)["main_loss"], loss.detach())
-
-
 def test_training_resolution_follows_the_schedule(build):
     pipeline = build()
     for step, size in ((0, (9, 12)), (3000, (18, 24)), (6000, (36, 48))):
@@ -199,23 +171,20 @@ def test_intrinsics_shrink_with_the_image():
 @pytest.mark.parametrize("batched", [True, False])
 def test_a_fixed_camera_is_what_a_camera_is(batched):
     pose = torch.cat([torch.linalg.qr(torch.randn(3, 3))[0], 100 * torch.randn(3, 1)], dim=1)
-    camera = Cameras(pose[None], fx=100.5, fy=90.25, cx=50.0, cy=31.0, width=101, height=63)[
-        slice(0, 1) if batched else 0
-    ]
-    expected, got = pinhole(camera, pose[None], 1), FixedPinholes(torch.device("cpu"))(camera)
+    cameras = Cameras(pose[None], fx=100.5, fy=90.25, cx=50.0, cy=31.0, width=101, height=63)
+    camera = cameras[0:1] if batched else cameras[0]
+    expected, got = pinhole(camera, pose[None], 1), Pinholes().fixed(camera, torch.device("cpu"))
     assert (got.width, got.height) == (101, 63)
-    for mine, theirs in zip(
-        (got.viewmat, got.K, got.center), (expected.viewmat, expected.K, expected.center), strict=True
-    ):
-        assert torch.equal(mine, theirs) and mine.data_ptr() % 16 == 0
+    for name in ("viewmat", "K", "center"):
+        assert torch.equal(getattr(got, name), getattr(expected, name)) and getattr(got, name).data_ptr() % 16 == 0
 
 
 def test_another_camera_than_a_pinhole_is_drawn_as_one_and_that_is_said_once(capsys):
     """`ns-render camera-path` and the viewer's Render tab offer fisheyes and panoramas."""
-    pinholes = FixedPinholes(torch.device("cpu"))
+    pinholes, cpu = Pinholes(), torch.device("cpu")
     for kind, said in (("PERSPECTIVE", ""), ("EQUIRECTANGULAR", "drawn as pinholes"), ("EQUIRECTANGULAR", "")):
         pose = torch.eye(4)[None, :3]
-        pinholes(Cameras(pose, 50.0, 50.0, 8.0, 8.0, 16, 16, camera_type=CameraType[kind])[0:1])
+        pinholes.fixed(Cameras(pose, 50.0, 50.0, 8.0, 8.0, 16, 16, camera_type=CameraType[kind])[0:1], cpu)
         out = capsys.readouterr().out
         assert said in out and bool(said) == ("Warning" in out)
 
@@ -223,12 +192,12 @@ def test_another_camera_than_a_pinhole_is_drawn_as_one_and_that_is_said_once(cap
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
-    pinholes = FixedPinholes(torch.device("cuda"))
+    pinholes, gpu = Pinholes(), torch.device("cuda")
     camera = Cameras(torch.eye(4)[None, :3], fx=100.0, fy=90.0, cx=50.0, cy=31.0, width=101, height=63)[0:1].to("cuda")
-    first = pinholes(camera)
-    assert pinholes(camera) is first
+    first = pinholes.fixed(camera, gpu)
+    assert pinholes.fixed(camera, gpu) is first
     camera.camera_to_worlds[0, 0, 3] = 7.0
-    assert pinholes(camera).center.tolist() == [7.0, 0.0, 0.0]
+    assert pinholes.fixed(camera, gpu).center.tolist() == [7.0, 0.0, 0.0]
 
 
 def test_world_to_camera_inverts_the_pose_and_flips_y_and_z():
@@ -297,3 +266,44 @@ def test_losses_are_splatfactos(build, masked, regularised):
     for name, gradient in gradients.items():
         error = (gradient - expected_gradients[name]).norm() / expected_gradients[name].norm()
         assert error < 1e-3, (name, error)
+
+
+def residual(model, cameras) -> float:
+    """Root mean square residual over all cameras."""
+    views = [model.project(cameras[index : index + 1]) for index in range(len(cameras))]
+    losses = [model.head.neutral_loss(model.field.splats, view.visible, view.center) for view in views]
+    return torch.stack(losses).mean().sqrt().item()
+
+
+def test_warm_up_quiets_a_loud_field_and_moves_nothing_else(build):
+    pipeline = build("nrfgs", "--pipeline.model.appearance.output-init", "default")
+    model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
+    splats = {name: value.detach().clone() for name, value in model.gauss_params.items()}
+    before = residual(model, cameras)
+    warm_up(model, cameras, steps=50)
+    assert before > 0.01 and residual(model, cameras) < before / 3
+    for name, value in model.gauss_params.items():
+        assert torch.equal(value, splats[name]) and value.grad is None
+    assert all(weight.grad is None for weight in model.head.parameters())
+
+
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
+def test_warm_up_leaves_alone_zero_outputs_and_heads_without_weights(build, method):
+    pipeline = build(method)
+    weights = [weight.detach().clone() for weight in pipeline.model.head.parameters()]
+    with CONSOLE.capture() as log:
+        warm_up(pipeline.model, pipeline.datamanager.train_dataset.cameras, steps=50)
+    assert log.get() == ""
+    assert all(torch.equal(a, b) for a, b in zip(weights, pipeline.model.head.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("option, steps", [((), 8), (("--pipeline.model.warmup-steps", "3"), 3)])
+def test_training_starts_with_one_warm_up_step_per_view_or_as_many_as_asked(build, monkeypatch, option, steps):
+    taken = []
+    monkeypatch.setattr("nrfgs_ns.model.model.warm_up", lambda model, cameras, steps: taken.append(steps))
+    pipeline = build("nrfgs", *option)
+    attributes = TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=pipeline, trainer=None)
+    first = pipeline.get_training_callbacks(attributes)[0]
+    for step in range(3):
+        first.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+    assert taken == [steps], "once, before step 0"

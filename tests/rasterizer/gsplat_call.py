@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`gsplat.rasterization` by `project` and `composite`: the call by which the two are held against gsplat."""
+"""`gsplat.rasterization` by `project` and `composite`, for comparisons with gsplat."""
 
-import weakref
 from dataclasses import replace
 from typing import Any
 
@@ -57,16 +56,9 @@ def rasterization(
             info[name] = rows.new_zeros(c, n, *rows.shape[1:]).index_put(cell, rows)
         info.update(means2d=dense_means2d, camera_ids=None, gaussian_ids=None)
         if absgrad and dense_means2d.requires_grad:
-            _densify_absgrad(dense_means2d, projection.means2d, cell)
+
+            def densify(grad: Tensor) -> None:
+                dense_means2d.absgrad = torch.zeros_like(grad).index_put(cell, projection.means2d.absgrad)
+
+            dense_means2d.register_hook(densify)
     return render, alphas, info
-
-
-def _densify_absgrad(dense: Tensor, packed: Tensor, cell: tuple[Tensor, Tensor]) -> None:
-    """Copy `packed.absgrad` [M, 2] to `dense.absgrad` [C, N, 2] as soon as the backward pass has produced it."""
-    target = weakref.ref(dense)  # a hook that owned its own tensor would keep it alive for ever
-
-    def copy(grad: Tensor) -> None:
-        if (tensor := target()) is not None:
-            tensor.absgrad = torch.zeros_like(grad).index_put(cell, packed.absgrad)
-
-    dense.register_hook(copy)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The slow twin: the same image from dense float64 arithmetic, every splat against every pixel, gradients by autograd.
 
-Written to be checked by eye against the definition and sharing no code with the fast path. Arrays are [N, H, W] for
-one camera, so this is for small images. It also says how sure its decisions are: a cut-off (1/255, 1e-4, 0.999, the
-radius and its tiles) is a step, float32 may fall on its other side, and a comparison must know at which pixels that
-can happen, and how far it can go.
+It is written to be checked by eye against the definition, and shares no code with the fast path. Arrays are [N, H, W]
+for one camera, so images must be small. Cut-offs (1/255, 1e-4, 0.999, the radius and its tiles) are steps, and float32
+may fall on the other side: `Image` says at which pixels that can happen, and how far they can move.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class Screen:
 
 @dataclass
 class Image:
-    """One camera's image and what is needed to judge another one by it. float64"""
+    """One camera's image, and bounds to judge another one by. float64"""
 
     render: Tensor
     """[H, W, D]"""
@@ -280,18 +279,8 @@ def rasterization(
         if rasterize_mode == "antialiased":
             opacity, opacity_error = opacities.double() * screen.compensations, 8 * unit * screen.condition
         order = None if orders is None else orders[camera]
-        image = composite(
-            screen,
-            color,
-            opacity,
-            width,
-            height,
-            background=background,
-            unit=unit,
-            opacity_error=opacity_error,
-            order=order,
-            perturb=perturb,
-        )
+        errors = {"unit": unit, "opacity_error": opacity_error, "order": order, "perturb": perturb}
+        image = composite(screen, color, opacity, width, height, background=background, **errors)
         render = image.render
         if render_mode == "RGB+ED":
             alphas = 1 - perturb(1 - image.alphas)

@@ -4,12 +4,10 @@
 from pathlib import Path
 
 import pytest
-import torch
-from agreement import assert_agrees, judge
+from agreement import BOUNDS, assert_agrees, judge, needs_cuda
 from gsplat_call import rasterization
-from make_gsplat_fixtures import CASES, evaluate, load
+from make_gsplat_fixtures import CASES, evaluate, load, upstream
 
-from nrfgs_ns.host import gsplat_version
 from nrfgs_ns.rasterizer.torch_cpu import projection
 
 RECORDED = Path(__file__).resolve().parents[1] / "fixtures" / "gsplat.npz"
@@ -43,15 +41,10 @@ def test_cpu_agrees_with_gsplat(recorded, monkeypatch):
     assert (ours["radii"] - gsplat["radii"]).abs()[seen].le(1).all()
 
 
+@needs_cuda
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_gpu_back_end_agrees_with_the_twin(name):
-    from make_gsplat_fixtures import upstream
-
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
-    bounds = "rectangle" if gsplat_version() >= (1, 5) else "square"
-    case = CASES[name]()
+    case, bounds = CASES[name](), BOUNDS["cuda"]
     grads = upstream(case, bounds=bounds)
-    verdict = judge(case, grads, bounds=bounds)
-    assert_agrees(verdict, evaluate(rasterization, case, grads, "cuda", packed=False))
+    assert_agrees(judge(case, grads, bounds=bounds), evaluate(rasterization, case, grads, "cuda", packed=False))

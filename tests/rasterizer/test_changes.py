@@ -1,34 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What images would change without each splat, against images without it."""
+"""The change of images without each splat, against images without it."""
 
 import pytest
 import torch
-from make_gsplat_fixtures import CASES, Case
+from agreement import devices
+from make_gsplat_fixtures import CASES
 from torch.testing import assert_close
 
 from nrfgs_ns.rasterizer import ProjectionOptions, changes_without, composite, project
 
-BEHIND = torch.tensor([0.9, 0.1, 0.4])
 
-
-def projected(case: Case, device: str):
-    """Projection, colours [M, 3] and opacities [M], below the cap of alpha."""
+@devices
+@pytest.mark.parametrize("name", ["ordinary", "several_cameras", "antialiased"])
+def test_an_image_without_the_splat(name, device):
+    """At one pixel and channel the estimate is exact, whatever the sign; over all it is so in the mean."""
+    case = CASES[name]()
     means, quats, scales, opacities, _, viewmats, Ks = (t.to(device) for t in case.arguments()[:-2])
     options = ProjectionOptions(case.options.get("rasterize_mode", "classic"))
     projection = project(means, quats, scales, viewmats, Ks, case.width, case.height, options)
-    g = torch.Generator().manual_seed(3)
-    colors = torch.rand(len(projection.gaussian_ids), 3, generator=g).to(device)
-    return projection, colors, (0.9 * opacities)[projection.gaussian_ids]
-
-
-def generator(device: str) -> torch.Generator:
-    return torch.Generator(device).manual_seed(5)
-
-
-def check(name: str, device: str) -> None:
-    """At one pixel and channel the estimate is exact, whatever the sign; over all it is so in the mean."""
-    projection, colors, opacities = projected(CASES[name](), device)
-    behind = BEHIND.to(device).repeat(projection.n_cameras, 1)
+    colors = torch.rand(len(projection.gaussian_ids), 3, generator=torch.Generator().manual_seed(3)).to(device)
+    opacities = (0.9 * opacities)[projection.gaussian_ids]  # below the cap of alpha
+    behind = torch.tensor([0.9, 0.1, 0.4], device=device).repeat(projection.n_cameras, 1)
+    generator = torch.Generator(device).manual_seed(5)
     render = composite(projection, colors, opacities, backgrounds=behind)[0]
     rows = list(range(0, len(opacities), max(1, len(opacities) // 6)))
     gone = []
@@ -40,24 +33,11 @@ def check(name: str, device: str) -> None:
     place = tuple(int(i) for i in torch.unravel_index(gone.sum(dim=(0, -1)).argmax(), gone.shape[1:4]))
     counted = torch.zeros(*render.shape[:-1], 1, dtype=torch.bool, device=device)
     counted[place] = True
-    one = changes_without(projection, colors[:, :1], opacities, counted, generator(device), backgrounds=behind[:, :1])
+    one = changes_without(projection, colors[:, :1], opacities, counted, generator, backgrounds=behind[:, :1])
     assert_close(one[rows], gone[(slice(None), *place, 0)], rtol=1e-3, atol=1e-7)
     counted[:] = True
-    many = changes_without(projection, colors, opacities, counted, generator(device), backgrounds=behind, passes=400)
-    # 400 drawings: a standard deviation is at most sqrt(2 / 400) = 0.07. What falls below 1/255 is linear no more: a
-    # row's share of it is small.
+    many = changes_without(projection, colors, opacities, counted, generator, backgrounds=behind, passes=400)
+    # 400 drawings: a standard deviation is at most sqrt(2 / 400) = 0.07. Below 1/255 the image is not linear: a small
+    # part of a row.
     assert_close(many[rows], gone.sum(dim=(1, 2, 3, 4)), rtol=0.3, atol=1e-4)
     assert not many.requires_grad and (many >= 0).all()
-
-
-@pytest.mark.parametrize("name", ["ordinary", "several_cameras", "antialiased"])
-def test_an_image_without_the_splat(name):
-    check(name, "cpu")
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("name", ["ordinary", "several_cameras", "antialiased"])
-def test_an_image_without_the_splat_on_the_gpu(name):
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
-    check(name, "cuda")

@@ -3,14 +3,12 @@
 
 import subprocess
 import sys
-from dataclasses import replace
 
 import pytest
 import torch
 from gsplat_call import rasterization
 from make_gsplat_fixtures import CASES
 
-from nrfgs_ns.host import gsplat_version
 from nrfgs_ns.rasterizer.torch_cpu import batches, compositing
 
 
@@ -24,35 +22,6 @@ def test_info_has_gsplats_keys():
     assert (info["tile_width"], info["tile_height"], info["n_cameras"]) == (4, 3, 1)  # 60 x 44 in tiles of 16
 
 
-@pytest.mark.parametrize("absgrad", [False, True])
-def test_gsplats_default_strategy_runs_unchanged(absgrad):
-    """Densification and pruning on our `info`, as splatfacto drives it."""
-    strategy_module = pytest.importorskip("gsplat.strategy")
-    if gsplat_version() >= (1, 5):
-        pytest.skip("from gsplat 1.5 on its strategies read two radii of a splat; `info` has the larger one")
-    case = CASES["ordinary"]()
-    stored = {"scales": case.scales.log(), "opacities": torch.logit(case.opacities), "colors": case.colors}
-    params = torch.nn.ParameterDict({"means": case.means, "quats": case.quats, **stored})
-    optimizers = {name: torch.optim.Adam([p], lr=1e-3) for name, p in params.items()}
-    strategy = strategy_module.DefaultStrategy(
-        absgrad=absgrad, grow_grad2d=1e-6, refine_start_iter=0, refine_every=1, refine_stop_iter=10, reset_every=5
-    )
-    strategy.check_sanity(params, optimizers)
-    state = strategy.initialize_state()
-    before = len(params["means"])
-    for step in range(1, 3):
-        geometry = params["means"], params["quats"], params["scales"].exp()
-        shown = params["opacities"].sigmoid(), params["colors"]
-        render, _, info = rasterization(*geometry, *shown, *case.arguments()[5:], absgrad=absgrad)
-        strategy.step_pre_backward(params, optimizers, state, step, info)
-        render.square().mean().backward()
-        strategy.step_post_backward(params, optimizers, state, step, info, packed=True)
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad()
-    assert len(params["means"]) > before
-
-
 def test_background_shines_through_and_has_a_gradient():
     case = CASES["ordinary"]()
     background = torch.tensor([[0.3, 0.6, 0.9]], requires_grad=True)
@@ -61,37 +30,6 @@ def test_background_shines_through_and_has_a_gradient():
     torch.testing.assert_close(render, black + (1 - alphas) * background[:, None, None])
     render.sum().backward()
     torch.testing.assert_close(background.grad, (1 - alphas).sum((1, 2)).expand(1, 3))
-
-
-def test_alpha_is_capped_without_gradient_to_the_shape():
-    """A splat much wider than the image has alpha = o everywhere: 0.999 at most, and then only colour has gradients."""
-    case = replace(CASES["one_splat"](), scales=torch.full((1, 3), 1e3), opacities=torch.tensor([1.0]))
-    leaves = [t.clone().requires_grad_() for t in case.arguments()[:5]]
-    render, alphas, _ = rasterization(*leaves, *case.arguments()[5:])
-    torch.testing.assert_close(alphas, torch.full_like(alphas, 0.999))
-    render.sum().backward()
-    assert all((leaf.grad == 0).all() for leaf in leaves[:4])
-    torch.testing.assert_close(leaves[4].grad, torch.full((1, 3), 0.999 * case.width * case.height))
-    # Just below the cap, the gradient is there.
-    below = torch.tensor([0.9985], requires_grad=True)
-    rasterization(*case.arguments()[:3], below, *case.arguments()[4:])[1].sum().backward()
-    torch.testing.assert_close(below.grad, torch.full((1,), 1.0 * case.width * case.height))
-
-
-def test_no_splats_at_all():
-    case = CASES["ordinary"]()
-    empty = [t[:0].clone().requires_grad_() for t in (case.means, case.quats, case.scales, case.opacities, case.colors)]
-    render, alphas, info = rasterization(*empty, *case.arguments()[5:], backgrounds=torch.ones(1, 3), absgrad=True)
-    (render.sum() + alphas.sum()).backward()
-    assert (render == 1).all() and (alphas == 0).all() and info["means2d"].shape == (0, 2)
-    assert all(t.grad is not None and t.grad.shape == t.shape for t in empty)
-
-
-@pytest.mark.parametrize(("field", "shape"), [("opacities", (1, 1)), ("colors", (1, 1, 1, 3))])
-def test_wrong_shapes_of_a_head_are_named(field, shape):
-    case = replace(CASES["one_splat"](), **{field: torch.ones(shape)})
-    with pytest.raises(ValueError, match=f"{field} must have shape"):
-        rasterization(*case.arguments())
 
 
 def test_other_devices_are_refused():

@@ -6,6 +6,8 @@ import pytest
 import torch
 from tile_list_cases import assert_lists, splats
 
+from nrfgs_ns.rasterizer import ProjectionOptions, composite, project
+
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -33,10 +35,20 @@ class TestOnCuda:
         tables += [torch.sigmoid(random(count, 3)), torch.sigmoid(2 * random(count) - 1)]
         upstream = random(1, 200, 300, 3 if mode == "RGB" else 4)
 
+        camera = torch.eye(4).cuda()[None], torch.tensor([[[200.0, 0, 150], [0, 200, 100], [0, 0, 1]]]).cuda(), 300, 200
+
         def render() -> tuple[list[torch.Tensor], int]:
+            """Image and gradients, and the number of pairs of splats and tiles."""
             leaves = [table.clone().requires_grad_() for table in tables]
-            image, pairs = drawn(*leaves, 300, 200, mode, rasterize_mode)
+            *geometry, colors, opacities = leaves
+            seen = project(*geometry, *camera, ProjectionOptions(rasterize_mode, assume_finite=True))
+            rows, options = seen.gaussian_ids, {"with_depth": mode == "RGB+ED", "assume_finite": True}
+            background = torch.full((1, 3), 0.3).cuda()
+            image, _, info = composite(seen, colors[rows], opacities[rows], backgrounds=background, **options)
             image.backward(upstream)
+            offsets, pairs = info["isect_offsets"], len(info["flatten_ids"])
+            if offsets.shape[1] > info["tile_height"]:  # the row below the image has spare room
+                pairs = int(offsets[0, -1, 0])
             return [image.detach(), *(leaf.grad for leaf in leaves)], pairs
 
         assert gsplat_cuda._kernels_run_on(torch.device("cuda", 0))
@@ -47,23 +59,3 @@ class TestOnCuda:
         torch.testing.assert_close(mine[0], theirs[0], rtol=0, atol=2e-6)
         for got, expected in zip(mine[1:], theirs[1:], strict=True):
             assert (got - expected).norm() <= 1e-5 * expected.norm()  # atomics add in any order
-
-
-def drawn(
-    means, quats, scales, colors, opacities, width, height, mode="RGB", rasterize_mode="classic"
-) -> tuple[torch.Tensor, int]:
-    """The image of splats before a camera, and how many pairs of splats and tiles it took."""
-    from nrfgs_ns.rasterizer import ProjectionOptions, composite, project
-
-    K = torch.tensor([[[200, 0, width / 2], [0, 200, height / 2], [0, 0, 1]]]).cuda()
-    view = torch.eye(4).cuda()[None]
-    options = ProjectionOptions(rasterize_mode, assume_finite=True)
-    seen = project(means, quats, scales, view, K, width, height, options)
-    rows, background = seen.gaussian_ids, torch.full((1, 3), 0.3).cuda()
-    image, _, info = composite(
-        seen, colors[rows], opacities[rows], with_depth=mode == "RGB+ED", assume_finite=True, backgrounds=background
-    )
-    offsets, pairs = info["isect_offsets"], len(info["flatten_ids"])
-    if offsets.shape[1] > info["tile_height"]:  # the row below the image has what there is only room for
-        pairs = int(offsets[0, -1, 0])
-    return image, pairs

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lists against their definition: every splat that reaches a pixel is listed there, in order, and hardly anything
+"""The lists against their definition: every splat that reaches a pixel is listed there, in order, and little
 else.
 """
 

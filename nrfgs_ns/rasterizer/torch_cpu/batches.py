@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batches: how the work of compositing is cut up, and the numbers that each piece needs.
+"""Batches: the pieces into which compositing is cut, and their numbers.
 
 Tiles advance together in *slabs* of 16 splats of depth. After each slab the tiles that have run out of splats or of
 light leave, so hidden splats cost nothing. A slab is cut into batches of tiles with similar counts, so little is
-padded, and the arrays [B, n, 64] of a batch stay within `BATCH_ELEMENTS` for each thread, the memory knob of the
-arithmetic. For the backward pass a batch keeps T in front of its slab and the numbers of its splats; all that is per
-pixel and splat is computed again.
+padded, and the arrays [B, n, 64] of a batch stay within `BATCH_ELEMENTS` for each thread, which bounds the memory. For
+the backward pass a batch keeps T in front of its slab and the numbers of its splats; all that is per pixel and splat is
+computed again.
 
 Slabs are shallow so that batches are wide: torch divides only operations on more than 32,768 numbers among its threads,
 and in a wide batch even the slice [B, 64] of a single splat is divided, at the same tile as the whole, so that each
@@ -22,11 +22,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from .tiles import SUB_TILE, Footprints, TileLists
+from .tiles import MIN_ALPHA, SUB_TILE, Footprints, TileLists
 
-SLAB = 16  # splats of depth between two looks at which tiles are finished
+SLAB = 16  # splats of depth between two checks for finished tiles
 BATCH_ELEMENTS = 2**19  # pixels x splats in flight per thread; four float arrays of this size exist at a time (8 MiB)
-MAX_THREADS = 16  # for more threads than these, batches grow no further
+MAX_THREADS = 16  # threads beyond which batches do not grow
 LN_2 = math.log(2.0)
 LOG2_NEARLY_MAX_ALPHA = math.log2(0.9989)  # a splat below this opacity stays below 0.999 however l is rounded
 NOTHING = -1e5  # exp2(NOTHING) = 0: the log-alpha of padding
@@ -40,8 +40,8 @@ def batch_elements() -> int:
 class Sheet:
     """The constant part of the work: splats in depth order, the tile grid and its pixel basis.
 
-    A row of a table holds all that is read of a splat, so that each pair fetches it once. Behind the last of the F
-    splats there is one more that shows nothing: lists that are too short are padded with it.
+    A row of a table holds all numbers of a splat, so that each pair fetches it once. Behind the last of the F splats
+    there is an invisible one, which pads lists that are too short.
     """
 
     def __init__(self, prints: Footprints, colors: Tensor, n_cameras: int, width: int, height: int) -> None:
@@ -58,11 +58,11 @@ class Sheet:
         y, x = (grid.flatten() for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
         self.basis = torch.stack([torch.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])  # [6, P]
 
-        inside_x = (torch.arange(prints.tiles_x * edge) < width).view(1, 1, prints.tiles_x, 1, edge)
-        inside_y = (torch.arange(prints.tiles_y * edge) < height).view(1, prints.tiles_y, 1, edge, 1)
-        inside = (inside_x & inside_y).expand(n_cameras, -1, -1, -1, -1)
-        self.inside = inside.reshape(self.n_tiles, edge * edge).to(dtype)  # 1 in pixels of the image. [C * tiles, P]
+        # 1 in pixels of the images. [C * tiles, P]
+        self.inside = self.tiled(torch.ones(n_cameras, height, width, 1, dtype=dtype)).squeeze(1)
         self.scratch = Scratch(max(batch_elements(), (SLAB + 1) * edge * edge), dtype)
+        # The largest number below MIN_ALPHA: threshold_ keeps what is strictly greater.
+        self.too_faint = torch.tensor(MIN_ALPHA, dtype=dtype).nextafter(torch.zeros((), dtype=dtype)).item()
 
     def centres(self, tiles: Tensor) -> Tensor:
         """Centres x, y of tiles in pixels, y counted from the top of the first image. [L] -> [2, L, 1], float64"""
@@ -86,20 +86,19 @@ class Sheet:
 
 
 class Scratch:
-    """Memory for the arrays of a batch, used by one batch after the other.
+    """Memory for the arrays of a batch, `size` numbers each, used by one batch after the other.
 
     Getting megabytes from the system costs more than a pass of arithmetic, and making n slices a fifth of their
     arithmetic.
     """
 
     def __init__(self, size: int, dtype: torch.dtype) -> None:
-        self.size = size  # of each array, in numbers
-        self.dtype = dtype
+        self.size, self.dtype = size, dtype
         self._memory: dict[str, Tensor] = {}
         self._arrays: dict[tuple, tuple[Tensor, tuple[Tensor, ...]]] = {}
 
     def array(self, name: str, n_tiles: int, n: int, pixels: int) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """The memory of a name as [B, n, P] and its n slices [B, P], with whatever was left there."""
+        """The memory of a name as [B, n, P] and its n slices [B, P], not cleared."""
         key = name, n_tiles, n, pixels
         if key not in self._arrays:
             if name not in self._memory:
@@ -110,12 +109,12 @@ class Scratch:
 
 
 class Numbers(NamedTuple):
-    """What compositing needs of the R = B n splats of a batch: sigma expanded around the centres of their tiles."""
+    """The R = B n splats of a batch, with sigma expanded around the centres of their tiles."""
 
     coefficients: Tensor  # of l / ln 2 in (1, x, y, x^2 / 2, xy, y^2 / 2). [6, R]
     centres: Tensor  # mx, my. [2, R]
     colors: Tensor  # [B, n, D]
-    strong: Tensor  # which of the R can exceed an alpha of 0.999
+    strong: Tensor  # rows of the R that can exceed an alpha of 0.999
 
 
 @dataclass
@@ -159,11 +158,8 @@ def expand(sheet: Sheet, lists: TileLists, centres: Tensor, pairs: Tensor) -> Nu
 
 
 def similar_tiles(remaining: Tensor, tiles: Tensor, pixels: int) -> list[tuple[Tensor, int]]:
-    """Cut tiles, sorted by falling number of splats, into groups of similar numbers that fit into a batch.
-
-    Returns:
-        For each group its tiles and the largest of their numbers.
-    """
+    """Cut tiles, sorted by falling number of splats, into groups that fit into a batch: tiles, and their largest
+    number."""
     counts = remaining.tolist()
     groups, begin, elements = [], 0, batch_elements()
     while begin < len(counts):

@@ -5,7 +5,7 @@ Forward. Splat k (nearest first) covers a pixel centre x with
 
     alpha_k = min(0.999, exp(l_k)),    l_k = ln o_k - sigma_k,    sigma_k = (x - m_k)^T Q_k (x - m_k) / 2,
 
-counted as 0 below 1/255. What is left of the light behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat
+counted as 0 below 1/255. The light that is left behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat
 that would push T_k to 1e-4 or below ends the pixel: it and all behind it are not drawn, as if their alpha were 0. Then
 
     C = sum_k w_k c_k,    A = 1 - T_n,    w_k = alpha_k T_{k-1}.
@@ -42,7 +42,6 @@ How the work is cut up is the business of `batches`.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -54,7 +53,7 @@ from torch.nn import functional as F
 from ..contract import Projection
 from . import batches
 from .batches import LN_2, Batch, Numbers, Sheet, expand, pairs_of, similar_tiles
-from .tiles import MIN_ALPHA, TileLists, footprints, list_tiles, split_into_blocks
+from .tiles import TileLists, footprints, list_tiles, split_into_blocks
 
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4  # a pixel ends before T falls to this
@@ -63,7 +62,7 @@ BLOCK_PAIRS = 2**21  # (tile, splat) pairs listed at a time; about 200 bytes eac
 
 @contextmanager
 def full_precision() -> Iterator[None]:
-    """Keep matrix products in the precision of their operands, whatever autocast or the matmul precision ask for.
+    """Keep matrix products in the precision of their operands, under autocast and any matmul precision.
 
     log-alpha reaches tens and is then exponentiated: bfloat16 would be wrong by whole factors. The matmul precision
     reaches CPU products through oneDNN.
@@ -81,12 +80,12 @@ def full_precision() -> Iterator[None]:
 class _Blend:
     """A batch, composited. Most of it is scratch memory, which the next batch overwrites."""
 
-    alpha: Tensor  # 0 where splat k is not drawn, but for pixels that had ended before. [B, n, P]
+    alpha: Tensor  # 0 where splat k is not drawn, except in pixels that had ended before. [B, n, P]
     alphas: tuple[Tensor, ...]  # its n slices. [B, P] each
     through: Tensor  # T_0 ... T_n as if no pixel ended. [B, n + 1, P]
     weights: Tensor  # w_k = alpha_k T_{k-1}. [B, n, P]
     last: Tensor  # T behind the slab, 0 in pixels that have ended. [B, P]
-    ends: Tensor | None  # which pixels end in this slab; None if none does. [B, P]
+    ends: Tensor | None  # pixels that end in this slab, if any. [B, P]
     capped: tuple[Tensor, Tensor] | None  # rows (of B * n) that can exceed 0.999, and their pixels that do, if any
 
 
@@ -100,7 +99,7 @@ def _blend(sheet: Sheet, numbers: Numbers, start: Tensor) -> _Blend:
     alpha, alphas = sheet.scratch.array("alpha", n_tiles, n, pixels)
     flat = alpha.view(-1, pixels)
     torch.mm(numbers.coefficients.t(), sheet.basis, out=flat).exp2_()
-    F.threshold_(flat, _just_below(MIN_ALPHA, flat.dtype), 0.0)
+    F.threshold_(flat, sheet.too_faint, 0.0)
     capped = None
     if numbers.strong.numel() > 0:
         strong = flat.index_select(0, numbers.strong)
@@ -124,22 +123,12 @@ def _blend(sheet: Sheet, numbers: Numbers, start: Tensor) -> _Blend:
     return _Blend(alpha, alphas, through, weights, last, ends if some_end else None, capped)
 
 
-@functools.cache
-def _just_below(value: float, dtype: torch.dtype) -> float:
-    """The largest number of a type below a value of that type, as threshold_ keeps what is strictly greater."""
-    value = torch.tensor(value, dtype=dtype)
-    return float(torch.nextafter(value, torch.zeros_like(value)))
-
-
 def _sweep(sheet: Sheet, lists: TileLists, final: Tensor, render: Tensor | None) -> list[Batch]:
-    """Composite one block front to back.
+    """Composite one block front to back; return its batches in the order of work, for the backward pass.
 
     Args:
         final: transmittance behind the last drawn splat, set for the tiles that have splats. [C * tiles, P]
         render: colours, added in place; None repeats a sweep for its batches only. [C * tiles, D, P]
-
-    Returns:
-        The batches in the order of work: all that the backward pass needs.
     """
     record = []
     live = sheet.inside.index_select(0, lists.tiles)  # T, or 0 in finished pixels. [L, P]
@@ -175,15 +164,12 @@ def _sweep(sheet: Sheet, lists: TileLists, final: Tensor, render: Tensor | None)
 def _backward_batch(
     sheet: Sheet, batch: Batch, grad: Tensor, behind: Tensor, absgrad: bool, gradients: Tensor
 ) -> Tensor:
-    """Gradients of one batch with respect to its splats: the backward equations of the module docstring.
+    """The backward equations of the module docstring for one batch; returns U in front of the first splat, [B, P].
 
     Args:
         grad: dL/dC of its tiles. [B, D, P]
         behind: U of the last splat. [B, P]
         gradients: receives those of centre x, y, conic a, b, c, ln o, colours, then absgrad. [B * n, 6 + D (+ 2)]
-
-    Returns:
-        U in front of the first splat. [B, P]
     """
     numbers, start = batch.numbers, batch.transmittance
     blend = _blend(sheet, numbers, start)
@@ -226,14 +212,14 @@ def _backward_batch(
 def _backward_block(
     sheet: Sheet, lists: TileLists, work: list[Batch], grad: Tensor, behind: Tensor, absgrad: bool, n_columns: int
 ) -> Tensor:
-    """Gradients of one block with respect to its footprints, in the columns of `_backward_batch`. [F, columns]
+    """Gradients of one block by its footprints, in the columns of `_backward_batch`. [F, columns]
 
     Args:
         work: the batches of its sweep.
         grad: dL/dC. [C * tiles, D, P]
         behind: U behind the last splat; afterwards U in front of the first one. [C * tiles, P]
     """
-    # Gradients in the order of work, and the row of each slot; pairs that no batch reached share a row of 0.
+    # Gradients in the order of work, and the row of each slot; pairs beyond all batches share a row of 0.
     end = sum(batch.pairs.numel() for batch in work)
     gradients = grad.new_empty(end + 1, n_columns)
     gradients[end] = 0
@@ -266,7 +252,7 @@ class _Composite(torch.autograd.Function):
         for block in blocks:
             lists = list_tiles(prints, block)
             work = _sweep(sheet, lists, final, render)
-            # With several blocks, keeping the record of each would undo the bound on memory: they are swept again.
+            # Records of several blocks would undo the bound on memory: the blocks are swept again instead.
             records.append((lists, work) if len(blocks) == 1 else None)
         ctx.save_for_backward(means2d, conics, opacities, colors)
         ctx.sheet, ctx.blocks, ctx.records, ctx.absgrad = sheet, blocks, records, absgrad
@@ -314,6 +300,6 @@ def composite(
     return render, 1 - transmittance, {}
 
 
-def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
+def leaves_out(*_) -> bool:
     """Whether `composite` can leave out rows that are not finite."""
     return False

@@ -65,10 +65,7 @@ class _Screen(NamedTuple):
 
 
 def directions(quats: Tensor) -> Tensor:
-    """Quaternions (w, x, y, z) of length 1. [N, 4] -> [4, N]
-
-    NaN for a quaternion shorter than MIN_QUATERNION, or so long that its square overflows.
-    """
+    """Quaternions (w, x, y, z) of length 1; NaN if shorter than MIN_QUATERNION, or too long. [N, 4] -> [4, N]"""
     squared = quats.square().sum(-1, keepdim=True)
     squared = squared.masked_fill((squared < MIN_QUATERNION**2) | squared.isinf(), math.nan)
     return (quats / squared.sqrt()).t().contiguous()
@@ -140,6 +137,14 @@ def _compensations(screen: _Screen) -> Tensor:
     return (det / det_blurred).sqrt()
 
 
+def _visible(screen: _Screen, radii: Tensor, width: int, height: int, options: ProjectionOptions) -> Tensor:
+    """Whether each splat is between the planes and touches the image; False if its projection is not finite. [n]"""
+    x, y = screen.means2d
+    visible = (screen.depths >= options.near_plane) & (screen.depths <= options.far_plane)
+    visible &= (screen.det_blurred > 0) & (radii > 0) & (radii < LARGEST_RADIUS)
+    return visible & (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
+
+
 class _Project(torch.autograd.Function):
     """(means, quats, scales, viewmat) of one camera -> ids, radii, and means2d, depths, conics, compensations.
 
@@ -148,9 +153,10 @@ class _Project(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, means, quats, scales, viewmat, K, size: tuple[int, int], visible):
+    def forward(ctx, means, quats, scales, viewmat, K, size: tuple[int, int], options: ProjectionOptions):
         screen = _to_screen(means, quats, scales, viewmat, K, *size)
-        radii, ids = visible(screen)
+        radii = _radii(screen)
+        ids = _visible(screen, radii, *size, options).nonzero().squeeze(1)
         ctx.save_for_backward(means, quats, scales, viewmat, K, ids)
         ctx.size = size
         radii = radii.index_select(0, ids).clamp(max=MAX_RADIUS).to(torch.int32)
@@ -197,8 +203,8 @@ def _back_to_camera(
     root = _compensations(screen)
     by_ratio = (by_compensations * 0.5 / (root + COMPENSATION_EPS)) / screen.det_blurred
     by_inverse = -(by_conics * _conics(screen).t()).sum(0)
-    # Of det(cov2d) by itself and as a part of det(cov2d + e I): the difference of the two, which is nearly nothing
-    # for a large splat, is 1 - root^2, written as what the blur adds.
+    # det(cov2d) counts by itself and as a part of det(cov2d + e I). The two nearly cancel for a large splat: their
+    # difference, 1 - root^2, is written as the blur's part of the determinant.
     xx, _, yy = screen.blurred
     by_det = by_inverse + by_ratio * (EPS2D * (xx + yy - EPS2D) / screen.det_blurred)
     by_trace = EPS2D * (by_inverse - by_ratio * root * root)
@@ -237,22 +243,10 @@ def _back_to_quats(screen: _Screen, by_rotations: Tensor, quats: Tensor) -> Tens
 
 
 def project(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> Projection:
-    """See `nrfgs_ns.rasterizer.project`: means, quats, scales; viewmats, Ks, width, height.
-
-    A projection that is not finite fails the comparisons below, so `assume_finite` changes nothing.
-    """
+    """See `nrfgs_ns.rasterizer.project`: means, quats, scales; viewmats, Ks, width, height."""
     viewmats, Ks, width, height = cameras
-
-    def visible(screen: _Screen) -> tuple[Tensor, Tensor]:
-        radii = _radii(screen)
-        x, y = screen.means2d
-        seen = (screen.depths >= options.near_plane) & (screen.depths <= options.far_plane)
-        seen &= (screen.det_blurred > 0) & (radii > 0) & (radii < LARGEST_RADIUS)
-        seen &= (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
-        return radii, seen.nonzero().squeeze(1)
-
     cameras = zip(viewmats, Ks, strict=True)
-    projected = [_Project.apply(*geometry, *camera, (width, height), visible) for camera in cameras]
+    projected = [_Project.apply(*geometry, *camera, (width, height), options) for camera in cameras]
     ids, *columns, compensations = (torch.cat(rows) for rows in zip(*projected, strict=True))
     camera_ids = torch.cat([torch.full_like(camera[0], index) for index, camera in enumerate(projected)])
     if options.rasterize_mode != "antialiased":

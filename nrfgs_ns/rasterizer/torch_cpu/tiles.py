@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tiles: which splats can touch which pixels, sorted front to back.
+"""Tiles: the splats that can touch each tile of pixels, front to back.
 
 gsplat lets a splat touch exactly the `tile_size` tiles that its radius square meets. That rule is part of its image (it
 truncates tails at tile borders), so it is kept. Inside these tiles the splats are listed per *sub-tile* of 8 x 8
@@ -38,7 +38,7 @@ REACH_SLACK = 1e-3  # added to s: covers the rounding of sigma in float32 (below
 
 
 class Block(NamedTuple):
-    """A rectangle of sub-tiles. Rows of all cameras are stacked: row = camera * tiles_y + y."""
+    """A rectangle of sub-tiles. All cameras' rows are stacked: row = camera * tiles_y + y."""
 
     row0: int
     row1: int
@@ -48,54 +48,41 @@ class Block(NamedTuple):
 
 @dataclass
 class Footprints:
-    """The splats that can leave a mark, in depth order, and the sub-tiles around them; F of the M projected rows."""
+    """The F of M projected splats that can be seen, in depth order, and the sub-tiles around them."""
 
-    tiles_x: int
-    tiles_y: int
-    """Sub-tiles per image row and column."""
-    rows: Tensor
-    """Row of the projection. [F], int64"""
-    shape: Tensor
-    """Centre x, y (from the top of the first of the stacked images), conic a, b, c, ln(opacity). [6, F], float64"""
-    spans: Tensor
-    """Bounding box in sub-tiles of the stacked images: first and end row, first and end column. [4, F], int64"""
+    tiles_x: int  # sub-tiles per image row
+    tiles_y: int  # and column
+    rows: Tensor  # rows of the projection. [F], int64
+    shape: Tensor  # centre x, y (from the top of the stacked images), conic a, b, c, ln(opacity). [6, F], float64
+    spans: Tensor  # first and end row, first and end column in sub-tiles of the stacked images. [4, F], int64
 
     @property
     def whole(self) -> Block:
         """All rows that any splat meets, all columns."""
         if self.rows.numel() == 0:
-            return Block(0, 0, 0, self.tiles_x)
+            return Block(0, 0, 0, 0)
         return Block(int(self.spans[0].min()), int(self.spans[1].max()), 0, self.tiles_x)
 
 
 @dataclass
 class TileLists:
-    """The (sub-tile, splat) pairs of a block; K pairs."""
+    """The K (sub-tile, splat) pairs of a block."""
 
-    tiles: Tensor
-    """Sub-tiles that have splats, as indices into all [C * tiles_y * tiles_x]. [L], int64"""
-    start: Tensor
-    """First pair of each of these sub-tiles. [L], int64"""
-    count: Tensor
-    """Number of its pairs. [L], int64"""
-    splat: Tensor
-    """Footprint of each pair, sorted by sub-tile, then depth; last F, for a pair K to pad lists with. [K + 1], int64"""
-    slot: Tensor
-    """Position of each pair when sorted by splat instead: where its gradient is collected; then K. [K + 1], int64"""
-    splat_start: Tensor
-    """First slot of each footprint. [F], int64"""
+    tiles: Tensor  # sub-tiles that have splats, as indices into all C * tiles_y * tiles_x. [L], int64
+    start: Tensor  # first pair of each sub-tile. [L], int64
+    count: Tensor  # number of its pairs. [L], int64
+    splat: Tensor  # footprint of each pair, sorted by sub-tile, then depth; F for pair K, the padding. [K + 1], int64
+    slot: Tensor  # place of each pair when sorted by splat, where its gradient is collected; then K. [K + 1], int64
+    splat_start: Tensor  # first slot of each footprint. [F], int64
 
     @property
     def n_pairs(self) -> int:
-        """K."""
         return self.splat.numel() - 1
 
 
 def _inclusive_range(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """Sub-tiles [first, end) that have a pixel centre in [low, high] (pixels, float64). Centres lie at +0.5."""
-    first = torch.ceil((low - (SUB_TILE - 0.5)) / SUB_TILE)
-    end = torch.floor((high - 0.5) / SUB_TILE) + 1
-    return first, end
+    return torch.ceil((low - (SUB_TILE - 0.5)) / SUB_TILE), torch.floor((high - 0.5) / SUB_TILE) + 1
 
 
 def _square_range(centre: Tensor, radius: Tensor, n_tiles: int) -> tuple[Tensor, Tensor]:
@@ -105,7 +92,7 @@ def _square_range(centre: Tensor, radius: Tensor, n_tiles: int) -> tuple[Tensor,
 
 
 def footprints(projection: Projection, opacities: Tensor) -> Footprints:
-    """Bound every splat: where gsplat's tiles and its own 1/255 ellipse allow it to be seen. Opacities: [M]."""
+    """Bound every splat, with opacities [M], by gsplat's tiles and by its own 1/255 ellipse."""
     per_tile = TILE_SIZE // SUB_TILE
     width, height = projection.width, projection.height
     tiles_x, tiles_y = -(-width // SUB_TILE), -(-height // SUB_TILE)
@@ -147,7 +134,7 @@ def footprints(projection: Projection, opacities: Tensor) -> Footprints:
 
 
 def _clip(spans: Tensor, block: Block) -> Tensor:
-    """Spans within a block; a splat outside gets an empty row range. [4, F]"""
+    """Spans within a block, with an empty range of rows for splats outside. [4, F]"""
     row0, row1 = spans[0].clamp(min=block.row0), spans[1].clamp(max=block.row1)
     col0, col1 = spans[2].clamp(min=block.col0), spans[3].clamp(max=block.col1)
     row1 = torch.where(col0 < col1, row1.maximum(row0), row0)
@@ -155,7 +142,7 @@ def _clip(spans: Tensor, block: Block) -> Tensor:
 
 
 def split_into_blocks(prints: Footprints, max_pairs: int) -> list[Block]:
-    """Cut the sub-tiles into blocks of at most `max_pairs` pairs (by bounding boxes), or of one sub-tile."""
+    """Blocks of at most `max_pairs` pairs (by bounding boxes), or of one sub-tile, that cover all splats."""
 
     def split(block: Block) -> list[Block]:
         row0, row1, col0, col1 = block
@@ -185,8 +172,8 @@ def list_tiles(prints: Footprints, block: Block) -> TileLists:
     splat = torch.repeat_interleave(n_rows, output_size=total)
     row = torch.arange(total) + (row0 - row_end + n_rows).index_select(0, splat)
 
-    # The interval of columns that the ellipse covers on the pixel rows [y0, y1] of each: on the line dy of a splat,
-    # dx = slope dy -+ sqrt(widest - narrowing dy^2).
+    # The columns that the ellipse covers on the pixel rows [y0, y1]: on the line dy, dx = slope dy -+ sqrt(widest -
+    # narrowing dy^2).
     x, y, a, b, c, log_opacity = prints.shape
     det = a * c - b * b
     reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
