@@ -23,8 +23,8 @@ NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 def projection_options(
     rasterize_mode: RasterizeMode, scene_unit: float, near: float = 0.0, *, assume_finite: bool = False
 ) -> ProjectionOptions:
-    """Options of a projection with splatfacto's planes, where a scene unit is `scene_unit` world units; the near plane is
-    at least `near` world units away."""
+    """Options of a projection with splatfacto's planes, `scene_unit` being the world units in a scene unit. The near
+    plane is at least `near` world units away."""
     planes = max(NEAR_PLANE * scene_unit, near), FAR_PLANE * scene_unit
     return ProjectionOptions(rasterize_mode, *planes, assume_finite=assume_finite)
 

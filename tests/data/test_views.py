@@ -7,12 +7,13 @@ import pytest
 import scipy.spatial
 import torch
 from hard_trainings import rescale
+from nerfstudio.cameras.cameras import Cameras
 from short_trainings import set_up
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
-from nrfgs_ns.data.views import different_views, evenly_spaced, scene_unit
+from nrfgs_ns.data.views import different_views, evenly_spaced, nearest_depth, scene_unit
 
 
 @pytest.mark.parametrize(
@@ -46,6 +47,21 @@ def ring_of_poses(count, outwards=False):
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(back)
     rotation = torch.stack([torch.linalg.cross(up, back), up, -back if outwards else back], dim=-1)
     return torch.cat([rotation, 5 * back[..., None]], dim=-1)
+
+
+@pytest.mark.parametrize("scale, size", [(1.0, 100), (1.0, 400), (50.0, 100)])
+def test_the_nearest_depth_is_that_of_the_camera_that_comes_nearest(scale, size):
+    """In world units, whatever the size of the images; a few stray points before a camera do not count."""
+    generator = torch.Generator().manual_seed(1)
+    points = torch.rand(4000, 3, generator=generator) - 0.5
+    points[:, :] *= 2 / points.norm(dim=1, keepdim=True)  # a sphere of radius 2
+    poses = ring_of_poses(12).float()
+    poses[3, :, 3] *= 4 / 5  # this one stands 2 before the sphere
+    stray = 0.9 * poses[3, :, 3] + 0.01 * torch.randn(5, 3, generator=generator)
+    poses[:, :, 3] *= scale
+    cameras = Cameras(poses, float(size), float(size), size / 2, size / 2, size, size)
+    assert nearest_depth(scale * torch.cat([points, stray]), cameras) == pytest.approx(2 * scale, rel=0.02)
+    assert nearest_depth(scale * points[:10], cameras) == 0.0
 
 
 def moved(poses, sigma):

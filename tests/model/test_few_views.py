@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 import torch
-from short_trainings import command_line, models_of, set_up, trained
+from short_trainings import checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -69,6 +69,17 @@ def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_c
     assert again.num_views == 8 and again.trust == trust
     assert again.head.config == NrfConfig(opacity_scale=trust * 0.2) and again.noise_factor == 0.5 / trust
     assert again.view_noise.sigma == again.noise_factor * again.camera_spacing / 3**0.5
+
+
+def test_nothing_is_drawn_before_half_the_nearest_depth(tiny_scene, tmp_path, no_cuda):
+    """A checkpoint keeps the plane of its training."""
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "new", 2, QUICK))
+    state = checkpoint_of(config)["pipeline"]["_model._extra_state"]
+    model = ready(tiny_scene, tmp_path / "on", 4, {"--load-dir": models_of(config)}).pipeline.model
+    depth = model.nearest_depth
+    assert model.projection_options.near_plane == 0.5 * depth == 0.5 * state["nearest_depth"] > 0.01 * model.scene_unit
+    off = ready(tiny_scene, tmp_path / "off", 1, {"--pipeline.model.near-plane": "off"}).pipeline.model
+    assert off.projection_options.near_plane == 0.01 * off.scene_unit
 
 
 def test_mcmc_has_residuals_on_the_logit(tiny_scene, tmp_path, no_cuda, capsys):
