@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether Triton's kernels run here, found out by running them: Triton or a C compiler may be missing, or the device
-may have too little shared memory. Nothing here imports Triton; trials do, once it is known to be there."""
+"""Trials of Triton's kernels: Triton or a C compiler may be missing, or the device may have too little shared memory.
+
+Nothing here imports Triton; trials do, once it is known to be there.
+"""
 
 import importlib.util
 import logging
@@ -16,28 +18,6 @@ Outcome = TypeVar("Outcome")
 logger = logging.getLogger(__name__)
 
 
-def try_triton(trial: Callable[[], Outcome]) -> Outcome | str:
-    """The trial's result, or why Triton's kernels do not run here, for after a colon.
-
-    Args:
-        trial: imports and runs kernels, with gradients if it likes, whatever mode the caller is in; raises what goes
-            wrong.
-
-    Raises:
-        torch.OutOfMemoryError: that says nothing about Triton and must not be remembered.
-    """
-    if importlib.util.find_spec("triton") is None:
-        return "Triton is not installed"
-    try:
-        with torch.inference_mode(False), torch.enable_grad():
-            return trial()
-    except torch.OutOfMemoryError:
-        raise
-    except Exception as error:
-        first_line = next(iter(str(error).splitlines()), "")
-        return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
-
-
 @contextmanager
 def tried_meanwhile(trials: Sequence[Callable[[], object]], device: torch.device) -> Iterator[None]:
     """Try kernels, which compiles them, on a thread of its own while the block runs; joined at its end.
@@ -51,21 +31,19 @@ def tried_meanwhile(trials: Sequence[Callable[[], object]], device: torch.device
                 with suppress(Exception):
                     trial()
 
-    thread = Thread(target=run, name="kernels") if trials else None
-    if thread is not None:
-        thread.start()
+    thread = Thread(target=run, name="kernels")
+    thread.start()
     try:
         yield
     finally:
-        if thread is not None:
-            thread.join()
+        thread.join()
 
 
 class Gate(dict[Hashable, Any]):
-    """Results of kernels' trials: each key is tried once, and a failure reported once.
+    """Outcomes of kernels' trials: each key is tried once, and a failure reported once.
 
     Args:
-        what: they compute, the subject of the warning.
+        what: the subject of the warning "... runs in plain PyTorch".
     """
 
     def __init__(self, what: str):
@@ -75,16 +53,20 @@ class Gate(dict[Hashable, Any]):
     def find(
         self, key: Hashable, device: torch.device, trial: Callable[[], Outcome], quiet: bool = False
     ) -> Outcome | str:
-        """The trial's result, or why the kernels do not run on a device (`try_triton`).
+        """The trial's result, or why the kernels do not run here, for after a colon.
 
         Args:
             key: what the answer holds for.
             device: for the warning.
-            trial: as for `try_triton`; it may also return a reason.
+            trial: imports and runs kernels, with gradients whatever mode the caller is in; raises what goes wrong, or
+                returns a reason.
             quiet: do not warn.
+
+        Raises:
+            torch.OutOfMemoryError: that says nothing about Triton and is not remembered.
         """
         if key not in self:
-            self[key] = try_triton(trial)
+            self[key] = _tried(trial)
             if isinstance(self[key], str) and not quiet:
                 logger.warning("%s runs in plain PyTorch on %s: %s.", self.what, device, self[key])
         return self[key]
@@ -92,3 +74,16 @@ class Gate(dict[Hashable, Any]):
     def opens(self, key: Hashable, device: torch.device, trial: Callable[[], object]) -> bool:
         """Whether the kernels run."""
         return not isinstance(self.find(key, device, trial), str)
+
+
+def _tried(trial: Callable[[], Outcome]) -> Outcome | str:
+    if importlib.util.find_spec("triton") is None:
+        return "Triton is not installed"
+    try:
+        with torch.inference_mode(False), torch.enable_grad():
+            return trial()
+    except torch.OutOfMemoryError:
+        raise
+    except Exception as error:
+        first_line = next(iter(str(error).splitlines()), "")
+        return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
