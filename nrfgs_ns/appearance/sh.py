@@ -72,8 +72,7 @@ class SphericalHarmonics(AppearanceHead):
         return self.active_degree
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        names = "means", "features_dc", "features_rest", "opacities"
-        tables = [splats[name] for name in names]
+        tables = [splats[name] for name in ("means", "features_dc", "features_rest", "opacities")]
         # One camera's rows ascend: N of them are the table, which need not be copied.
         if camera_centers.dim() > 1 or len(visible) < len(tables[0]):
             tables = [table.index_select(0, visible) for table in tables]
@@ -121,17 +120,12 @@ def sh_bases(degree: int, directions: Tensor) -> Tensor:
 
 
 def eval_sh(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
-    """Sum of harmonics up to `degree`.
-
-    On CUDA this is a kernel, `harmonics_triton.py`'s or, where Triton does not run, gsplat's; elsewhere `sh_bases`.
+    """Sum of harmonics up to `degree`, [M, 3]: on CUDA by `harmonics_triton.py`, or by gsplat without Triton.
 
     Args:
         degree: highest degree used; coefficients beyond it are ignored.
         directions: [M, 3], any length but zero.
         coefficients: [M, B, 3] with B >= (degree + 1)^2.
-
-    Returns:
-        [M, 3].
 
     Raises:
         RuntimeError: a CUDA graph is being recorded, which misses gsplat's kernel, and Triton does not run.

@@ -92,7 +92,7 @@ def grid(**options):
 
 def test_numbered_level_has_one_row_for_each_lattice_point_of_the_cube():
     """Features at lattice points are the table's rows: 32^3 points from -1 to 31/32, all rows, each once."""
-    level = grid(levels=1, features=1)
+    level = grid(levels=1)
     level.table.data[:, 0] = torch.arange(2**15)
     side = torch.arange(-16, 16, dtype=torch.double) / 16
     rows = level(torch.cartesian_prod(side, side, side))[:, 0]

@@ -10,7 +10,7 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,8 +25,7 @@ from nrfgs_ns.kernels.launch import Launcher
 launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
 
 
-@dataclass(frozen=True)
-class Launch:
+class Launch(NamedTuple):
     """How a kernel is compiled and launched."""
 
     block: int
@@ -52,8 +51,7 @@ class Launch:
         return options if self.registers is None or hidden > 128 else {**options, "maxnreg": self.registers}
 
 
-@dataclass(frozen=True)
-class Launches:
+class Launches(NamedTuple):
     """How both kernels are launched."""
 
     forward: Launch
@@ -110,19 +108,21 @@ INTERPRETER_PROGRAMS = 2
 """Programs in Triton's interpreter: as few as show that programs share the work."""
 
 
-@dataclass(frozen=True)
-class FieldOptions:
+class FieldOptions(NamedTuple):
     """The part of the field's configuration that the kernels need."""
 
-    color_scale: float
-    opacity_scale: float
-    distance_eps: float
-    """in world units"""
-    log_unit: float
-    """log of the world units in a scene unit"""
+    scalars: tuple[float, ...]
+    """squared smallest distance in world units, log of the world units in a scene unit, s_c, s_alpha, SH_C0"""
     bound: str
     """an OpacityBound, or "none" for a field without opacity residual"""
     precision: str
+
+    @staticmethod
+    def of(config, scene_unit: float = 1.0) -> "FieldOptions":
+        """Options of an NrfConfig."""
+        eps_squared, log_unit = (config.distance_eps * scene_unit) ** 2, math.log(scene_unit)
+        scalars = eps_squared, log_unit, config.color_scale, config.opacity_scale, SH_C0
+        return FieldOptions(scalars, config.bound if config.opacity_residual else "none", config.precision)
 
 
 class FusedFunction(torch.autograd.Function):
@@ -149,6 +149,7 @@ class FusedFunction(torch.autograd.Function):
         *tables, flags, visible, centers, packed = ctx.saved_tensors
         count, rows, device = len(visible), len(tables[0]), visible.device
         one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[9]
+        # Without zeros only where the kernel writes each row, once.
         zero = not one_center or count < rows or flags is not None
         d_tables = _tables(rows, packing.latent_dim, device, zero)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
@@ -157,16 +158,11 @@ class FusedFunction(torch.autograd.Function):
         if count > 0:
             programs = _programs(how, count, device)
             partials = tables[0].new_empty(programs, len(packing.gather) + CENTER_SLOTS)
-            kind, gradient_kind = KINDS[options.precision]
             launch_backward(
-                (programs, 1, 1), *tables, _or(flags, visible), visible, centers, packed,
+                (programs, 1, 1), *tables, visible if flags is None else flags, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
-                count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
-                D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
-                B=how.block, COLUMNS=how.columns, SLOTS=partials.shape[1],
-                ONE_CENTER=one_center, BOUND=options.bound, CENTER=wants_center,
-                KIND=kind, GRADIENT_KIND=gradient_kind, DIFFUSE=flags is not None,
-                **how.options(packing.hidden),
+                count, *options.scalars, SLOTS=partials.shape[1], CENTER=wants_center,
+                GRADIENT_KIND=KINDS[options.precision][1], **_constants(packing, how, options, one_center, flags),
             )  # fmt: skip
             sums = partials.sum(dim=0)
         else:
@@ -200,16 +196,30 @@ def evaluate(packing: Packing, how: Launch, options: FieldOptions, tables: Seque
     colors, seen = packed.new_empty(count, 3), packed.new_empty(count)
     if count > 0:
         launch_forward(
-            (_programs(how, count, device), 1, 1), *tables, _or(flags, visible), visible, centers,
-            packed, colors, seen,
-            count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
-            D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
-            B=how.block, COLUMNS=how.columns,
-            ONE_CENTER=centers.dim() == 1, BOUND=options.bound, KIND=KINDS[options.precision][0],
-            DIFFUSE=flags is not None,
-            **how.options(packing.hidden),
+            (_programs(how, count, device), 1, 1), *tables, visible if flags is None else flags, visible, centers,
+            packed, colors, seen, count, *options.scalars,
+            **_constants(packing, how, options, centers.dim() == 1, flags),
         )  # fmt: skip
     return colors, seen, flags
+
+
+def _constants(
+    packing: Packing, how: Launch, options: FieldOptions, one_center: bool, flags: Tensor | None
+) -> dict[str, Any]:
+    """Constants of both kernels, and options of Triton's compiler. Without `flags` the kernels read no mask."""
+    return {
+        "D": packing.latent_dim,
+        "P": packing.width,
+        "H": packing.hidden,
+        "BANDS": packing.num_bands,
+        "B": how.block,
+        "COLUMNS": how.columns,
+        "ONE_CENTER": one_center,
+        "BOUND": options.bound,
+        "KIND": KINDS[options.precision][0],
+        "DIFFUSE": flags is not None,
+        **how.options(packing.hidden),
+    }
 
 
 def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool) -> Launches:
@@ -218,29 +228,26 @@ def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool)
     A missing C compiler and a lack of shared memory show only here. Out-of-memory is re-raised: otherwise a slower
     launch would be kept for good.
     """
-    *more, last = LAUNCHES[options.precision]
-    for launches in more:
+    for launches in LAUNCHES[options.precision]:
         try:
             probe(packing, launches, options, some_diffuse)
+            return launches
         except torch.OutOfMemoryError:
             raise
-        except Exception:  # if the last one fails too, it says why
-            continue
-        return launches
-    probe(packing, last, options, some_diffuse)
-    return last
+        except Exception as error:
+            reason = error
+    raise reason
 
 
 def probe(packing: Packing, launches: Launches, options: FieldOptions, some_diffuse: bool) -> None:
     """Compile and run both kernels on one splat, for one camera; raise whatever goes wrong."""
     device = packing.gather.device
-    with torch.inference_mode(False), torch.enable_grad():
-        tables = [torch.zeros(1, n, device=device, requires_grad=True) for n in (3, packing.latent_dim, 3, 1)]
-        weights = [torch.zeros(shape, device=device, requires_grad=True) for shape in packing.shapes]
-        visible, center = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(3, device=device)
-        diffuse = torch.zeros(1, dtype=torch.bool, device=device) if some_diffuse else None
-        outputs = FusedFunction.apply(packing, launches, options, *tables, diffuse, visible, center, *weights)
-        sum(output.sum() for output in outputs).backward()
+    tables = [torch.zeros(1, n, device=device, requires_grad=True) for n in (3, packing.latent_dim, 3, 1)]
+    weights = [torch.zeros(shape, device=device, requires_grad=True) for shape in packing.shapes]
+    visible, center = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(3, device=device)
+    diffuse = torch.zeros(1, dtype=torch.bool, device=device) if some_diffuse else None
+    outputs = FusedFunction.apply(packing, launches, options, *tables, diffuse, visible, center, *weights)
+    sum(output.sum() for output in outputs).backward()
 
 
 def _programs(how: Launch, count: int, device: torch.device) -> int:
@@ -252,8 +259,7 @@ def _programs(how: Launch, count: int, device: torch.device) -> int:
 def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> list[Tensor]:
     """Tables [N, 3], [N, D], [N, 3] and [N, 1], cut from one allocation so that one launch clears them.
 
-    Each begins at a multiple of 16 bytes: Triton compiles another kernel for pointers that do not. Zeros are not needed
-    if one camera sees every row and none is diffuse: then the kernel writes each row, once.
+    Each begins at a multiple of 16 bytes: Triton compiles another kernel for pointers that do not.
     """
     padded = -(-rows // 4) * 4
     widths = (3, latent_dim, 3, 1)
@@ -267,11 +273,6 @@ def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> lis
 def _contiguous(x: Tensor) -> Tensor:
     """A dense tensor without gradient."""
     return x.detach().contiguous()
-
-
-def _or(flags: Tensor | None, instead: Tensor) -> Tensor:
-    """The mask of diffuse splats; without one, any tensor, which the kernels do not read then."""
-    return instead if flags is None else flags
 
 
 @functools.cache
