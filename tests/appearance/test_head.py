@@ -124,8 +124,3 @@ def test_one_camera_is_as_good_as_one_for_each_splat(config):
     one = head(splats, visible, centers[0])
     each = head(splats, visible, centers[:1].expand(len(visible), 3))
     assert torch.equal(one.colors, each.colors) and torch.equal(one.opacities, each.opacities)
-
-
-def test_only_the_neural_residual_field_is_warmed_up(config):
-    head = awake(config)
-    assert (head.neutral_loss(*scene(head)) is not None) == isinstance(config, NrfConfig)

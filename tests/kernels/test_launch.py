@@ -10,28 +10,23 @@ from nrfgs_ns.kernels.launch import Launcher
 
 
 class Kernel:
-    """Stands for a function under triton.jit: notes each launch, and the variants that were compiled."""
+    """Stands for a function under triton.jit, or for a compiled variant: notes each launch."""
 
     arg_names = ("x", "count", "scale", "B", "KIND")
 
-    def __init__(self, compiles: bool = True):
+    def __init__(self, compiles: bool = True, kind: str = "triton"):
         self.launches: list[tuple] = []
-        self.compiles = compiles
+        self.kind, self.compiles = kind, compiles
 
     def __getitem__(self, grid):
         def launch(*arguments, **constants):
-            self.launches.append(("triton", grid, arguments, constants))
-            return Compiled(self) if self.compiles else None
+            self.launches.append((self.kind, grid, arguments, constants))
+            if self.compiles:
+                variant = Kernel(kind="compiled")
+                variant.launches = self.launches
+                return variant
 
         return launch
-
-
-class Compiled:
-    def __init__(self, kernel: Kernel):
-        self.kernel = kernel
-
-    def __getitem__(self, grid):
-        return lambda *arguments: self.kernel.launches.append(("compiled", grid, arguments))
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +44,7 @@ def test_the_second_launch_is_the_compiled_variants_with_constants_in_the_kernel
     launch((2, 1, 1), x, 7, 0.25, **CONSTANTS)
     assert kernel.launches == [
         ("triton", (1, 1, 1), (x, 8, 0.5), CONSTANTS),
-        ("compiled", (2, 1, 1), (x.data_ptr(), 7, 0.25, 64, "bf16")),
+        ("compiled", (2, 1, 1), (x.data_ptr(), 7, 0.25, 64, "bf16"), {}),
     ]
 
 
