@@ -14,8 +14,8 @@ NEAREST = 0.01
 """Smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
 FARTHEST = 1e18
 """Coordinates of v are clamped to this, without gradient beyond: their squares must stay below float32's 3e38."""
-LOW_DIM = 9
-"""Numbers in the low bands: the raw direction (3), sin and cos of band 0 (6)."""
+BAND_DIM = 6
+"""Numbers in a band: sin and cos of three coordinates."""
 
 
 def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -41,11 +41,6 @@ def unit_vectors(vectors: Tensor, floor: float) -> Tensor:
     Spherical harmonics and lobes take the direction from camera to splat, opposite to `view_geometry`'s.
     """
     return vectors / vectors.square().sum(dim=-1, keepdim=True).clamp_min(floor * floor).sqrt()
-
-
-def high_dim(num_bands: int) -> int:
-    """Numbers in the high bands 1..K-1 of a K-band encoding: sin and cos of three coordinates each."""
-    return 6 * (num_bands - 1)
 
 
 def fourier_bands(directions: Tensor, num_bands: int) -> tuple[Tensor, Tensor]:

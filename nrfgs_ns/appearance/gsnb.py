@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.encoding import NEAREST, fourier_bands, unit_vectors
+from nrfgs_ns.appearance.encoding import BAND_DIM, NEAREST, fourier_bands, unit_vectors
 from nrfgs_ns.appearance.head import SplatAppearance, base_opacities
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh, num_bases
 
@@ -54,7 +54,7 @@ class NeuralBasis(SphericalHarmonics):
         self.ramp = 1.0
         """rho: weight of the learnt basis."""
         self.basis = nn.Sequential(
-            nn.Linear(3 * config.raw_direction + 6 * BANDS, HIDDEN_WIDTH),
+            nn.Linear(3 * config.raw_direction + BAND_DIM * BANDS, HIDDEN_WIDTH),
             nn.LeakyReLU(),
             nn.Linear(HIDDEN_WIDTH, HIDDEN_WIDTH),
             nn.LeakyReLU(),

@@ -47,11 +47,6 @@ class HashGrid(nn.Module):
         per_level_scale: b, ratio of neighbouring levels' resolutions, >= 1.
     """
 
-    resolutions: Tensor
-    primes: Tensor
-    sides: Tensor
-    offsets: Tensor
-
     def __init__(
         self, base_resolution: int, *, levels: int = 4, log2_table_size: int = 15, per_level_scale: float = 1.5
     ) -> None:

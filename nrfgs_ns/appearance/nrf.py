@@ -30,7 +30,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.encoding import LOW_DIM, NEAREST, fourier_bands, high_dim, view_geometry
+from nrfgs_ns.appearance.encoding import BAND_DIM, NEAREST, fourier_bands, view_geometry
 from nrfgs_ns.appearance.field import DIFFUSE, view_dependent
 from nrfgs_ns.appearance.fused import FusedField
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, Component, SplatAppearance, base_colors
@@ -87,8 +87,7 @@ class NrfConfig(AppearanceHeadConfig):
         return replace(self, opacity_scale=share * self.opacity_scale) if self.opacity_residual else self
 
     def for_copies(self) -> "NrfConfig":
-        """Residuals on the logit, by default: n copies of a splat have 1/n of its opacity each, but would each add a
-        whole residual to it."""
+        """Residuals on the logit, by default: n copies of a splat would each add a whole residual to their opacity."""
         return self if self.opacity_bound or not self.opacity_residual else replace(self, opacity_bound="logit")
 
     def validate(self) -> None:
@@ -110,18 +109,12 @@ class NrfConfig(AppearanceHeadConfig):
 class Branches(NamedTuple):
     """Base appearance, and the branches' outputs before any tanh; None for what the configuration leaves out."""
 
-    color: Tensor
-    """c, not clamped, [M, 3]"""
-    logit: Tensor
-    """of the base opacity, [M, 1]"""
-    dc_low: Tensor
-    """[M, 3]; of the single branch, if there is only one"""
-    dc_high: Tensor | None
-    """[M, 3]"""
-    gate: Tensor | None
-    """sigmoid(w), [M, 1]"""
-    d_alpha: Tensor | None
-    """[M, 1]"""
+    color: Tensor  # c, not clamped, [M, 3]
+    logit: Tensor  # of alpha, [M, 1]
+    dc_low: Tensor  # [M, 3]; of the single branch, if there is only one
+    dc_high: Tensor | None  # [M, 3]
+    gate: Tensor | None  # sigmoid(w), [M, 1]
+    d_alpha: Tensor | None  # [M, 1]
 
 
 class NeuralResidualField(AppearanceHead):
@@ -134,15 +127,15 @@ class NeuralResidualField(AppearanceHead):
         super().__init__()
         self.config = config
         shared = config.latent_dim + 3 + int(config.use_distance)  # z, c, log r
+        low, high = 1 + 3 + BAND_DIM, BAND_DIM * (config.num_bands - 1)  # alpha, d and band 0; the other bands
         outputs = 3 + int(config.opacity_residual)  # dc, d_alpha
-        bands = high_dim(config.num_bands)
         self.high: nn.Sequential | None = None
         if config.split_bands:
-            self.low = mlp(shared + 1 + LOW_DIM, config.hidden_width, outputs)
-            if bands > 0:
-                self.high = mlp(shared + bands, config.hidden_width, 3 + 1)  # dc, gate
+            self.low = mlp(shared + low, config.hidden_width, outputs)
+            if high > 0:
+                self.high = mlp(shared + high, config.hidden_width, 3 + 1)  # dc, gate
         else:
-            self.low = mlp(shared + 1 + LOW_DIM + bands, 2 * config.hidden_width, outputs)
+            self.low = mlp(shared + low + high, 2 * config.hidden_width, outputs)
         branches = [branch for branch in (self.low, self.high) if branch is not None]
         if config.output_init == "zero":
             for branch in branches:

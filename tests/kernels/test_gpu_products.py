@@ -98,7 +98,7 @@ def test_every_mode(tiny_scene, tmp_path):
     assert gpu.keys() == cpu.keys() and {DEPTH, VIEW_DEPENDENCE, "gate weight", "opacity residual"} <= gpu.keys()
     for name in gpu:
         error = (gpu[name] - cpu[name]).abs()
-        # A contribution that only one device cuts at alpha = 1/255 moves a blended number by 1/255 of its range; changes
-        # are drawn AMPLIFICATION times as large, and viridis is less steep than 2. Few pixels have such a contribution.
+        # A contribution that only one device cuts at alpha = 1/255 moves a blended number by 1/255 of its range; few
+        # pixels have one. Changes are drawn AMPLIFICATION times as large, and viridis is less steep than 2.
         assert (error > 2 * AMPLIFICATION / 255).float().mean() < 0.01, name
         assert error.mean() < 1e-3, name

@@ -8,7 +8,7 @@ without CUDA lack it. With TRITON_INTERPRET=1 the same kernels run in Triton's i
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,9 +17,6 @@ from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.fused.packing import Packing, pack
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.kernels.trial import Gate
-
-if TYPE_CHECKING:  # imports Triton
-    from nrfgs_ns.appearance.fused.launch import Launches
 
 TABLES = "means", "latents", "features_dc", "opacities"
 """Names of the tables that the kernels read."""
@@ -41,7 +38,6 @@ class FusedField:
         self.config = config
         self.layers = [layer for branch in branches for layer in branch if isinstance(layer, nn.Linear)]
         self.on_cpu = pack(config.latent_dim, config.num_bands, config.use_distance, branches)
-        # By device, precision, and whether some splats are diffuse.
         self.ready = Gate("The field")
 
     def takes(self, splats: Mapping[str, Tensor]) -> bool:
@@ -89,13 +85,13 @@ class FusedField:
         packed = packed_weights(packing, weights)
         return evaluate(packing, launches.forward, options, whole[:4], diffuse, *whole[4:], packed)[:2]
 
-    def _ready_on(self, device: torch.device, some_diffuse: bool = False) -> "tuple[Packing, Launches] | str":
+    def _ready_on(self, device: torch.device, some_diffuse: bool = False) -> tuple[Packing, Any] | str:
         """Index maps and launches on `device`, or why there are none: tried and reported once."""
         key = device, self.config.precision, some_diffuse
         quiet = self.config.implementation != "auto"
         return self.ready.find(key, device, lambda: self._prepare(device, some_diffuse), quiet)
 
-    def _prepare(self, device: torch.device, some_diffuse: bool) -> "tuple[Packing, Launches] | str":
+    def _prepare(self, device: torch.device, some_diffuse: bool) -> tuple[Packing, Any] | str:
         width, hidden = self.on_cpu.width, self.on_cpu.hidden
         if width > MAX_WIDTH or 2 * width * hidden > MAX_WEIGHTS:
             return (

@@ -171,8 +171,7 @@ class FusedFunction(torch.autograd.Function):
             d_centers = sums[len(packing.gather) : len(packing.gather) + 3]
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
-        d_centers = d_centers if wants_center else None
-        return None, None, None, *d_tables, None, None, d_centers, *d_weights
+        return None, None, None, *d_tables, None, None, d_centers if wants_center else None, *d_weights
 
 
 def packed_weights(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
