@@ -7,8 +7,8 @@ Nothing here imports Triton; trials do, once it is known to be there.
 import importlib.util
 import logging
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
-from threading import Thread
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from typing import Any, TypeVar
 
 import torch
@@ -25,18 +25,14 @@ def tried_meanwhile(trials: Sequence[Callable[[], object]], device: torch.device
     Errors are not reported here: whoever needs the kernels will meet them again.
     """
 
-    def run() -> None:
+    def run(trial: Callable[[], object]) -> None:
         with torch.cuda.device(device) if device.type == "cuda" else nullcontext():  # each thread has its own
-            for trial in trials:
-                with suppress(Exception):
-                    trial()
+            trial()
 
-    thread = Thread(target=run, name="kernels")
-    thread.start()
-    try:
+    with ThreadPoolExecutor(1, "kernels") as pool:
+        for trial in trials:
+            pool.submit(run, trial)
         yield
-    finally:
-        thread.join()
 
 
 class Gate(dict[Hashable, Any]):

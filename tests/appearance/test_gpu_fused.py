@@ -149,13 +149,6 @@ def test_lengths_are_in_scene_units():
     compare(head, twin, case, DEVICE_FLOAT32 * float32_tolerance())
 
 
-def test_twice_is_the_same():
-    head, _ = heads("cuda")
-    case = scene(head, 120_000, 100_000)
-    first, second = evaluate(head, *case), evaluate(head, *case)
-    assert all(torch.equal(first[name], second[name]) for name in first)
-
-
 def test_auto_takes_the_kernels_and_falls_back():
     for config, taken in (({}, True), ({"latent_dim": 65}, False)):
         head = NrfConfig(**config).setup().cuda()

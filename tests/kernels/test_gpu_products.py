@@ -23,15 +23,18 @@ FROZEN = "full, as seen from another camera"
 STEPS = 60
 
 
-def model_with_something_to_show(device: str, scene: Path, out: Path):
-    """A model in evaluation mode whose field is drawn at random, the same on every device; and its cameras."""
+def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tensor]:
+    """The picture of every mode, and one whose view is frozen, moved to the CPU.
+
+    The field is drawn at random, the same on every device.
+    """
     config = parse(["nrfgs", "--data", str(scene), "--output-dir", str(out), "--machine.device-type", device])
     config.pipeline.model.background_color = "black"
     config.pipeline.model.few_views = "off"
     config.pipeline.model.appearance.precision = "fp32"  # as on the CPU
     torch.manual_seed(0)
     pipeline = config.pipeline.setup(device=device, test_mode="val")
-    model = pipeline.model
+    model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras.to(device)
     generator = torch.Generator().manual_seed(1)
     drawn = {"latents": 0.3, "scales": 0.5}
     for name, parameter in [*model.head.named_parameters(), *model.gauss_params.items()]:
@@ -41,19 +44,12 @@ def model_with_something_to_show(device: str, scene: Path, out: Path):
     model.gauss_params["opacities"].data.fill_(1.0)  # a pixel shows few splats
     model.update_to_step(10**6)
     pipeline.eval()
-    return model, pipeline.datamanager.train_dataset.cameras.to(device)
-
-
-def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tensor]:
-    """The picture of every mode, and one whose view is frozen, moved to the CPU."""
-    model, cameras = model_with_something_to_show(device, scene, out)
     camera, elsewhere = cameras[0:1], cameras[4:5].camera_to_worlds[0, :3, 3]
     shown = {mode: Shown(mode) for mode in modes(model.field)} | {FROZEN: Shown(frozen_center=elsewhere)}
-    pictures = {}
-    for name, what in shown.items():
-        pictures[name] = picture(model, camera, what)["rgb"]
-        assert pictures[name].shape == (36, 48, 3) and pictures[name].device.type == device, name
-        assert ((pictures[name] >= 0) & (pictures[name] <= 1)).all(), name  # NaN is in no interval
+    pictures = {name: picture(model, camera, what)["rgb"] for name, what in shown.items()}
+    for name, drawn_picture in pictures.items():
+        assert drawn_picture.shape == (36, 48, 3) and drawn_picture.device.type == device, name
+        assert ((drawn_picture >= 0) & (drawn_picture <= 1)).all(), name  # NaN is in no interval
     assert torch.equal(pictures[FULL], model.get_outputs_for_camera(camera)["rgb"])
     assert torch.equal(pictures[BASE], model.get_base_color(camera))
     for pair in combinations(pictures, 2):
@@ -87,7 +83,6 @@ def test_exported_files(tiny_scene, tmp_path):
     worth = ply["psnr_model"] - ply["psnr_base"]
     assert worth > 0.5
     assert abs(ply["loss_db"]) < worth / 3 and abs(compact["loss_db"]) < worth / 3
-    # Nearly half of so small a file is the network, which all splats share.
     assert compact["view_dependent"] > 0 and compact["ply_ratio"] > 2
 
 
