@@ -50,7 +50,6 @@ class NeuralBasis(SphericalHarmonics):
 
     def __init__(self, config: GsnbConfig):
         super().__init__(config)
-        self.config: GsnbConfig = config
         self.ramp = 1.0
         """rho: weight of the learnt basis."""
         self.basis = nn.Sequential(

@@ -37,12 +37,12 @@ def test_values_and_gradients(opacity_bound, repeated):
     compare(head, twin, scene(head, 230 if not repeated else 30, 200, repeated), float32_tolerance())
 
 
-@pytest.mark.parametrize("diffuse", [None, 0.5])
-def test_without_gradients_the_values_are_the_same(diffuse):
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+@pytest.mark.parametrize("diffuse", [0.0, 0.5])
+def test_without_gradients_the_values_are_the_same(diffuse, mode):
     head, _ = heads()
-    case = scene(head, 75, 70)
-    case = case if diffuse is None else some_diffuse(case, diffuse, last=True)
-    with torch.no_grad():
+    case = some_diffuse(scene(head, 75, 70), diffuse, last=True)
+    with mode():
         alone = head(*case)
     assert all(map(torch.equal, alone, head(*case)))
 

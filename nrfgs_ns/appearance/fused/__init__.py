@@ -72,18 +72,12 @@ class FusedField:
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float = 1.0
     ) -> tuple[Tensor, Tensor]:
         """Colours [M, 3] and opacities [M]: see AppearanceHead.forward, after `takes` said yes."""
-        from nrfgs_ns.appearance.fused.launch import FieldOptions, FusedFunction, evaluate, packed_weights
+        from nrfgs_ns.appearance.fused.launch import FieldOptions, FusedFunction
 
         weights = [weight for layer in self.layers for weight in (layer.weight, layer.bias)]
-        tables = [splats[name] for name in TABLES]
-        diffuse = splats.get(DIFFUSE)
-        packing, launches = self._ready_on(visible.device, diffuse is not None)
-        options = FieldOptions.of(self.config, scene_unit)
-        if torch.is_grad_enabled():
-            return FusedFunction.apply(packing, launches, options, *tables, diffuse, visible, camera_centers, *weights)
-        whole = [tensor.detach().contiguous() for tensor in (*tables, visible, camera_centers)]
-        packed = packed_weights(packing, weights)
-        return evaluate(packing, launches.forward, options, whole[:4], diffuse, *whole[4:], packed)[:2]
+        tables, diffuse = [splats[name] for name in TABLES], splats.get(DIFFUSE)
+        ready, options = self._ready_on(visible.device, diffuse is not None), FieldOptions.of(self.config, scene_unit)
+        return FusedFunction.apply(*ready, options, *tables, diffuse, visible, camera_centers, *weights)
 
     def _ready_on(self, device: torch.device, some_diffuse: bool = False) -> tuple[Packing, Any] | str:
         """Index maps and launches on `device`, or why there are none: tried and reported once."""

@@ -136,8 +136,18 @@ class FusedFunction(torch.autograd.Function):
     def forward(ctx, packing: Packing, launches: Launches, options: FieldOptions, means, latents, features_dc,
                 opacities, diffuse, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
-        visible, centers, packed = _contiguous(visible), _contiguous(centers), packed_weights(packing, weights)
-        colors, seen, flags = evaluate(packing, launches.forward, options, tables, diffuse, visible, centers, packed)
+        visible, centers, packed = _contiguous(visible), _contiguous(centers), _packed(packing, weights)
+        # Triton lays out a product's factors by the narrowest number that they are computed from: for bytes, it took
+        # more columns to a thread than d_Y has, and float32's d_hidden was wrong.
+        flags = None if diffuse is None else diffuse.to(torch.int32)
+        count, how = len(visible), launches.forward
+        colors, seen = packed.new_empty(count, 3), packed.new_empty(count)
+        if count > 0:
+            launch_forward(
+                (_programs(how, count, visible.device), 1, 1), *tables, visible if flags is None else flags, visible,
+                centers, packed, colors, seen, count, *options.scalars,
+                **_constants(packing, how, options, centers.dim() == 1, flags),
+            )  # fmt: skip
         ctx.save_for_backward(*tables, flags, visible, centers, packed)
         ctx.packing, ctx.how, ctx.options = packing, launches.backward, options
         return colors, seen
@@ -174,32 +184,10 @@ class FusedFunction(torch.autograd.Function):
         return None, None, None, *d_tables, None, None, d_centers if wants_center else None, *d_weights
 
 
-def packed_weights(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
+def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
     """The shared weights as the kernels read them."""
     flat = [weight.detach().reshape(-1) for weight in weights]
     return torch.cat([*flat, _zero(flat[0].device)]).index_select(0, packing.gather)
-
-
-def evaluate(packing: Packing, how: Launch, options: FieldOptions, tables: Sequence[Tensor], diffuse: Tensor | None,
-             visible: Tensor, centers: Tensor, packed: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:  # fmt: skip
-    """Colours [M, 3] and opacities [M] without gradients, and `diffuse` as the kernels read it.
-
-    Args:
-        tables: means, latents, features_dc and opacities, dense and without gradient like all tensors here.
-        packed: of `packed_weights`.
-    """
-    count, device = len(visible), visible.device
-    # Triton lays out a product's factors by the narrowest number that they are computed from: for bytes, it took
-    # more columns to a thread than d_Y has, and float32's d_hidden was wrong.
-    flags = None if diffuse is None else diffuse.to(torch.int32)
-    colors, seen = packed.new_empty(count, 3), packed.new_empty(count)
-    if count > 0:
-        launch_forward(
-            (_programs(how, count, device), 1, 1), *tables, visible if flags is None else flags, visible, centers,
-            packed, colors, seen, count, *options.scalars,
-            **_constants(packing, how, options, centers.dim() == 1, flags),
-        )  # fmt: skip
-    return colors, seen, flags
 
 
 def _constants(

@@ -23,8 +23,8 @@ def sigmoid(x):
     return inverse(1.0 + tl.exp(-x))
 
 
-# The interpreter truncates to bfloat16 and multiplies the bits as integers: there, operands are rounded by hand and stay
-# float32.
+# The interpreter truncates to bfloat16 and multiplies the bits as integers: there, operands are rounded by hand, and
+# stay float32.
 INTERPRETED = tl.constexpr(not isinstance(sigmoid, triton.runtime.JITFunction))
 
 
