@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Launcher`: when a compiled variant is launched again, and when Triton is asked anew. No GPU is needed for that."""
+"""`Launcher`: when a compiled variant is launched again, and when Triton is asked anew, without a GPU."""
 
 import pytest
 import torch
