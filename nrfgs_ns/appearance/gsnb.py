@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.encoding import BAND_DIM, NEAREST, fourier_bands, unit_vectors
-from nrfgs_ns.appearance.head import SplatAppearance, base_opacities
+from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh, num_bases
 
 RAMP_STEPS = 5000
@@ -70,14 +70,10 @@ class NeuralBasis(SphericalHarmonics):
         return super().phase, self.ramp
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        means = splats["means"].index_select(0, visible)
+        means, coefficients, opacities = self.rows(splats, visible, camera_centers)
         directions = unit_vectors(means - camera_centers, NEAREST * self.scene_unit)
         inputs = torch.cat(fourier_bands(directions, BANDS), dim=-1)
         learnt = self.basis(inputs if self.config.raw_direction else inputs[:, 3:])  # [M, B]
-        coefficients = self.coefficients(splats, visible)
         colors = eval_sh(self.active_degree, directions, coefficients)
         colors = colors + self.ramp * (learnt[..., None] * coefficients).sum(dim=1)
-        return SplatAppearance(
-            colors=(colors + 0.5).clamp_min(0.0),
-            opacities=base_opacities(splats["opacities"].index_select(0, visible)),
-        )
+        return SplatAppearance((colors + 0.5).clamp_min(0.0), opacities)

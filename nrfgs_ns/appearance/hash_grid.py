@@ -63,15 +63,11 @@ class HashGrid(nn.Module):
     def forward(self, positions: Tensor) -> Tensor:
         """Interpolated features [M, levels * 4], level by level, of positions [M, 3] in scene units."""
         float32 = positions.dtype == self.table.dtype == torch.float32
-        if positions.is_cuda and float32 and _kernels_run_on(positions.device):
+        if positions.is_cuda and float32 and kernels_run_on(positions.device):
             from nrfgs_ns.appearance.hash_grid_triton import Interpolation
 
             return Interpolation.apply(positions, self.table, self.resolutions, len(self.sides), self.table_size)
         return self.in_torch(positions)
-
-    def try_kernels(self, device: torch.device) -> None:
-        """Try the kernels on a CUDA device, which compiles them."""
-        _kernels_run_on(device)
 
     def in_torch(self, positions: Tensor) -> Tensor:
         """The kernels' twin: the same in PyTorch, on any device and of any floating dtype."""
@@ -104,14 +100,13 @@ def _corners(per_axis: Tensor, combine: Callable[[Tensor, Tensor], Tensor]) -> T
 _GATE = Gate("The hash grid")
 
 
-def _kernels_run_on(device: torch.device) -> bool:
-    """Whether Triton's kernels run on a CUDA device; tried once."""
-    return _GATE.opens(device, device, lambda: _try_kernels(device))
+def kernels_run_on(device: torch.device) -> bool:
+    """Whether Triton's kernels run on a CUDA device; tried once, which compiles them."""
 
+    def trial() -> None:
+        from nrfgs_ns.appearance.hash_grid_triton import Interpolation
 
-def _try_kernels(device: torch.device) -> None:
-    """Compile and run both kernels on one position; raise whatever goes wrong."""
-    from nrfgs_ns.appearance.hash_grid_triton import Interpolation
+        position, table = (torch.zeros(*shape, device=device, requires_grad=True) for shape in ((1, 3), (2, FEATURES)))
+        Interpolation.apply(position, table, torch.ones(1, device=device), 0, 2).sum().backward()
 
-    position, table = (torch.zeros(*shape, device=device, requires_grad=True) for shape in ((1, 3), (2, FEATURES)))
-    Interpolation.apply(position, table, torch.ones(1, device=device), 0, 2).sum().backward()
+    return _GATE.opens(device, device, trial)

@@ -82,8 +82,8 @@ def _level(x, y, z, level, resolutions, numbered_levels):
 
 @triton.jit
 def _offsets(keys, numbered, table_size, CORNER: tl.constexpr, F: tl.constexpr):
-    """Where a corner's features begin in the level's table, int64 [B, 1]. Corner 4 i + 2 j + k is the upper one on x,
-    y, z where i, j, k are 1."""
+    """Starts of a corner's features in the level's table, int64 [B, 1]. Corner 4 i + 2 j + k is the upper one on x, y,
+    z where i, j, k are 1."""
     a, b, c = keys[0][CORNER // 4], keys[1][CORNER // 2 % 2], keys[2][CORNER % 2]
     rows = tl.where(numbered, a + b + c, (a ^ b ^ c) & (table_size - 1).to(tl.uint32))
     return rows.to(tl.int64)[:, None] * F

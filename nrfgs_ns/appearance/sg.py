@@ -79,10 +79,8 @@ class SphericalGaussians(AppearanceHead):
         colors = base_colors(splats["features_dc"].index_select(0, visible))
         if self.active:
             colors = colors + self._lobes(splats, visible, camera_centers)
-        return SplatAppearance(
-            colors=colors.clamp_min(0.0),
-            opacities=base_opacities(splats["opacities"].index_select(0, visible)),
-        )
+        opacities = base_opacities(splats["opacities"].index_select(0, visible))
+        return SplatAppearance(colors.clamp_min(0.0), opacities)
 
     def _lobes(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor:
         """Sum of the visible splats' lobes, [M, 3]."""

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.encoding import NEAREST, unit_vectors
-from nrfgs_ns.appearance.hash_grid import HashGrid
-from nrfgs_ns.appearance.head import Component, SplatAppearance, base_opacities
+from nrfgs_ns.appearance.hash_grid import HashGrid, kernels_run_on
+from nrfgs_ns.appearance.head import Component, SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh
 
 HIDDEN_WIDTH = 32
@@ -62,17 +62,14 @@ class ViewDirectionFactors(SphericalHarmonics):
 
     def try_kernels(self, device: torch.device) -> None:
         super().try_kernels(device)
-        self.grid.try_kernels(device)
+        kernels_run_on(device)
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        means = splats["means"].index_select(0, visible)
+        means, coefficients, opacities = self.rows(splats, visible, camera_centers)
         directions = unit_vectors(means - camera_centers, NEAREST * self.scene_unit)
         factors = torch.sigmoid(self.network(torch.cat([directions, self.grid(means / self.scene_unit)], dim=-1)))
-        coefficients = self.coefficients(splats, visible)
-        return SplatAppearance(
-            colors=(eval_sh(self.active_degree, directions, coefficients) + 0.5).clamp_min(0.0),
-            opacities=base_opacities(splats["opacities"].index_select(0, visible)) * factors[:, 0],
-        )
+        colors = eval_sh(self.active_degree, directions, coefficients) + 0.5
+        return SplatAppearance(colors.clamp_min(0.0), opacities * factors[:, 0])
 
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
         """The harmonics' "residual", and the factor's "opacity residual"."""

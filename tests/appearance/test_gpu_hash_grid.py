@@ -25,14 +25,6 @@ def test_values_and_gradients(count, options):
     assert_near_twin(*grids("cuda", **options), positions(count, "cuda"), interpolate)
 
 
-def test_positions_that_start_anywhere():
-    """Neither dense nor at a multiple of 16 bytes: another compiled kernel each time, and the usual one again."""
-    case = grids("cuda", **PAPER)
-    x = positions(3000, "cuda")
-    for part in (x, x[1:], x[::2], x):
-        assert_near_twin(*case, part, interpolate)
-
-
 def test_what_is_no_lattice_coordinate():
     grid, _ = grids("cuda", **PAPER)
     wild = [[1e12, -1e12, 1e30], [-1e30] * 3, [0.1, torch.nan, 0.1], [0.1, 0.1, torch.inf], [0.3, -0.2, 0.1]]

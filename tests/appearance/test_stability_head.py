@@ -66,13 +66,6 @@ def assert_healthy(head, splats, center, rows=None):
 
 
 @pytest.mark.parametrize("head", HEADS)
-def test_camera_exactly_on_a_splat(head):
-    head, splats, center = build(head, Extreme())
-    splats["means"].data[:3] = center.data
-    assert_healthy(head, splats, center)
-
-
-@pytest.mark.parametrize("head", HEADS)
 @settings(max_examples=12, derandomize=True)
 @given(exponent=st.floats(-30, 30), seed=st.integers(0, 99))
 def test_distances_from_1e_30_to_1e30(head, exponent, seed):

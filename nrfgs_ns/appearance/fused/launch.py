@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kernels as one differentiable function of tables, camera centres and shared weights.
 
-A training step of a small scene is bound by the host, so this is written for few launches: two to pack the weights,
-one forward, one to zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the
-weights' gradients. Diffuse splats cost one more, for a 32-bit mask, and the tables' gradients are always zeroed.
+A training step of a small scene is bound by the host, hence few launches: two to pack the weights, one forward, one to
+zero the tables' gradients unless every splat is visible and none diffuse, one backward, two to sum and unpack the
+weights' gradients; one for a 32-bit mask of diffuse splats.
 """
 
 import functools
@@ -28,18 +28,12 @@ launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_ke
 class Launch(NamedTuple):
     """How a kernel is compiled and launched."""
 
-    block: int
-    """visible splats that a program takes at once"""
-    warps: int
-    """warps of a program"""
-    stages: int
-    """software pipelining of the loop over blocks; 1 is none"""
-    programs_per_sm: int
-    """programs for each multiprocessor; a program walks over many blocks"""
-    columns: int
-    """of W2 for the tensor cores: 8, or 16 with zeros behind; with 16, d_W1 is X^T d_pre instead of d_pre^T X"""
-    registers: int | None = None
-    """most registers of a thread, for up to 128 hidden units; None leaves them to the compiler"""
+    block: int  # visible splats that a program takes at once
+    warps: int  # of a program
+    stages: int  # software pipelining of the loop over blocks; 1: none
+    programs_per_sm: int  # a program walks over many blocks
+    columns: int  # of W2 for the tensor cores: 8, or 16 with zeros behind; then d_W1 is X^T d_pre, not d_pre^T X
+    registers: int | None = None  # most of a thread, for up to 128 hidden units; None leaves them to the compiler
 
     def options(self, hidden: int) -> dict[str, int]:
         """Options of Triton's compiler, for H hidden units.

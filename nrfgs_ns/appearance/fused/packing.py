@@ -32,18 +32,15 @@ class Packing:
     """Index maps and sizes; on the CPU until `to`."""
 
     latent_dim: int
-    width: int
-    """P: columns of the latents' tile and of the features' tile."""
-    hidden: int
-    """H: hidden units, a power of two >= 16."""
-    num_bands: int
-    """K, at least 1."""
+    width: int  # P
+    hidden: int  # H, a power of two >= 16
+    num_bands: int  # K >= 1
     gather: Tensor
     """[2 P H + 8 H + 8], int64: packed weights = flat[gather], flat being all parameters in a row and then one 0."""
     scatter: Tensor
     """[number of weights], int64: gradient of the flat parameters = gradient of the packed ones [scatter]."""
     shapes: tuple[torch.Size, ...]
-    """Shapes of the parameters, in the order in which they are laid in a row."""
+    """Shapes of the parameters, in the order of `flat`."""
 
     def to(self, device: torch.device) -> "Packing":
         """The same with its tensors on `device`."""
