@@ -19,17 +19,7 @@ from torch import Tensor
 from nrfgs_lab.training_run import machine
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
-from nrfgs_ns.appearance.reduce import (
-    LatentBasis,
-    Layers,
-    branches_of,
-    input_columns,
-    latent_basis,
-    layers,
-    pair,
-    rebuilt,
-    with_rank,
-)
+from nrfgs_ns.appearance.reduce import LatentBasis, branches, input_columns, latent_basis, rebuilt, with_rank
 from nrfgs_ns.compact.slim import THRESHOLDS, FieldViews, Residuals, dropped, look_over, slim
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
@@ -242,35 +232,31 @@ def table(rows: list[Row]) -> Table:
 
 def without_high_branch(field: Field) -> Field:
     """The low branch alone, as with a shut gate."""
-    return Field(rebuilt(field.head, {"num_bands": 1}, layers(field.head.low), None), field.splats)
+    low = {name: value for name, value in field.head.state_dict().items() if name.startswith("low.")}
+    return rebuilt(field, low, num_bands=1)
 
 
 def without_low_branch(field: Field) -> Field:
     """The low branch's colours are 0; its opacity residual stays."""
-    w1, b1, w2, b2 = layers(field.head.low)
-    w2, b2 = w2.clone(), b2.clone()
-    w2[:3], b2[:3] = 0.0, 0.0
-    return Field(rebuilt(field.head, {}, (w1, b1, w2, b2), _high(field.head)), field.splats)
+    weights = dict(field.head.state_dict())
+    for name in ("low.2.weight", "low.2.bias"):
+        weights[name] = torch.cat([torch.zeros_like(weights[name][:3]), weights[name][3:]])
+    return rebuilt(field, weights)
 
 
 def without_opacity_residual(field: Field) -> Field:
     """Base opacities."""
-    w1, b1, w2, b2 = layers(field.head.low)
-    return Field(
-        rebuilt(field.head, {"opacity_residual": False}, (w1, b1, w2[:3], b2[:3]), _high(field.head)), field.splats
-    )
+    weights = dict(field.head.state_dict())
+    weights |= {name: weights[name][:3] for name in ("low.2.weight", "low.2.bias")}
+    return rebuilt(field, weights, opacity_residual=False)
 
 
 def with_constant_distance(field: Field, log_distance: float) -> Field:
     """A constant log distance, folded into the biases."""
-    changed = []
-    for name, branch in branches_of(field.head):
-        w1, b1, w2, b2 = layers(branch)
-        (column,) = input_columns(field.head.config, name)["distance"]
-        keep = [i for i in range(w1.shape[1]) if i != column]
-        changed.append((w1[:, keep], b1 + log_distance * w1[:, column], w2, b2))
-    return Field(rebuilt(field.head, {"use_distance": False}, *pair(changed)), field.splats)
-
-
-def _high(head: NeuralResidualField) -> Layers | None:
-    return None if head.high is None else layers(head.high)
+    weights = dict(field.head.state_dict())
+    for branch in branches(weights):
+        first = weights[f"{branch}.0.weight"]
+        (column,) = input_columns(field.head.config, branch)["distance"]
+        weights[f"{branch}.0.weight"] = torch.cat([first[:, :column], first[:, column + 1 :]], dim=1)
+        weights[f"{branch}.0.bias"] = weights[f"{branch}.0.bias"] + log_distance * first[:, column]
+    return rebuilt(field, weights, use_distance=False)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directions and distances from cameras to splats, and the Fourier bands of directions.
+"""Directions and distances from splats to cameras, and the Fourier bands of directions.
 
-For camera centre o and mean x: v = o - x, r = max(|v|, eps), d = v / r, distance feature log r. The floor is applied
-once, inside the square root, so that direction, distance and their gradients stay finite when the camera sits on the
-splat: there |d| < 1, log r = log eps, and the gradient of d is bounded by 1 / eps.
+For camera centre o and mean x: v = o - x, r = max(|v|, eps), d = v / r, distance feature log r. With the camera on the
+splat |d| < 1, log r = log eps, and d's gradient is at most 1 / eps.
 """
 
 import math
@@ -11,10 +10,12 @@ import math
 import torch
 from torch import Tensor
 
+NEAREST = 0.01
+"""Smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
 FARTHEST = 1e18
-"""Coordinates of v are held within this, without gradient beyond: their squares must stay below float32's 3e38."""
-LOW_DIM = 9
-"""Numbers in the low bands: the raw direction (3), sin and cos of band 0 (6)."""
+"""Coordinates of v are clamped to this, without gradient beyond: their squares must stay below float32's 3e38."""
+BAND_DIM = 6
+"""Numbers in a band: sin and cos of three coordinates."""
 
 
 def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -27,8 +28,7 @@ def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float
         unit: world units in a scene unit.
 
     Returns:
-        directions [M, 3], of norm 1 wherever |v| >= eps and shorter elsewhere; logs of the distances in scene units,
-        [M, 1], >= log eps.
+        directions [M, 3], shorter than 1 where |v| < eps; logs of the distances in scene units, [M, 1], >= log eps.
     """
     v = (camera_centers - means).clamp(-FARTHEST, FARTHEST)
     r = v.square().sum(dim=-1, keepdim=True).clamp_min((eps * unit) ** 2).sqrt()
@@ -36,16 +36,11 @@ def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float
 
 
 def unit_vectors(vectors: Tensor, floor: float) -> Tensor:
-    """V / max(|v|, floor), [..., 3], for finite v and floor > 0; its gradient is at most 1 / floor.
+    """Vectors v / max(|v|, floor), [..., 3], for finite v and floor > 0; its gradient is at most 1 / floor.
 
-    Spherical harmonics and lobes look from the camera to the splat, and `view_geometry` the other way.
+    Spherical harmonics and lobes take the direction from camera to splat, opposite to `view_geometry`'s.
     """
     return vectors / vectors.square().sum(dim=-1, keepdim=True).clamp_min(floor * floor).sqrt()
-
-
-def high_dim(num_bands: int) -> int:
-    """Numbers in the high bands 1..K-1 of a K-band encoding: sin and cos of three coordinates each."""
-    return 6 * (num_bands - 1)
 
 
 def fourier_bands(directions: Tensor, num_bands: int) -> tuple[Tensor, Tensor]:

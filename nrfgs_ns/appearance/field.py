@@ -2,13 +2,12 @@
 """A field: a head and the table of splats that it draws, some of which may be diffuse.
 
 A table may have the entry "diffuse", bool [N]. A diffuse splat has its base colour and base opacity from everywhere,
-whatever its other numbers are. The entry is no parameter: nothing learns it, and other heads never see it.
+whatever its other numbers are. The entry is no parameter; only the neural residual field knows it.
 """
 
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
-import torch
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import AppearanceHead, Component, SplatAppearance
@@ -55,46 +54,30 @@ class Field(NamedTuple):
     @property
     def bytes(self) -> int:
         """Bytes that a renderer needs in float32; diffuse splats need a bit, and no residual's parameters."""
-        size = sum(weight.numel() * weight.element_size() for weight in self.head.parameters())
+        size = sum(weight.nbytes for weight in self.head.parameters())
         diffuse = self.splats.get(DIFFUSE)
         for name, value in self.splats.items():
             if name == DIFFUSE:
                 size += -(-len(value) // 8)
+            elif diffuse is not None and name in self.head.residual_params:
+                size += value[~diffuse].nbytes
             else:
-                left_out = diffuse is not None and name in self.head.residual_params
-                rows = int((~diffuse).sum()) if left_out else len(value)
-                size += rows * value[:1].numel() * value.element_size()
+                size += value.nbytes
         return size
 
 
-class Others:
+def view_dependent(
+    splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor
+) -> tuple[Tensor, tuple[Mapping[str, Tensor], Tensor, Tensor]]:
     """The visible splats that are not diffuse, for heads in PyTorch; finding them waits for the device.
 
     Args:
         splats, visible, camera_centers: as for `AppearanceHead.forward`, with "diffuse" among the splats.
 
-    Attributes:
-        arguments: the same three for the others alone, without the entry.
+    Returns:
+        their indices among the M visible, and the three arguments for them alone, without the entry.
     """
-
-    def __init__(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor):
-        self.count = len(visible)
-        self.rows = (~splats[DIFFUSE].index_select(0, visible)).nonzero()[:, 0]
-        centers = camera_centers if camera_centers.dim() == 1 else camera_centers.index_select(0, self.rows)
-        table = {name: value for name, value in splats.items() if name != DIFFUSE}
-        self.arguments = table, visible.index_select(0, self.rows), centers
-
-    def over(self, base: SplatAppearance, appearance: SplatAppearance) -> SplatAppearance:
-        """The base appearance of all M visible splats, with the others' appearance put in."""
-        return SplatAppearance(
-            colors=base.colors.index_copy(0, self.rows, appearance.colors.to(base.colors.dtype)),
-            opacities=base.opacities.index_copy(0, self.rows, appearance.opacities.to(base.opacities.dtype)),
-        )
-
-    def spread(self, components: Mapping[str, Component]) -> dict[str, Component]:
-        """Components of all M visible splats: zeros where there is no residual."""
-        spread = {}
-        for name, (values, kind) in components.items():
-            whole = torch.zeros(self.count, *values.shape[1:], dtype=values.dtype, device=values.device)
-            spread[name] = Component(whole.index_copy(0, self.rows, values), kind)
-        return spread
+    indices = (~splats[DIFFUSE].index_select(0, visible)).nonzero()[:, 0]
+    centers = camera_centers if camera_centers.dim() == 1 else camera_centers.index_select(0, indices)
+    table = {name: value for name, value in splats.items() if name != DIFFUSE}
+    return indices, (table, visible.index_select(0, indices), centers)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GSNB: spherical harmonics, and beside them as many basis functions that the scene learns.
+"""GSNB: spherical harmonics, and as many basis functions that the scene learns.
 
 Seen from the direction d from camera to splat, with coefficients k per splat and one network phi for the scene,
 
@@ -10,8 +10,8 @@ two hidden layers of 64 leaky ReLUs, and tanh: 39 -> 64 -> 64 -> 16, 7,760 share
 the first 5,000 steps. The encoding keeps d itself: sines and cosines of whole multiples of pi cannot tell +x from -x.
 Opacity does not depend on the view. Source: the paper "Gaussian Splatting with Neural Basis Extension", called GSNB.
 
-The reference's resolution ramp, patch loss and learning rates are not the colour model: here all methods have the
-host's; only the basis network has the reference's optimiser, AdamW at 1e-3 (docs/deviations.md).
+The reference's resolution ramp, patch loss and learning rates are not the colour model: all methods have the host's.
+Only the basis network has the reference's optimiser, AdamW at 1e-3 (docs/deviations.md).
 """
 
 from collections.abc import Hashable, Mapping
@@ -20,12 +20,16 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.encoding import fourier_bands, unit_vectors
-from nrfgs_ns.appearance.head import SplatAppearance, base_opacities
+from nrfgs_ns.appearance.encoding import BAND_DIM, NEAREST, fourier_bands, unit_vectors
+from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh, num_bases
 
 RAMP_STEPS = 5000
 """Training steps over which the learnt basis is faded in."""
+BANDS = 6
+"""Fourier bands of the view direction."""
+HIDDEN_WIDTH = 64
+"""Units of each hidden layer."""
 
 
 @dataclass
@@ -34,20 +38,8 @@ class GsnbConfig(ShConfig):
 
     _target: type = field(default_factory=lambda: NeuralBasis)
     """the head class that this configuration builds"""
-    num_bands: int = 6
-    """Fourier bands of the view direction."""
     raw_direction: bool = True
     """whether the direction itself stands beside its bands; its reference has the bands alone, 36 inputs"""
-    hidden_width: int = 64
-    """units of each of the basis network's two hidden layers."""
-    distance_eps: float = 0.01
-    """smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
-
-    def validate(self) -> None:
-        super().validate()
-        for name in ("num_bands", "hidden_width"):
-            self.require(getattr(self, name) >= 1, name, "at least 1")
-        self.require(self.distance_eps > 0, "distance_eps", "positive")
 
 
 class NeuralBasis(SphericalHarmonics):
@@ -58,15 +50,14 @@ class NeuralBasis(SphericalHarmonics):
 
     def __init__(self, config: GsnbConfig):
         super().__init__(config)
-        self.config: GsnbConfig = config
         self.ramp = 1.0
-        """rho: how much of the learnt basis counts."""
+        """rho: weight of the learnt basis."""
         self.basis = nn.Sequential(
-            nn.Linear(3 * config.raw_direction + 6 * config.num_bands, config.hidden_width),
+            nn.Linear(3 * config.raw_direction + BAND_DIM * BANDS, HIDDEN_WIDTH),
             nn.LeakyReLU(),
-            nn.Linear(config.hidden_width, config.hidden_width),
+            nn.Linear(HIDDEN_WIDTH, HIDDEN_WIDTH),
             nn.LeakyReLU(),
-            nn.Linear(config.hidden_width, num_bases(config.degree)),
+            nn.Linear(HIDDEN_WIDTH, num_bases(config.degree)),
             nn.Tanh(),
         )
 
@@ -79,14 +70,10 @@ class NeuralBasis(SphericalHarmonics):
         return super().phase, self.ramp
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        means = splats["means"].index_select(0, visible)
-        directions = unit_vectors(means - camera_centers, self.config.distance_eps * self.scene_unit)
-        inputs = torch.cat(fourier_bands(directions, self.config.num_bands), dim=-1)
+        means, coefficients, opacities = self.rows(splats, visible, camera_centers)
+        directions = unit_vectors(means - camera_centers, NEAREST * self.scene_unit)
+        inputs = torch.cat(fourier_bands(directions, BANDS), dim=-1)
         learnt = self.basis(inputs if self.config.raw_direction else inputs[:, 3:])  # [M, B]
-        coefficients = self.coefficients(splats, visible)
         colors = eval_sh(self.active_degree, directions, coefficients)
         colors = colors + self.ramp * (learnt[..., None] * coefficients).sum(dim=1)
-        return SplatAppearance(
-            colors=(colors + 0.5).clamp_min(0.0),
-            opacities=base_opacities(splats["opacities"].index_select(0, visible)),
-        )
+        return SplatAppearance((colors + 0.5).clamp_min(0.0), opacities)

@@ -18,8 +18,6 @@ from nrfgs_ns.kernels.launch import Launcher
 BLOCK = 128
 """Splats that a program takes; a power of two."""
 WARPS = 4
-MAX_DEGREE = 3
-
 SMALLEST = tl.constexpr(1e-12)
 """Shortest length of a direction, as in `torch.nn.functional.normalize`."""
 C0 = tl.constexpr(math.sqrt(1 / (4 * math.pi)))

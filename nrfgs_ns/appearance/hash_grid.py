@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Multiresolution hash grid: features of a position, interpolated from lattices of growing resolution.
 
-Level l has N_l = floor(N_0 b^l) lattice steps per unit of length and a table of T feature vectors. At position x it
-answers the trilinear interpolation of the features at the eight lattice points around N_l x; lattice point (i, j, k)
-finds its own in row
+Level l has N_l = floor(N_0 b^l) lattice steps per unit of length and a table of T vectors of four features. At position
+x it interpolates trilinearly between the eight lattice points around N_l x; lattice point (i, j, k) has row
 
     (i p_1) xor (j p_2) xor (k p_3)  mod T,    p = 1, 2654435761, 805459861
 
@@ -32,83 +31,54 @@ from nrfgs_ns.kernels.trial import Gate
 
 PRIMES = (1, 2654435761, 805459861)
 """The hash's multipliers for x, y, z; `hash_grid_triton.py` repeats them."""
+FEATURES = 4
+"""Numbers per lattice point and level."""
 INITIAL_RANGE = 1e-4
 """Features start uniform in +- this, as in the paper."""
 
 
 class HashGrid(nn.Module):
-    """Features of positions, [M, 3] -> [M, levels * features].
+    """Features of positions, [M, 3] -> [M, levels * 4].
 
     Args:
         base_resolution: N_0, lattice steps per unit of length on level 0.
         levels: number of lattices, >= 1.
-        features: numbers per lattice point and level, a power of two.
         log2_table_size: log2 T, rows of each level's table.
         per_level_scale: b, ratio of neighbouring levels' resolutions, >= 1.
     """
 
-    resolutions: Tensor
-    primes: Tensor
-    sides: Tensor
-    offsets: Tensor
-
     def __init__(
-        self,
-        base_resolution: int,
-        *,
-        levels: int = 4,
-        features: int = 4,
-        log2_table_size: int = 15,
-        per_level_scale: float = 1.5,
+        self, base_resolution: int, *, levels: int = 4, log2_table_size: int = 15, per_level_scale: float = 1.5
     ) -> None:
         super().__init__()
-        self.table_size = 2**log2_table_size
+        self.table_size, self.width = 2**log2_table_size, levels * FEATURES
         steps = [int(base_resolution * per_level_scale**level) for level in range(levels)]
         sides = [2 * n for n in steps if (2 * n) ** 3 <= self.table_size]  # of the numbered levels: the first ones
-        self.table = nn.Parameter(torch.empty(levels * self.table_size, features).uniform_(-1.0, 1.0) * INITIAL_RANGE)
+        self.table = nn.Parameter(torch.empty(levels * self.table_size, FEATURES).uniform_(-1.0, 1.0) * INITIAL_RANGE)
         self.register_buffer("resolutions", torch.tensor(steps, dtype=torch.float32), persistent=False)
         self.register_buffer("primes", torch.tensor(PRIMES), persistent=False)
         self.register_buffer("sides", torch.tensor(sides, dtype=torch.int64)[:, None, None], persistent=False)
         self.register_buffer("offsets", torch.arange(levels) * self.table_size, persistent=False)
 
-    @property
-    def width(self) -> int:
-        """Numbers per position."""
-        return len(self.resolutions) * self.table.shape[1]
-
     def forward(self, positions: Tensor) -> Tensor:
-        """Interpolated features [M, levels * features], level by level, of positions [M, 3] in scene units."""
-        if self._kernels_take(positions):
+        """Interpolated features [M, levels * 4], level by level, of positions [M, 3] in scene units."""
+        float32 = positions.dtype == self.table.dtype == torch.float32
+        if positions.is_cuda and float32 and kernels_run_on(positions.device):
             from nrfgs_ns.appearance.hash_grid_triton import Interpolation
 
             return Interpolation.apply(positions, self.table, self.resolutions, len(self.sides), self.table_size)
         return self.in_torch(positions)
 
-    def try_kernels(self, device: torch.device) -> None:
-        """Try the kernels on a CUDA device, which compiles them."""
-        _kernels_run_on(device, self.table.shape[1])
-
     def in_torch(self, positions: Tensor) -> Tensor:
-        """The same in PyTorch alone, on any device and of any floating dtype: the kernels' twin."""
+        """The kernels' twin: the same in PyTorch, on any device and of any floating dtype."""
         scaled = positions[:, None, :] * self.resolutions[:, None]  # [M, L, 3]
         cells = scaled.floor()
         after = scaled - cells
         weights = _corners(torch.stack([1.0 - after, after], dim=-1), torch.mul)  # [M, L, 8]
         cells = cells.long()
         rows = self._rows(torch.stack([cells, cells + 1], dim=-1))
-        features = self.table.index_select(0, rows.flatten())
-        features = features.view(*weights.shape, self.table.shape[1])  # [M, L, 8, F]
+        features = self.table.index_select(0, rows.flatten()).view(*weights.shape, FEATURES)  # [M, L, 8, F]
         return (weights[..., None] * features).sum(dim=2).flatten(1)
-
-    def _kernels_take(self, positions: Tensor) -> bool:
-        """Whether the kernels compute this call."""
-        table = self.table
-        return (
-            positions.is_cuda
-            and positions.device == table.device
-            and positions.dtype == table.dtype == self.resolutions.dtype == torch.float32
-            and _kernels_run_on(positions.device, table.shape[1])
-        )
 
     def _rows(self, coordinates: Tensor) -> Tensor:
         """Rows of the table, [M, L, 8], for the lower and upper lattice coordinates, int64 [M, L, 3, 2]."""
@@ -130,14 +100,13 @@ def _corners(per_axis: Tensor, combine: Callable[[Tensor, Tensor], Tensor]) -> T
 _GATE = Gate("The hash grid")
 
 
-def _kernels_run_on(device: torch.device, features: int) -> bool:
-    """Whether Triton's kernels run on a CUDA device, for so many features per level; tried once."""
-    return _GATE.opens((device, features), device, lambda: _try_kernels(device, features))
+def kernels_run_on(device: torch.device) -> bool:
+    """Whether Triton's kernels run on a CUDA device; tried once, which compiles them."""
 
+    def trial() -> None:
+        from nrfgs_ns.appearance.hash_grid_triton import Interpolation
 
-def _try_kernels(device: torch.device, features: int) -> None:
-    """Compile and run both kernels on one position; raise whatever goes wrong."""
-    from nrfgs_ns.appearance.hash_grid_triton import Interpolation
+        position, table = (torch.zeros(*shape, device=device, requires_grad=True) for shape in ((1, 3), (2, FEATURES)))
+        Interpolation.apply(position, table, torch.ones(1, device=device), 0, 2).sum().backward()
 
-    position, table = (torch.zeros(*shape, device=device, requires_grad=True) for shape in ((1, 3), (2, features)))
-    Interpolation.apply(position, table, torch.ones(1, device=device), 0, 2).sum().backward()
+    return _GATE.opens(device, device, trial)

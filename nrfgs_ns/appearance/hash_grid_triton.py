@@ -4,9 +4,7 @@
 A thread takes positions and walks over the eight corners of a level's cell, all in registers. Forward, a program has
 one level, so that neighbouring programs gather from the same table. Backward, it has all of them: a position's gradient
 is their sum, written once. The table's gradient is added up by atomics, so its last bits differ from run to run, as
-those of PyTorch's index_select do. Only the gradients that autograd asks for are computed.
-
-The number of features is a power of two; up to four are read, and on recent cards added, at once.
+those of PyTorch's index_select do.
 
 Lattice coordinates are int32 and the hash is unsigned 32-bit: the rows are those of `hash_grid.py` wherever coordinates
 are below 2^31, and stay at the last float32 below it beyond. A position that is NaN, or infinite on the lattice, gets
@@ -21,10 +19,8 @@ from torch.autograd.function import once_differentiable
 
 from nrfgs_ns.kernels.launch import Launcher
 
-POSITIONS = 128
-"""Most positions of a program: one for each thread."""
-TILE = 512
-"""Most features that a program has of each corner: four for each thread."""
+BLOCK = 128
+"""Positions of a program: one for each thread, with four features of each corner."""
 # Nothing is fused: far out, position * N_l is rounded by more than a step, and fused with the subtraction of its
 # floor that rounding would come back as the distance into the cell. There is nothing to pipeline either.
 OPTIONS = {"num_warps": 4, "num_stages": 1, "enable_fp_fusion": False}
@@ -86,8 +82,8 @@ def _level(x, y, z, level, resolutions, numbered_levels):
 
 @triton.jit
 def _offsets(keys, numbered, table_size, CORNER: tl.constexpr, F: tl.constexpr):
-    """Where a corner's features begin in the level's table, int64 [B, 1]. Corner 4 i + 2 j + k is the upper one on x,
-    y, z where i, j, k are 1."""
+    """Starts of a corner's features in the level's table, int64 [B, 1]. Corner 4 i + 2 j + k is the upper one on x, y,
+    z where i, j, k are 1."""
     a, b, c = keys[0][CORNER // 4], keys[1][CORNER // 2 % 2], keys[2][CORNER % 2]
     rows = tl.where(numbered, a + b + c, (a ^ b ^ c) & (table_size - 1).to(tl.uint32))
     return rows.to(tl.int64)[:, None] * F
@@ -122,10 +118,9 @@ def forward_kernel(
 def backward_kernel(
     positions, table, resolutions, d_features, d_positions, d_table,
     count, levels, numbered_levels, table_size,
-    F: tl.constexpr, B: tl.constexpr, BY_POSITION: tl.constexpr, BY_TABLE: tl.constexpr,
+    F: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of positions (written) and table (added); one that is not computed, without BY_POSITION or BY_TABLE,
-    may be any tensor."""
+    """Gradients of positions (written) and of the table (added)."""
     items, valid, x, y, z, lanes = _block(positions, count, F, B)
     here = valid[:, None]
 
@@ -137,30 +132,27 @@ def backward_kernel(
         upstream = tl.load(d_features + begin + lanes, mask=here, other=0.0)
 
         # All corners are read before any is added to: the compiler does not move a load past an atomic.
-        if BY_POSITION:
-            by_x, by_y, by_z = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
-            for corner in tl.static_range(CORNERS):
-                offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
-                read = tl.load(table + level_begin + offsets)
-                by_weight = tl.sum(read * upstream, axis=1)
-                w_x, w_y, w_z = weights[0][corner // 4], weights[1][corner // 2 % 2], weights[2][corner % 2]
-                by_x += w_y * w_z * by_weight * (2 * (corner // 4) - 1)
-                by_y += w_x * w_z * by_weight * (2 * (corner // 2 % 2) - 1)
-                by_z += w_x * w_y * by_weight * (2 * (corner % 2) - 1)
-            d_x += by_x * resolution
-            d_y += by_y * resolution
-            d_z += by_z * resolution
+        by_x, by_y, by_z = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
+        for corner in tl.static_range(CORNERS):
+            offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
+            read = tl.load(table + level_begin + offsets)
+            by_weight = tl.sum(read * upstream, axis=1)
+            w_x, w_y, w_z = weights[0][corner // 4], weights[1][corner // 2 % 2], weights[2][corner % 2]
+            by_x += w_y * w_z * by_weight * (2 * (corner // 4) - 1)
+            by_y += w_x * w_z * by_weight * (2 * (corner // 2 % 2) - 1)
+            by_z += w_x * w_y * by_weight * (2 * (corner % 2) - 1)
+        d_x += by_x * resolution
+        d_y += by_y * resolution
+        d_z += by_z * resolution
 
-        if BY_TABLE:
-            for corner in tl.static_range(CORNERS):
-                offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
-                gradient = _weight(weights, corner)[:, None] * upstream
-                tl.atomic_add(d_table + level_begin + offsets, gradient, mask=here, sem="relaxed")
+        for corner in tl.static_range(CORNERS):
+            offsets = _offsets(keys, numbered, table_size, corner, F) + lanes
+            gradient = _weight(weights, corner)[:, None] * upstream
+            tl.atomic_add(d_table + level_begin + offsets, gradient, mask=here, sem="relaxed")
 
-    if BY_POSITION:
-        tl.store(d_positions + items * 3, d_x, mask=valid)
-        tl.store(d_positions + items * 3 + 1, d_y, mask=valid)
-        tl.store(d_positions + items * 3 + 2, d_z, mask=valid)
+    tl.store(d_positions + items * 3, d_x, mask=valid)
+    tl.store(d_positions + items * 3 + 1, d_y, mask=valid)
+    tl.store(d_positions + items * 3 + 2, d_z, mask=valid)
 
 
 launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
@@ -169,41 +161,28 @@ launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_ke
 class Interpolation(torch.autograd.Function):
     """(positions [M, 3], table [L T, F], resolutions [L]) -> features [M, L F]; all float32 on one device.
 
-    The first `numbered_levels` are numbered; T is a power of two up to 2^24.
+    The first `numbered_levels` are numbered; T is a power of two up to 2^24, F a power of two.
     """
 
     @staticmethod
     def forward(ctx, positions: Tensor, table: Tensor, resolutions: Tensor, numbered_levels: int, table_size: int):
         positions, table = positions.detach().contiguous(), table.detach().contiguous()
-        sizes = len(positions), len(resolutions), numbered_levels, table_size
+        ctx.save_for_backward(positions, table, resolutions)
+        ctx.sizes = sizes = len(positions), len(resolutions), numbered_levels, table_size
         features = positions.new_empty(len(positions), len(resolutions) * table.shape[1])
         if len(positions) > 0:
-            blocks, constants = _blocks(len(positions), table.shape[1])
-            launch_forward(
-                (blocks, len(resolutions), 1), positions, table, resolutions, features, *sizes, **constants, **OPTIONS
-            )
-        ctx.save_for_backward(positions, table, resolutions)
-        ctx.sizes = sizes
+            grid = triton.cdiv(len(positions), BLOCK), len(resolutions), 1
+            launch_forward(grid, positions, table, resolutions, features, *sizes, F=table.shape[1], B=BLOCK, **OPTIONS)
         return features
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_features: Tensor):
         positions, table, resolutions = ctx.saved_tensors
-        by_position, by_table = ctx.needs_input_grad[:2]
-        d_positions = torch.empty_like(positions) if by_position else None
-        d_table = torch.zeros_like(table) if by_table else None
+        d_positions, d_table = torch.empty_like(positions), torch.zeros_like(table)
         if len(positions) > 0:
-            blocks, constants = _blocks(len(positions), table.shape[1])
             launch_backward(
-                (blocks, 1, 1), positions, table, resolutions, d_features.contiguous(),
-                positions if d_positions is None else d_positions, table if d_table is None else d_table,
-                *ctx.sizes, **constants, BY_POSITION=by_position, BY_TABLE=by_table, **OPTIONS,
+                (triton.cdiv(len(positions), BLOCK), 1, 1), positions, table, resolutions, d_features.contiguous(),
+                d_positions, d_table, *ctx.sizes, F=table.shape[1], B=BLOCK, **OPTIONS,
             )  # fmt: skip
         return d_positions, d_table, None, None, None
-
-
-def _blocks(count: int, features: int) -> tuple[int, dict[str, int]]:
-    """Blocks of positions, and the kernels' constants."""
-    block = max(1, min(POSITIONS, TILE // features))
-    return triton.cdiv(count, block), {"F": features, "B": block}

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The appearance head: the one seam between a splat's colours and opacity and everything else.
 
-A head defines the numbers that a splat stores (`splat_params`), which join the model's `gauss_params`, so that
-densification, optimisers and checkpoints carry them without knowing their meaning; the colours and opacities of the
-splats that a camera sees (`forward`); and their part that does not depend on the view (`base_appearance`). Shared
-weights are the head's own parameters. Nothing here knows nerfstudio or the rasterizer.
+A head defines the numbers that a splat stores (`splat_params`), which densification, optimisers and checkpoints carry
+without knowing their meaning; colours and opacities of the splats that a camera sees (`forward`); and their part that
+does not depend on the view (`base_appearance`). Shared weights are the head's own parameters.
 """
 
 from abc import ABC, abstractmethod
@@ -50,11 +49,7 @@ class AppearanceHeadConfig:
     """Fields that are numbers of training steps, stretched with the schedules."""
 
     def setup(self, scene_unit: float = 1.0) -> "AppearanceHead":
-        """Build the head; `scene_unit` is the world units in a scene unit.
-
-        Raises:
-            InputError: a field is out of range; the message names it.
-        """
+        """Build the head, or raise InputError if a field is out of range; `scene_unit`: world units in a scene unit."""
         self.validate()
         head = self._target(self)
         head.scene_unit = scene_unit
@@ -99,11 +94,9 @@ class AppearanceHead(nn.Module, ABC):
     """Whether colours are exactly the harmonics in `features_dc` and `features_rest`, and opacities the base's."""
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
-        """Initial per-splat tensors, for base colours rgb [N, 3] in [0, 1].
+        """Initial per-splat tensors [N, ...] by name, on rgb's device, for base colours rgb [N, 3] in [0, 1].
 
-        Returns:
-            name -> tensor [N, ...] on rgb's device. Each name needs an optimiser of the same name in the method's
-            configuration.
+        Each name needs an optimiser of the same name in the method's configuration.
         """
         return {"features_dc": (rgb - 0.5) / SH_C0}
 
@@ -127,14 +120,8 @@ class AppearanceHead(nn.Module, ABC):
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
         """Parts of the head's result, for the viewer and for logs; never called in training.
 
-        Every entry becomes a mode of the viewer under its name. The names must not depend on the arguments; M = 0 must
-        work.
-
-        Args:
-            splats, visible, camera_centers: as for `forward`.
-
-        Returns:
-            name -> M values. Always "residual": the colours of `forward` less those of `base_appearance`.
+        Each is a mode of the viewer under its name. The names must not depend on the arguments; M = 0 must work.
+        "residual" is always there: the colours of `forward` less those of `base_appearance`.
         """
         colors = self(splats, visible, camera_centers).colors
         return {"residual": Component(colors - self.base_appearance(splats, visible).colors, "color")}

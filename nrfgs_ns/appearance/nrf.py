@@ -10,9 +10,9 @@ direction's Fourier bands split into low(d) and high(d) (`encoding.py`):
     colour  = c     + s_c     tanh(dc_low + sigmoid(w) dc_high)
     opacity = alpha + s_alpha tanh(d_alpha)
 
-The high branch's detail passes a gate w that the splat opens only where detail pays. Both branches are one hidden layer
-of ReLUs: 46 -> 64 -> 4 and 48 -> 64 -> 4, 6,664 weights at the default sizes. Without the split, one branch of twice
-the width sees everything (58 -> 128 -> 4, 8,068 weights), without a gate.
+The gate w lets detail through only where it pays. Both branches are one hidden layer of ReLUs: 46 -> 64 -> 4 and
+48 -> 64 -> 4, 6,664 weights at the default sizes. Without the split, one branch of twice the width sees everything
+(58 -> 128 -> 4, 8,068 weights), without a gate.
 
 Two bounds keep opacity in [0, 1], with t = tanh(d_alpha) and x = alpha + s_alpha t:
 
@@ -30,8 +30,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.encoding import LOW_DIM, fourier_bands, high_dim, view_geometry
-from nrfgs_ns.appearance.field import DIFFUSE, Others
+from nrfgs_ns.appearance.encoding import BAND_DIM, NEAREST, fourier_bands, view_geometry
+from nrfgs_ns.appearance.field import DIFFUSE, view_dependent
 from nrfgs_ns.appearance.fused import FusedField
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, Component, SplatAppearance, base_colors
 
@@ -65,7 +65,7 @@ class NrfConfig(AppearanceHeadConfig):
     """s_c: largest change of a colour channel, in units of white"""
     opacity_scale: float = 0.2
     """s_alpha: largest change of opacity"""
-    distance_eps: float = 0.01
+    distance_eps: float = NEAREST
     """smallest camera distance told apart, in scene units: the near plane"""
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
@@ -87,8 +87,7 @@ class NrfConfig(AppearanceHeadConfig):
         return replace(self, opacity_scale=share * self.opacity_scale) if self.opacity_residual else self
 
     def for_copies(self) -> "NrfConfig":
-        """Residuals on the logit, by default: n copies of a splat have 1/n of its opacity each, but would each add a
-        whole residual to it."""
+        """Residuals on the logit, by default: n copies of a splat would each add a whole residual to their opacity."""
         return self if self.opacity_bound or not self.opacity_residual else replace(self, opacity_bound="logit")
 
     def validate(self) -> None:
@@ -107,17 +106,15 @@ class NrfConfig(AppearanceHeadConfig):
             self.require(getattr(self, name) in choices, name, "one of " + ", ".join(map(repr, choices)))
 
 
-class BranchOutputs(NamedTuple):
-    """The branches' outputs before any tanh; None for what the configuration leaves out."""
+class Branches(NamedTuple):
+    """Base appearance, and the branches' outputs before any tanh; None for what the configuration leaves out."""
 
-    dc_low: Tensor
-    """[M, 3]; of the single branch, if there is only one."""
-    dc_high: Tensor | None
-    """[M, 3]"""
-    gate: Tensor | None
-    """sigmoid(w), [M, 1]"""
-    d_alpha: Tensor | None
-    """[M, 1]"""
+    color: Tensor  # c, not clamped, [M, 3]
+    logit: Tensor  # of alpha, [M, 1]
+    dc_low: Tensor  # [M, 3]; of the single branch, if there is only one
+    dc_high: Tensor | None  # [M, 3]
+    gate: Tensor | None  # sigmoid(w), [M, 1]
+    d_alpha: Tensor | None  # [M, 1]
 
 
 class NeuralResidualField(AppearanceHead):
@@ -130,20 +127,21 @@ class NeuralResidualField(AppearanceHead):
         super().__init__()
         self.config = config
         shared = config.latent_dim + 3 + int(config.use_distance)  # z, c, log r
+        low, high = 1 + 3 + BAND_DIM, BAND_DIM * (config.num_bands - 1)  # alpha, d and band 0; the other bands
         outputs = 3 + int(config.opacity_residual)  # dc, d_alpha
-        bands = high_dim(config.num_bands)
         self.high: nn.Sequential | None = None
         if config.split_bands:
-            self.low = mlp(shared + 1 + LOW_DIM, config.hidden_width, outputs)
-            if bands > 0:
-                self.high = mlp(shared + bands, config.hidden_width, 3 + 1)  # dc, gate
+            self.low = mlp(shared + low, config.hidden_width, outputs)
+            if high > 0:
+                self.high = mlp(shared + high, config.hidden_width, 3 + 1)  # dc, gate
         else:
-            self.low = mlp(shared + 1 + LOW_DIM + bands, 2 * config.hidden_width, outputs)
+            self.low = mlp(shared + low + high, 2 * config.hidden_width, outputs)
+        branches = [branch for branch in (self.low, self.high) if branch is not None]
         if config.output_init == "zero":
-            for branch in filter(None, (self.low, self.high)):
+            for branch in branches:
                 nn.init.zeros_(branch[-1].weight)
                 nn.init.zeros_(branch[-1].bias)
-        self.fused = FusedField(config, self.low, self.high)
+        self.fused = FusedField(config, branches)
 
     def try_kernels(self, device: torch.device) -> None:
         self.fused.try_on(device)
@@ -154,72 +152,52 @@ class NeuralResidualField(AppearanceHead):
         return {**super().splat_params(rgb), "latents": latents}
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        if self.fused.takes(splats, camera_centers):
+        if self.fused.takes(splats):
             return SplatAppearance(*self.fused(splats, visible, camera_centers, self.scene_unit))
         if DIFFUSE in splats:
-            others = Others(splats, visible, camera_centers)
-            return others.over(self.base_appearance(splats, visible), self.forward(*others.arguments))
-        color, logit = self._base(splats, visible)
-        d_color, d_alpha = self._residual(splats, visible, camera_centers, color, logit)
-        if d_alpha is None:
-            opacity = torch.sigmoid(logit)
-        else:
-            opacity = bounded_opacity(logit, d_alpha, self.config.opacity_scale, self.config.bound)
-        return SplatAppearance(
-            colors=(color + self.config.color_scale * d_color).clamp_min(0.0), opacities=opacity.squeeze(-1)
-        )
+            indices, others = view_dependent(splats, visible, camera_centers)
+            pairs = zip(self.base_appearance(splats, visible), self.forward(*others), strict=True)
+            return SplatAppearance(*(base.index_copy(0, indices, full.to(base.dtype)) for base, full in pairs))
+        out = self._branches(splats, visible, camera_centers)
+        opacities = self._opacity(out).squeeze(-1)
+        return SplatAppearance((out.color + self._color_residual(out)).clamp_min(0.0), opacities)
 
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
         """The residuals, before colours are clamped at black; branches and gate, if there are two branches.
 
-        "low branch" is the residual with a shut gate, s_c tanh(dc_low), and "high branch" the rest of "residual":
-        s_c (tanh(dc_low + sigmoid(w) dc_high) - tanh(dc_low)).
+        "low branch" is the residual with a shut gate, s_c tanh(dc_low), and "high branch" the rest of "residual".
         """
         if DIFFUSE in splats:
-            others = Others(splats, visible, camera_centers)
-            return others.spread(self.components(*others.arguments))
-        color, logit = self._base(splats, visible)
-        dc_low, dc_high, gate, d_alpha = self._branches(splats, visible, camera_centers, color, logit)
-        low = whole = self.config.color_scale * torch.tanh(dc_low)
-        if dc_high is not None:
-            whole = self.config.color_scale * torch.tanh(dc_low + gate * dc_high)
-        shown = {"residual": Component(whole, "color")}
-        if dc_high is not None:
+            indices, others = view_dependent(splats, visible, camera_centers)
+            return {
+                name: Component(values.new_zeros(len(visible), values.shape[1]).index_copy(0, indices, values), kind)
+                for name, (values, kind) in self.components(*others).items()
+            }
+        out = self._branches(splats, visible, camera_centers)
+        residual = self._color_residual(out)
+        shown = {"residual": Component(residual, "color")}
+        if out.gate is not None:
+            low = self._color_residual(out._replace(dc_high=None))
             shown["low branch"] = Component(low, "color")
-            shown["high branch"] = Component(whole - low, "color")
-            shown["gate weight"] = Component(gate, "weight")
-        if d_alpha is not None:
-            scale, bound = self.config.opacity_scale, self.config.bound
-            change = bounded_opacity(logit, torch.tanh(d_alpha), scale, bound) - torch.sigmoid(logit)
-            shown["opacity residual"] = Component(change, "opacity")
+            shown["high branch"] = Component(residual - low, "color")
+            shown["gate weight"] = Component(out.gate, "weight")
+        if out.d_alpha is not None:
+            shown["opacity residual"] = Component(self._opacity(out) - torch.sigmoid(out.logit), "opacity")
         return shown
 
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor:
         """Mean square of the colour and opacity residuals."""
-        d_color, d_alpha = self._residual(splats, visible, camera_centers, *self._base(splats, visible))
-        loss = (self.config.color_scale * d_color).square().mean()
-        return loss if d_alpha is None else loss + (self.config.opacity_scale * d_alpha).square().mean()
+        out = self._branches(splats, visible, camera_centers)
+        loss = self._color_residual(out).square().mean()
+        if out.d_alpha is None:
+            return loss
+        return loss + (self.config.opacity_scale * torch.tanh(out.d_alpha)).square().mean()
 
-    def _base(self, splats: Mapping[str, Tensor], visible: Tensor) -> tuple[Tensor, Tensor]:
-        """Base colours [M, 3], not clamped, and base opacities' logits [M, 1]."""
-        color = base_colors(splats["features_dc"].index_select(0, visible))
-        return color, splats["opacities"].index_select(0, visible)
-
-    def _residual(
-        self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, color: Tensor, logit: Tensor
-    ) -> tuple[Tensor, Tensor | None]:
-        """The residuals before scaling, in [-1, 1]: colour's [M, 3]; opacity's [M, 1], or None if switched off."""
-        d_color, dc_high, gate, d_alpha = self._branches(splats, visible, camera_centers, color, logit)
-        if dc_high is not None:
-            d_color = d_color + gate * dc_high
-        return torch.tanh(d_color), None if d_alpha is None else torch.tanh(d_alpha)
-
-    def _branches(
-        self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, color: Tensor, logit: Tensor
-    ) -> BranchOutputs:
-        """Both branches' outputs, from base colours [M, 3] and base opacities' logits [M, 1]."""
-        means = splats["means"].index_select(0, visible)
-        latents = splats["latents"].index_select(0, visible)
+    def _branches(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Branches:
+        means, latents, features_dc, logit = (
+            splats[name].index_select(0, visible) for name in ("means", "latents", "features_dc", "opacities")
+        )
+        color = base_colors(features_dc)
         directions, log_distance = view_geometry(means, camera_centers, self.config.distance_eps, self.scene_unit)
         low, high = fourier_bands(directions, self.config.num_bands)
 
@@ -230,7 +208,18 @@ class NeuralResidualField(AppearanceHead):
         if self.high is not None:
             detail = self.high(torch.cat([*shared, high], dim=-1))
             dc_high, gate = detail[:, :3], torch.sigmoid(detail[:, 3:])
-        return BranchOutputs(out[:, :3], dc_high, gate, out[:, 3:] if self.config.opacity_residual else None)
+        return Branches(color, logit, out[:, :3], dc_high, gate, out[:, 3:] if self.config.opacity_residual else None)
+
+    def _color_residual(self, out: Branches) -> Tensor:
+        """s_c tanh(dc_low + sigmoid(w) dc_high), [M, 3]."""
+        dc = out.dc_low if out.dc_high is None else out.dc_low + out.gate * out.dc_high
+        return self.config.color_scale * torch.tanh(dc)
+
+    def _opacity(self, out: Branches) -> Tensor:
+        """Opacity with its residual, [M, 1]."""
+        if out.d_alpha is None:
+            return torch.sigmoid(out.logit)
+        return bounded_opacity(out.logit, torch.tanh(out.d_alpha), self.config.opacity_scale, self.config.bound)
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:

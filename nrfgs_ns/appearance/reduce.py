@@ -9,16 +9,13 @@ Latents that lie in a subspace are folded into the first layer, which is exact: 
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
-
-Layers = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Weights of a branch: W1 [H, I], b1 [H], W2 [O, H], b2 [O]."""
 
 
 def input_columns(config: NrfConfig, branch: str) -> dict[str, list[int]]:
@@ -67,7 +64,8 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     weight = (weight / weight.sum()).double()[:, None]
     mean = (weight * latents).sum(dim=0)
     size = latents.shape[1]
-    first_layers = torch.cat([layers(branch)[0][:, :size].double() for _, branch in branches_of(field.head)])
+    weights = field.head.state_dict()
+    first_layers = torch.cat([weights[f"{branch}.0.weight"][:, :size].double() for branch in branches(weights)])
     gram = first_layers.T @ first_layers
     values, vectors = torch.linalg.eigh(gram)
     # Latents beside the layer's row space keep a millionth of the strongest one's metric: everything can be inverted.
@@ -81,28 +79,27 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
 
 def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
     """Latents of `rank` numbers, 1..D: their first principal components, folded into the first layer."""
-    size = field.head.config.latent_dim
-    latents = field.splats["latents"]
+    latents, weights = field.splats["latents"], dict(field.head.state_dict())
+    size = latents.shape[1]
+    for branch in branches(weights):
+        first = weights[f"{branch}.0.weight"].double()
+        of_latents, others = first[:, :size], first[:, size:]
+        weights[f"{branch}.0.weight"] = torch.cat([of_latents @ basis.axes[:, :rank], others], dim=1)
+        weights[f"{branch}.0.bias"] = weights[f"{branch}.0.bias"].double() + of_latents @ basis.mean
     reduced = (latents.detach().double() - basis.mean) @ basis.inverse[:rank].T
-    changed = []
-    for _, branch in branches_of(field.head):
-        w1, b1, w2, b2 = layers(branch)
-        of_latents = w1[:, :size].double()
-        folded = torch.cat([of_latents @ basis.axes[:, :rank], w1[:, size:].double()], dim=1)
-        changed.append((folded, b1.double() + of_latents @ basis.mean, w2, b2))
-    head = rebuilt(field.head, {"latent_dim": rank}, *pair(changed))
-    return Field(head, {**field.splats, "latents": reduced.to(latents.dtype)})
+    field = Field(field.head, {**field.splats, "latents": reduced.to(latents.dtype)})
+    return rebuilt(field, weights, latent_dim=rank)
 
 
 def with_components(field: Field, columns: Tensor) -> Field:
     """Only these components of the latents, [R], at least one; the others are 0 for every splat."""
-    size = field.head.config.latent_dim
-    changed = []
-    for _, branch in branches_of(field.head):
-        w1, b1, w2, b2 = layers(branch)
-        changed.append((torch.cat([w1[:, :size][:, columns], w1[:, size:]], dim=1), b1, w2, b2))
-    head = rebuilt(field.head, {"latent_dim": len(columns)}, *pair(changed))
-    return Field(head, {**field.splats, "latents": field.splats["latents"][:, columns]})
+    latents, weights = field.splats["latents"], dict(field.head.state_dict())
+    size = latents.shape[1]
+    for branch in branches(weights):
+        first = weights[f"{branch}.0.weight"]
+        weights[f"{branch}.0.weight"] = torch.cat([first[:, :size][:, columns], first[:, size:]], dim=1)
+    field = Field(field.head, {**field.splats, "latents": latents[:, columns]})
+    return rebuilt(field, weights, latent_dim=len(columns))
 
 
 def with_diffuse(field: Field, diffuse: Tensor, features_dc: Tensor, opacities: Tensor) -> Field:
@@ -113,35 +110,20 @@ def with_diffuse(field: Field, diffuse: Tensor, features_dc: Tensor, opacities: 
     return Field(field.head, splats)
 
 
-def layers(branch: nn.Sequential) -> Layers:
-    """A branch's weights, detached."""
-    return tuple(weight.detach() for weight in (branch[0].weight, branch[0].bias, branch[2].weight, branch[2].bias))
+def branches(weights: Mapping[str, Tensor]) -> list[str]:
+    """Names of the branches in a head's `state_dict`: "low" (or the only one), "high"."""
+    return [name for name in ("low", "high") if f"{name}.0.weight" in weights]
 
 
 def build(config: NrfConfig, weights: Mapping[str, Tensor], scene_unit: float) -> NeuralResidualField:
     """A head with given weights, by their names in its `state_dict`. The random generators are left alone."""
     with torch.random.fork_rng(devices=[]):
-        head = config.setup()
+        head = config.setup(scene_unit)
     head.load_state_dict({name: value.float() for name, value in weights.items()})
-    head.scene_unit = scene_unit
     return head.to(next(iter(weights.values())).device).requires_grad_(False).eval()
 
 
-def rebuilt(old: NeuralResidualField, changes: dict, low: Layers, high: Layers | None) -> NeuralResidualField:
-    """A head with other options and other weights of its branches."""
-    weights = {}
-    for name, branch in (("low", low), ("high", high)):
-        if branch is not None:
-            keys = (f"{name}.0.weight", f"{name}.0.bias", f"{name}.2.weight", f"{name}.2.bias")
-            weights |= dict(zip(keys, branch, strict=True))
-    return build(replace(old.config, **changes), weights, old.scene_unit)
-
-
-def branches_of(head: NeuralResidualField) -> list[tuple[str, nn.Sequential]]:
-    """The branches that a head has, by name."""
-    return [(name, branch) for name, branch in (("low", head.low), ("high", head.high)) if branch is not None]
-
-
-def pair(changed: list[Layers]) -> tuple[Layers, Layers | None]:
-    """The low branch (or the only one), and the high one."""
-    return changed[0], changed[1] if len(changed) > 1 else None
+def rebuilt(field: Field, weights: Mapping[str, Tensor], **options: Any) -> Field:
+    """The field with other weights and options of its head."""
+    head = field.head
+    return Field(build(replace(head.config, **options), weights, head.scene_unit), field.splats)

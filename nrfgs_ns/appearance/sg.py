@@ -10,9 +10,9 @@ length): 3 + 7 L = 24 colour numbers, half of what harmonics of degree 3 take. O
 Sources: the papers "SG-Splatting" (three lobes about the fixed axes x, y, z, from step 2,000) and "MEGS2" (free axes,
 |s|), which this follows.
 
-Axes start at x, y, z: at right angles the lobes can follow a gradient of colour in every direction equally well.
-Amplitudes start at zero, so that switching the lobes on changes nothing; sharpness at 2, so that neighbours overlap (56
-% of the height halfway to the next axis), and each has directions to itself (2 % opposite its axis).
+Axes start at x, y, z; amplitudes at zero, so that switching the lobes on changes nothing; sharpness at 2, so that
+neighbours overlap (56 % of the height halfway to the next axis), and each lobe has directions to itself (2 % opposite
+its axis).
 """
 
 from collections.abc import Hashable, Mapping
@@ -21,14 +21,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.encoding import unit_vectors
-from nrfgs_ns.appearance.head import (
-    AppearanceHead,
-    AppearanceHeadConfig,
-    SplatAppearance,
-    base_colors,
-    base_opacities,
-)
+from nrfgs_ns.appearance.encoding import NEAREST, unit_vectors
+from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_colors, base_opacities
 
 START_STEP = 2000
 """Training step of the first lobes; before it only the base colour is trained."""
@@ -45,13 +39,10 @@ class SgConfig(AppearanceHeadConfig):
     """the head class that this configuration builds"""
     lobes: int = 3
     """L: lobes of each splat, 1 to 6. They start about x, y, z, -x, -y, -z, in this order."""
-    distance_eps: float = 0.01
-    """smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
 
     def validate(self) -> None:
         # Two lobes that started alike would get the same gradients and stay alike.
         self.require(1 <= self.lobes <= 6, "lobes", "1 to 6, so that no two lobes start about the same axis")
-        self.require(self.distance_eps > 0, "distance_eps", "positive")
 
 
 class SphericalGaussians(AppearanceHead):
@@ -66,8 +57,8 @@ class SphericalGaussians(AppearanceHead):
         """whether there are lobes yet."""
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
-        """Base colours "features_dc" [N, 3] and lobes: "sg_axes" [N, L, 3], of any length but zero; "sg_sharpness" [N,
-        L], of any sign; "sg_colors" [N, L, 3], amplitudes in units of white."""
+        """Base colours "features_dc" [N, 3]; axes "sg_axes" [N, L, 3], of any length but zero; "sg_sharpness" [N, L],
+        of any sign; amplitudes "sg_colors" [N, L, 3], in units of white."""
         count, lobes = len(rgb), self.config.lobes
         axes = torch.eye(3, device=rgb.device)
         return {
@@ -88,15 +79,13 @@ class SphericalGaussians(AppearanceHead):
         colors = base_colors(splats["features_dc"].index_select(0, visible))
         if self.active:
             colors = colors + self._lobes(splats, visible, camera_centers)
-        return SplatAppearance(
-            colors=colors.clamp_min(0.0),
-            opacities=base_opacities(splats["opacities"].index_select(0, visible)),
-        )
+        opacities = base_opacities(splats["opacities"].index_select(0, visible))
+        return SplatAppearance(colors.clamp_min(0.0), opacities)
 
     def _lobes(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor:
-        """What the lobes add to the visible splats' colours, [M, 3]."""
+        """Sum of the visible splats' lobes, [M, 3]."""
         means = splats["means"].index_select(0, visible)
-        directions = unit_vectors(means - camera_centers, self.config.distance_eps * self.scene_unit)
+        directions = unit_vectors(means - camera_centers, NEAREST * self.scene_unit)
         axes = unit_vectors(splats["sg_axes"].index_select(0, visible), SHORTEST_AXIS)
         sharpness = splats["sg_sharpness"].index_select(0, visible).abs()
         heights = torch.exp(sharpness * ((axes * directions[:, None]).sum(dim=-1) - 1.0))  # [M, L]

@@ -72,22 +72,18 @@ class SphericalHarmonics(AppearanceHead):
         return self.active_degree
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        names = "means", "features_dc", "features_rest", "opacities"
-        tables = [splats[name] for name in names]
+        means, coefficients, opacities = self.rows(splats, visible, camera_centers)
+        colors = eval_sh(self.active_degree, means - camera_centers, coefficients) + 0.5
+        return SplatAppearance(colors.clamp_min(0.0), opacities)
+
+    def rows(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> tuple[Tensor, ...]:
+        """Means [M, 3], coefficients [M, (degree + 1)^2, 3] and base opacities [M] of the visible splats."""
+        tables = [splats[name] for name in ("means", "features_dc", "features_rest", "opacities")]
         # One camera's rows ascend: N of them are the table, which need not be copied.
         if camera_centers.dim() > 1 or len(visible) < len(tables[0]):
             tables = [table.index_select(0, visible) for table in tables]
         means, constant, rest, logits = tables
-        coefficients = torch.cat([constant[:, None], rest], dim=1)
-        return SplatAppearance(
-            colors=(eval_sh(self.active_degree, means - camera_centers, coefficients) + 0.5).clamp_min(0.0),
-            opacities=base_opacities(logits),
-        )
-
-    def coefficients(self, splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:
-        """All coefficients of the visible splats, [M, (degree + 1)^2, 3]."""
-        constant = splats["features_dc"].index_select(0, visible)[:, None]
-        return torch.cat([constant, splats["features_rest"].index_select(0, visible)], dim=1)
+        return means, torch.cat([constant[:, None], rest], dim=1), base_opacities(logits)
 
 
 def num_bases(degree: int) -> int:
@@ -121,17 +117,12 @@ def sh_bases(degree: int, directions: Tensor) -> Tensor:
 
 
 def eval_sh(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
-    """Sum of harmonics up to `degree`.
-
-    On CUDA this is a kernel, `harmonics_triton.py`'s or, where Triton does not run, gsplat's; elsewhere `sh_bases`.
+    """Sum of harmonics up to `degree`, [M, 3]: on CUDA by `harmonics_triton.py`, or by gsplat without Triton.
 
     Args:
         degree: highest degree used; coefficients beyond it are ignored.
         directions: [M, 3], any length but zero.
         coefficients: [M, B, 3] with B >= (degree + 1)^2.
-
-    Returns:
-        [M, 3].
 
     Raises:
         RuntimeError: a CUDA graph is being recorded, which misses gsplat's kernel, and Triton does not run.
@@ -156,14 +147,13 @@ _GATE = Gate("Spherical harmonics")
 
 def kernels_run_on(device: torch.device) -> bool:
     """Whether Triton's kernels run on a CUDA device; tried once, which compiles them."""
-    return _GATE.opens(device, device, lambda: _try_kernels(device))
 
+    def trial() -> None:
+        from nrfgs_ns.appearance.harmonics_triton import Harmonics
 
-def _try_kernels(device: torch.device) -> None:
-    """Compile and run both kernels on one splat, at each degree; raise whatever goes wrong."""
-    from nrfgs_ns.appearance.harmonics_triton import MAX_DEGREE, Harmonics
+        direction = torch.ones(1, 3, device=device, requires_grad=True)
+        coefficients = torch.ones(1, 16, 3, device=device, requires_grad=True)
+        for degree in range(4):
+            Harmonics.apply(degree, direction, coefficients).sum().backward()
 
-    direction = torch.ones(1, 3, device=device, requires_grad=True)
-    for degree in range(MAX_DEGREE + 1):
-        coefficients = torch.ones(1, num_bases(MAX_DEGREE), 3, device=device, requires_grad=True)
-        Harmonics.apply(degree, direction, coefficients).sum().backward()
+    return _GATE.opens(device, device, trial)

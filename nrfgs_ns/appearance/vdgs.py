@@ -20,10 +20,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.encoding import unit_vectors
-from nrfgs_ns.appearance.hash_grid import HashGrid
-from nrfgs_ns.appearance.head import Component, SplatAppearance, base_opacities
+from nrfgs_ns.appearance.encoding import NEAREST, unit_vectors
+from nrfgs_ns.appearance.hash_grid import HashGrid, kernels_run_on
+from nrfgs_ns.appearance.head import Component, SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh
+
+HIDDEN_WIDTH = 32
+"""Units of each hidden layer."""
 
 
 @dataclass
@@ -32,18 +35,12 @@ class VdgsConfig(ShConfig):
 
     _target: type = field(default_factory=lambda: ViewDirectionFactors)
     """the head class that this configuration builds"""
-    hidden_width: int = 32
-    """units of each of the network's two hidden layers."""
     grid_base_resolution: int = 16
     """lattice steps per scene unit on the coarsest level."""
-    distance_eps: float = 0.01
-    """smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
 
     def validate(self) -> None:
         super().validate()
-        for name in ("hidden_width", "grid_base_resolution"):
-            self.require(getattr(self, name) >= 1, name, "at least 1")
-        self.require(self.distance_eps > 0, "distance_eps", "positive")
+        self.require(self.grid_base_resolution >= 1, "grid_base_resolution", "at least 1")
 
 
 class ViewDirectionFactors(SphericalHarmonics):
@@ -54,29 +51,25 @@ class ViewDirectionFactors(SphericalHarmonics):
 
     def __init__(self, config: VdgsConfig):
         super().__init__(config)
-        self.config: VdgsConfig = config
         self.grid = HashGrid(config.grid_base_resolution)
         self.network = nn.Sequential(
-            nn.Linear(3 + self.grid.width, config.hidden_width),
+            nn.Linear(3 + self.grid.width, HIDDEN_WIDTH),
             nn.LeakyReLU(),
-            nn.Linear(config.hidden_width, config.hidden_width),
+            nn.Linear(HIDDEN_WIDTH, HIDDEN_WIDTH),
             nn.LeakyReLU(),
-            nn.Linear(config.hidden_width, 1),
+            nn.Linear(HIDDEN_WIDTH, 1),
         )
 
     def try_kernels(self, device: torch.device) -> None:
         super().try_kernels(device)
-        self.grid.try_kernels(device)
+        kernels_run_on(device)
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        means = splats["means"].index_select(0, visible)
-        directions = unit_vectors(means - camera_centers, self.config.distance_eps * self.scene_unit)
+        means, coefficients, opacities = self.rows(splats, visible, camera_centers)
+        directions = unit_vectors(means - camera_centers, NEAREST * self.scene_unit)
         factors = torch.sigmoid(self.network(torch.cat([directions, self.grid(means / self.scene_unit)], dim=-1)))
-        coefficients = self.coefficients(splats, visible)
-        return SplatAppearance(
-            colors=(eval_sh(self.active_degree, directions, coefficients) + 0.5).clamp_min(0.0),
-            opacities=base_opacities(splats["opacities"].index_select(0, visible)) * factors[:, 0],
-        )
+        colors = eval_sh(self.active_degree, directions, coefficients) + 0.5
+        return SplatAppearance(colors.clamp_min(0.0), opacities * factors[:, 0])
 
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
         """The harmonics' "residual", and the factor's "opacity residual"."""

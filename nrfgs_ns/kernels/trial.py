@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether Triton's kernels run here, found out by running them: Triton or a C compiler may be missing, or the device
-may have too little shared memory. Nothing here imports Triton; trials do, once it is known to be there."""
+"""Trials of Triton's kernels: Triton or a C compiler may be missing, or the device may have too little shared memory.
+
+Nothing here imports Triton; trials do, once it is known to be there.
+"""
 
 import importlib.util
 import logging
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
-from threading import Thread
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from typing import Any, TypeVar
 
 import torch
@@ -16,16 +18,61 @@ Outcome = TypeVar("Outcome")
 logger = logging.getLogger(__name__)
 
 
-def try_triton(trial: Callable[[], Outcome]) -> Outcome | str:
-    """The trial's result, or why Triton's kernels do not run here, for after a colon.
+@contextmanager
+def tried_meanwhile(trials: Sequence[Callable[[], object]], device: torch.device) -> Iterator[None]:
+    """Try kernels, which compiles them, on a thread of its own while the block runs; joined at its end.
+
+    Errors are not reported here: whoever needs the kernels will meet them again.
+    """
+
+    def run(trial: Callable[[], object]) -> None:
+        with torch.cuda.device(device) if device.type == "cuda" else nullcontext():  # each thread has its own
+            trial()
+
+    with ThreadPoolExecutor(1, "kernels") as pool:
+        for trial in trials:
+            pool.submit(run, trial)
+        yield
+
+
+class Gate(dict[Hashable, Any]):
+    """Outcomes of kernels' trials: each key is tried once, and a failure reported once.
 
     Args:
-        trial: imports and runs kernels, with gradients if it likes, whatever mode the caller is in; raises what goes
-            wrong.
-
-    Raises:
-        torch.OutOfMemoryError: that says nothing about Triton and must not be remembered.
+        what: the subject of the warning "... runs in plain PyTorch".
     """
+
+    def __init__(self, what: str):
+        super().__init__()
+        self.what = what
+
+    def find(
+        self, key: Hashable, device: torch.device, trial: Callable[[], Outcome], quiet: bool = False
+    ) -> Outcome | str:
+        """The trial's result, or why the kernels do not run here, for after a colon.
+
+        Args:
+            key: what the answer holds for.
+            device: for the warning.
+            trial: imports and runs kernels, with gradients whatever mode the caller is in; raises what goes wrong, or
+                returns a reason.
+            quiet: do not warn.
+
+        Raises:
+            torch.OutOfMemoryError: that says nothing about Triton and is not remembered.
+        """
+        if key not in self:
+            self[key] = _tried(trial)
+            if isinstance(self[key], str) and not quiet:
+                logger.warning("%s runs in plain PyTorch on %s: %s.", self.what, device, self[key])
+        return self[key]
+
+    def opens(self, key: Hashable, device: torch.device, trial: Callable[[], object]) -> bool:
+        """Whether the kernels run."""
+        return not isinstance(self.find(key, device, trial), str)
+
+
+def _tried(trial: Callable[[], Outcome]) -> Outcome | str:
     if importlib.util.find_spec("triton") is None:
         return "Triton is not installed"
     try:
@@ -36,59 +83,3 @@ def try_triton(trial: Callable[[], Outcome]) -> Outcome | str:
     except Exception as error:
         first_line = next(iter(str(error).splitlines()), "")
         return f"Triton's kernels do not run here ({type(error).__name__}: {first_line})"
-
-
-@contextmanager
-def tried_meanwhile(trials: Sequence[Callable[[], object]], device: torch.device) -> Iterator[None]:
-    """Try kernels, which compiles them, on a thread of its own while the block runs; joined at its end.
-
-    Errors are not reported here: whoever needs the kernels will meet them again.
-    """
-
-    def run() -> None:
-        with torch.cuda.device(device) if device.type == "cuda" else nullcontext():  # each thread has its own
-            for trial in trials:
-                with suppress(Exception):
-                    trial()
-
-    thread = Thread(target=run, name="kernels") if trials else None
-    if thread is not None:
-        thread.start()
-    try:
-        yield
-    finally:
-        if thread is not None:
-            thread.join()
-
-
-class Gate(dict[Hashable, Any]):
-    """Results of kernels' trials: each key is tried once, and a failure reported once.
-
-    Args:
-        what: they compute, the subject of the warning.
-    """
-
-    def __init__(self, what: str):
-        super().__init__()
-        self.what = what
-
-    def find(
-        self, key: Hashable, device: torch.device, trial: Callable[[], Outcome], quiet: bool = False
-    ) -> Outcome | str:
-        """The trial's result, or why the kernels do not run on a device (`try_triton`).
-
-        Args:
-            key: what the answer holds for.
-            device: for the warning.
-            trial: as for `try_triton`; it may also return a reason.
-            quiet: do not warn.
-        """
-        if key not in self:
-            self[key] = try_triton(trial)
-            if isinstance(self[key], str) and not quiet:
-                logger.warning("%s runs in plain PyTorch on %s: %s.", self.what, device, self[key])
-        return self[key]
-
-    def opens(self, key: Hashable, device: torch.device, trial: Callable[[], object]) -> bool:
-        """Whether the kernels run."""
-        return not isinstance(self.find(key, device, trial), str)

@@ -64,12 +64,10 @@ def evaluate(head, splats, visible, centers, dtype=torch.float32) -> dict[str, T
     d_opacities = torch.randn(len(visible), generator=generator).to(opacities)
     ((colors * d_colors).sum() + (opacities * d_opacities).sum()).backward()
     inputs = {**leaves, "centers": centers, **dict(head.named_parameters())}
-    gradients = {f"d {name}": zero_if_none(leaf) for name, leaf in inputs.items()}
+    gradients = {
+        f"d {name}": torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in inputs.items()
+    }
     return {"colors": colors.detach(), "opacities": opacities.detach(), **gradients}
-
-
-def zero_if_none(leaf: Tensor) -> Tensor:
-    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
 
 
 def relative_errors(ours: dict[str, Tensor], exact: dict[str, Tensor]) -> dict[str, float]:

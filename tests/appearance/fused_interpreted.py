@@ -4,8 +4,6 @@
 Run by kernels/test_interpreted.py.
 """
 
-from dataclasses import replace
-
 import pytest
 import quick_interpreter  # noqa: F401
 import torch
@@ -39,71 +37,58 @@ def test_values_and_gradients(opacity_bound, repeated):
     compare(head, twin, scene(head, 230 if not repeated else 30, 200, repeated), float32_tolerance())
 
 
-@pytest.mark.parametrize("diffuse", [None, 0.5])
-def test_without_gradients_the_values_are_the_same(diffuse):
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+@pytest.mark.parametrize("diffuse", [0.0, 0.5])
+def test_without_gradients_the_values_are_the_same(diffuse, mode):
     head, _ = heads()
-    case = scene(head, 75, 70)
-    case = case if diffuse is None else some_diffuse(case, diffuse, last=True)
-    with torch.no_grad():
+    case = some_diffuse(scene(head, 75, 70), diffuse, last=True)
+    with mode():
         alone = head(*case)
     assert all(map(torch.equal, alone, head(*case)))
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=24, deadline=None, derandomize=True)
 @given(
-    num_bands=st.integers(1, 5),
+    num_bands=st.sampled_from([1, 2, 3, 5, 7]),
     split_bands=st.booleans(),
     opacity_residual=st.booleans(),
+    opacity_bound=st.sampled_from(["straight-through", "logit"]),
     use_distance=st.booleans(),
-    latent_dim=st.sampled_from([1, 7, 16, 33]),
-    hidden_width=st.sampled_from([3, 16, 40]),
+    latent_dim=st.sampled_from([1, 7, 16, 31, 33]),
+    hidden_width=st.sampled_from([3, 16, 33]),
+    columns=st.sampled_from([8, 16]),
     visible=st.integers(0, 70),
     repeated=st.booleans(),
-    diffuse=st.sampled_from([None, 0.5, 1.0]),
+    diffuse=st.sampled_from([None, 0.0, 0.5, 1.0]),
 )
-def test_every_switch(num_bands, visible, repeated, diffuse, **switches):
+def test_every_switch_and_size(num_bands, columns, visible, repeated, diffuse, **switches):
+    """And both ways of giving the output layer to the tensor cores."""
     head, twin = heads(num_bands=num_bands, **switches)
     case = scene(head, 75, visible, repeated)
     case = case if diffuse is None else some_diffuse(case, diffuse, last=repeated)
-    compare(head, twin, case, float32_tolerance(num_bands))
-
-
-@pytest.mark.parametrize("columns", [8, 16])
-@pytest.mark.parametrize(
-    "sizes",
-    [
-        {"num_bands": 1, "latent_dim": 1, "hidden_width": 5},
-        {"num_bands": 2, "latent_dim": 7, "hidden_width": 20, "opacity_bound": "logit"},
-        {"num_bands": 3, "latent_dim": 31, "hidden_width": 64},
-        {"num_bands": 5, "latent_dim": 17, "hidden_width": 33, "opacity_bound": "logit"},
-        {"num_bands": 7, "latent_dim": 33, "hidden_width": 9, "split_bands": False},
-    ],
-)
-def test_sizes_beside_powers_of_two(sizes, columns, monkeypatch):
-    """Both ways of giving the output layer to the tensor cores, for every number of tiles and what is padded."""
     (launches,) = launch.LAUNCHES["fp32"]
-    ours = launch.Launches(replace(launches.forward, columns=columns), replace(launches.backward, columns=columns))
-    monkeypatch.setitem(launch.LAUNCHES, "fp32", (ours,))
-    head, twin = heads(**sizes)
-    compare(head, twin, scene(head, 60, 50, repeated=columns == 8), float32_tolerance(sizes["num_bands"]))
+    ours = launch.Launches(*(how._replace(columns=columns) for how in launches))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(launch.LAUNCHES, "fp32", (ours,))
+        compare(head, twin, case, float32_tolerance(num_bands))
 
 
 @triton.jit
-def waves_kernel(directions, found, N: tl.constexpr, BANDS: tl.constexpr):
+def waves_kernel(directions, waves_out, N: tl.constexpr, BANDS: tl.constexpr):
     positions = tl.arange(0, N)[:, None] * 4 + tl.arange(0, 4)[None, :]
     waves = _waves(tl.load(directions + positions), BANDS)
     for i in tl.static_range(2 * BANDS):
-        tl.store(found + i * 4 * N + positions, waves[i])
+        tl.store(waves_out + i * 4 * N + positions, waves[i])
 
 
 def test_bands_by_double_angles():
     bands, n = 7, 2**14
     directions = torch.cat([torch.linspace(-1, 1, 4 * n - 4), torch.tensor([0.0, 0.25, -0.5, 1e-6])]).view(n, 4)
-    found = torch.empty(bands, 2, n, 4)
-    waves_kernel[(1,)](directions, found, N=n, BANDS=bands)
+    waves = torch.empty(bands, 2, n, 4)
+    waves_kernel[(1,)](directions, waves, N=n, BANDS=bands)
     for k in range(bands):
         angle = torch.pi * 2.0**k * directions.double()
-        error = (found[k].double() - torch.stack([angle.sin(), angle.cos()])).norm(dim=0).max().item()
+        error = (waves[k].double() - torch.stack([angle.sin(), angle.cos()])).norm(dim=0).max().item()
         assert error <= 2.0**k * 4 * ULP  # the kernel derives 2^k 4e-7; the error of band 0 is known, 2.1e-7
 
 
@@ -123,26 +108,17 @@ def test_the_next_way_is_taken_where_the_first_does_not_run(monkeypatch):
     assert tried == [first, second]
 
 
-def test_what_is_not_cleared_is_written():
-    """All rows visible to one camera: the tables' gradients begin as anything, here as NaN."""
+@pytest.fixture
+def memory_begins_as_nan():
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def test_gradients_that_are_not_cleared_are_written(memory_begins_as_nan):
+    """All rows visible to one camera."""
     head, twin = heads()
-    case = scene(head, 70, 70)
-    torch.use_deterministic_algorithms(True)  # fills what is allocated without a value
-    try:
-        found = evaluate(head, *case)
-    finally:
-        torch.use_deterministic_algorithms(False)
-    assert_near(found, evaluate(twin, *case, dtype=torch.float64), float32_tolerance())
-
-
-def test_zero_outputs_add_exactly_nothing():
-    head, _ = heads(output_init="zero")
-    case = scene(head, 20, 15)
-    colors, opacities = head(*case)
-    base = head.base_appearance(*case[:2])
-    # c = 0.5 + SH_C0 k rounds once here and may round twice there; the sigmoid is another library's.
-    assert (colors - base.colors).abs().max() <= 2 * ULP
-    assert (opacities - base.opacities).abs().max() <= 4 * ULP
+    compare(head, twin, scene(head, 70, 70), float32_tolerance())
 
 
 EXTREMES = {
@@ -179,21 +155,18 @@ def test_extremes(extreme, opacity_bound, scale):
 
 @pytest.mark.parametrize("precision", ["tf32", "bf16", "fp16"])
 def test_rounded_products(precision):
-    """The twin rounds the same factors, so that what is left is float32, and factors that fall on either side.
+    """The twin rounds the same factors: float32's roundings are left, and factors that fall on either side.
 
     A factor within a few float32 roundings of the middle of two neighbours, one in 2^12 for bf16 and in 2^9 for the
     others, may be rounded up by one and down by the other: an error of 2 u in each of that many, u being 2^-9 and
     2^-12, is 2 u sqrt(1 / 2^12) = 2^-14, or 2^-15.5. Four products in a row double it.
     """
     head, twin = heads(precision=precision)
-    compare(head, rounding(twin, launch.KINDS[precision]), scene(head, 150, 140), 2.0**-13)
-
-
-def test_float16_saturates():
-    head, twin = heads(precision="fp16")
-    case = scene(head, 40, 30)
+    case = scene(head, 150, 140)
+    compare(head, rounding(twin, launch.KINDS[precision]), case, 2.0**-13)
     case[0]["latents"] *= 1e6
-    colors, opacities = evaluate(head, *case)["colors"], evaluate(head, *case)["opacities"]
+    with torch.no_grad():
+        colors, opacities = head(*case)  # float16 saturates
     assert torch.isfinite(colors).all() and ((opacities >= 0) & (opacities <= 1)).all()
 
 
@@ -205,7 +178,7 @@ def test_diffuse_splats(opacity_bound, last, repeated, monkeypatch):
     head, twin = heads(opacity_bound=opacity_bound)
     case = some_diffuse(scene(head, 230 if not repeated else 60, 200, repeated), 0.6, last)
     exact = evaluate(twin, *case, dtype=torch.float64)
-    monkeypatch.setattr("nrfgs_ns.appearance.nrf.Others", None)
+    monkeypatch.setattr("nrfgs_ns.appearance.nrf.view_dependent", None)
     found = evaluate(head, *case)
     assert_near(found, exact, float32_tolerance())
     splats, visible, _ = case
@@ -213,7 +186,7 @@ def test_diffuse_splats(opacity_bound, last, repeated, monkeypatch):
     is_diffuse = diffuse[visible]
     assert 0 < is_diffuse.sum() < 200
     assert (found["d latents"][diffuse] == 0).all() and (found["d means"][diffuse] == 0).all()
-    # As where nothing is added: test_zero_outputs_add_exactly_nothing.
+    # 0.5 + SH_C0 k rounds once here and may round twice there; the sigmoid is another library's.
     assert (found["colors"] - base.colors)[is_diffuse].abs().max() <= 2 * ULP
     assert (found["opacities"] - base.opacities)[is_diffuse].abs().max() <= 4 * ULP
 
@@ -245,17 +218,13 @@ def test_a_diffuse_splat_with_a_base_that_is_not_finite_spoils_nothing_else():
 
 
 @pytest.mark.parametrize("repeated", [False, True])
-def test_without_others_there_is_no_network(repeated):
-    """All splats diffuse and visible; shared weights of NaN would show. Gradients begin as anything, here as NaN."""
+def test_without_others_there_is_no_network(repeated, memory_begins_as_nan):
+    """All splats diffuse and visible; shared weights of NaN would show."""
     head, _ = heads()
     for weight in head.parameters():
         weight.data.fill_(torch.nan)
     splats, visible, centers = some_diffuse(scene(head, 150, 150, repeated), 1.1, last=True)
-    torch.use_deterministic_algorithms(True)  # fills what is allocated without a value
-    try:
-        found = evaluate(head, splats, visible, centers)
-    finally:
-        torch.use_deterministic_algorithms(False)
+    found = evaluate(head, splats, visible, centers)
     assert all(torch.isfinite(value).all() for value in found.values())
     for name, value in found.items():
         if name.startswith("d "):
@@ -270,17 +239,6 @@ def test_without_others_there_is_no_network(repeated):
         assert torch.equal(beside[name][mixed[DIFFUSE]], found[name][mixed[DIFFUSE]])
 
 
-@pytest.mark.parametrize("precision", ["fp32", "fp16"])
-@pytest.mark.parametrize("repeated", [False, True])
-def test_none_diffuse_is_no_entry(repeated, precision):
-    head, _ = heads(precision=precision)
-    splats, visible, centers = some_diffuse(scene(head, 230, 200, repeated), 0.0, last=True)
-    found = evaluate(head, splats, visible, centers)
-    splats.pop(DIFFUSE)
-    expected = evaluate(head, splats, visible, centers)
-    assert all(torch.equal(found[name], value) for name, value in expected.items())
-
-
 def test_tiny_gradients_survive_half_precision():
     """A mean over a million pixels: gradients of 1e-9, below what fp16 holds."""
     head, _ = heads(precision="fp16")
@@ -293,13 +251,6 @@ def test_tiny_gradients_survive_half_precision():
         gradients.append(splats["latents"].grad / factor)
     assert gradients[0].abs().max() > 0
     assert torch.equal(*gradients)
-
-
-def test_twice_is_the_same():
-    head, _ = heads()
-    case = scene(head, 150, 140)
-    first, second = evaluate(head, *case), evaluate(head, *case)
-    assert all(torch.equal(first[name], second[name]) for name in first)
 
 
 def test_rows_beyond_32_bit_offsets():

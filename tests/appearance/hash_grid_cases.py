@@ -6,7 +6,7 @@ import copy
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.hash_grid import HashGrid
+from nrfgs_ns.appearance.hash_grid import FEATURES, HashGrid
 
 ULP = 2.0**-24
 """Relative rounding error of float32."""
@@ -16,7 +16,7 @@ def grids(device: str = "cpu", **options) -> tuple[HashGrid, HashGrid]:
     """A grid in float32, and the same in float64. By default 4, 6 and 9 lattice steps per unit in tables of 2,048
     rows: two numbered levels, the sides of one of which, 12, are no power of two, and a hashed one."""
     torch.manual_seed(0)
-    defaults = {"levels": 3, "features": 4, "log2_table_size": 11, "base_resolution": 4, "per_level_scale": 1.5}
+    defaults = {"levels": 3, "log2_table_size": 11, "base_resolution": 4, "per_level_scale": 1.5}
     grid = HashGrid(**{**defaults, **options})
     grid.table.data.normal_()
     grid = grid.to(device)
@@ -49,7 +49,7 @@ def assert_near_twin(grid: HashGrid, twin: HashGrid, x: Tensor, interpolate) -> 
         1, and each has two ends: products add up to at most twice the largest feature times the gradient.
     """
     x, exact_x = x.detach().requires_grad_(), x.detach().double().requires_grad_()
-    levels, features = len(twin.resolutions), twin.table.shape[1]
+    levels, features = len(twin.resolutions), FEATURES
     found, exact = interpolate(grid, x), twin.in_torch(exact_x)
     assert found.shape == exact.shape and found.dtype == torch.float32
     upstream = torch.randn(exact.shape, generator=torch.Generator().manual_seed(7)).to(x.device)

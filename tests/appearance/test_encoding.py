@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.encoding import fourier_bands, view_geometry
+from nrfgs_ns.appearance.encoding import view_geometry
 
 coordinate = st.floats(-1e6, 1e6, allow_nan=False, width=32)
 point = st.tuples(coordinate, coordinate, coordinate)
@@ -30,11 +30,3 @@ def test_camera_on_the_splat_has_finite_values_and_gradients():
     (directions.sum() + log_distance.sum()).backward()
     # d = v / eps there, so its slope is -1 / eps; the floored distance does not move.
     assert_close(mean.grad, torch.full((1, 3), -100.0))
-
-
-def test_bands_are_the_formula():
-    d = torch.nn.functional.normalize(torch.randn(7, 3, dtype=torch.double), dim=-1)
-    low, high = fourier_bands(d, 3)
-    assert_close(low, torch.cat([d, (math.pi * d).sin(), (math.pi * d).cos()], dim=-1))
-    bands = [f(2.0**k * math.pi * d) for k in (1, 2) for f in (torch.sin, torch.cos)]
-    assert_close(high, torch.cat(bands, dim=-1))

@@ -26,10 +26,10 @@ def test_values_and_gradients(opacity_bound, visible, repeated):
     compare(head, twin, scene(head, 6000, visible, repeated), DEVICE_FLOAT32 * float32_tolerance())
 
 
-@pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize("precision", ["tf32", "bf16", "fp16"])
-def test_rounded_products(precision, repeated):
-    """Values: derivation in fused_interpreted.py; the card's float32 is coarser, so four times as many factors differ.
+def rounded_limits(exact):
+    """Relative errors against the rounding twin.
+
+    Values: derivation in fused_interpreted.py; the card's float32 is coarser, so four times as many factors differ.
 
     Gradients: where a factor is rounded up by one and down by the other, a hidden unit near zero may be on in one and
     off in the other, and its whole gradient comes or goes. One in 2^9 features of tf32 is 2^-10 off, which moves the
@@ -37,13 +37,18 @@ def test_rounded_products(precision, repeated):
     half that are on: sqrt(2 * 2^-15.5) = 2^-7 of a gradient's norm if all features are as coarse, and most (the
     latents) are exact: 2^-8. Not rounding in the twin at all would leave 2^-6 (tf32) to 2^-4.6 (bf16).
     """
+    return {name: 2.0**-8 if name.startswith("d ") else 2.0**-12 for name in exact}
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+@pytest.mark.parametrize("precision", ["tf32", "bf16", "fp16"])
+def test_rounded_products(precision, repeated):
     from nrfgs_ns.appearance.fused.launch import KINDS
 
     head, twin = heads("cuda", precision=precision)
     case = scene(head, 120_000, 100_000, repeated)
     exact = evaluate(rounding(twin, KINDS[precision]), *case, dtype=torch.float64)
-    limits = {name: 2.0**-8 if name.startswith("d ") else 2.0**-12 for name in exact}
-    assert_near(evaluate(head, *case), exact, limits)
+    assert_near(evaluate(head, *case), exact, rounded_limits(exact))
 
 
 @pytest.mark.parametrize("way", [0, 1])
@@ -62,15 +67,14 @@ def test_rounded_products(precision, repeated):
     ],
 )
 def test_sizes_and_ways(config, repeated, way, monkeypatch):
-    """Every size that the kernels take, launched in the first way and in the one for small cards. Limits: above."""
+    """Every size that the kernels take, launched in the first way and in the one for small cards."""
     from nrfgs_ns.appearance.fused import launch
 
     monkeypatch.setitem(launch.LAUNCHES, "bf16", launch.LAUNCHES["bf16"][way:])
     head, twin = heads("cuda", precision="bf16", **config)
     case = scene(head, 6000, 5000, repeated)
     exact = evaluate(rounding(twin, launch.KINDS["bf16"]), *case, dtype=torch.float64)
-    limits = {name: 2.0**-8 if name.startswith("d ") else 2.0**-12 for name in exact}
-    assert_near(evaluate(head, *case), exact, limits)
+    assert_near(evaluate(head, *case), exact, rounded_limits(exact))
 
 
 @pytest.mark.parametrize("precision", ["fp32", "tf32", "bf16", "fp16"])
@@ -100,7 +104,7 @@ def test_diffuse_splats(opacity_bound, share, last, repeated):
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("precision", ["fp32", "tf32", "bf16", "fp16"])
 def test_nothing_but_the_base_of_a_diffuse_splat_is_looked_at(precision, last, repeated, way, monkeypatch):
-    """A mask and none in turn, so that the direct launcher has to tell the kernels apart. Limits: above."""
+    """A mask and none in turn, so that the launcher has to tell the kernels apart."""
     from nrfgs_ns.appearance.fused import launch
 
     monkeypatch.setitem(launch.LAUNCHES, precision, launch.LAUNCHES[precision][way:])
@@ -121,8 +125,7 @@ def test_nothing_but_the_base_of_a_diffuse_splat_is_looked_at(precision, last, r
     if precision == "fp32":
         return  # test_diffuse_splats
     exact = evaluate(rounding(twin, launch.KINDS[precision]), dirty, visible, centers, dtype=torch.float64)
-    limits = {name: 2.0**-8 if name.startswith("d ") else 2.0**-12 for name in exact}
-    assert_near(found, exact, limits)
+    assert_near(found, exact, rounded_limits(exact))
 
 
 def test_diffuse_splats_are_not_waited_for():
@@ -146,19 +149,12 @@ def test_lengths_are_in_scene_units():
     compare(head, twin, case, DEVICE_FLOAT32 * float32_tolerance())
 
 
-def test_twice_is_the_same():
-    head, _ = heads("cuda")
-    case = scene(head, 120_000, 100_000)
-    first, second = evaluate(head, *case), evaluate(head, *case)
-    assert all(torch.equal(first[name], second[name]) for name in first)
-
-
 def test_auto_takes_the_kernels_and_falls_back():
     for config, taken in (({}, True), ({"latent_dim": 65}, False)):
-        head = NrfConfig(output_init="default", **config).setup().cuda()
-        splats, visible, centers = scene(head, 100, 80)
-        assert head.fused.takes(splats, centers) == taken
-        head(splats, visible, centers)
+        head = NrfConfig(**config).setup().cuda()
+        case = scene(head, 100, 80)
+        assert head.fused.takes(case[0]) == taken
+        head(*case)
 
 
 def test_rows_beyond_32_bit_offsets():

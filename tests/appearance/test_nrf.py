@@ -4,12 +4,10 @@ import math
 import pytest
 import torch
 from head_cases import awake, scene, shared_weights
-from hypothesis import given
-from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0
-from nrfgs_ns.appearance.nrf import OPACITY_BOUNDS, NrfConfig, bounded_opacity
+from nrfgs_ns.appearance.nrf import NrfConfig, bounded_opacity
 
 
 def by_hand(head, splats, visible, centers):
@@ -58,7 +56,6 @@ def test_every_switch_builds_and_is_felt(split_bands, opacity_residual, use_dist
     head = awake(NrfConfig(**switches, num_bands=num_bands, latent_dim=7, hidden_width=16))
     splats, visible, centers = scene(head)
     colors, opacities = head(splats, visible, centers)
-    assert colors.shape == (len(visible), 3) and opacities.shape == (len(visible),)
     assert (head.high is not None) == (split_bands and num_bands > 1)
 
     base = head.base_appearance(splats, visible)
@@ -89,16 +86,6 @@ def test_straight_through_is_a_clamp_whose_gradient_ignores_it():
     assert residual.grad.squeeze().tolist() == [0.2, 0.2, 0.2]
 
 
-@given(st.floats(-1e4, 1e4), st.floats(-1, 1), st.floats(0, 1), st.sampled_from(OPACITY_BOUNDS))
-def test_every_bound_stays_within_0_and_1_and_keeps_gradients_finite(logit, residual, scale, bound):
-    logit = torch.tensor([[logit]], dtype=torch.float32, requires_grad=True)
-    residual = torch.tensor([[residual]], dtype=torch.float32, requires_grad=True)
-    opacity = bounded_opacity(logit, residual, scale, bound)
-    assert 0 <= opacity.item() <= 1
-    opacity.sum().backward()
-    assert torch.isfinite(logit.grad).all() and torch.isfinite(residual.grad).all() and residual.grad.item() >= 0
-
-
 def test_logit_bound_is_the_residual_at_half_opacity():
     residual = torch.tensor([[1e-4]], dtype=torch.double)
     opacity = bounded_opacity(torch.zeros(1, 1, dtype=torch.double), residual, 0.2, "logit")
@@ -107,19 +94,7 @@ def test_logit_bound_is_the_residual_at_half_opacity():
 
 
 @pytest.mark.parametrize(
-    "field, value",
-    [
-        ("num_bands", 0),
-        ("latent_dim", 0),
-        ("hidden_width", 0),
-        ("color_scale", -0.1),
-        ("opacity_scale", -1.0),
-        ("distance_eps", 0.0),
-        ("output_init", "ones"),
-        ("opacity_bound", "none"),
-        ("implementation", "cuda"),
-        ("precision", "fp8"),
-    ],
+    "field, value", [("num_bands", 0), ("latent_dim", 0), ("color_scale", -0.1), ("precision", "fp8")]
 )
 def test_impossible_settings_are_named(field, value):
     with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):

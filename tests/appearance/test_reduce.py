@@ -27,9 +27,8 @@ def case(request):
 
 
 def assert_same(field: Field, other: Field, visible, centers, **tolerance) -> None:
-    for a, b in zip(
-        field.head(field.splats, visible, centers), other.head(other.splats, visible, centers), strict=True
-    ):
+    pair = (each.head(each.splats, visible, centers) for each in (field, other))
+    for a, b in zip(*pair, strict=True):
         assert_close(a, b, **tolerance)
 
 

@@ -18,19 +18,6 @@ def test_bases_are_gsplats(degree):
     assert_close(sh_bases(degree, unit(200)), _eval_sh_bases_fast(num_bases(degree), unit(200)), rtol=0, atol=1e-12)
 
 
-def test_bases_are_orthonormal_to_degree_five():
-    """Gauss-Legendre in z and equal steps in azimuth integrate products of degree 10 exactly."""
-    import numpy as np
-
-    z, weight = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(8))
-    phi = torch.arange(16, dtype=torch.double) * (2 * torch.pi / 16)
-    s = (1 - z**2).sqrt()[:, None]
-    points = torch.stack([s * phi.cos(), s * phi.sin(), z[:, None].expand(-1, 16)], dim=-1).reshape(-1, 3)
-    area = (weight[:, None] * (2 * torch.pi / 16)).expand(-1, 16).reshape(-1)
-    bases = sh_bases(5, points)
-    assert_close((bases * area[:, None]).T @ bases, torch.eye(36, dtype=torch.double), rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("degree", range(4))
 def test_sum_ignores_higher_coefficients(degree):
     coefficients = torch.randn(50, 16, 3, dtype=torch.double)

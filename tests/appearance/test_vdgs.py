@@ -83,47 +83,27 @@ def test_what_the_view_takes_from_opacity_can_be_shown():
     assert torch.equal(parts["residual"].values, shown.colors - head.base_appearance(splats, visible).colors)
 
 
-def grid(**options):
+@pytest.fixture
+def grid():
     torch.manual_seed(0)
-    made = HashGrid(16, **options).double()
-    made.table.data.normal_()
-    return made
-
-
-def test_numbered_level_has_one_row_for_each_lattice_point_of_the_cube():
-    """Features at lattice points are the table's rows: 32^3 points from -1 to 31/32, all rows, each once."""
-    level = grid(levels=1, features=1)
-    level.table.data[:, 0] = torch.arange(2**15)
-    side = torch.arange(-16, 16, dtype=torch.double) / 16
-    rows = level(torch.cartesian_prod(side, side, side))[:, 0]
-    assert torch.equal(rows.sort().values, torch.arange(2**15).double())
-
-
-def test_numbered_level_repeats_itself_beyond_the_cube_and_hashed_levels_do_not():
-    made = grid()
-    x = torch.rand(50, 3, dtype=torch.double) * 2 - 1
-    for shift in ([2.0, 0, 0], [0, -2.0, 0], [0, 4.0, -6.0]):
-        here, there = made(x), made(x + torch.tensor(shift).double())
-        # The shift rounds x by 2^-50, times 16 steps, times differences of a few between features.
-        assert_close(here[:, :4], there[:, :4], rtol=0, atol=1e-12)
-        assert ((here - there)[:, 4:].abs().amax(dim=1) > 0.1).all()
+    grid = HashGrid(16).double()
+    grid.table.data.normal_()
+    return grid
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_features_are_continuous_across_cells_zero_and_the_cube(axis):
-    made = grid()
+def test_features_are_continuous_across_cells_zero_and_the_cube(axis, grid):
     x = torch.rand(40, 3, dtype=torch.double) * 2 - 1
     x[:, axis] = torch.arange(-20, 20) / 16  # faces of cells on level 0, of some on the others
     before, after = x.clone(), x.clone()
     before[:, axis] -= 1e-9
     after[:, axis] += 1e-9
     # A feature changes by at most 54 steps per unit times the largest difference of two normal numbers among 2^19.
-    assert (made(after) - made(before)).abs().max() < 2e-9 * 54 * 10
+    assert (grid(after) - grid(before)).abs().max() < 2e-9 * 54 * 10
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_far_splats_find_rows_too(dtype):
-    made = grid().to(dtype)
+def test_far_splats_find_rows_too(dtype, grid):
     far = torch.tensor([[1e6, -1e6, 1e6], [-1e9, 1e9, 0.1], [1e30, -1e30, 0.0]], dtype=dtype)
-    features = made(far)
+    features = grid.to(dtype)(far)
     assert torch.isfinite(features).all() and (features != 0).any(dim=1).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Launcher`: when a compiled variant is launched again, and when Triton is asked anew. No GPU is needed for that."""
+"""`Launcher`: when a compiled variant is launched again, and when Triton is asked anew, without a GPU."""
 
 import pytest
 import torch
@@ -10,28 +10,23 @@ from nrfgs_ns.kernels.launch import Launcher
 
 
 class Kernel:
-    """Stands for a function under triton.jit: notes each launch, and the variants that were compiled."""
+    """Stands for a function under triton.jit, or for a compiled variant: notes each launch."""
 
     arg_names = ("x", "count", "scale", "B", "KIND")
 
-    def __init__(self, compiles: bool = True):
+    def __init__(self, compiles: bool = True, kind: str = "triton"):
         self.launches: list[tuple] = []
-        self.compiles = compiles
+        self.kind, self.compiles = kind, compiles
 
     def __getitem__(self, grid):
         def launch(*arguments, **constants):
-            self.launches.append(("triton", grid, arguments, constants))
-            return Compiled(self) if self.compiles else None
+            self.launches.append((self.kind, grid, arguments, constants))
+            if self.compiles:
+                variant = Kernel(kind="compiled")
+                variant.launches = self.launches
+                return variant
 
         return launch
-
-
-class Compiled:
-    def __init__(self, kernel: Kernel):
-        self.kernel = kernel
-
-    def __getitem__(self, grid):
-        return lambda *arguments: self.kernel.launches.append(("compiled", grid, arguments))
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +44,7 @@ def test_the_second_launch_is_the_compiled_variants_with_constants_in_the_kernel
     launch((2, 1, 1), x, 7, 0.25, **CONSTANTS)
     assert kernel.launches == [
         ("triton", (1, 1, 1), (x, 8, 0.5), CONSTANTS),
-        ("compiled", (2, 1, 1), (x.data_ptr(), 7, 0.25, 64, "bf16")),
+        ("compiled", (2, 1, 1), (x.data_ptr(), 7, 0.25, 64, "bf16"), {}),
     ]
 
 
@@ -65,21 +60,18 @@ def test_the_second_launch_is_the_compiled_variants_with_constants_in_the_kernel
     ids=["unaligned", "64 bits", "another type", "another constant", "another option"],
 )
 def test_what_asks_for_another_variant_goes_to_triton(arguments, constants):
-    kernel = Kernel()
-    launch = Launcher(kernel)
-    launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
-    launch((1, 1, 1), *arguments, **{**CONSTANTS, **constants})
-    assert [kind for kind, *_ in kernel.launches] == ["triton", "triton"]
-    launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
-    assert kernel.launches[-1][0] == "compiled", "the ordinary one is still known"
-
-
-def test_an_unaligned_first_launch_is_not_what_later_ones_use():
-    kernel = Kernel()
-    launch = Launcher(kernel)
-    launch((1, 1, 1), torch.zeros(9)[1:], 8, 0.5, **CONSTANTS)
-    launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
-    assert [kind for kind, *_ in kernel.launches] == ["triton", "triton"]
+    for order, expected in (
+        ("ordinary other ordinary", ["triton", "triton", "compiled"]),
+        ("other ordinary", ["triton", "triton"]),
+    ):
+        kernel = Kernel()
+        launch = Launcher(kernel)
+        for name in order.split():
+            if name == "ordinary":
+                launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
+            else:
+                launch((1, 1, 1), *arguments, **{**CONSTANTS, **constants})
+        assert [kind for kind, *_ in kernel.launches] == expected
 
 
 @pytest.mark.parametrize("old", [True, False])

@@ -8,13 +8,13 @@ the rows of the table and computes
 
 Nothing of that is written to memory: the backward kernel computes it again, which costs less than reading it.
 
-What a splat has three or four of (direction, base colour and opacity, outputs, their gradients) is a tile [B, 4] whose
-columns are called lanes: three axes or colours, and in lane 3 the opacity or the gate. The features are R tiles. A
-splat's lanes stay in the four threads in which tensor cores have its row, latents and features (`tiles.py`).
+Direction, base colour and opacity, outputs and their gradients are tiles [B, 4] whose columns are called lanes: three
+axes or colours, and in lane 3 the opacity or the gate. The features are R tiles. A splat's lanes stay in the four
+threads in which tensor cores have its row, latents and features (`tiles.py`).
 
 The kernels are bound by instructions and by threads that wait for each other. So bands follow from one another by
-double angles, the backward kernel's slopes are the forward's waves, nothing is divided, and loads of the next blocks
-are on their way while one is computed. Rows have 64-bit offsets: 2^26 splats with 32 latents each pass 2^31 numbers.
+double angles, the backward kernel's slopes are the forward's waves, nothing is divided, and the next blocks are loaded
+while one is computed. Rows have 64-bit offsets: 2^26 splats with 32 latents each pass 2^31 numbers.
 """
 
 import triton
@@ -101,7 +101,7 @@ def _features(d, base, log_r, waves, lanes, B: tl.constexpr, R: tl.constexpr, BA
 
 @triton.jit
 def _features_backward(d_F, waves, lanes, B: tl.constexpr, R: tl.constexpr, BANDS: tl.constexpr):
-    """From the features' gradient [B, P] that of (direction, log r) and that of (c, alpha)."""
+    """Gradients of (direction, log r) and of (c, alpha), from the features' [B, P]."""
     stacked = tl.permute(tl.reshape(d_F, (B, R, 4)), (0, 2, 1))
     twos: tl.constexpr = 4 if R == 16 else 3 if R == 8 else 2
     tiles = unstack(tl.reshape(stacked, (B, 4) + (2,) * twos), R)
@@ -133,7 +133,7 @@ def _bounded_opacity(logit, alpha, t, scale, BOUND: tl.constexpr):
 
 @triton.jit
 def _outputs(Y, lanes, B: tl.constexpr, COLUMNS: tl.constexpr):
-    """High branch's outputs [B, 4], the gate's opening [B, 1], and what tanh sees [B, 4]."""
+    """High branch's outputs [B, 4], the open gate sigmoid(w) [B, 1], and tanh's argument [B, 4]."""
     if COLUMNS == 16:
         Y, _ = tl.split(tl.permute(tl.reshape(Y, (B, 2, 8)), (0, 2, 1)))
     low, high = tl.split(tl.reshape(Y, (B, 4, 2)))
@@ -155,19 +155,19 @@ def _inputs(Z, F, B: tl.constexpr, P: tl.constexpr, KIND: tl.constexpr):
 
 @triton.jit
 def _silenced(X, is_diffuse, B: tl.constexpr, P: tl.constexpr):
-    """X with zeros for diffuse splats, whatever theirs are: 0 times NaN would be NaN in the weights' gradients."""
+    """X with zeros for diffuse splats: 0 times NaN would be NaN in the weights' gradients."""
     lanes = tl.reshape(X, (B, P // 4, 4, 2))
     return tl.reshape(tl.where(is_diffuse[:, None, :, None], 0.0, lanes), (B, 2 * P))
 
 
-# Blocks of which all splats are diffuse: a program walks backwards over its last ones, as long as they need no network.
-# Diffuse splats come last in the table, so these are all blocks that have some, but one. A branch in the main loop
-# would serve a table in any order, but it keeps the compiler from loading the next blocks while one is computed.
+# Blocks whose splats are all diffuse: a program walks backwards over its last ones, as long as they need no network.
+# Diffuse splats come last in the table, so at most one other block has some. A branch in the main loop would serve a
+# table in any order, but it keeps the compiler from loading the next blocks while one is computed.
 
 
 @triton.jit
 def base_of(stored, lanes, sh_c0):
-    """(c, alpha) from what is stored: features_dc, and the logit in lane 3."""
+    """(c, alpha) from features_dc, and the logit in lane 3."""
     return tl.where(lanes < 3, 0.5 + sh_c0 * stored, sigmoid(stored))
 
 
@@ -256,7 +256,7 @@ def forward_kernel(
             features_dc, opacities, diffuse, visible, colors_out, opacities_out, count, sh_c0, lanes, B
         )  # fmt: skip
 
-    # What is hoisted out of the loop lives in registers that its inside lacks.
+    # Values hoisted out of the loop would take registers that its inside needs.
     for block in tl.range(tl.program_id(0), blocks, tl.num_programs(0), disable_licm=True):
         items = block * B + tl.arange(0, B)[:, None]
         valid = items < count
@@ -298,7 +298,7 @@ def backward_kernel(
 ):  # fmt: skip
     """Gradients of everything, from those of colours and opacities; d_x is the loss's derivative by x.
 
-    Rows of the tables' gradients that no block visits are left as they are; with DIFFUSE, so may be what is 0. Each
+    Rows of the tables' gradients that no block visits are not written; with DIFFUSE, zeros may not be either. Each
     program writes its sum of the packed weights' gradients, and of one shared camera centre's, to its row of `partials`
     [programs, SLOTS]: no atomics, so the result is the same every time.
     """

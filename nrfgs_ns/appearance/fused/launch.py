@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kernels as one differentiable function of tables, camera centres and shared weights.
 
-A training step of a small scene is bound by the host, so this is written for few launches: two to pack the weights,
-one forward, one to zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the
-weights' gradients. Diffuse splats cost one more, for a 32-bit mask, and the tables' gradients are always zeroed.
+A training step of a small scene is bound by the host, hence few launches: two to pack the weights, one forward, one to
+zero the tables' gradients unless every splat is visible and none diffuse, one backward, two to sum and unpack the
+weights' gradients; one for a 32-bit mask of diffuse splats.
 """
 
 import functools
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,22 +25,15 @@ from nrfgs_ns.kernels.launch import Launcher
 launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
 
 
-@dataclass(frozen=True)
-class Launch:
+class Launch(NamedTuple):
     """How a kernel is compiled and launched."""
 
-    block: int
-    """visible splats that a program takes at once"""
-    warps: int
-    """warps of a program"""
-    stages: int
-    """software pipelining of the loop over blocks; 1 is none"""
-    programs_per_sm: int
-    """programs for each multiprocessor; a program walks over many blocks"""
-    columns: int
-    """of W2 for the tensor cores: 8, or 16 with zeros behind; with 16, d_W1 is X^T d_pre instead of d_pre^T X"""
-    registers: int | None = None
-    """most registers of a thread, for up to 128 hidden units; None leaves them to the compiler"""
+    block: int  # visible splats that a program takes at once
+    warps: int  # of a program
+    stages: int  # software pipelining of the loop over blocks; 1: none
+    programs_per_sm: int  # a program walks over many blocks
+    columns: int  # of W2 for the tensor cores: 8, or 16 with zeros behind; then d_W1 is X^T d_pre, not d_pre^T X
+    registers: int | None = None  # most of a thread, for up to 128 hidden units; None leaves them to the compiler
 
     def options(self, hidden: int) -> dict[str, int]:
         """Options of Triton's compiler, for H hidden units.
@@ -52,8 +45,7 @@ class Launch:
         return options if self.registers is None or hidden > 128 else {**options, "maxnreg": self.registers}
 
 
-@dataclass(frozen=True)
-class Launches:
+class Launches(NamedTuple):
     """How both kernels are launched."""
 
     forward: Launch
@@ -110,19 +102,21 @@ INTERPRETER_PROGRAMS = 2
 """Programs in Triton's interpreter: as few as show that programs share the work."""
 
 
-@dataclass(frozen=True)
-class FieldOptions:
+class FieldOptions(NamedTuple):
     """The part of the field's configuration that the kernels need."""
 
-    color_scale: float
-    opacity_scale: float
-    distance_eps: float
-    """in world units"""
-    log_unit: float
-    """log of the world units in a scene unit"""
+    scalars: tuple[float, ...]
+    """squared smallest distance in world units, log of the world units in a scene unit, s_c, s_alpha, SH_C0"""
     bound: str
     """an OpacityBound, or "none" for a field without opacity residual"""
     precision: str
+
+    @staticmethod
+    def of(config, scene_unit: float = 1.0) -> "FieldOptions":
+        """Options of an NrfConfig."""
+        eps_squared, log_unit = (config.distance_eps * scene_unit) ** 2, math.log(scene_unit)
+        scalars = eps_squared, log_unit, config.color_scale, config.opacity_scale, SH_C0
+        return FieldOptions(scalars, config.bound if config.opacity_residual else "none", config.precision)
 
 
 class FusedFunction(torch.autograd.Function):
@@ -136,8 +130,18 @@ class FusedFunction(torch.autograd.Function):
     def forward(ctx, packing: Packing, launches: Launches, options: FieldOptions, means, latents, features_dc,
                 opacities, diffuse, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
-        visible, centers, packed = _contiguous(visible), _contiguous(centers), packed_weights(packing, weights)
-        colors, seen, flags = evaluate(packing, launches.forward, options, tables, diffuse, visible, centers, packed)
+        visible, centers, packed = _contiguous(visible), _contiguous(centers), _packed(packing, weights)
+        # Triton lays out a product's factors by the narrowest number that they are computed from: for bytes, it took
+        # more columns to a thread than d_Y has, and float32's d_hidden was wrong.
+        flags = None if diffuse is None else diffuse.to(torch.int32)
+        count, how = len(visible), launches.forward
+        colors, seen = packed.new_empty(count, 3), packed.new_empty(count)
+        if count > 0:
+            launch_forward(
+                (_programs(how, count, visible.device), 1, 1), *tables, visible if flags is None else flags, visible,
+                centers, packed, colors, seen, count, *options.scalars,
+                **_constants(packing, how, options, centers.dim() == 1, flags),
+            )  # fmt: skip
         ctx.save_for_backward(*tables, flags, visible, centers, packed)
         ctx.packing, ctx.how, ctx.options = packing, launches.backward, options
         return colors, seen
@@ -149,6 +153,7 @@ class FusedFunction(torch.autograd.Function):
         *tables, flags, visible, centers, packed = ctx.saved_tensors
         count, rows, device = len(visible), len(tables[0]), visible.device
         one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[9]
+        # Without zeros only where the kernel writes each row, once.
         zero = not one_center or count < rows or flags is not None
         d_tables = _tables(rows, packing.latent_dim, device, zero)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
@@ -157,16 +162,11 @@ class FusedFunction(torch.autograd.Function):
         if count > 0:
             programs = _programs(how, count, device)
             partials = tables[0].new_empty(programs, len(packing.gather) + CENTER_SLOTS)
-            kind, gradient_kind = KINDS[options.precision]
             launch_backward(
-                (programs, 1, 1), *tables, _or(flags, visible), visible, centers, packed,
+                (programs, 1, 1), *tables, visible if flags is None else flags, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
-                count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
-                D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
-                B=how.block, COLUMNS=how.columns, SLOTS=partials.shape[1],
-                ONE_CENTER=one_center, BOUND=options.bound, CENTER=wants_center,
-                KIND=kind, GRADIENT_KIND=gradient_kind, DIFFUSE=flags is not None,
-                **how.options(packing.hidden),
+                count, *options.scalars, SLOTS=partials.shape[1], CENTER=wants_center,
+                GRADIENT_KIND=KINDS[options.precision][1], **_constants(packing, how, options, one_center, flags),
             )  # fmt: skip
             sums = partials.sum(dim=0)
         else:
@@ -175,41 +175,32 @@ class FusedFunction(torch.autograd.Function):
             d_centers = sums[len(packing.gather) : len(packing.gather) + 3]
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
-        d_centers = d_centers if wants_center else None
-        return None, None, None, *d_tables, None, None, d_centers, *d_weights
+        return None, None, None, *d_tables, None, None, d_centers if wants_center else None, *d_weights
 
 
-def packed_weights(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
+def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
     """The shared weights as the kernels read them."""
     flat = [weight.detach().reshape(-1) for weight in weights]
     return torch.cat([*flat, _zero(flat[0].device)]).index_select(0, packing.gather)
 
 
-def evaluate(packing: Packing, how: Launch, options: FieldOptions, tables: Sequence[Tensor], diffuse: Tensor | None,
-             visible: Tensor, centers: Tensor, packed: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:  # fmt: skip
-    """Colours [M, 3] and opacities [M] without gradients, and `diffuse` as the kernels read it.
-
-    Args:
-        tables: means, latents, features_dc and opacities, dense and without gradient like all tensors here.
-        packed: of `packed_weights`.
-    """
-    count, device = len(visible), visible.device
-    # Triton lays out a product's factors by the narrowest number that they are computed from: for bytes, it took
-    # more columns to a thread than d_Y has, and float32's d_hidden was wrong.
-    flags = None if diffuse is None else diffuse.to(torch.int32)
-    colors, seen = packed.new_empty(count, 3), packed.new_empty(count)
-    if count > 0:
-        launch_forward(
-            (_programs(how, count, device), 1, 1), *tables, _or(flags, visible), visible, centers,
-            packed, colors, seen,
-            count, options.distance_eps**2, options.log_unit, options.color_scale, options.opacity_scale, SH_C0,
-            D=packing.latent_dim, P=packing.width, H=packing.hidden, BANDS=packing.num_bands,
-            B=how.block, COLUMNS=how.columns,
-            ONE_CENTER=centers.dim() == 1, BOUND=options.bound, KIND=KINDS[options.precision][0],
-            DIFFUSE=flags is not None,
-            **how.options(packing.hidden),
-        )  # fmt: skip
-    return colors, seen, flags
+def _constants(
+    packing: Packing, how: Launch, options: FieldOptions, one_center: bool, flags: Tensor | None
+) -> dict[str, Any]:
+    """Constants of both kernels, and options of Triton's compiler. Without `flags` the kernels read no mask."""
+    return {
+        "D": packing.latent_dim,
+        "P": packing.width,
+        "H": packing.hidden,
+        "BANDS": packing.num_bands,
+        "B": how.block,
+        "COLUMNS": how.columns,
+        "ONE_CENTER": one_center,
+        "BOUND": options.bound,
+        "KIND": KINDS[options.precision][0],
+        "DIFFUSE": flags is not None,
+        **how.options(packing.hidden),
+    }
 
 
 def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool) -> Launches:
@@ -218,29 +209,26 @@ def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool)
     A missing C compiler and a lack of shared memory show only here. Out-of-memory is re-raised: otherwise a slower
     launch would be kept for good.
     """
-    *more, last = LAUNCHES[options.precision]
-    for launches in more:
+    for launches in LAUNCHES[options.precision]:
         try:
             probe(packing, launches, options, some_diffuse)
+            return launches
         except torch.OutOfMemoryError:
             raise
-        except Exception:  # if the last one fails too, it says why
-            continue
-        return launches
-    probe(packing, last, options, some_diffuse)
-    return last
+        except Exception as error:
+            reason = error
+    raise reason
 
 
 def probe(packing: Packing, launches: Launches, options: FieldOptions, some_diffuse: bool) -> None:
     """Compile and run both kernels on one splat, for one camera; raise whatever goes wrong."""
     device = packing.gather.device
-    with torch.inference_mode(False), torch.enable_grad():
-        tables = [torch.zeros(1, n, device=device, requires_grad=True) for n in (3, packing.latent_dim, 3, 1)]
-        weights = [torch.zeros(shape, device=device, requires_grad=True) for shape in packing.shapes]
-        visible, center = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(3, device=device)
-        diffuse = torch.zeros(1, dtype=torch.bool, device=device) if some_diffuse else None
-        outputs = FusedFunction.apply(packing, launches, options, *tables, diffuse, visible, center, *weights)
-        sum(output.sum() for output in outputs).backward()
+    tables = [torch.zeros(1, n, device=device, requires_grad=True) for n in (3, packing.latent_dim, 3, 1)]
+    weights = [torch.zeros(shape, device=device, requires_grad=True) for shape in packing.shapes]
+    visible, center = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(3, device=device)
+    diffuse = torch.zeros(1, dtype=torch.bool, device=device) if some_diffuse else None
+    outputs = FusedFunction.apply(packing, launches, options, *tables, diffuse, visible, center, *weights)
+    sum(output.sum() for output in outputs).backward()
 
 
 def _programs(how: Launch, count: int, device: torch.device) -> int:
@@ -252,8 +240,7 @@ def _programs(how: Launch, count: int, device: torch.device) -> int:
 def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> list[Tensor]:
     """Tables [N, 3], [N, D], [N, 3] and [N, 1], cut from one allocation so that one launch clears them.
 
-    Each begins at a multiple of 16 bytes: Triton compiles another kernel for pointers that do not. Zeros are not needed
-    if one camera sees every row and none is diffuse: then the kernel writes each row, once.
+    Each begins at a multiple of 16 bytes: Triton compiles another kernel for pointers that do not.
     """
     padded = -(-rows // 4) * 4
     widths = (3, latent_dim, 3, 1)
@@ -267,11 +254,6 @@ def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> lis
 def _contiguous(x: Tensor) -> Tensor:
     """A dense tensor without gradient."""
     return x.detach().contiguous()
-
-
-def _or(flags: Tensor | None, instead: Tensor) -> Tensor:
-    """The mask of diffuse splats; without one, any tensor, which the kernels do not read then."""
-    return instead if flags is None else flags
 
 
 @functools.cache

@@ -16,6 +16,7 @@ both; H hidden units of both branches side by side, rounded up to a power of two
   d_alpha and column 7 the gate's logit w.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -31,50 +32,45 @@ class Packing:
     """Index maps and sizes; on the CPU until `to`."""
 
     latent_dim: int
-    width: int
-    """P: columns of the latents' tile and of the features' tile."""
-    hidden: int
-    """H: hidden units, a power of two >= 16."""
-    num_bands: int
-    """K, at least 1."""
+    width: int  # P
+    hidden: int  # H, a power of two >= 16
+    num_bands: int  # K >= 1
     gather: Tensor
     """[2 P H + 8 H + 8], int64: packed weights = flat[gather], flat being all parameters in a row and then one 0."""
     scatter: Tensor
     """[number of weights], int64: gradient of the flat parameters = gradient of the packed ones [scatter]."""
     shapes: tuple[torch.Size, ...]
-    """Shapes of the parameters, in the order in which they are laid in a row."""
+    """Shapes of the parameters, in the order of `flat`."""
 
     def to(self, device: torch.device) -> "Packing":
         """The same with its tensors on `device`."""
         return replace(self, gather=self.gather.to(device), scatter=self.scatter.to(device))
 
 
-def pack(
-    latent_dim: int, num_bands: int, use_distance: bool, low: nn.Sequential, high: nn.Sequential | None
-) -> Packing:
+def pack(latent_dim: int, num_bands: int, use_distance: bool, branches: Sequence[nn.Sequential]) -> Packing:
     """Lay out a field.
 
     Args:
         use_distance: whether the log distance is among the inputs.
-        low: the low branch or the only one, Linear - ReLU - Linear.
-        high: the high branch, or None.
+        branches: low and high, or the only one; each is Linear - ReLU - Linear.
     """
     width = max(16, _power_of_two(latent_dim), 4 * _power_of_two(2 * num_bands + 2))
-    columns = _feature_columns(num_bands, width // 4)
-    hidden_units = [branch[0].out_features for branch in (low, high) if branch is not None]
-    hidden = max(16, _power_of_two(sum(hidden_units)))
+    hidden = max(16, _power_of_two(sum(branch[0].out_features for branch in branches)))
 
-    latents = [_latent_column(i) for i in range(latent_dim)]
-    color = [columns[name] for name in ("c0", "c1", "c2")]
-    shared = latents + color + ([columns["log_r"]] if use_distance else [])
-    low_bands = [columns[name] for name in ("dx", "dy", "dz", *_band(0))]
-    high_bands = [columns[name] for k in range(1, num_bands) for name in _band(k)]
-    low_inputs = [*shared, columns["alpha"], *low_bands]
-    if high is None and low[0].in_features > len(low_inputs):
-        low_inputs += high_bands  # the single branch sees everything
+    def lanes(tile: int) -> list[int]:
+        return [2 * (4 * tile + lane) + 1 for lane in range(4)]
 
-    parameters = [p for branch in (low, high) if branch is not None for p in branch.parameters()]
-    shapes = tuple(parameter.shape for parameter in parameters)
+    *direction, one = lanes(0)
+    *color, alpha = lanes(width // 4 - 1)
+    latents = [2 * (4 * (i // 16 * 4 + i % 4) + i // 4 % 4) for i in range(latent_dim)]
+    shared = latents + color + ([lanes(1)[3]] if use_distance else [])
+    low_bands, *high_bands = (lanes(1 + 2 * k)[:3] + lanes(2 + 2 * k)[:3] for k in range(num_bands))
+    high_bands = sum(high_bands, [])
+    inputs = [[*shared, alpha, *direction, *low_bands], [*shared, *high_bands]]
+    if len(branches) == 1 and branches[0][0].in_features > len(inputs[0]):
+        inputs[0] += high_bands  # the single branch sees everything
+
+    shapes = tuple(parameter.shape for branch in branches for parameter in branch.parameters())
     zero = sum(shape.numel() for shape in shapes)
     first = torch.full((2 * width, hidden), zero)
     second = torch.full((hidden, OUTPUT_COLUMNS), zero)
@@ -82,45 +78,19 @@ def pack(
     ranges = torch.arange(zero).split([shape.numel() for shape in shapes])
     positions = [numbers.view(shape) for numbers, shape in zip(ranges, shapes, strict=True)]
     unit = 0
-    branches = [(low_inputs, positions[:4], 0)]
-    if high is not None:
-        branches.append((shared + high_bands, positions[4:], 1))
-    for inputs, (w1, b1, w2, b2), offset in branches:
+    for branch in range(len(branches)):
+        w1, b1, w2, b2 = positions[4 * branch : 4 * branch + 4]
         units = torch.arange(unit, unit + len(b1))
         unit += len(b1)
-        outputs = 2 * torch.arange(len(b2)) + offset
-        first[torch.tensor(inputs)[:, None], units] = w1.T
-        first[columns["one"], units] = b1
+        outputs = 2 * torch.arange(len(b2)) + branch
+        first[torch.tensor(inputs[branch])[:, None], units] = w1.T
+        first[one, units] = b1
         second[units[:, None], outputs] = w2.T
         bias[outputs] = b2
     gather = torch.cat([first.flatten(), second.flatten(), bias])
     scatter = torch.empty(zero + 1, dtype=torch.int64)
     scatter[gather] = torch.arange(len(gather))
     return Packing(latent_dim, width, hidden, num_bands, gather, scatter[:zero].clone(), shapes)
-
-
-def _feature_columns(num_bands: int, tiles: int) -> dict[str, int]:
-    """Each feature's column in X."""
-    lanes = {(0, 3): "one", (1, 3): "log_r"}
-    for lane, name in enumerate(("dx", "dy", "dz")):
-        lanes[0, lane] = name
-    for lane, name in enumerate(("c0", "c1", "c2", "alpha")):
-        lanes[tiles - 1, lane] = name
-    for k in range(num_bands):
-        for i, name in enumerate(_band(k)):
-            lanes[1 + 2 * k + i // 3, i % 3] = name
-    return {name: 2 * (4 * tile + lane) + 1 for (tile, lane), name in lanes.items()}
-
-
-def _latent_column(i: int) -> int:
-    """Latent i's column in X."""
-    lane, tile = i // 4 % 4, i // 16 * 4 + i % 4
-    return 2 * (4 * tile + lane)
-
-
-def _band(k: int) -> list[str]:
-    """Names of band k's six features, in the encoding's order."""
-    return [f"{wave}{k}{axis}" for wave in ("sin", "cos") for axis in "xyz"]
 
 
 def _power_of_two(n: int) -> int:

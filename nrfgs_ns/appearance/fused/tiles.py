@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Building blocks of the fused kernels: functions and products on tensor cores, and access to tables.
 
-Every number is read by the thread in which tensor cores want it. The compiler deals the rows of a load to the threads,
-four for each row: eight rows to each warp, then eight more. Tensor cores want sixteen neighbours in a warp. Which row
-of a matrix a splat is does not matter, so rows are renumbered, at no cost, such that every number is where it belongs.
-A thread reads four numbers of a row at once, so latents come in sixteens. D, P, R and B: packing.py and kernels.py.
+Every number is read by the thread in which tensor cores need it. The compiler deals the rows of a load to the threads,
+four for each row: eight rows to each warp, then eight more. Tensor cores need sixteen neighbours in a warp. The order
+of splats in a matrix is free, so rows are renumbered at no cost. A thread reads four numbers of a row at once, so
+latents come in sixteens. D, P, R and B: packing.py and kernels.py.
 """
 
 import triton
@@ -23,7 +23,7 @@ def sigmoid(x):
     return inverse(1.0 + tl.exp(-x))
 
 
-# The interpreter cuts floats down to bfloat16 and then multiplies their bits: there, operands are rounded by hand, and
+# The interpreter truncates to bfloat16 and multiplies the bits as integers: there, operands are rounded by hand, and
 # stay float32.
 INTERPRETED = tl.constexpr(not isinstance(sigmoid, triton.runtime.JITFunction))
 
@@ -38,7 +38,7 @@ def tanh(x):
 
 @triton.jit
 def operand(x, KIND: tl.constexpr):
-    """Round to what the tensor cores multiply. float16 saturates: beyond 65504 it would be infinite.
+    """Round a factor as tensor cores take it. float16 saturates: beyond 65504 it would be infinite.
 
     Tensor cores cut float32 down to tf32's 10 bits of mantissa; rounding first halves the error and removes its bias.
     """
@@ -55,8 +55,8 @@ def operand(x, KIND: tl.constexpr):
         else:
             return x.to(tl.bfloat16)
     elif KIND == "tf32":
-        # NaN and infinity stay. They are told by their bits: where x is a product, fused multiply-add takes x - x for
-        # the product's rounding error, which is not 0.
+        # NaN and infinity stay, recognised by their bits: where x is a product, fused multiply-add would make x - x the
+        # product's rounding error, not 0.
         bits = x.to(tl.int32, bitcast=True)
         rounded = (bits + 0x1000) & -0x2000
         return tl.where((bits & 0x7F800000) == 0x7F800000, x, rounded.to(tl.float32, bitcast=True))
