@@ -89,7 +89,7 @@ class Web(_Format):
 
 
 def check_compact(options: CompactOptions) -> None:
-    for name in ("finetune", "rate", "budget"):
+    for name in ("finetune", "rate"):
         if not getattr(options, name) >= 0:
             raise InputError(f"--{name} is {getattr(options, name)}; it must be zero or positive.")
 

@@ -23,15 +23,12 @@ class PlyOptions:
 
 @dataclass
 class CompactOptions:
-    """What a compact file may leave out."""
+    """How a compact file is made smaller."""
 
     finetune: int = 0
-    """steps in which the model is trained on for the file: tables that cost less, and how finely each is rounded"""
+    """steps of a fine-tune for the file: tables that cost less, learnt rounding. 0: the model's numbers, rounded"""
     rate: float = 1e-4
-    """with finetune: how much of the training's loss a byte for each splat is worth. More: a smaller file"""
-    budget: float = 0.03
-    """without finetune: dB on some training views that splats made diffuse and shorter latents may cost. 0: nothing is
-    left out"""
+    """with finetune: the training's loss that one byte for each splat is worth. More: a smaller file"""
 
 
 @dataclass

@@ -30,7 +30,6 @@ from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.export.command import Web
-from nrfgs_ns.export.options import CompactOptions
 from nrfgs_ns.export.web.page import page as page_of
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
@@ -45,8 +44,6 @@ pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e
 ALIKE = 40.0
 """dB between the page's picture and the renderer's."""
 SIZE = (320, 240)
-ALL = CompactOptions(budget=0.0)
-"""Nothing left out but digits: what a budget in dB allows is much, where a training has just begun."""
 MODES = ["full", "base", "residual", "opacity residual"]
 KINDS = {
     "as trained by default": ("classic", {}),
@@ -225,7 +222,7 @@ def demo(tiny_scene, tmp_path_factory):
         "--optimizers.field.optimizer.lr": 0.05,  # something to show after a few steps
     }
     config = trained(command_line("nrfgs", tiny_scene, folder, 80, options))
-    Web(config, output=folder / "page.html", options=ALL).main()
+    Web(config, output=folder / "page.html").main()
     return config, folder / "page.html"
 
 

@@ -12,6 +12,7 @@ from PIL import Image
 
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import input_columns
+from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
@@ -48,13 +49,13 @@ def export_web(
                 f"{load_config}: the field's weights fill {vectors} vectors of a shader, and some phones have room for "
                 f"{MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
             )
-        header, streams, numbers = packed(pipeline, load_config, options)
+        header, streams, numbers = packed(pipeline, options)
         about, poster = surroundings(pipeline)
         with TemporaryDirectory() as temporary:
             file = Path(temporary) / SCENE
             scene_bytes = write_container(file, header, streams)
             scene = file.read_bytes()
-            losses = measure_file(pipeline, write_config(load_config, file)) if measure else {}
+            losses = measure_file(pipeline, write_config(load_config, file, decode(file).config)) if measure else {}
     title = output.stem if web.title is None else web.title
     text = page(about, poster, scene if alone else SCENE, title, web.author)
     contents = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
@@ -65,9 +66,8 @@ def export_web(
     size = sum(map(len, contents.values()))
     name = about["photographs"][about["start"]]["name"]
     lines = [
-        f"{output}: {numbers['written']:,} splats, {numbers['view_dependent']:,} of them view-dependent, "
-        f"{size / 1e6:.2f} MB; 3DGS's PLY of as many splats has {numbers['ply_bytes'] / 1e6:.2f} MB. It begins where "
-        f"{name} was taken."
+        f"{output}: {numbers['written']:,} splats, {size / 1e6:.2f} MB; 3DGS's PLY of as many splats has "
+        f"{numbers['ply_bytes'] / 1e6:.2f} MB. It begins where {name} was taken."
     ]
     lines += [lost(losses)] if measure else []
     lines.append("Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md.")

@@ -5,11 +5,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from nrfgs_lab import residuals
+from nrfgs_lab.residuals import EIGHT_BIT_STEP, FieldViews, dropped, look_over, slim
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.reduce import latent_basis, with_diffuse, with_rank
-from nrfgs_ns.compact import slim as slimming
-from nrfgs_ns.compact.slim import EIGHT_BIT_STEP, FieldViews, dropped, look_over, slim
+from nrfgs_ns.model.harmonics_fit import observe
 from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -50,8 +51,6 @@ def seen(loud):
 
 
 def test_the_mean_appearance_is_weighted_by_contribution(loud, seen):
-    from nrfgs_ns.model.harmonics_fit import observe
-
     model, cameras = loud.model, loud.datamanager.train_dataset.cameras
     sums = torch.zeros(model.num_points, 5)
     for index in range(len(cameras)):
@@ -103,11 +102,11 @@ def test_loss_falls_with_the_rank(loud, field, seen, monkeypatch):
     basis = latent_basis(field, seen.weight)
     scores = [views.psnr(with_rank(field, basis, rank)) for rank in range(1, 7)]
     assert scores == sorted(scores) and scores[-1] > 80 > scores[0]
-    assert slim(field, seen, views, -1e3, lambda _: None).threshold == float("inf")
+    assert slim(field, seen, views, -1e3).threshold == float("inf")
     # The smallest that reaches a score is found, and no smaller one would do.
-    monkeypatch.setattr(slimming, "THRESHOLDS", ())
+    monkeypatch.setattr(residuals, "THRESHOLDS", ())
     for wanted in (scores[0] - 1, 0.5 * (scores[1] + scores[2]), scores[4]):
-        slimmed = slim(field, seen, views, wanted, lambda _: None)
+        slimmed = slim(field, seen, views, wanted)
         assert views.psnr(slimmed.field) >= wanted
         assert slimmed.rank == 1 or scores[slimmed.rank - 2] < wanted
 
