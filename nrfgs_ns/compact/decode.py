@@ -13,7 +13,7 @@ from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.encode import FORMAT, GROUPS
-from nrfgs_ns.compact.format import LARGEST_RATIO, LONGEST_REASON, SMALL, read_container
+from nrfgs_ns.compact.format import BROKEN, LARGEST_RATIO, SMALL, read_container
 from nrfgs_ns.compact.tables import COLUMNS, Grid, from_morton, splats_of
 from nrfgs_ns.errors import InputError
 
@@ -21,6 +21,8 @@ MOST_BANDS = 16
 """Most bands of a head: the sixteenth repeats every ten microradians."""
 NUMBERS = 14
 """Numbers of a splat, except its latents."""
+LONGEST_REASON = 200
+"""Characters of a message that may quote the file."""
 WIDTHS = dict(zip(COLUMNS, (1, 3, 3, 3), strict=True))
 """Columns of each table in the stream "splats"."""
 
@@ -39,8 +41,10 @@ class Decoded(NamedTuple):
 
 def decode(path: Path) -> Decoded:
     """Read a compact file; InputError if it cannot be read, is damaged, or describes no field."""
-    header, streams = read_container(path)
     try:
+        if not path.is_file():
+            raise ValueError("it is no file")
+        header, streams = read_container(path.read_bytes())
         if header["format"] != FORMAT or header["head"]["name"] != "nrf":
             raise ValueError(f"it holds {header['format']!r} with a head named {header['head']['name']!r}")
         config = _config(header["head"])
@@ -55,11 +59,11 @@ def decode(path: Path) -> Decoded:
         grids = _grids(header["grids"], config.latent_dim)
         _check_size(header["splats"], config.latent_dim, sum(stream.nbytes for stream in streams.values()))
         return Decoded(config, weights, _splats(header["splats"], grids, streams), header)
-    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
+    except BROKEN as error:
         reason = " ".join(str(error).split())[:LONGEST_REASON]
         raise InputError(
-            f"{path} does not describe a field ({type(error).__name__}: {reason}). Export it again with nrfgs export "
-            "compact."
+            f"{path} cannot be read as a compact file ({type(error).__name__}: {reason}). Copy it again, or export it "
+            "again with nrfgs export compact."
         ) from error
 
 

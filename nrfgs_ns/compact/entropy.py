@@ -284,10 +284,8 @@ def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
         for step in range(lanes.steps):
             count = lanes.active(step)
             x = state[:count]
-            slot = x & ((1 << PRECISION) - 1)
-            if part.contexts > 1:
-                likely = activity[step, :count] + s1 * said[step + 1, :count] + s2 * said[step, :count]
-                slot += part.first_slot.take(likely)
+            likely = activity[step, :count] + s1 * said[step + 1, :count] + s2 * said[step, :count]
+            slot = part.first_slot.take(likely) + (x & ((1 << PRECISION) - 1))
             token = part.tokens.take(slot)
             x = part.frequencies.take(slot) * (x >> PRECISION) + part.offsets.take(slot)
             x, at = _refilled(x, words, at)
@@ -328,20 +326,18 @@ def _refilled(x: Array, words: Array, at: int) -> tuple[Array, int]:
 
 
 class _Column(NamedTuple):
-    """A column's model. A slot is a context's number, times 2^PRECISION, and a state's low bits."""
+    """A column's model. A slot is a context's number times 2^PRECISION, plus a state's low bits."""
 
     signed: bool
     weights: list[int]
     shares: list[int]
-    contexts: int
     first_slot: Array
     """of the context, by activity"""
     tokens: Array
-    """by slot"""
+    """by slot; so are the others"""
     frequencies: Array
-    """of the slot's token"""
     offsets: Array
-    """of the slot from its token's first one"""
+    """from the first slot of the token"""
 
 
 def _read_model(model: Array, columns: int) -> Iterator[_Column]:
@@ -376,6 +372,6 @@ def _read_model(model: Array, columns: int) -> Iterator[_Column]:
         contexts = np.searchsorted(thresholds, np.arange(MOST_ACTIVITY + 1), side="right") << PRECISION
         offsets = slots - np.repeat(starts.ravel(), table.ravel())
         frequencies = np.repeat(table.ravel(), table.ravel())
-        yield _Column(signed, weights, shares, count + 1, contexts, tokens, frequencies, offsets)
+        yield _Column(signed, weights, shares, contexts, tokens, frequencies, offsets)
     if at != len(numbers):
         raise BadStream("its model does not end where its table does")

@@ -23,7 +23,7 @@ from torch.testing import assert_close
 from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.head import base_colors
-from nrfgs_ns.appearance.reduce import build, latent_basis, with_rank
+from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode
 from nrfgs_ns.compact.entropy import encode_table
@@ -77,10 +77,7 @@ def test_the_nearest_turn_draws_the_same_ellipsoid(seed):
     assert np.allclose(again, turned) and (same == permuted).all()
 
 
-@pytest.mark.parametrize("finer", [1.0, 0.25])
-def test_every_number_comes_back_within_half_a_step(finer, tmp_path, monkeypatch):
-    for name in STEPS:
-        monkeypatch.setitem(STEPS, name, STEPS[name] * finer)
+def test_every_number_comes_back_within_half_a_step(tmp_path):
     one = field()
     decoded = through_a_file(one, tmp_path)
     read, truth = decoded.splats, {name: value[matched(one, decoded.splats)] for name, value in one.splats.items()}
@@ -110,15 +107,9 @@ def test_every_number_comes_back_within_half_a_step(finer, tmp_path, monkeypatch
 
 
 def test_splats_are_in_morton_order_and_the_file_is_small(tmp_path):
-    one = field(3000)
-    through_a_file(one, tmp_path)
-    header, streams = read_container(tmp_path / "f.nrf")
-    upper, lower = streams["means"].astype(np.uint64)
-    codes = from_morton(np.cumsum((upper << np.uint64(32)) | lower, dtype=np.uint64))
-    places = Grid(*(np.array(header["grids"]["means"][part]) for part in ("low", "step"))).values(codes)
-    assert_close(decode(tmp_path / "f.nrf").splats["means"], torch.from_numpy(places).float())
-    assert header["splats"]["view"] + header["splats"][DIFFUSE] == 3000
-    assert streams["latents"].shape == (8, header["splats"]["view"])
+    decoded = through_a_file(field(3000), tmp_path)
+    grid = Grid(*(np.array(decoded.header["grids"]["means"][part]) for part in ("low", "step")))
+    assert (np.diff(morton(grid.codes(decoded.splats["means"].double().numpy())).astype(np.int64)) >= 0).all()
     size = (tmp_path / "f.nrf").stat().st_size
     assert size < 248 * 3000 / 10, "random splats already take a tenth of a PLY file"
 
@@ -136,15 +127,12 @@ def test_splats_that_are_not_finite_are_left_out_and_huge_ones_written(tmp_path)
         through_a_file(one, tmp_path)
 
 
-def test_large_weights_a_lone_splat_and_a_low_rank(tmp_path):
+def test_large_weights_and_a_lone_splat(tmp_path):
     one = field(1)
     one.head.low[0].weight[0, 0] = 1e6  # beyond float16
     decoded = through_a_file(one, tmp_path)
     assert decoded.weights["low.0.weight"][0, 0] == 1e6
     assert_close(decoded.splats["means"], one.splats["means"])
-    one = field()
-    decoded = through_a_file(with_rank(one, latent_basis(one, torch.ones(60)), 3), tmp_path)
-    assert decoded.config.latent_dim == 3 and decoded.splats["latents"].shape == (60, 3)
 
 
 @pytest.mark.parametrize(
@@ -248,17 +236,6 @@ def test_a_training_does_not_begin_with_a_compact_file(exported, tiny_scene, tmp
         set_up([*line, "--pipeline.compact", str(exported[1])])
 
 
-def test_a_broken_file_stops_ns_eval_with_a_sentence(exported, tmp_path):
-    _, file, _ = exported
-    whole = file.read_bytes()
-    try:
-        file.write_bytes(whole[:-5])
-        with pytest.raises(InputError, match="cut short"):
-            evaluate(file.parent / "small.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml", tmp_path / "eval.json")
-    finally:
-        file.write_bytes(whole)
-
-
 def test_what_the_command_says_and_refuses(exported, tmp_path, capsys):
     config, _, _ = exported
     words = ["compact", str(config.parent), "--output", str(tmp_path / "x.nrf"), "--no-measure"]
@@ -272,17 +249,16 @@ def test_what_the_command_says_and_refuses(exported, tmp_path, capsys):
 
 def test_a_model_is_trained_for_the_file(exported, tmp_path):
     """The dearer a byte, the coarser the steps and the smaller the tables; the pictures stay as good."""
-    config, plain, _ = exported
+    config, _, _ = exported
     bytes_of, steps = {}, {}
     for rate in ("0", "3e-3"):
-        words = ["compact", "--load-config", str(config), "--output", str(tmp_path / f"{rate}.nrf")]
-        words += ["--finetune", "120", "--rate", rate]
-        words += ["--report", str(tmp_path / f"{rate}.json")]
+        output, report = tmp_path / f"{rate}.nrf", tmp_path / f"{rate}.json"
         torch.manual_seed(0)
-        tyro.cli(Export, args=words).main()
-        found = json.loads((tmp_path / f"{rate}.json").read_text())
+        words = f"compact --load-config {config} --output {output} --finetune 120 --rate {rate} --report {report}"
+        tyro.cli(Export, args=words.split()).main()
+        found = json.loads(report.read_text())
         bytes_of[rate] = sum(found["stream_bytes"][name] for name in ("means", "splats", "latents"))
-        grids = decode(tmp_path / f"{rate}.nrf").header["grids"]
+        grids = decode(output).header["grids"]
         steps[rate] = np.concatenate([grids[name]["step"] for name in ("means", "scales", "colors", "turns")])
         assert found["loss_db"] < 0.1, "it has been trained on"
     assert (steps["3e-3"] > 1.1 * steps["0"]).all()
@@ -357,5 +333,5 @@ def test_what_training_expects_is_what_a_file_has(tmp_path):
     steps = {name: np.ones(n) for name, n in (("turns", 3), ("scales", 3), ("opacities", 1), ("colors", 3))}
     steps |= {"latents": np.ones(8), "means": means.steps.detach().double().numpy()}
     write_container(tmp_path / "f.nrf", *encode(Field(one.head, splats), {}, steps))
-    entries = read_container(tmp_path / "f.nrf")[0]["streams"]
+    entries = read_container((tmp_path / "f.nrf").read_bytes())[0]["streams"]
     assert of_places == pytest.approx({entry["name"]: entry["bytes"] for entry in entries}["means"], rel=0.03)
