@@ -5,10 +5,10 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 
-from nrfgs_ns.appearance.head import AppearanceHead
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 from nrfgs_ns.compact.decode import decode
@@ -22,6 +22,7 @@ from nrfgs_ns.progress import progress
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import find_data, finish, load_model, lost, measure_loss
 from nrfgs_ns.training.config_file import read_config
+from nrfgs_ns.training.pipeline import NrfgsPipeline
 
 PLY_BYTES = 62 * 4
 """Bytes of a splat in 3DGS's PLY file, with harmonics of degree 3."""
@@ -32,47 +33,36 @@ def export_compact(
 ) -> None:
     """Write a compact file, and report its size and loss; see `nrfgs export compact --help`."""
     with few_threads() as threads:
-        pipeline = load_model(load_config, "test")
+        pipeline = load_field(load_config)
         threads.suit_to(pipeline)
-        check_head(pipeline.model.head, load_config)
-        header, streams, numbers = packed(pipeline, options)
-        begin = perf_counter()
-        size = write_container(output, header, streams)
-        written = perf_counter()
-        decoded = decode(output)
-        numbers["seconds"]["encode"] += written - begin
-        numbers["seconds"]["decode"] = perf_counter() - written
-        config, count = write_config(load_config, output, decoded.config), numbers["written"]
-        if measure:
-            numbers |= measure_file(pipeline, config)
-    numbers |= {
-        "finetune": options.finetune,
-        "rate": options.rate if options.finetune else None,
-        "bytes": size,
-        "ply_ratio": numbers["ply_bytes"] / size,
-        "stream_bytes": {entry["name"]: entry["bytes"] for entry in decoded.header["streams"]},
-    }
+        config, numbers = write_file(pipeline, load_config, output, options, measure)
+    count, size, ply_size = (numbers[name] for name in ("written", "bytes", "ply_bytes"))
     lines = [
         f"{output}: {count:,} splats with latents of {numbers['rank']} numbers, {size / 1e6:.2f} MB, "
-        f"{size / count:.1f} bytes a splat: 3DGS's PLY of as many splats has {numbers['ply_bytes'] / 1e6:.2f} MB, "
-        f"{numbers['ply_ratio']:.1f} times as much."
+        f"{size / count:.1f} bytes a splat: 3DGS's PLY of as many splats has {ply_size / 1e6:.2f} MB, "
+        f"{ply_size / size:.1f} times as much."
     ]
     lines += [lost(numbers)] if measure else []
     lines += [f"Look at it with:  nrfgs view {output}", f"Evaluate it with:  ns-eval --load-config {config}"]
     finish(lines, numbers, report)
 
 
-def check_head(head: AppearanceHead, load_config: Path) -> None:
-    if not isinstance(head, NeuralResidualField):
+def load_field(load_config: Path) -> NrfgsPipeline:
+    """A trained pipeline; InputError if its head is not a neural residual field."""
+    pipeline = load_model(load_config, "test")
+    if not isinstance(pipeline.model.head, NeuralResidualField):
         raise InputError(
             f"{load_config}: compact files and pages hold a neural residual field, and this model has the "
-            f"{head.name!r} head. Use nrfgs export ply."
+            f"{pipeline.model.head.name!r} head. Use nrfgs export ply."
         )
+    return pipeline
 
 
-def packed(pipeline, options: CompactOptions) -> tuple[dict, dict, dict[str, Any]]:
-    """The header and streams of a model's compact file, fine-tuned if asked for, and their numbers for a report."""
-    model, begin = pipeline.model, perf_counter()
+def write_file(
+    pipeline, load_config: Path, output: Path, options: CompactOptions, measure: bool
+) -> tuple[Path, dict[str, Any]]:
+    """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report."""
+    model, times = pipeline.model, [perf_counter()]
     field, steps = model.field.detached(), None
     if options.finetune > 0:
         with progress("Training for the file", -(-options.finetune // REPORT_EVERY)) as advance:
@@ -85,18 +75,29 @@ def packed(pipeline, options: CompactOptions) -> tuple[dict, dict, dict[str, Any
     else:  # the same field in fewer bytes: components of latents that hardly matter are rounded to 0
         basis = latent_basis(field, torch.ones(model.num_points, device=model.device))
         field = with_rank(field, basis, field.head.config.latent_dim)
-    trained = perf_counter()
+    times.append(perf_counter())
     render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
-    header, streams = encode(field, render, steps)
-    count = sum(header["splats"].values())
+    size = write_container(output, *encode(field, render, steps))
+    times.append(perf_counter())
+    decoded = decode(output)
+    times.append(perf_counter())
+    config, count = write_config(load_config, output, decoded.config), len(decoded.splats["means"])
     numbers = {
         "splats": model.num_points,
         "written": count,
-        "rank": header["head"]["config"]["latent_dim"],
-        "seconds": {"finetune": trained - begin, "encode": perf_counter() - trained},
+        "rank": decoded.config.latent_dim,
+        "seconds": dict(zip(("finetune", "encode", "decode"), np.diff(times).tolist(), strict=True)),
+        "finetune": options.finetune,
+        "rate": options.rate if options.finetune else None,
+        "bytes": size,
         "ply_bytes": PLY_BYTES * count,
+        "ply_ratio": PLY_BYTES * count / size,
+        "stream_bytes": {entry["name"]: entry["bytes"] for entry in decoded.header["streams"]},
     }
-    return header, streams, numbers
+    if measure:
+        file = load_model(config, "test").model  # as ns-eval reads it
+        numbers |= measure_loss(pipeline, lambda camera: {"file": file.get_outputs_for_camera(camera)["rgb"]})
+    return config, numbers
 
 
 def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
@@ -120,9 +121,3 @@ def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
     path = config.get_base_dir() / "config.yml"
     write_whole(path, yaml.dump(config))
     return path
-
-
-def measure_file(pipeline, config: Path) -> dict[str, Any]:
-    """`measure_loss` of a file, read as ns-eval reads it, by the config.yml beside it."""
-    small = load_model(config, "test").model
-    return measure_loss(pipeline, lambda camera: {"file": small.get_outputs_for_camera(camera)["rgb"]})

@@ -74,7 +74,7 @@ def test_the_style_and_the_scripts_are_installed_with_the_package():
     ],
 )
 def test_how_many_weights_a_view_needs(options, vectors):
-    assert weight_vectors(NrfConfig(**options)) == vectors
+    assert weight_vectors(NrfConfig(**options).setup()) == vectors
 
 
 def test_nothing_in_the_scripts_is_fetched_from_elsewhere():
