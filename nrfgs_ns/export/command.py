@@ -43,11 +43,9 @@ class Ply(_Format):
     options: Annotated[PlyOptions, FLAT] = field(default_factory=PlyOptions)
 
     def main(self) -> None:
-        config, largest, steps = self.checked(self.output), self.options.largest, self.options.steps
-        if largest is not None and not 0 < largest < float("inf"):
-            raise InputError(f"--largest is {largest}; it must be positive.")
-        if steps is not None and steps < 0:
-            raise InputError(f"--steps is {steps}; it must be at least 0.")
+        config = self.checked(self.output)
+        if self.options.steps is not None and self.options.steps < 0:
+            raise InputError(f"--steps is {self.options.steps}; it must be at least 0.")
         from nrfgs_ns.export.ply import export_ply
 
         export_ply(config, self.output, self.options, self.measure, self.report)

@@ -8,7 +8,6 @@ turn a head's colours and opacities into a file's; `ns-export gaussian-splat` wr
 world.
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
@@ -57,9 +56,7 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
         pipeline.model.fit_on(pipeline.datamanager.train_dataset.cameras, options.steps)
         begin = perf_counter()
         fit = pipeline.model.fit
-        splats, seconds = fit.splats, perf_counter() - begin
-        if options.largest is not None:
-            splats = splats._replace(scales=splats.scales.clamp_max(math.log(options.largest)))
+        seconds = perf_counter() - begin
         # Brush's mark, which splat-transform reads, too: the splats are dimmed for the blur that a renderer adds.
         comments = ["SplatRenderMode: mip"] if pipeline.model.config.rasterize_mode == "antialiased" else []
         placed, origin = Y_DOWN if options.world == "viewers" else NOWHERE, np.zeros(3)
@@ -68,7 +65,7 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
             comments.append(f"origin {' '.join(f'{number:.17g}' for number in origin)}")
         report = {
             "splats": len(fit.splats.means),
-            "written": write_splats(placed.moved(splats), output, comments),
+            "written": write_splats(placed.moved(fit.splats), output, comments),
             "bytes": output.stat().st_size,
             "world": options.world,
             "exact": fit.exact,
@@ -100,8 +97,7 @@ def summary(output: Path, report: dict[str, Any]) -> Iterator[str]:
         if report["psnr_file"] - report["psnr_on_screen"] > WORTH_A_WORD:
             yield (
                 f"Viewers that leave out splats centred off the screen, as Spark does, show "
-                f"{report['psnr_on_screen']:.2f} dB. In Spark raise clipXY from {SPARKS_EDGE}; for all viewers "
-                "--largest cuts large splats down."
+                f"{report['psnr_on_screen']:.2f} dB. In Spark raise clipXY from {SPARKS_EDGE}."
             )
 
 
