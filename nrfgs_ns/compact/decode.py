@@ -48,11 +48,8 @@ def decode(path: Path) -> Decoded:
         if header["format"] != FORMAT or header["head"]["name"] != "nrf":
             raise ValueError(f"it holds {header['format']!r} with a head named {header['head']['name']!r}")
         config = _config(header["head"])
-        weights = {
-            name.removeprefix("head."): torch.from_numpy(value.astype(np.float32))
-            for name, value in streams.items()
-            if name.startswith("head.")
-        }
+        heads = {name: stream.astype(np.float32) for name, stream in streams.items() if name.startswith("head.")}
+        weights = {name.removeprefix("head."): torch.from_numpy(stream) for name, stream in heads.items()}
         build(config, weights, header["head"]["scene_unit"])  # RuntimeError for weights of other shapes
         if not all(weight.isfinite().all() for weight in weights.values()):
             raise ValueError("the head's weights are not finite")
@@ -105,12 +102,8 @@ def _check_size(splats: dict[str, int], latent_dim: int, unpacked: int) -> None:
 
 
 def _splats(counts: dict[str, int], grids: dict[str, Grid], streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
-    count, of_view = sum(counts[group] for group in GROUPS), counts["view"]
-    shapes = {
-        "means": (2, count),
-        "splats": (1 + sum(WIDTHS.values()), count),
-        "latents": (len(grids["latents"].step), of_view),
-    }
+    count, of_view, rank = sum(counts[group] for group in GROUPS), counts["view"], len(grids["latents"].step)
+    shapes = {"means": (2, count), "splats": (1 + sum(WIDTHS.values()), count), "latents": (rank, of_view)}
     for name, shape in shapes.items():
         if streams[name].shape != shape or streams[name].dtype.kind not in "iu":
             raise ValueError(f"{name} of shape {list(streams[name].shape)} instead of {list(shape)}")

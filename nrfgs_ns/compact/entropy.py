@@ -120,14 +120,9 @@ class _Lanes:
 
 
 def encode_table(table: Array, signed: bool = True) -> tuple[Array, bytes]:
-    """Encode a table.
+    """The model, int32 numbers, and the coder's bytes of a table of integers [C, n].
 
-    Args:
-        table: integers, |x| < 2^31, or from 0 to 2^32 - 1 if not signed. [C, n]
-        signed: numbers may be negative, and are predicted.
-
-    Returns:
-        the model, int32 numbers, and the coder's bytes.
+    If signed, |x| < 2^31, and numbers are predicted; otherwise they are from 0 to 2^32 - 1.
     """
     columns, rows = table.shape
     lanes = _Lanes(columns, rows)
@@ -326,18 +321,16 @@ def _refilled(x: Array, words: Array, at: int) -> tuple[Array, int]:
 
 
 class _Column(NamedTuple):
-    """A column's model. A slot is a context's number times 2^PRECISION, plus a state's low bits."""
+    """A column's model: a context's first slot by activity; and by slot, a context's number times 2^PRECISION plus a
+    state's low bits, the token, its frequency, and the slot's distance from the token's first one."""
 
     signed: bool
     weights: list[int]
     shares: list[int]
     first_slot: Array
-    """of the context, by activity"""
     tokens: Array
-    """by slot; so are the others"""
     frequencies: Array
     offsets: Array
-    """from the first slot of the token"""
 
 
 def _read_model(model: Array, columns: int) -> Iterator[_Column]:

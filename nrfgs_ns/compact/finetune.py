@@ -103,7 +103,8 @@ class Gated(NamedTuple):
 
 
 def growth_without(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]]) -> tuple[Tensor, float]:
-    """Growth of the training views' squared error when one splat is removed, for each splat.
+    """Growth of the views' squared error when one splat is removed, as a share of it, for each splat [N]; and the mean
+    of the training's loss.
 
     A pixel is linear in the opacity of each splat alone: removing splat i takes d_p = dI_p / dg_i from each pixel p,
     where g_i = 1 multiplies its opacity, and the squared error grows by
@@ -116,9 +117,6 @@ def growth_without(model, field: Field, views: Iterable[tuple[Any, dict[str, Any
     Args:
         model: in training mode.
         views: training cameras and their photographs.
-
-    Returns:
-        the growth as a share of the squared error [N], and the mean of the training's loss.
     """
     count, device = len(field.splats["means"]), field.splats["means"].device
     growth, error, loss = (torch.zeros(n, device=device) for n in (count, 1, 1))
@@ -173,14 +171,12 @@ def fine_tune(
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
     coded, count = CodedSplats(field.splats), len(field.splats["means"])
     of_bits = rate / (8 * count)  # loss of a bit
-    scale = {"means": model.scene_unit}
+    rates = RATES | {"means": RATES["means"] * model.scene_unit}
     if len(latents := coded.tables["latents"].values) > 1:
-        scale["latents"] = float(latents.detach().std(dim=0, correction=0).max())
-    groups = [
-        {"params": [table.values], "lr": RATES[name] * scale.get(name, 1.0)} for name, table in coded.tables.items()
-    ]
+        rates["latents"] *= float(latents.detach().std(dim=0, correction=0).max())
     densities = [*coded.density.parameters(), *coded.density_of_latents.parameters()]
-    groups += [
+    groups = [
+        *({"params": [table.values], "lr": rates[name]} for name, table in coded.tables.items()),
         {"params": [table.log_steps for table in coded.tables.values()], "lr": STEPS_RATE},
         {"params": densities, "lr": DENSITY_RATE},
         {"params": list(head.parameters()), "lr": FIELD_RATE},

@@ -43,12 +43,10 @@ MOST_BITS = 21
 
 
 class Grid(NamedTuple):
-    """A uniform grid for each column: value = low + step code."""
+    """A uniform grid for each of C columns: value = low + step code, step > 0."""
 
     low: Array
-    """[C]"""
     step: Array
-    """[C], > 0"""
 
     def codes(self, values: Array) -> Array:
         """Nearest grid points of values [N, C], int64, cut off at 2^62 steps."""
@@ -87,12 +85,8 @@ NEAR = 0.8
 def nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:
     """The same ellipsoids with their axes named so that rotations are smallest. One with |w| > NEAR keeps its axes.
 
-    Args:
-        quats: rotations (w, x, y, z) of any length except 0. [N, 4]
-        scales: one for each axis. [N, 3]
-
-    Returns:
-        quats [N, 4] of unit length with w >= NEAR, and permuted scales [N, 3].
+    Takes quaternions (w, x, y, z) of any length except 0 [N, 4], and a scale for each axis [N, 3]; returns quaternions
+    of unit length with w >= NEAR, and permuted scales.
     """
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     best = np.abs(unit @ (OCTAHEDRAL * [1, -1, -1, -1]).T).argmax(axis=1)  # |w| of q g
