@@ -225,6 +225,8 @@ def test_nerfstudios_commands_read_the_file(exported, tmp_path):
     assert numbers["loss_db"] == pytest.approx(numbers["psnr_model"] - numbers["psnr_file"])
     # Rounding alone: errors of 65 dB, in steps of 1/512 of white, against this model's of 16 dB.
     assert abs(numbers["loss_db"]) < 0.03 and numbers["written"] == numbers["splats"] and numbers["rank"] == 8
+    spread = decode(file).splats["latents"].std(dim=0)
+    assert (spread.diff() < 1e-3).all() and spread[0] > 1.5 * spread[-1], "principal components, the strongest first"
     DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
     assert len(list((tmp_path / "renders" / "test" / "rgb").rglob("*.png"))) == 2
 
