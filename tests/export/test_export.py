@@ -12,6 +12,7 @@ import pytest
 import short_trainings
 import torch
 import tyro
+from compact_fields import plain_splats
 from plyfile import PlyData
 from short_trainings import command_line
 from torch.testing import assert_close
@@ -48,13 +49,6 @@ def short_fine_tune(monkeypatch):
     monkeypatch.setattr(harmonics_tune, "STEPS_ON_A_CPU", 8)
 
 
-def random_splats(count: int) -> PlainSplats:
-    torch.manual_seed(0)
-    quats = torch.nn.functional.normalize(torch.randn(count, 4), dim=-1)
-    shapes = {"scales": (3,), "opacities": (1,), "features_dc": (3,), "features_rest": (15, 3)}
-    return PlainSplats(torch.randn(count, 3), quats, *(torch.randn(count, *shape) for shape in shapes.values()))
-
-
 @pytest.fixture(scope="module")
 def trained(tiny_scene, tmp_path_factory):
     """config.yml of a finished 8-step training of each method."""
@@ -82,7 +76,7 @@ def model_on(scene: Path, out: Path, method: str = "nrfgs", *options: str):
 
 
 def test_layout_is_that_of_3dgs(tmp_path):
-    splats = random_splats(7)
+    splats = plain_splats(7)
     assert write_splats(splats, tmp_path / "deep" / "splats.ply") == 7
     data = (tmp_path / "deep" / "splats.ply").read_bytes()
     header, _, body = data.partition(b"end_header\n")
@@ -104,7 +98,7 @@ def test_layout_is_that_of_3dgs(tmp_path):
 
 
 def test_splats_that_cannot_be_drawn_are_left_out(tmp_path):
-    splats = random_splats(6)
+    splats = plain_splats(6)
     splats.quats[1] = math.nan  # there was no direction
     splats.features_rest[2, 7, 1] = math.inf
     splats.opacities[3] = -5.6  # below logit(1/255) = -5.537
@@ -118,7 +112,7 @@ def test_splats_that_cannot_be_drawn_are_left_out(tmp_path):
 
 
 def test_a_splat_without_a_rotation_is_left_out_of_a_turned_scene(tmp_path):
-    splats = random_splats(4)
+    splats = plain_splats(4)
     splats.quats[2] = 0.0
     assert write_splats(Y_DOWN.moved(splats), tmp_path / "splats.ply") == 3
 
