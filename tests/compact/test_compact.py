@@ -23,6 +23,7 @@ from torch.testing import assert_close
 from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.head import base_colors
+from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode
@@ -150,6 +151,18 @@ def test_tables_of_no_field_are_refused(change, says, tmp_path):
     change(streams)
     write_container(tmp_path / "f.nrf", header, streams)
     with pytest.raises(InputError, match=says):
+        decode(tmp_path / "f.nrf")
+
+
+def test_tables_much_larger_than_the_file_are_refused(tmp_path):
+    """Diffuse splats have no latents in the file, and need them in memory."""
+    wide = NrfConfig(latent_dim=1024, hidden_width=16).setup().requires_grad_(False)
+    diffuse = {**field(4).splats, "latents": torch.zeros(4, 1024), DIFFUSE: torch.ones(4, dtype=torch.bool)}
+    header, streams = encode(Field(wide, diffuse), {})
+    header["splats"][DIFFUSE] = 20_000
+    streams |= {"means": Table(np.zeros((2, 20_000)), signed=False), "splats": Table(np.ones((11, 20_000)))}
+    write_container(tmp_path / "f.nrf", header, streams)
+    with pytest.raises(InputError, match="20000 splats with latents of 1024"):
         decode(tmp_path / "f.nrf")
 
 
