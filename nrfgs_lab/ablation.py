@@ -16,11 +16,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 from torch import Tensor
 
+from nrfgs_lab.residuals import THRESHOLDS, FieldViews, Residuals, dropped, look_over, slim
 from nrfgs_lab.training_run import machine
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.reduce import LatentBasis, branches, input_columns, latent_basis, rebuilt, with_rank
-from nrfgs_ns.compact.slim import THRESHOLDS, FieldViews, Residuals, dropped, look_over, slim
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, write_whole
@@ -163,7 +163,7 @@ def together(
             if full - views.psnr(smaller) <= 0.5 * budget:
                 field = smaller
                 left_out.append(part.part)
-    slimmed = slim(field, seen, views, full - budget, lambda _: None)
+    slimmed = slim(field, seen, views, full - budget)
     every = slimmed.threshold == float("inf")
     if diffuse_splats(slimmed.field) > diffuse_splats(field):
         left_out.append("all residuals" if every else f"residuals below {slimmed.threshold:g} steps")

@@ -9,7 +9,7 @@ Keys of the header, beside "streams":
     render   "rasterize_mode", "background" (RGB)
     grids    for "means", "turns", "scales", "opacities", "colors", "latents": "low" and "step", [columns]
 
-A whole number k in a column of a table stands for low + step k, low being 0 except in means. The streams:
+An integer k in a column of a table stands for low + step k; low is 0 except in means. The streams:
 
     means        rans   [2, N]    upper and lower 32 bits of the differences of successive Morton numbers, the first
                                   counted from 0; not signed. Bit 3 k + a of a Morton number is bit k of the code of
@@ -20,11 +20,10 @@ A whole number k in a column of a table stands for low + step k, low being 0 exc
     head.<name>  xz               the network's weights, float16; float32 where they are too large for it
 
 head.low.0.weight [H, I], head.low.0.bias, head.low.2.weight, head.low.2.bias and the same of high are the layers of
-`appearance/nrf.py`. A diffuse splat has its base colour, cut off at 0, and its base opacity from everywhere.
+`appearance/nrf.py`. A diffuse splat has its base colour, at least 0, and its base opacity from everywhere.
 
-All splats lie in Morton order of their rounded means, so that a number's neighbours in its table are neighbours in
-space. Every table lies on a grid whose step is a choice of precision, not of bits: outliers then cost a few long codes,
-and not everyone's precision.
+Splats are in Morton order of their rounded means, so that a number's neighbours in its table are neighbours in space.
+A grid's step is a choice of precision, not of bits: an outlier costs a few long codes, and no other splat's precision.
 """
 
 from collections.abc import Mapping
@@ -42,28 +41,24 @@ from nrfgs_ns.errors import InputError
 
 FORMAT = "nrfgs-compact"
 LARGEST_LOGIT = 10.0
-"""Cut-off of the opacities' logits: beyond, the opacity changes by less than 5e-5."""
+"""Cut-off of opacity logits: beyond it, opacity changes by less than 5e-5."""
 LARGEST_HALF = 6e4
-"""Largest weight in float16; larger ones are float32."""
+"""Largest weight that is stored as float16."""
 LARGEST_CODE = 2**30
-"""Cut-off of whole numbers."""
 GROUPS = ("view", DIFFUSE)
 
 
 def encode(
     field: Field, render: dict[str, Any], steps: Mapping[str, np.ndarray] | None = None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray | Table]]:
-    """The header and streams of a compact file, without the splats that are not finite.
+    """The header and streams of a compact file of the finite splats; InputError if there are none.
 
     Args:
         render: the header's "render".
-        steps: of the grids of a fine-tuned field's tables; None: `steps_of`.
-
-    Raises:
-        InputError: no splat is finite.
+        steps: of a fine-tuned field's tables; None: `steps_of`.
     """
-    rows = [value.detach().reshape(len(value), -1) for value in field.splats.values()]
-    finite = torch.stack([row.isfinite().all(dim=1) for row in rows]).all(dim=0)
+    finite = torch.cat([value.detach().flatten(1) for value in field.splats.values() if value.dim() > 1], dim=1)
+    finite = finite.isfinite().all(dim=1)
     finite &= field.splats["quats"].detach().abs().amax(dim=1) > 0
     if not finite.any():
         raise InputError(f"None of the {len(finite)} splats is finite: there is nothing to write.")

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A finished field trained on for the file: tables that cost less, and the steps on which they lie.
+"""Fine-tuning of a finished field for its file: tables that cost less, and learnt steps of their grids.
 
-The loss is the training's, of pictures drawn from tables as the file would give them back, plus `rate` for each
-byte that a splat is estimated to cost in the mean (`rate.py`). Which splats are diffuse stays. A few times, splats go
-whose bytes cost more than the pictures would lose without them (`without_them`).
+The loss is the training's, of images rendered from tables as the file would give them back, plus `rate` for each byte
+that a splat is estimated to cost on average (`rate.py`). Diffuse splats stay diffuse. A few times, splats are removed
+whose bytes cost more than images lose without them (`growth_without`).
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.field import Field, Sight
@@ -18,21 +19,22 @@ from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
+from nrfgs_ns.model.harmonics_fit import look_through
 from nrfgs_ns.model.loss import photometric
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 
 EVERY = 4
-"""Steps for each count of the bits, which takes longer than a picture."""
+"""Steps between two counts of the bits, which take longer than an image."""
 REPORT_EVERY = 20 * EVERY
 """Steps between two reports: reading a number waits for the GPU."""
 NOISY = 0.3
 """Share of the steps with noise instead of rounding."""
 RATES = {"means": 1.6e-6, "turns": 5e-4, "scales": 2e-3, "opacities": 1e-2, "colors": 7e-4, "latents": 4e-3}
-"""Learning rates of the tables; the means' in scene units, the latents' in standard deviations of the strongest."""
+"""Learning rates of the tables; means: in scene units; latents: in standard deviations of the strongest component."""
 STEPS_RATE, DENSITY_RATE, FIELD_RATE = 3e-2, 2e-2, 5e-4
 PRUNINGS = (0.08, 0.16, 0.24, 0.32)
-"""When splats are removed, in shares of the steps. Each time every fourth in the file's order is a candidate:
-neighbours, which hide behind each other, must not go together."""
+"""When splats are removed, in shares of the steps. Each time every fourth in the file's order is a candidate, because
+neighbours, which hide behind each other, must not be removed together."""
 WORTH = 1.0
 """Weight of a splat's bytes against the growth of the loss without it."""
 LAST = 0.03
@@ -40,7 +42,7 @@ LAST = 0.03
 
 
 class CodedSplats(nn.Module):
-    """The tables of a field (`tables.py`), each with learnable steps."""
+    """The tables of a field (`tables.py`) in the order of a file, each with learnable steps."""
 
     def __init__(self, splats: Mapping[str, Tensor]):
         super().__init__()
@@ -48,7 +50,7 @@ class CodedSplats(nn.Module):
         steps = steps_of(values)
         grid = Grid(values["means"].amin(dim=0).cpu().numpy(), steps["means"])
         codes = grid.codes(values["means"].cpu().numpy()).clip(max=2**MOST_BITS - 1)
-        order = torch.from_numpy(np.argsort(morton(codes), kind="stable")).to(diffuse.device)  # as in a file
+        order = torch.from_numpy(np.argsort(morton(codes), kind="stable")).to(diffuse.device)
         values["latents"] = values["latents"][(~diffuse).cumsum(0)[order[~diffuse[order]]] - 1]
         values |= {name: values[name][order] for name in ("means", *COLUMNS)}
         self.diffuse = diffuse[order]
@@ -60,14 +62,13 @@ class CodedSplats(nn.Module):
         self.density_of_latents = Density(values["latents"])
 
     def forward(self, rounded: bool) -> dict[str, Tensor]:
-        """The tables as a file would give them back."""
         return {name: table(rounded) for name, table in self.tables.items()}
 
     def splats(self, tables: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return splats_of(tables, self.diffuse)
 
     def bits(self, tables: Mapping[str, Tensor]) -> Tensor:
-        """Bits of each splat in tables as `forward` gives them, [N]."""
+        """Bits of each splat, [N], in tables that `forward` returned."""
         steps = {name: table.steps for name, table in self.tables.items()}
         bits = bits_of_places(tables["means"], steps["means"]) + self.density.bits(self._row(tables), self._row(steps))
         latents = self.density_of_latents.bits(tables["latents"], steps["latents"])
@@ -75,16 +76,16 @@ class CodedSplats(nn.Module):
 
     @torch.no_grad()
     def keep(self, kept: Tensor, optimizer: torch.optim.Optimizer) -> None:
-        """Keep the splats `kept`, bool [N], and their optimizer state."""
+        """Remove the splats that are not `kept`, bool [N], and their optimizer state."""
         of_latents, self.diffuse = kept[~self.diffuse], self.diffuse[kept]
         for group, (name, table) in zip(optimizer.param_groups, self.tables.items(), strict=False):
             rows, old = of_latents if name == "latents" else kept, table.values
-            state = {
+            table.values = nn.Parameter(old[rows])
+            group["params"] = [table.values]
+            optimizer.state[table.values] = {
                 key: value[rows] if value.shape == old.shape else value
                 for key, value in optimizer.state.pop(old, {}).items()
             }
-            table.values = nn.Parameter(old[rows])
-            optimizer.state[table.values], group["params"] = state, [table.values]
 
     @staticmethod
     def _row(tables: Mapping[str, Tensor]) -> Tensor:
@@ -92,34 +93,31 @@ class CodedSplats(nn.Module):
 
 
 class Gated(NamedTuple):
-    """A field whose rendered opacities are multiplied."""
+    """A field whose opacities are multiplied by gates [N]."""
 
     field: Field
     gates: Tensor
-    """[N]"""
 
     def seen_from(self, view: Sight) -> SplatAppearance:
         appearance = self.field.seen_from(view)
         return appearance._replace(opacities=appearance.opacities * self.gates[view.visible])
 
 
-def without_them(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]]) -> tuple[Tensor, float]:
-    """Growth of the training views' squared error without each splat, the others as they are.
+def growth_without(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]]) -> tuple[Tensor, float]:
+    """Growth of the views' squared error when one splat is removed, as a share of it, for each splat [N]; and the mean
+    of the training's loss.
 
-    A pixel is linear in the opacity of each splat alone: taking splat i away takes d_p = dI_p / dg_i from each pixel p,
+    A pixel is linear in the opacity of each splat alone: removing splat i takes d_p = dI_p / dg_i from each pixel p,
     where g_i = 1 multiplies its opacity, and the squared error grows by
 
         sum_p |d_p|^2 - 2 (I_p - truth_p) d_p.
 
-    The second sum is the error's gradient by g_i. The first is the mean of (d sum_p s_p I_p / dg_i)^2 over signs s_p
-    drawn at random (Hutchinson's estimator), one drawing for each view.
+    The second sum is the error's gradient by g_i. The first is the mean of (d sum_p s_p I_p / dg_i)^2 over random signs
+    s_p (Hutchinson's estimator), one sample a view.
 
     Args:
         model: in training mode.
         views: training cameras and their photographs.
-
-    Returns:
-        the growth as a share of the squared error [N], and the mean of the training's loss.
     """
     count, device = len(field.splats["means"]), field.splats["means"].device
     growth, error, loss = (torch.zeros(n, device=device) for n in (count, 1, 1))
@@ -139,35 +137,46 @@ def without_them(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]
     return growth / error, float(loss)
 
 
+@torch.no_grad()
+def contributions_to(model, cameras: Cameras) -> Tensor:
+    """Contribution of each splat of a model to its views: alpha T, summed over pixels and views. [N]"""
+    total = torch.zeros(model.num_points, dtype=torch.float64, device=model.device)
+    for index in range(len(cameras)):
+        view, _, share = look_through(model, model.field, cameras[index : index + 1])
+        total.index_add_(0, view.visible, share.clamp_min(0.0).double())
+    return total.float()
+
+
 def fine_tune(
-    pipeline, field: Field, weight: Tensor, steps: int, rate: float, on_step: Callable[[int, float], None]
+    pipeline, steps: int, rate: float, on_report: Callable[[float], None]
 ) -> tuple[Field, dict[str, np.ndarray]]:
-    """Fine-tune a field for its size in a file.
+    """Fine-tune a trained field for its size in a file.
 
     Args:
-        pipeline: of the trained model, whose own splats stay as they are, and of its training views.
-        field: the field to begin with.
-        weight: the splats' contributions to the training views. [N]
+        pipeline: of the trained model, in evaluation mode; its own splats stay as they are.
         rate: loss for a byte of each splat.
-        on_step: called with the step and the bits, every REPORT_EVERY steps.
+        on_report: called with the bits of all splats every REPORT_EVERY steps.
 
     Returns:
-        the field, and the steps of its tables' columns: its numbers lie on them.
+        the field, and the grids' steps for each table's columns: its numbers lie on them.
     """
-    model, next_view = pipeline.model, pipeline.datamanager.next_train
-    centers = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
-    noise = ViewNoise(model.noise_factor * camera_spacing(centers), torch.initial_seed())
+    model, data = pipeline.model, pipeline.datamanager
+    view_count = len(data.cached_train)  # before the cameras: undistortion crops them while it loads the images
+    cameras = data.train_dataset.cameras
+    noise = ViewNoise(model.noise_factor * camera_spacing(cameras.camera_to_worlds[:, :3, 3]), torch.initial_seed())
+    field = model.field.detached()
     # Latents begin as their own principal components.
-    field = with_rank(field, latent_basis(field, weight), field.head.config.latent_dim)
+    basis = latent_basis(field, contributions_to(model, cameras))
+    field = with_rank(field, basis, field.head.config.latent_dim)
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
     coded, count = CodedSplats(field.splats), len(field.splats["means"])
     of_bits = rate / (8 * count)  # loss of a bit
-    groups = [{"params": [table.values], "lr": RATES[name]} for name, table in coded.tables.items()]
-    groups[0]["lr"] *= model.scene_unit
+    rates = RATES | {"means": RATES["means"] * model.scene_unit}
     if len(latents := coded.tables["latents"].values) > 1:
-        groups[-1]["lr"] *= float(latents.detach().std(dim=0, correction=0).max())
+        rates["latents"] *= float(latents.detach().std(dim=0, correction=0).max())
     densities = [*coded.density.parameters(), *coded.density_of_latents.parameters()]
-    groups += [
+    groups = [
+        *({"params": [table.values], "lr": rates[name]} for name, table in coded.tables.items()),
         {"params": [table.log_steps for table in coded.tables.values()], "lr": STEPS_RATE},
         {"params": densities, "lr": DENSITY_RATE},
         {"params": list(head.parameters()), "lr": FIELD_RATE},
@@ -184,12 +193,13 @@ def fine_tune(
             with torch.no_grad():
                 tables = coded(rounded=True)
                 cost = coded.bits(tables) * (WORTH * of_bits)
-            growth, loss = without_them(model, Field(head, coded.splats(tables)), map(next_view, range(len(centers))))
+            views = map(data.next_train, range(view_count))
+            growth, loss = growth_without(model, Field(head, coded.splats(tables)), views)
             # The training's loss is about the root of the squared error.
             kept = (turns != prunings.index(step)) | (0.5 * loss * growth > cost)
             coded.keep(kept, optimizer)
             turns = turns[kept]
-        camera, batch = next_view(step)
+        camera, batch = data.next_train(step)
         tables = coded(rounded=step >= NOISY * steps)
         splats = coded.splats(tables)
         outputs, _ = model.render(Field(head, splats), camera, Field(head, noise.moved(splats, step)))
@@ -202,7 +212,7 @@ def fine_tune(
         optimizer.step()
         schedule.step()
         if step % REPORT_EVERY == 0:
-            on_step(step, float(bits.detach()))
+            on_report(float(bits.detach()))
     model.eval()
     with torch.no_grad():
         splats = coded.splats(coded(rounded=True))

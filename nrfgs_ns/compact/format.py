@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The container: named arrays of whole numbers or floats, compressed, each with a checksum, behind a JSON header.
+"""The container: named arrays of integers or floats, compressed, each with a checksum, behind a JSON header.
 
     offset  bytes
     0       8      magic: 89 4E 52 46 0D 0A 1A 0A ("NRF" between bytes that a transfer as text would change)
@@ -18,16 +18,15 @@ next, and so on; numbers (uint8, uint16, uint32, uint64, float16 or float32) in 
 "rans": a table [columns, rows] of int16, int32 or uint32, by an entropy coder:
 
     bytes
-    4      how many numbers the coder's model has, uint32
+    4      number of integers in the coder's model, uint32
     4      bytes of the packed model, uint32
            the model, int32 numbers, packed as in "xz"
-           what the coder wrote (`entropy.py`)
+           the coder's output (`entropy.py`)
 
-`encode.py` says which streams there are. The version is 2; a reader refuses any other, another length than the file's,
-and a checksum that does not hold.
+`encode.py` lists the streams. The version is 2. A reader refuses other versions, wrong lengths and wrong checksums.
 
-Nothing in a file is ever run, and nothing is allocated before its size was checked against the lengths in the header,
-and these against the size of the file: it cannot unpack to more than 32 times that, or 16 MB.
+Nothing in a file is ever run. Sizes are checked before anything is allocated: a file may unpack to 16 MB, or to 32
+times its own size.
 """
 
 import json
@@ -42,7 +41,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nrfgs_ns.compact.entropy import MOST_MODEL, decode_table, encode_table
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole
 
 MAGIC = b"\x89NRF\r\n\x1a\n"
@@ -50,7 +48,7 @@ VERSION = 2
 PREAMBLE = struct.Struct("<8sIIQ")
 CHECKSUM = struct.Struct("<I")
 MODEL = struct.Struct("<II")
-"""Numbers of a coded table's model, and its bytes."""
+"""Integers in a coded table's model, and bytes."""
 DTYPES = ("uint8", "uint16", "uint32", "uint64", "float16", "float32")
 CODINGS = {"xz": DTYPES, "rans": ("int16", "int32", "uint32")}
 """Codings, and the types of numbers that each holds."""
@@ -64,17 +62,27 @@ LARGEST_DICTIONARY = 2**26
 """Bytes within which xz looks for repetitions."""
 LARGEST_MEMORY = 2**28
 """Bytes that xz may take to unpack: more than the dictionary needs."""
-LONGEST_REASON = 200
-"""Characters of a message's reason, which may quote the file."""
+BROKEN = (
+    OSError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    OverflowError,
+    RuntimeError,
+    lzma.LZMAError,
+    struct.error,
+)
+"""Errors of reading a damaged or hostile file."""
 
 
 class Table(NamedTuple):
-    """Whole numbers that an entropy coder packs (`entropy.py`)."""
+    """Integers for the entropy coder (`entropy.py`)."""
 
     numbers: np.ndarray
     """[C, n]"""
     signed: bool = True
-    """False: from 0 to 2^32 - 1, each on its own; otherwise from -2^31 to 2^31 - 1, like their neighbours"""
+    """from -2^31 to 2^31 - 1, and like their neighbours; False: from 0 to 2^32 - 1"""
 
 
 def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> int:
@@ -86,10 +94,8 @@ def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str,
     """
     entries, bodies = [], []
     for name, stream in streams.items():
-        if isinstance(stream, Table):
-            array, body, coding = _coded(stream)
-        else:
-            array, body, coding = stream, _pack(_planes(stream)), "xz"
+        coding = "rans" if isinstance(stream, Table) else "xz"
+        array, body = _coded(stream) if coding == "rans" else (stream, _pack(stream))
         sizes = {"dtype": array.dtype.name, "shape": list(array.shape), "bytes": len(body)}
         entries.append({"name": name, "coding": coding, **sizes, "crc32": zlib.crc32(body)})
         bodies.append(body)
@@ -101,22 +107,8 @@ def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str,
     return total
 
 
-def read_container(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The header and the streams, by name, of a file; InputError if it is missing, of another kind, or damaged."""
-    try:
-        if not path.is_file():
-            raise ValueError("it is no file")
-        return _read(path.read_bytes())
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, lzma.LZMAError, struct.error) as error:
-        reason = " ".join(str(error).split())[:LONGEST_REASON]
-        raise InputError(
-            f"{path} cannot be read as a compact file ({reason}). Copy it again, or export it again with nrfgs export "
-            "compact."
-        ) from error
-
-
-def _read(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The header and the streams of a file's bytes; any of several errors if they are not one."""
+def read_container(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The header and the streams, by name, of a file's bytes; one of BROKEN if they are damaged or of another kind."""
     if not data.startswith(MAGIC):
         raise ValueError(f"it begins with {data[: len(MAGIC)]!r}")
     _, version, length, total = PREAMBLE.unpack_from(data)
@@ -143,8 +135,10 @@ def _read(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return header, streams
 
 
-def _pack(raw: bytes) -> bytes:
-    """Compressed without context: a quantised number's byte does not depend on the one beside it."""
+def _pack(array: np.ndarray) -> bytes:
+    """The bytes of "xz", compressed without context: neighbours tell nothing of a number's byte."""
+    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).reshape(-1, 1)
+    raw = little.view(np.uint8).T.tobytes()
     options = {"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0}
     options["dict_size"] = min(max(len(raw), 4096), LARGEST_DICTIONARY)
     return lzma.compress(raw, format=lzma.FORMAT_XZ, check=lzma.CHECK_NONE, filters=[options])
@@ -160,19 +154,19 @@ def _unpack(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     return np.ascontiguousarray(planes.T).view(np.dtype(entry["dtype"]).newbyteorder("<")).reshape(entry["shape"])
 
 
-def _coded(table: Table) -> tuple[np.ndarray, bytes, str]:
-    """A table in its narrowest type, its bytes, and how they are coded."""
+def _coded(table: Table) -> tuple[np.ndarray, bytes]:
+    """A table in its narrowest type, and the bytes of "rans"."""
     low, high = int(table.numbers.min(initial=0)), int(table.numbers.max(initial=0))
     dtype = "uint32" if not table.signed else "int16" if -(2**15) <= low and high < 2**15 else "int32"
     model, words = encode_table(table.numbers, table.signed)
-    packed = _pack(_planes(model))
-    return table.numbers.astype(dtype), MODEL.pack(len(model), len(packed)) + packed + words, "rans"
+    packed = _pack(model)
+    return table.numbers.astype(dtype), MODEL.pack(len(model), len(packed)) + packed + words
 
 
 def _uncoded(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     columns, rows = entry["shape"]
     count, size = MODEL.unpack_from(body)
-    if columns > MOST_COLUMNS or count > min(columns * MOST_MODEL, SMALL // 4):
+    if columns > MOST_COLUMNS or count > columns * MOST_MODEL:
         raise ValueError(f"a model of {count} numbers for {columns} columns is too large")
     model = _unpack({"shape": [count], "dtype": "int32"}, body[MODEL.size : MODEL.size + size])
     table = decode_table(model, body[MODEL.size + size :], columns, rows)
@@ -180,8 +174,3 @@ def _uncoded(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     if table.size and not bounds.min <= table.min() <= table.max() <= bounds.max:
         raise ValueError(f"it holds numbers that are no {entry['dtype']}")
     return table.astype(entry["dtype"])
-
-
-def _planes(array: np.ndarray) -> bytes:
-    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
-    return np.ascontiguousarray(little.reshape(-1, 1).view(np.uint8).reshape(-1, little.dtype.itemsize).T).tobytes()

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""The size of a table in a file as a differentiable function, and learnable steps.
 
-A column of a table lies on a uniform grid, value = step * whole number. While it is trained, rounding is imitated by
-noise that is uniform over a step (Balle et al., arXiv 1611.01704), or done, with the gradient of the identity. A number
-x then costs
+A column of a table lies on a uniform grid, value = step * integer. In training, rounding is imitated by noise that is
+uniform over a step (Balle et al., arXiv 1611.01704), or done, with the gradient of the identity. A number x then costs
 
     -log2 P(x),    P(x) = sum_k w_k (F((x + step/2 - m - m_k) / b_k) - F((x - step/2 - m - m_k) / b_k)),
 
-F the logistic function: a mixture of two, each column its own, about a mean m that is linear in the row before, the one
-before that, and the row's earlier columns; its widths b_k grow with the neighbours' distances from their means. The
-coder of a file (`entropy.py`) expects numbers by the same neighbours, but nothing of this is in a file.
+F the logistic function: a mixture of two for each column, about a mean m that is linear in the two rows before and in
+the row's earlier columns; its widths b_k grow with the neighbours' distances from their means. A file's coder
+(`entropy.py`) predicts from the same neighbours, but nothing of this is in a file.
 """
 
 import math
@@ -19,11 +18,11 @@ from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
 WIDTHS = (-2.0, -0.3)
-"""Logarithms of the logistics' first widths, in standard deviations of the column."""
+"""Logarithms of the logistics' initial widths, in standard deviations of the column."""
 SEEN = 0.3
 """Added to the neighbours' errors, in usual widths."""
 NARROWEST = 0.05
-"""Narrowest logistic, in steps: narrower ones cost nothing less."""
+"""Width of the narrowest logistic, in steps: narrower ones cost no less."""
 
 
 class Rounded(nn.Module):
@@ -41,12 +40,8 @@ class Rounded(nn.Module):
     def forward(self, rounded: bool) -> Tensor:
         """The table as a file would give it back: rounded, or with noise instead. [N, C]"""
         steps = self.steps
-        if rounded:
-            with torch.no_grad():
-                places = self.values / steps
-                off = places.round() - places
-        else:
-            off = torch.rand_like(self.values) - 0.5
+        places = (self.values / steps).detach()
+        off = places.round() - places if rounded else torch.rand_like(places) - 0.5
         return self.values + steps * off
 
 
@@ -55,8 +50,9 @@ class Density(nn.Module):
 
     def __init__(self, values: Tensor):
         super().__init__()
-        columns, none = values.shape[1], values[:0].sum(dim=0)
-        spread, mean = (values.std(dim=0, correction=0), values.mean(dim=0)) if len(values) else (none, none)
+        columns = values.shape[1]
+        values = values if len(values) else values.new_zeros(1, columns)
+        spread, mean = values.std(dim=0, correction=0), values.mean(dim=0)
         widths = spread.clamp_min(1e-6).log()[:, None] + values.new_tensor(WIDTHS)
         self.centers = nn.Parameter(mean[:, None].repeat(1, len(WIDTHS)))
         self.log_widths = nn.Parameter(widths)
@@ -97,7 +93,7 @@ def _earlier(values: Tensor, count: int) -> Tensor:
 
 
 def bits_of_places(means: Tensor, steps: Tensor) -> Tensor:
-    """Bits of each of N means [N, 3] in cells of steps [3], a scalar: its cell among all of their box, in any order."""
+    """Bits of one of N means [N, 3]: the choice of a cell of size `steps` [3] in their box, in any order."""
     extent = (means.detach().amax(dim=0) - means.detach().amin(dim=0)).clamp_min(1e-30)
     cells = (extent.log() - steps.log()).sum() / math.log(2.0)
     return cells - math.log2(max(len(means), 1)) + 1.0 / math.log(2.0)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of a file: the numbers of a splat before they are rounded, and the steps to which they are.
+"""The tables of a file: a splat's numbers before rounding, and the steps of the grids that they are rounded to.
 
 means      [N, 3]
-turns      [N, 3]   x, y, z of the rotation with w > 0 that turns least and draws the same ellipsoid: of the 24 ways to
-                    name its axes. A reader takes w = sqrt(max(1 - x^2 - y^2 - z^2, 1e-6)), and unit length
+turns      [N, 3]   x, y, z of a rotation with w > 0: of the 24 that draw the same ellipsoid, with its axes named
+                    otherwise, the smallest. A reader takes w = sqrt(max(1 - x^2 - y^2 - z^2, 1e-6)), and normalises
 scales     [N, 3]   natural logarithms of the standard deviations, along the axes that the rotation names
 opacities  [N, 1]   logits, cut off at +-10
 colors     [N, 3]   base colours, 1 is white
@@ -24,7 +24,7 @@ from nrfgs_ns.appearance.head import SH_C0, base_colors
 Array = np.ndarray
 
 COLUMNS = ("opacities", "scales", "colors", "turns")
-"""Tables of all splats, beside the means, in the order of a file."""
+"""Tables of all splats, besides the means, in the order of a file."""
 SMALLEST_W2 = 1e-6
 """Smallest w^2 of a rotation: x, y and z may be rounded beyond unit length."""
 STEPS = {
@@ -35,33 +35,29 @@ STEPS = {
     "colors": 1 / 512,
     "latents": 1 / 16,
 }
-"""Steps of the grids of a field that was not trained for the file: means in standard deviations of the median splat,
-latents in those of the strongest. Means are finer than the others, because a splat smaller than the median suffers
-more, and pixels notice places first. A sixteenth is 6 % of a size, and at most 1/64 of an opacity."""
+"""Steps of the grids without a fine-tune: means in standard deviations of the median splat, latents in those of the
+strongest component. Means have the finest, because errors of place show first, and most with small splats. A sixteenth
+is 6 % of a size, and at most 1/64 of an opacity."""
 MOST_BITS = 21
 """Bits of a coordinate: three of them are interleaved in 63."""
 
 
 class Grid(NamedTuple):
-    """A uniform grid for each column: value = low + step code."""
+    """A uniform grid for each of C columns: value = low + step code, step > 0."""
 
     low: Array
-    """[C]"""
     step: Array
-    """[C], > 0"""
 
     def codes(self, values: Array) -> Array:
-        """Nearest grid points of [N, C], int64, of those within 2^62 steps. Off by at most step / 2, and float64's
-        rounding."""
+        """Nearest grid points of values [N, C], int64, cut off at 2^62 steps."""
         return np.rint((values - self.low) / self.step).clip(-(2.0**62), 2.0**62).astype(np.int64)
 
     def values(self, codes: Array) -> Array:
-        """[N, C]"""
         return self.low + self.step * codes
 
 
 def morton(codes: Array) -> Array:
-    """Interleaved bits of three coordinates [N, 3] of up to 21 bits, uint64 [N]: bit 3 k + a is bit k of axis a."""
+    """Morton numbers of coordinates [N, 3] of up to 21 bits, uint64 [N]: bit 3 k + a is bit k of axis a."""
     interleaved = np.zeros(len(codes), dtype=np.uint64)
     for axis, column in enumerate(codes.astype(np.uint64).T):
         for bit in range(MOST_BITS):
@@ -70,7 +66,7 @@ def morton(codes: Array) -> Array:
 
 
 def from_morton(interleaved: Array) -> Array:
-    """The coordinates [N, 3], int64, of `morton`'s numbers [N]."""
+    """Coordinates [N, 3], int64, of Morton numbers [N]."""
     codes = np.zeros((3, len(interleaved)), dtype=np.uint64)
     for axis, column in enumerate(codes):
         for bit in range(MOST_BITS):
@@ -79,23 +75,18 @@ def from_morton(interleaved: Array) -> Array:
 
 
 GROUP = Rotation.create_group("O")
-"""The 24 rotations that take the axes to the axes."""
+"""The 24 rotations that map the axes to the axes."""
 OCTAHEDRAL = np.roll(GROUP.as_quat(), 1, axis=1)
 """The same as quaternions (w, x, y, z). [24, 4]"""
 NEAR = 0.8
-"""A rotation by 74 degrees; the nearest of 24 turns by no more than 62.8, where w is 0.853."""
+"""w of a rotation by 74 degrees. The smallest of the 24 turns by at most 62.8 degrees: w is at least 0.853."""
 
 
 def nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:
-    """The same ellipsoids by the rotations that turn least: of the 24 ways to name an ellipsoid's axes, the one whose
-    rotation is nearest to the identity. A rotation with |w| > NEAR is left as it is.
+    """The same ellipsoids with their axes named so that rotations are smallest. One with |w| > NEAR keeps its axes.
 
-    Args:
-        quats: rotations (w, x, y, z) of any length but 0. [N, 4]
-        scales: one for each axis. [N, 3]
-
-    Returns:
-        quats [N, 4] of unit length with w >= NEAR, and scales [N, 3], permuted.
+    Takes quaternions (w, x, y, z) of any length except 0 [N, 4], and a scale for each axis [N, 3]; returns quaternions
+    of unit length with w >= NEAR, and permuted scales.
     """
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     best = np.abs(unit @ (OCTAHEDRAL * [1, -1, -1, -1]).T).argmax(axis=1)  # |w| of q g
@@ -107,7 +98,7 @@ def nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:
 
 
 def tables_of(splats: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
-    """The file's tables of a field's table, float64 without gradients, and which splats are diffuse, bool [N]."""
+    """A file's tables of a field's splats, float64 without gradients, and the mask of diffuse splats, bool [N]."""
     double = {name: value.detach().double() for name, value in splats.items() if name != DIFFUSE}
     like = double["means"]
     diffuse = splats.get(DIFFUSE, torch.zeros(len(like), dtype=torch.bool, device=like.device))
@@ -123,7 +114,7 @@ def tables_of(splats: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
 
 
 def splats_of(tables: Mapping[str, Tensor], diffuse: Tensor) -> dict[str, Tensor]:
-    """The field's table of a file's, with gradients."""
+    """A field's splats of a file's tables, with gradients."""
     turns, latents = tables["turns"], tables["latents"]
     w = (1.0 - turns.square().sum(dim=1, keepdim=True)).clamp_min(SMALLEST_W2).sqrt()
     rows = (~diffuse).nonzero()[:, 0]
@@ -139,7 +130,7 @@ def splats_of(tables: Mapping[str, Tensor], diffuse: Tensor) -> dict[str, Tensor
 
 
 def steps_of(tables: Mapping[str, Tensor]) -> dict[str, Array]:
-    """STEPS for tables that were not trained for the file, one for each column."""
+    """Steps of each table's columns without a fine-tune."""
     median = float(np.exp(np.median(tables["scales"].mean(dim=1).cpu().numpy())))
     latents = tables["latents"]
     spread = float(latents.std(dim=0, correction=0).max()) if len(latents) > 1 else 0.0

@@ -18,7 +18,7 @@ FLAT = tyro.conf.arg(name="")
 
 @dataclass
 class _Format(NamesTraining):
-    """What all formats have in common."""
+    """Options of all formats."""
 
     output: Path = field(kw_only=True)
     """the file to write; an older one is replaced"""
@@ -27,12 +27,12 @@ class _Format(NamesTraining):
     report: Path | None = None
     """also write the numbers to this file, as JSON"""
 
-    def checked(self, file: Path | None = None) -> Path:
-        """The config.yml; the paths that are written at the end are checked."""
+    def checked(self, file: Path) -> Path:
+        """The config.yml; paths that are written at the end are checked."""
         config = self.config()
-        for path, option in ((self.report, "--report"), (file or self.output, "--output")):
-            if path is not None:
-                check_writable(path, option)
+        if self.report is not None:
+            check_writable(self.report, "--report")
+        check_writable(file, "--output")
         return config
 
 
@@ -43,11 +43,9 @@ class Ply(_Format):
     options: Annotated[PlyOptions, FLAT] = field(default_factory=PlyOptions)
 
     def main(self) -> None:
-        config, largest, steps = self.checked(), self.options.largest, self.options.steps
-        if largest is not None and not 0 < largest < float("inf"):
-            raise InputError(f"--largest is {largest}; it must be positive.")
-        if steps is not None and steps < 0:
-            raise InputError(f"--steps is {steps}; it must be at least 0.")
+        config = self.checked(self.output)
+        if self.options.steps is not None and self.options.steps < 0:
+            raise InputError(f"--steps is {self.options.steps}; it must be at least 0.")
         from nrfgs_ns.export.ply import export_ply
 
         export_ply(config, self.output, self.options, self.measure, self.report)
@@ -60,7 +58,7 @@ class Compact(_Format):
     options: Annotated[CompactOptions, FLAT] = field(default_factory=CompactOptions)
 
     def main(self) -> None:
-        config = self.checked()
+        config = self.checked(self.output)
         check_compact(self.options)
         from nrfgs_ns.export.compact import export_compact
 
@@ -89,9 +87,9 @@ class Web(_Format):
 
 
 def check_compact(options: CompactOptions) -> None:
-    for name in ("finetune", "rate", "budget"):
-        if not getattr(options, name) >= 0:
-            raise InputError(f"--{name} is {getattr(options, name)}; it must be zero or positive.")
+    for name, value in vars(options).items():
+        if not value >= 0:
+            raise InputError(f"--{name} is {value}; it must be zero or positive.")
 
 
 @dataclass

@@ -1,22 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs export compact`: choose what is left out, write the file, and a config.yml with which nerfstudio reads it."""
+"""`nrfgs export compact`: write the file, and a config.yml with which nerfstudio's commands read it."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 
-from nrfgs_ns.appearance.head import AppearanceHead
-from nrfgs_ns.appearance.nrf import NeuralResidualField
+from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
+from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.finetune import REPORT_EVERY, fine_tune
-from nrfgs_ns.compact.format import read_container, write_container
-from nrfgs_ns.compact.slim import FieldViews, look_over, slim
-from nrfgs_ns.data.views import evenly_spaced
+from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.options import CompactOptions
 from nrfgs_ns.files import write_whole
@@ -24,11 +22,10 @@ from nrfgs_ns.progress import progress
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import find_data, finish, load_model, lost, measure_loss
 from nrfgs_ns.training.config_file import read_config
+from nrfgs_ns.training.pipeline import NrfgsPipeline
 
 PLY_BYTES = 62 * 4
 """Bytes of a splat in 3DGS's PLY file, with harmonics of degree 3."""
-VIEWS = 8
-"""Training views, evenly spaced, on which threshold and rank are chosen."""
 
 
 def export_compact(
@@ -36,101 +33,83 @@ def export_compact(
 ) -> None:
     """Write a compact file, and report its size and loss; see `nrfgs export compact --help`."""
     with few_threads() as threads:
-        pipeline = load_model(load_config, "test")
+        pipeline = load_field(load_config)
         threads.suit_to(pipeline)
-        header, streams, numbers = packed(pipeline, load_config, options)
-        begin = perf_counter()
-        size = write_container(output, header, streams)
-        written = perf_counter()
-        decode(output)
-        numbers["seconds"]["encode"] += written - begin
-        numbers["seconds"]["decode"] = perf_counter() - written
-        config, count = write_config(load_config, output), numbers["written"]
-        if measure:
-            numbers |= measure_file(pipeline, config)
-    numbers |= {
-        "finetune": options.finetune,
-        "rate": options.rate if options.finetune else None,
-        "bytes": size,
-        "ply_ratio": numbers["ply_bytes"] / size,
-        "stream_bytes": {entry["name"]: entry["bytes"] for entry in read_container(output)[0]["streams"]},
-    }
+        config, numbers = write_file(pipeline, load_config, output, options, measure)
+    count, size, ply_size = (numbers[name] for name in ("written", "bytes", "ply_bytes"))
     lines = [
-        f"{output}: {count:,} splats, {header['splats']['view']:,} of them view-dependent with latents of "
-        f"{numbers['rank']} numbers, {size / 1e6:.2f} MB, {size / count:.1f} bytes a splat: 3DGS's PLY of as many "
-        f"splats has {numbers['ply_bytes'] / 1e6:.2f} MB, {numbers['ply_ratio']:.1f} times as much."
+        f"{output}: {count:,} splats with latents of {numbers['rank']} numbers, {size / 1e6:.2f} MB, "
+        f"{size / count:.1f} bytes a splat: 3DGS's PLY of as many splats has {ply_size / 1e6:.2f} MB, "
+        f"{ply_size / size:.1f} times as much."
     ]
     lines += [lost(numbers)] if measure else []
     lines += [f"Look at it with:  nrfgs view {output}", f"Evaluate it with:  ns-eval --load-config {config}"]
     finish(lines, numbers, report)
 
 
-def check_head(head: AppearanceHead, load_config: Path) -> None:
-    if not isinstance(head, NeuralResidualField):
+def load_field(load_config: Path) -> NrfgsPipeline:
+    """A trained pipeline; InputError if its head is not a neural residual field."""
+    pipeline = load_model(load_config, "test")
+    if not isinstance(pipeline.model.head, NeuralResidualField):
         raise InputError(
             f"{load_config}: compact files and pages hold a neural residual field, and this model has the "
-            f"{head.name!r} head. Use nrfgs export ply."
+            f"{pipeline.model.head.name!r} head. Use nrfgs export ply."
         )
+    return pipeline
 
 
-def packed(pipeline, load_config: Path, options: CompactOptions) -> tuple[dict, dict, dict[str, Any]]:
-    """The header and streams of a model's compact file, fine-tuned or slimmed within the budget, and their numbers for
-    a report."""
-    model, data = pipeline.model, pipeline.datamanager
-    check_head(model.head, load_config)
-    images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
-    cameras = data.train_dataset.cameras
-    with progress(f"Looking at the splats from {len(cameras)} training views"):
-        seen = look_over(model, cameras)
-    begin = perf_counter()
-    field, threshold, steps = model.field.detached(), 0.0, None
+def write_file(
+    pipeline, load_config: Path, output: Path, options: CompactOptions, measure: bool
+) -> tuple[Path, dict[str, Any]]:
+    """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report."""
+    model, times = pipeline.model, [perf_counter()]
+    field, steps = model.field.detached(), None
     if options.finetune > 0:
         with progress("Training for the file", -(-options.finetune // REPORT_EVERY)) as advance:
-
-            def on_step(step: int, bits: float) -> None:
-                advance(f"Training for the file ({bits / 8e6:.2f} MB)")
-
-            field, steps = fine_tune(pipeline, field, seen.weight, options.finetune, options.rate, on_step)
-    elif options.budget > 0:
-        chosen = evenly_spaced(len(images), VIEWS)
-        pairs = [(cameras[i : i + 1].to(model.device), images[i]) for i in chosen]
-        views = FieldViews(model, pairs, photographs_of(model, data.train_dataset.image_filenames, chosen))
-        with progress("Choosing what to leave out") as advance:
-            lowest = views.psnr(field) - options.budget
-            slimmed = slim(field, seen, views, lowest, lambda candidate: advance(f"Without {candidate}"))
-        field, threshold = slimmed.field, slimmed.threshold
-    trained = perf_counter()
+            field, steps = fine_tune(
+                pipeline,
+                options.finetune,
+                options.rate,
+                lambda bits: advance(f"Training for the file ({bits / 8e6:.2f} MB)"),
+            )
+    else:  # the same field in fewer bytes: components of latents that hardly matter are rounded to 0
+        basis = latent_basis(field, torch.ones(model.num_points, device=model.device))
+        field = with_rank(field, basis, field.head.config.latent_dim)
+    times.append(perf_counter())
     render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
-    header, streams = encode(field, render, steps)
-    count = sum(header["splats"].values())
+    size = write_container(output, *encode(field, render, steps))
+    times.append(perf_counter())
+    decoded = decode(output)
+    times.append(perf_counter())
+    config, count = write_config(load_config, output, decoded.config), len(decoded.splats["means"])
     numbers = {
         "splats": model.num_points,
         "written": count,
-        "view_dependent": header["splats"]["view"],
-        "rank": header["head"]["config"]["latent_dim"],
-        "threshold": threshold if threshold != float("inf") else None,
-        "seconds": {"finetune": trained - begin if options.finetune else 0.0, "encode": perf_counter() - trained},
+        "rank": decoded.config.latent_dim,
+        "seconds": dict(zip(("finetune", "encode", "decode"), np.diff(times).tolist(), strict=True)),
+        "finetune": options.finetune,
+        "rate": options.rate if options.finetune else None,
+        "bytes": size,
         "ply_bytes": PLY_BYTES * count,
+        "ply_ratio": PLY_BYTES * count / size,
+        "stream_bytes": {entry["name"]: entry["bytes"] for entry in decoded.header["streams"]},
     }
-    return header, streams, numbers
+    if measure:
+        file = load_model(config, "test").model  # as ns-eval reads it
+        numbers |= measure_loss(pipeline, lambda camera: {"file": file.get_outputs_for_camera(camera)["rgb"]})
+    return config, numbers
 
 
-def photographs_of(model, files: Sequence[Path], chosen: Sequence[int]) -> list[int | None]:
-    """Indices of the chosen training images among a model's photographs; None: not among them."""
-    known = [] if model.photograph is None else model.photograph.names
-    return [i if i < len(known) and known[i] == Path(files[i]).name else None for i in chosen]
-
-
-def write_config(load_config: Path, output: Path) -> Path:
-    """Write what nerfstudio's commands need to read FILE.nrf, a config.yml, whose path is returned, and an empty
-    checkpoint, into FILE.nrf.nerfstudio/METHOD/compact. Relative paths stay relative, as nerfstudio's."""
+def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
+    """Write what nerfstudio's commands need to read FILE.nrf into FILE.nrf.nerfstudio/METHOD/compact: a config.yml,
+    whose path is returned, and an empty checkpoint. Relative paths stay relative, as nerfstudio's."""
     config = read_config(load_config)
     find_data(config, load_config)
     config.output_dir, config.experiment_name, config.timestamp = output.parent, f"{output.name}.nerfstudio", "compact"
     config.relative_model_dir = Path("nerfstudio_models")
     config.load_dir = config.load_checkpoint = config.load_step = None
     config.pipeline.compact = output
-    config.pipeline.model.appearance = decode(output).config
+    config.pipeline.model.appearance = head
     config.pipeline.model.camera_optimizer.mode = "off"
     config.pipeline.model.use_bilateral_grid = False
     models = config.get_checkpoint_dir()
@@ -142,9 +121,3 @@ def write_config(load_config: Path, output: Path) -> Path:
     path = config.get_base_dir() / "config.yml"
     write_whole(path, yaml.dump(config))
     return path
-
-
-def measure_file(pipeline, config: Path) -> dict[str, Any]:
-    """`measure_loss` of a file, read as ns-eval reads it, by the config.yml beside it."""
-    small = load_model(config, "test").model
-    return measure_loss(pipeline, lambda camera: {"file": small.get_outputs_for_camera(camera)["rgb"]})

@@ -8,6 +8,7 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from nrfgs_ns.appearance.sh import sh_bases
 from nrfgs_ns.data.world import rounded
@@ -33,37 +34,30 @@ class Similarity:
         return Similarity(self.rotation.T, 1.0 / self.scale, -back @ self.translation)
 
     def places(self, points: Tensor) -> Tensor:
-        """Where points [N, 3] go, float64."""
+        """Images of points [N, 3], float64."""
         return self.scale * points.double() @ self.rotation.to(points.device).T + self.translation.to(points.device)
 
     def moved(self, splats: PlainSplats) -> PlainSplats:
-        """The splats, seen from a camera that moves with them, look the same."""
-        if self is NOWHERE:  # to the bit
+        """The splats in the other frame; NOWHERE's are the same to the bit."""
+        if self is NOWHERE:
             return splats
-        rotation = self.rotation.to(splats.means.device)
         quats = np.roll(splats.quats.double().cpu().numpy(), -1, axis=1)
-        undrawn = ~(np.linalg.norm(quats, axis=1) > 0)  # without a rotation, which SciPy refuses
+        undrawn = ~(np.linalg.norm(quats, axis=1) > 0)  # SciPy refuses what is no rotation
         quats[undrawn] = 1.0
         turned = (Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(quats)).as_quat()
         turned[undrawn] = np.nan
+        harmonics = _turned_harmonics(self.rotation.to(splats.means.device)).to(splats.features_rest)
         return splats._replace(
             means=self.places(splats.means).to(splats.means.dtype),
             quats=torch.from_numpy(np.roll(turned, 1, axis=1)).to(splats.quats),
             scales=splats.scales + torch.tensor(self.scale).log().item(),
-            features_rest=torch.einsum(
-                "ab,nbc->nac", _turned_harmonics(rotation).to(splats.features_rest), splats.features_rest
-            ),
+            features_rest=torch.einsum("ab,nbc->nac", harmonics, splats.features_rest),
         )
 
 
-def turn(*rows: tuple[float, float, float]) -> Similarity:
-    """A rotation about the origin by the rows of its matrix."""
-    return Similarity(torch.tensor(rows, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64))
-
-
-NOWHERE = turn((1, 0, 0), (0, 1, 0), (0, 0, 1))
-"""Stays where it is."""
-Y_DOWN = turn((1, 0, 0), (0, 0, -1), (0, 1, 0))
+NOWHERE = Similarity(torch.eye(3).double(), 1.0, torch.zeros(3).double())
+"""The identity."""
+Y_DOWN = Similarity(torch.tensor([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).double(), 1.0, torch.zeros(3).double())
 """From nerfstudio's world, whose z points up, to that of 3DGS's viewers, whose y points down."""
 
 
@@ -83,11 +77,10 @@ def to_capture(outputs: DataparserOutputs) -> tuple[Similarity, np.ndarray]:
 def _turned_harmonics(rotation: Tensor) -> Tensor:
     """The matrix that turns the 15 coefficients of degree 1 to 3, float64 [15, 15].
 
-    A turned function f'(d) = f(R^T d) has the coefficients k' with B(d) k' = B(R^T d) k for all d. Each degree stays
-    among itself; 64 directions determine it, and the system has no error but rounding's.
+    A turned function f'(d) = f(R^T d) has coefficients k' with B(d) k' = B(R^T d) k for all d. No degree mixes with
+    another: 64 directions determine the matrix, up to rounding.
     """
     generator = torch.Generator().manual_seed(0)
-    directions = torch.randn(64, 3, dtype=torch.float64, generator=generator).to(rotation.device)
-    directions = torch.nn.functional.normalize(directions, dim=-1)
+    directions = normalize(torch.randn(64, 3, dtype=torch.float64, generator=generator).to(rotation.device), dim=-1)
     bases, turned = sh_bases(3, directions), sh_bases(3, directions @ rotation)  # rows d^T R are (R^T d)^T
     return torch.linalg.lstsq(bases, turned).solution[1:, 1:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of the three formats. Imports next to nothing: they are read before torch is imported."""
+"""Options of the three formats, which are read before torch is imported."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -7,36 +7,30 @@ from typing import Literal
 
 @dataclass
 class PlyOptions:
-    """How splats lie in a PLY file."""
+    """Options of a PLY file."""
 
     world: Literal["viewers", "training", "capture"] = "viewers"
-    """viewers: y points down, as the programs expect that open files of 3DGS. training: as it was trained, z up, and as
-    ns-export writes it. capture: the data set's own axes and unit of length; of coordinates too large for float32 the
-    file's header says what was subtracted"""
+    """viewers: y points down, as viewers of 3DGS files expect. training: z points up, as in training and in ns-export's
+    files. capture: the data set's own axes and unit of length; from coordinates too large for float32 an origin is
+    subtracted, which the file's header tells"""
     steps: int | None = None
-    """of the fine-tune that makes the file draw what the model draws, 0 for none. None: 2,500; on a CPU 10 for each
-    training view, at most 400"""
-    largest: float | None = None
-    """cut the splats' standard deviations to this length, in the unit of the training's world, in which the cameras lie
-    between -1 and 1: viewers that leave out what is centred off the screen do less harm. None: as trained"""
+    """steps of the fine-tune towards the model's images. None: 2,500; on a CPU 10 for each training view, at most
+    400"""
 
 
 @dataclass
 class CompactOptions:
-    """What a compact file may leave out."""
+    """How a compact file is made smaller."""
 
     finetune: int = 0
-    """steps in which the model is trained on for the file: tables that cost less, and how finely each is rounded"""
+    """steps of a fine-tune for the file: tables that cost less, learnt rounding. 0: the model's numbers, rounded"""
     rate: float = 1e-4
-    """with finetune: how much of the training's loss a byte for each splat is worth. More: a smaller file"""
-    budget: float = 0.03
-    """without finetune: dB on some training views that splats made diffuse and shorter latents may cost. 0: nothing is
-    left out"""
+    """with finetune: the training's loss that one byte for each splat is worth. More: a smaller file"""
 
 
 @dataclass
 class WebOptions:
-    """What a page says of itself."""
+    """Texts of a page."""
 
     title: str | None = None
     """heading of the page. None: the output's name"""

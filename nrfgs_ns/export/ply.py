@@ -4,11 +4,10 @@
 One vertex for each splat, 62 little-endian floats: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44, opacity (a logit),
 scale_0..2 (logarithms), rot_0..3 (w x y z, of unit length). A viewer's colour is max(0, 1/2 + SH_C0 f_dc + ...), and
 f_rest is channel-major: 15 coefficients of red, then of green, then of blue. `harmonics_fit.py` and `harmonics_tune.py`
-say how a head's colours and opacities become a file's; `ns-export gaussian-splat` gets them from the model's properties
-and writes the same numbers, in the training's world.
+turn a head's colours and opacities into a file's; `ns-export gaussian-splat` writes the same numbers, in the training's
+world.
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
@@ -26,7 +25,7 @@ from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
-from nrfgs_ns.model.pinhole import pinhole
+from nrfgs_ns.model.pinhole import Pinhole, pinhole
 from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import finish, load_model, lost, measure_loss
@@ -43,9 +42,9 @@ PROPERTIES = (
 FAINTEST_LOGIT = -5.5373
 """Splats with a smaller opacity logit are left out, as by ns-export: logit(1/255), below which nothing is drawn."""
 SPARKS_EDGE = 1.4
-"""Largest distance of a splat's centre from the picture's middle, in halves of its size, in Spark 2.2: clipXY."""
+"""Largest distance of a splat's centre from the image's middle, in halves of its size, in Spark 2.2: clipXY."""
 WORTH_A_WORD = 0.1
-"""Loss in dB from which the command speaks of it."""
+"""Loss in dB from which the command mentions it."""
 
 
 def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bool, report_file: Path | None) -> None:
@@ -57,20 +56,16 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
         pipeline.model.fit_on(pipeline.datamanager.train_dataset.cameras, options.steps)
         begin = perf_counter()
         fit = pipeline.model.fit
-        splats, seconds = fit.splats, perf_counter() - begin
-        if options.largest is not None:
-            splats = splats._replace(scales=splats.scales.clamp_max(math.log(options.largest)))
+        seconds = perf_counter() - begin
         # Brush's mark, which splat-transform reads, too: the splats are dimmed for the blur that a renderer adds.
         comments = ["SplatRenderMode: mip"] if pipeline.model.config.rasterize_mode == "antialiased" else []
-        origin = None
-        placed = {"viewers": Y_DOWN, "training": NOWHERE}.get(options.world)
-        if placed is None:
+        placed, origin = Y_DOWN if options.world == "viewers" else NOWHERE, np.zeros(3)
+        if options.world == "capture":
             placed, origin = to_capture(pipeline.datamanager.train_dataparser_outputs)
             comments.append(f"origin {' '.join(f'{number:.17g}' for number in origin)}")
-        written = write_splats(placed.moved(splats), output, comments)
         report = {
             "splats": len(fit.splats.means),
-            "written": written,
+            "written": write_splats(placed.moved(fit.splats), output, comments),
             "bytes": output.stat().st_size,
             "world": options.world,
             "exact": fit.exact,
@@ -79,7 +74,7 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
             "unseen_splats": fit.unseen,
             "seconds": {"fit": seconds},
         }
-        if origin is not None and origin.any():
+        if origin.any():
             report["origin"] = origin.tolist()
         if measure:
             pipeline = load_model(load_config, "test")
@@ -95,24 +90,19 @@ def summary(output: Path, report: dict[str, Any]) -> Iterator[str]:
     yield f"{output}: {report['written']:,} of {report['splats']:,} splats, {harmonics}, {report['bytes'] / 1e6:.1f} MB"
     if "origin" in report:
         yield f"Its coordinates are the capture's less {tuple(report['origin'])}, as its header says."
-    if not report["exact"] and report["unseen_splats"]:
+    if report["unseen_splats"]:
         yield f"{report['unseen_splats']:,} splats are seen by no training view and have their base colour."
     if "psnr_file" in report:
         yield f"{lost(report)} Base colours and opacities alone have {report['psnr_base']:.2f} dB."
         if report["psnr_file"] - report["psnr_on_screen"] > WORTH_A_WORD:
             yield (
                 f"Viewers that leave out splats centred off the screen, as Spark does, show "
-                f"{report['psnr_on_screen']:.2f} dB. In Spark raise clipXY from {SPARKS_EDGE}; for all viewers "
-                "--largest cuts large splats down."
+                f"{report['psnr_on_screen']:.2f} dB. In Spark raise clipXY from {SPARKS_EDGE}."
             )
 
 
 def write_splats(splats: PlainSplats, path: Path, comments: Sequence[str] = ()) -> int:
-    """Write the splats that are finite and not too faint to a 3DGS PLY file; returns their number.
-
-    Raises:
-        InputError: none would be left.
-    """
+    """Write the splats that are finite and not too faint; returns their number. InputError if there are none."""
     count = len(splats.means)
     rest = splats.features_rest.transpose(1, 2).reshape(count, -1)  # channel-major
     normals = splats.means.new_zeros(count, 3)
@@ -129,36 +119,12 @@ def write_splats(splats: PlainSplats, path: Path, comments: Sequence[str] = ()) 
 
 
 def read_splats(path: Path) -> PlainSplats:
-    """Read a 3DGS PLY file of any degree up to 3, missing ones as zeros; InputError if it is none."""
-    try:
-        vertices = PlyData.read(str(path))["vertex"].data
-    except (OSError, KeyError, ValueError, PlyParseError) as error:
-        raise InputError(f"{path} cannot be read as a PLY file with vertices ({error}). Export it again.") from error
-    names = vertices.dtype.names
-    missing = [name for name in PROPERTIES if name not in names and name[0] not in "nf"]
-    missing += [f"f_dc_{i}" for i in range(3) if f"f_dc_{i}" not in names]
-    higher = sum(name.startswith("f_rest_") for name in names)
-    bases = math.isqrt(higher // 3 + 1) ** 2
-    if missing or higher != 3 * (bases - 1) or bases > 16:
-        raise InputError(
-            f"{path} is not a 3DGS file: {'no ' + ', '.join(missing) if missing else f'{higher} f_rest properties'}."
-        )
-
-    def table(*columns: str) -> Tensor:
-        return torch.from_numpy(np.stack([vertices[name] for name in columns], axis=1).astype(np.float32))
-
-    rest = torch.zeros(len(vertices), 15, 3)
-    if higher:
-        by_channel = table(*(f"f_rest_{i}" for i in range(higher))).reshape(len(vertices), 3, bases - 1)
-        rest[:, : bases - 1] = by_channel.transpose(1, 2)
-    return PlainSplats(
-        means=table("x", "y", "z"),
-        quats=table(*(f"rot_{i}" for i in range(4))),
-        scales=table(*(f"scale_{i}" for i in range(3))),
-        opacities=table("opacity"),
-        features_dc=table(*(f"f_dc_{i}" for i in range(3))),
-        features_rest=rest,
-    )
+    """Read a file of `write_splats`."""
+    vertices = PlyData.read(str(path))["vertex"]
+    columns = torch.from_numpy(np.stack([vertices[name] for name in PROPERTIES]))
+    means, _, features_dc, rest, opacities, scales, quats = columns.split((3, 3, 3, 45, 1, 3, 4))
+    flat = means.T, quats.T, scales.T, opacities.T, features_dc.T, rest.reshape(3, 15, -1).permute(2, 1, 0)
+    return PlainSplats(*(table.contiguous() for table in flat))
 
 
 @torch.no_grad()
@@ -166,36 +132,36 @@ def render_splats(
     splats: PlainSplats, camera, background: Tensor, rasterize_mode: str = "classic", scene_unit: float = 1.0
 ) -> Tensor:
     """Render a file's splats over a background [3] with this project's rasterizer, [H, W, 3] in [0, 1]."""
-    device = splats.means.device
-    pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
     field = Field(ShConfig(degree=3).setup(), splats._asdict())
     options = projection_options(rasterize_mode, scene_unit)
-    view = project_view(field.splats, pinhole(camera, pose.to(device), 1), options)
-    return composite_view(view, field.seen_from(view), background.to(device))[0]["rgb"]
+    view = project_view(field.splats, _pinhole(camera, splats.means.device), options)
+    return composite_view(view, field.seen_from(view), background.to(splats.means.device))[0]["rgb"]
+
+
+def _pinhole(camera, device: torch.device) -> Pinhole:
+    return pinhole(camera, camera.camera_to_worlds.reshape(1, 3, 4).to(device), 1)
 
 
 def on_screen(means: Tensor, camera) -> Tensor:
-    """Whether splats' centres [N, 3] lie within SPARKS_EDGE, bool [N]."""
-    pose = camera.camera_to_worlds.reshape(1, *camera.camera_to_worlds.shape[-2:])
-    seen_from = pinhole(camera, pose.to(means.device), 1)
-    viewmat, intrinsics = seen_from.viewmat.reshape(4, 4), seen_from.K.reshape(3, 3)
-    pixels = (means @ viewmat[:3, :3].T + viewmat[:3, 3]) @ intrinsics.T
-    half = pixels.new_tensor((seen_from.width, seen_from.height)) / 2
+    """Mask [N] of splats whose centres [N, 3] lie within SPARKS_EDGE."""
+    seen = _pinhole(camera, means.device)
+    pixels = (means @ seen.viewmat[0, :3, :3].T + seen.viewmat[0, :3, 3]) @ seen.K[0].T
+    half = pixels.new_tensor((seen.width, seen.height)) / 2
     return ((pixels[:, :2] - half * pixels[:, 2:]).abs() <= SPARKS_EDGE * half * pixels[:, 2:]).all(dim=1)
 
 
 def pictures_of_file(model, path: Path, placed: Similarity) -> Callable[[Any], dict[str, Tensor]]:
-    """A function from a camera to the pictures "file", "on_screen" (of the splats within SPARKS_EDGE) and "base" (the
+    """A function from a camera to the images "file", "on_screen" (of the splats within SPARKS_EDGE) and "base" (the
     model's base colours and opacities); `placed` leads from the training's world to the file's."""
     file = placed.inverse.moved(read_splats(path))
-    file = type(file)(*(value.to(model.device) for value in file))
+    file = PlainSplats(*(value.to(model.device) for value in file))
     how = model.background_color, model.config.rasterize_mode, model.scene_unit
 
     def pictures(camera) -> dict[str, Tensor]:
         within = on_screen(file.means, camera)
         return {
             "file": render_splats(file, camera, *how),
-            "on_screen": render_splats(type(file)(*(value[within] for value in file)), camera, *how),
+            "on_screen": render_splats(PlainSplats(*(value[within] for value in file)), camera, *how),
             "base": model.get_base_color(camera),
         }
 

@@ -110,7 +110,7 @@ def load_file(path: Path) -> "NrfgsModel":
         metadata={"scene_unit": decoded.header["head"]["scene_unit"]},
         seed_points=(means, torch.zeros_like(means)),
     )
-    model.load_state_dict(model_state(model, path))
+    model.load_state_dict(model_state(model, decoded))
     model.background_color = torch.tensor(background, dtype=torch.float32)
     model.to("cuda" if torch.cuda.is_available() else "cpu")
     model.update_to_step(config.densification.stop_split_at)

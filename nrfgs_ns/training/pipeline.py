@@ -17,7 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 from torchvision.utils import save_image
 
-from nrfgs_ns.compact.decode import model_state
+from nrfgs_ns.compact.decode import decode, model_state
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.errors import InputError
@@ -112,7 +112,7 @@ class NrfgsPipeline(VanillaPipeline):
         """Load a checkpoint, or the compact file that the configuration names; InputError where it cannot be this
         model's."""
         if self.config.compact is not None:
-            state = model_state(self.model, self.config.compact)
+            state = model_state(self.model, decode(self.config.compact))
             loaded_state = {f"_model.{name}": value for name, value in state.items()}
         if self.test_mode == "val":
             check_same_photographs(self.model.photograph, loaded_state.get("_model.photograph._extra_state"))

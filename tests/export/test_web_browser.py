@@ -30,7 +30,6 @@ from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.export.command import Web
-from nrfgs_ns.export.options import CompactOptions
 from nrfgs_ns.export.web.page import page as page_of
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
@@ -45,8 +44,6 @@ pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e
 ALIKE = 40.0
 """dB between the page's picture and the renderer's."""
 SIZE = (320, 240)
-ALL = CompactOptions(budget=0.0)
-"""Nothing left out but digits: what a budget in dB allows is much, where a training has just begun."""
 MODES = ["full", "base", "residual", "opacity residual"]
 KINDS = {
     "as trained by default": ("classic", {}),
@@ -225,42 +222,32 @@ def demo(tiny_scene, tmp_path_factory):
         "--optimizers.field.optimizer.lr": 0.05,  # something to show after a few steps
     }
     config = trained(command_line("nrfgs", tiny_scene, folder, 80, options))
-    Web(config, output=folder / "page.html", options=ALL).main()
+    Web(config, output=folder / "page.html").main()
     return config, folder / "page.html"
 
 
-def scene_in(path: Path, folder: Path) -> tuple[Path, dict]:
-    """The compact file that a page holds, and what its scripts know."""
-    text = path.read_text(encoding="utf-8")
-    (folder / "held.nrf").write_bytes(base64.b64decode(re.search(r'id="packed"[^>]*>([^<]*)<', text).group(1)))
-    return folder / "held.nrf", json.loads(re.search(r'id="about"[^>]*>([^<]*)<', text).group(1))
-
-
-def assert_like_the_renderer(browser, config: Path, path: Path, folder: Path) -> None:
+def test_a_demo_scene_is_drawn_as_by_the_renderer(demo, browser, tmp_path):
     """Three photographs: the page against the scene in it, and against the model that it was written from."""
-    scene, about = scene_in(path, folder)
-    size = tuple(about["photographs"][0]["size"])
-    page = Page(browser, path.as_uri(), size).begun()
-    cameras = load_model(config, "test")
-    model, cameras = cameras.model, cameras.datamanager.train_dataset.cameras
+    config, path = demo
+    text, scene = path.read_text(encoding="utf-8"), tmp_path / "held.nrf"
+    scene.write_bytes(base64.b64decode(re.search(r'id="packed"[^>]*>([^<]*)<', text).group(1)))
+    about = json.loads(re.search(r'id="about"[^>]*>([^<]*)<', text).group(1))
+    page = Page(browser, path.as_uri(), tuple(about["photographs"][0]["size"])).begun()
+    pipeline = load_model(config, "test")
+    cameras = pipeline.datamanager.train_dataset.cameras
     for index in sorted({about["start"], 0, len(cameras) // 2, len(cameras) - 1})[:3]:
         page.visit(index)
-        picture = page.picture()
-        expected = rendered(scene, about["photographs"][index])
-        assert psnr(picture, expected) >= ALIKE
-        assert psnr(picture, model.get_outputs_for_camera(cameras[index : index + 1])["rgb"]) >= ALIKE
+        picture, photograph = page.picture(), about["photographs"][index]
+        assert psnr(picture, rendered(scene, photograph)) >= ALIKE
+        assert psnr(picture, pipeline.model.get_outputs_for_camera(cameras[index : index + 1])["rgb"]) >= ALIKE
         # What is compared has a residual, of opacity too.
         page.set("show", "opacity residual", "change")
         changes = page.picture()
-        assert psnr(changes, rendered(scene, about["photographs"][index], "opacity residual")) >= ALIKE
+        assert psnr(changes, rendered(scene, photograph, "opacity residual")) >= ALIKE
         assert changes.std() > 0.01
         page.set("show", "full", "change")
     assert not page.errors
     page.page.close()
-
-
-def test_a_demo_scene_is_drawn_as_by_the_renderer(demo, browser, tmp_path):
-    assert_like_the_renderer(browser, *demo, tmp_path)
 
 
 def test_every_control_changes_the_picture(demo, browser):
@@ -426,27 +413,6 @@ def test_a_page_asks_the_network_for_nothing_and_works_in_a_frame(demo, browser,
     page.page.close()
 
 
-def broken_pages(path: Path) -> dict[str, str]:
-    text = path.read_text(encoding="utf-8")
-    at = text.index('id="packed"')
-    middle = at + (len(text) - at) // 2
-    return {
-        "a letter changed": text[:middle] + ("A" if text[middle] != "A" else "B") + text[middle + 1 :],
-        "cut short": text[:middle],
-        "without its scene": text[: text.rindex("<script", 0, at)],
-        "not base64": text[:middle] + "!" + text[middle + 1 :],
-        "of a later version": re.sub(
-            r'(id="packed"[^>]*>)([^<]*)',
-            lambda found: found.group(1) + _with_version(base64.b64decode(found.group(2)), 9),
-            text,
-        ),
-    }
-
-
-def _with_version(scene: bytes, version: int) -> str:
-    return base64.b64encode(scene[:8] + version.to_bytes(4, "little") + scene[12:]).decode()
-
-
 @pytest.mark.parametrize(
     "fault, said",
     {
@@ -458,7 +424,19 @@ def _with_version(scene: bytes, version: int) -> str:
     }.items(),
 )
 def test_a_broken_page_says_so(fault, said, demo, browser, tmp_path):
-    (tmp_path / "broken.html").write_text(broken_pages(demo[1])[fault], encoding="utf-8")
+    text = demo[1].read_text(encoding="utf-8")
+    at = text.index('id="packed"')
+    start, middle = text.index(">", at) + 1, at + (len(text) - at) // 2
+    scene = base64.b64decode(text[start : text.index("<", start)])
+    later = base64.b64encode(scene[:8] + (9).to_bytes(4, "little") + scene[12:]).decode()
+    broken = {
+        "a letter changed": text[:middle] + ("A" if text[middle] != "A" else "B") + text[middle + 1 :],
+        "cut short": text[:middle],
+        "without its scene": text[: text.rindex("<script", 0, at)],
+        "not base64": text[:middle] + "!" + text[middle + 1 :],
+        "of a later version": text[:start] + later + text[text.index("<", start) :],
+    }
+    (tmp_path / "broken.html").write_text(broken[fault], encoding="utf-8")
     page = Page(browser, (tmp_path / "broken.html").as_uri(), (400, 300))
     page.page.wait_for_selector("#failed:not([hidden])")
     assert said in page.page.inner_text("#failed")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small field, and a way through a compact file."""
+"""A small field, a way through a compact file, and splats with harmonics."""
 
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
+from nrfgs_ns.model.harmonics_fit import PlainSplats
 
 
 def field(count: int = 60) -> Field:
@@ -40,3 +41,16 @@ def matched(one: Field, found: dict) -> torch.Tensor:
     rows = torch.cdist(found["means"].double(), one.splats["means"].double()).argmin(dim=1)
     assert len(rows.unique()) == len(rows)
     return rows
+
+
+def plain_splats(count: int) -> PlainSplats:
+    """Splats of a 3DGS file, at random about the origin."""
+    torch.manual_seed(1)
+    return PlainSplats(
+        means=torch.randn(count, 3),
+        quats=torch.nn.functional.normalize(torch.randn(count, 4), dim=-1),
+        scales=torch.randn(count, 3) * 0.3 - 1.5,
+        opacities=torch.randn(count, 1),
+        features_dc=torch.randn(count, 3),
+        features_rest=torch.randn(count, 15, 3) * 0.3,
+    )

@@ -20,7 +20,7 @@ QUIET = {
     "--logging.profiler": "none",
     "--pipeline.model.dense-start": "off",
 }
-"""No viewer, no tables on the console, no evaluation within a thousand steps, and no plane sweep, which takes seconds."""
+"""No viewer, no tables on the console, no evaluation within a thousand steps, no plane sweep, which takes seconds."""
 
 
 def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict[str, Any]) -> list[str]:

@@ -11,7 +11,7 @@ from short_trainings import command_line, trained
 
 from nrfgs_lab.training_run import evaluate, parse
 from nrfgs_ns.export.command import Compact, Ply
-from nrfgs_ns.export.options import CompactOptions, PlyOptions
+from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture
 
@@ -70,8 +70,7 @@ def test_exported_files(tiny_scene, tmp_path):
     scores = evaluate(config, out / "eval.json")
     reports = {}
     Ply(config, output=out / "splats.ply", report=out / "ply.json", options=PlyOptions(steps=8)).main()
-    kept = CompactOptions(budget=0.0)  # so short a training could do without any view-dependent splat
-    Compact(config, output=out / "field.nrf", report=out / "compact.json", options=kept).main()
+    Compact(config, output=out / "field.nrf", report=out / "compact.json").main()
     for kind in ("ply", "compact"):
         reports[kind] = json.loads((out / f"{kind}.json").read_text())
         # The report's mean over the images is ns-eval's, which sums in another order.
@@ -83,7 +82,8 @@ def test_exported_files(tiny_scene, tmp_path):
     worth = ply["psnr_model"] - ply["psnr_base"]
     assert worth > 0.5
     assert abs(ply["loss_db"]) < worth / 3 and abs(compact["loss_db"]) < worth / 3
-    assert compact["view_dependent"] > 0 and compact["ply_ratio"] > 2
+    # Nearly half of so small a file is the network, which all splats share.
+    assert compact["ply_ratio"] > 2
 
 
 def test_every_mode(tiny_scene, tmp_path):

@@ -165,29 +165,6 @@ def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished,
         model.learn_photographs(model.photograph)
 
 
-def test_a_compact_file_is_chosen_by_photographs_with_their_look(finished):
-    """Else the error is that of exposure, and what is left out of the field hardly adds to it."""
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    from nrfgs_ns.compact.slim import FieldViews
-    from nrfgs_ns.export.compact import photographs_of
-
-    _, pipeline, _, _ = eval_setup(finished)
-    model, data = pipeline.model, pipeline.datamanager
-    cameras, chosen, pairs = data.train_dataset.cameras, [0, 5, 9, 13], []
-    for i in chosen:
-        camera = cameras[i : i + 1]
-        view = model.project(camera)
-        with torch.no_grad():
-            taken = model.composite(view, model.field.seen_from(view), photograph=i)[0]["rgb"]
-        pairs.append((camera, {"image": taken}))
-    photographs = photographs_of(model, data.train_dataset.image_filenames, chosen)
-    assert photographs == chosen
-    with_look, without = FieldViews(model, pairs, photographs), FieldViews(model, pairs)
-    assert with_look.psnr(model.field) > 60.0 and without.psnr(model.field) < 40.0
-    assert photographs_of(model, ["other.png"] * 20, chosen) == [None] * 4
-
-
 def test_what_is_behind_a_cut_out_photograph_is_exposed_with_it(tiny_scene, tmp_path):
     words = command_line("nrfgs-sh", tiny_scene, tmp_path, 1, QUICK, {"--pipeline.model.photographs": "on"})
     model = parse(words).pipeline.setup(device="cpu", test_mode="val").model.train()

@@ -17,7 +17,7 @@ at its largest, 1. A splat's largest change over the views is measured in steps 
 cannot, by itself, turn a pixel's byte by more than rounding does.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -89,12 +89,10 @@ class FieldViews:
     Args:
         model: in evaluation mode.
         views: pairs of a camera and its batch; at least one.
-        photographs: index of each view among the photographs whose exposure the model has learnt; None: the mean.
     """
 
-    def __init__(self, model, views: list, photographs: Sequence[int | None] | None = None):
+    def __init__(self, model, views: list):
         self.model, self.views = model, []
-        self.photographs = [None] * len(views) if photographs is None else photographs
         for camera, batch in views:
             with torch.no_grad():
                 view = model.project(camera.to(model.device))
@@ -105,8 +103,8 @@ class FieldViews:
     def psnr(self, field: Field) -> float:
         """Mean over the views, inside masks, dB; views whose mask is empty are left out."""
         scores = []
-        for (view, truth, mask), photograph in zip(self.views, self.photographs, strict=True):
-            outputs, _ = self.model.composite(view, field.seen_from(view), photograph=photograph)
+        for view, truth, mask in self.views:
+            outputs, _ = self.model.composite(view, field.seen_from(view))
             scores.append(psnr(outputs["rgb"], truth, mask))
         scores = [score for score in scores if score is not None]
         return sum(scores) / max(len(scores), 1)
@@ -127,15 +125,12 @@ class Slimmed(NamedTuple):
     """numbers in a latent"""
 
 
-def slim(
-    field: Field, seen: Residuals, views: FieldViews, lowest_psnr: float, on_trial: Callable[[str], None]
-) -> Slimmed:
+def slim(field: Field, seen: Residuals, views: FieldViews, lowest_psnr: float) -> Slimmed:
     """The smallest field that keeps a PSNR on the views, dB: first the largest of THRESHOLDS within its share of the
-    allowed loss, then the lowest rank for the other splats. `on_trial` is called with the name of each candidate."""
+    allowed loss, then the lowest rank for the other splats."""
     enough = lowest_psnr + (1 - SHARE_FOR_RESIDUALS) * (views.psnr(field) - lowest_psnr)
     threshold = 0.0
     for candidate in reversed(THRESHOLDS):
-        on_trial(f"residuals below {candidate:g} steps")
         smaller = dropped(field, seen, candidate)
         if views.psnr(smaller) >= enough:
             field, threshold = smaller, candidate
@@ -144,7 +139,6 @@ def slim(
     low, rank = 1, field.head.config.latent_dim
     while low < rank:  # the loss falls with the rank, except for rounding: halve the interval
         middle = (low + rank) // 2
-        on_trial(f"latent rank {middle}")
         enough = views.psnr(with_rank(field, basis, middle)) >= lowest_psnr
         low, rank = (low, middle) if enough else (middle + 1, rank)
     whole = rank == field.head.config.latent_dim
