@@ -34,7 +34,7 @@ def test_a_killed_process_is_named_and_the_checkpoint_shown(config):
     (config.get_checkpoint_dir() / "step-000000010.ckpt").touch()
     said = launch.explain(error, config)
     assert "process of device 1 of 2 was killed by SIGKILL. Out of memory" in said
-    assert "step-000000010.ckpt, whole; with --load-dir" in said
+    assert "step-000000010.ckpt; with --load-dir" in said
 
 
 def test_of_a_failed_process_the_error_is_shown_without_its_traceback(config):
