@@ -14,7 +14,16 @@ from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.options import CompactOptions, PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.rasterizer import composite
-from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture
+from nrfgs_ns.viewer.pictures import (
+    AMPLIFICATION,
+    BASE,
+    DEPTH,
+    FULL,
+    VIEW_DEPENDENCE,
+    PictureOptions,
+    legends,
+    picture,
+)
 
 pytestmark = [
     pytest.mark.gpu,
@@ -49,7 +58,8 @@ def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tens
     """The picture of every mode, and one whose view is frozen, on the CPU; what each must be is checked."""
     model, cameras = model_with_something_to_show(device, scene, out)
     camera, elsewhere = cameras[0:1], cameras[4:5].camera_to_worlds[0, :3, 3]
-    shown = {mode: Shown(mode) for mode in modes(model.field)} | {FROZEN: Shown(frozen_center=elsewhere)}
+    shown = {mode: PictureOptions(mode) for mode in legends(model.field)}
+    shown[FROZEN] = PictureOptions(frozen_center=elsewhere)
     pictures = {}
     for name, what in shown.items():
         pictures[name] = picture(model, camera, what)["rgb"]
