@@ -25,17 +25,11 @@ def agree(name, ours, theirs) -> None:
 
 
 @pytest.fixture(params=["plain", "rich"])
-def results(request, step_results):
+def results(request, two_devices):
     """(device 0, device 1, one process) of a step: `plain` is splatfacto's densification with absgrad and the largest
     changes of opacity; `rich` has antialiasing, learnt poses, bilateral grids, and losses over splats (MCMC's, aspect
     ratios). The two cameras differ in size."""
-    read = lambda who: torch.load(step_results / f"{request.param}-{who}.pt")  # noqa: E731
-    return read(0), read(1), read("alone")
-
-
-def dealt(ours: dict, theirs: dict, name: str):
-    """Each device's rows and those of one process that they are: dealt out in turn."""
-    return [(part[name], theirs[name][rank::2]) for rank, part in enumerate(ours)]
+    return tuple(torch.load(two_devices / f"{request.param}-{who}.pt") for who in (0, 1, "alone"))
 
 
 def test_every_device_renders_its_own_camera(results):
