@@ -103,20 +103,20 @@ def picture(
             outputs["rgb"] = exposed(outputs["rgb"], options.stops)
         return outputs
 
+    accumulation, behind = outputs["accumulation"], outputs["background"]
     if options.mode == DEPTH:
-        share = scaled_depth(outputs["depth"], outputs["accumulation"])
+        share = scaled_depth(outputs["depth"], accumulation)
     elif options.mode == VIEW_DEPENDENCE:
-        deviation = view_dependence(field, view)
-        share = _blend(view, deviation / FULL_DEVIATION, appearance.opacities, outputs["accumulation"])
+        share = _blend(view, view_dependence(field, view) / FULL_DEVIATION, appearance.opacities, accumulation)
     else:
         component = field.components_of(view)[options.mode]
         if component.kind != "weight":
             axis = 1.0 if component.kind == "color" else component.values.new_tensor(OPACITY_AXIS)
             drawn = GREY + AMPLIFICATION * options.gain * component.values * axis
-            outputs["rgb"] = _over_grey(view, drawn, appearance.opacities, outputs["accumulation"])
+            render, _, _ = composite(view.projection, drawn, appearance.opacities)
+            outputs["rgb"] = (render[0] + (1 - accumulation) * GREY).clamp(0.0, 1.0)
             return outputs
-        share = _blend(view, component.values, appearance.opacities, outputs["accumulation"])
-    accumulation, behind = outputs["accumulation"], outputs["background"]
+        share = _blend(view, component.values, appearance.opacities, accumulation)
     outputs["rgb"] = accumulation * apply_float_colormap(share.clamp(0.0, 1.0), "viridis") + (1 - accumulation) * behind
     return outputs
 
@@ -163,12 +163,6 @@ def scaled_depth(depth: Tensor, accumulation: Tensor) -> Tensor:
     ranked = solid.sort().values  # torch.quantile refuses more than 16 million numbers
     near, far = ranked[0], ranked[int(FAR_QUANTILE * (len(ranked) - 1))]
     return ((depth - near) / (far - near).clamp_min(1e-10)).clamp(0.0, 1.0)
-
-
-def _over_grey(view: "View", colors: Tensor, opacities: Tensor, accumulation: Tensor) -> Tensor:
-    """Blend signed colours [M, 3] over grey, [H, W, 3] in [0, 1]."""
-    render, _, _ = composite(view.projection, colors, opacities)
-    return (render[0] + (1 - accumulation) * GREY).clamp(0.0, 1.0)
 
 
 def _blend(view: "View", values: Tensor, opacities: Tensor, accumulation: Tensor) -> Tensor:

@@ -51,13 +51,14 @@ FIELD = ["residual", "low branch", "high branch", "gate weight", "opacity residu
 """What the default field shows of itself."""
 
 
-@pytest.fixture
-def build(tiny_scene, tmp_path):
+@pytest.fixture(scope="module")
+def build(tiny_scene, tmp_path_factory):
     """Pipeline of a method whose head has learnt something: random output layers and latents, or harmonics; and
     opacities at which a pixel shows few splats."""
 
     def pipeline(method="nrfgs", *options):
-        config = parse([method, "--data", str(tiny_scene), "--output-dir", str(tmp_path), *map(str, options)])
+        out = tmp_path_factory.mktemp("out")
+        config = parse([method, "--data", str(tiny_scene), "--output-dir", str(out), *map(str, options)])
         config.pipeline.model.few_views = "off"
         torch.manual_seed(0)
         pipeline = config.pipeline.setup(device="cpu", test_mode="val")
@@ -79,6 +80,13 @@ def two_cameras(pipeline):
     """Two training cameras that see the scene from different sides."""
     cameras = pipeline.datamanager.train_dataset.cameras
     return cameras[0:1], cameras[4:5]
+
+
+@pytest.fixture(scope="module")
+def scene(build):
+    """A model, and two cameras."""
+    pipeline = build()
+    return pipeline.model, *two_cameras(pipeline)
 
 
 def test_a_head_offers_what_it_has():
@@ -112,9 +120,8 @@ def test_every_mode_is_a_picture_of_its_own(build, method):
         assert (pictures[one] - pictures[other]).abs().mean() > 1 / 255, (one, other)
 
 
-def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(build):
-    pipeline = build()
-    model, (camera, _) = pipeline.model, two_cameras(pipeline)
+def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(scene):
+    model, camera, _ = scene
     assert torch.equal(picture(model, camera, PictureOptions(gain=0.0))["rgb"], model.get_base_color(camera))
     assert torch.equal(picture(model, camera, PictureOptions(BASE, gain=2.0))["rgb"], model.get_base_color(camera))
     assert torch.equal(picture(model, camera, PictureOptions(gain=1.0))["rgb"], model.get_outputs(camera)["rgb"])
@@ -129,10 +136,9 @@ def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(build):
 
 
 @pytest.mark.parametrize("mode", ["residual", "low branch", "high branch", "opacity residual"])
-def test_gain_scales_what_it_shows(build, mode):
+def test_gain_scales_what_it_shows(scene, mode):
     """Without any gain a change is grey, where the splats are as where they are not."""
-    pipeline = build()
-    model, (camera, _) = pipeline.model, two_cameras(pipeline)
+    model, camera, _ = scene
     # alpha + (1 - alpha), summed over at most 300 splats
     grey = picture(model, camera, PictureOptions(mode, gain=0.0))["rgb"]
     assert_close(grey, torch.full_like(grey, 0.5), rtol=0, atol=300 * 2**-24)
@@ -140,9 +146,8 @@ def test_gain_scales_what_it_shows(build, mode):
     assert half.abs().mean() < whole.abs().mean()
 
 
-def test_frozen_view_is_the_head_seen_from_elsewhere(build):
-    pipeline = build()
-    model, (here, there) = pipeline.model, two_cameras(pipeline)
+def test_frozen_view_is_the_head_seen_from_elsewhere(scene):
+    model, here, there = scene
     center = model.project(there).center
     view = model.project(here)
     expected = model.composite(view, model.field.seen_from(view._replace(center=center)))[0]["rgb"]
