@@ -5,7 +5,7 @@
 
     python -m nrfgs_ns.distributed.launch METHOD --machine.num-devices 2 --machine.device-type cpu ...
 
-starts them, with gloo between them. It takes the same options, and works on GPUs too.
+starts them, with gloo between them. It takes the same options, and works on the GPUs of one machine, too.
 
 When a process dies, its parent, nerfstudio's or ours, sees it at once and ends the others. On other machines the
 connection breaks, or the wait ends after `TIMEOUT`.
@@ -74,7 +74,8 @@ def check_devices(config: TrainerConfig) -> None:
 def explain(error: mp.ProcessExitedException | mp.ProcessRaisedException, config: TrainerConfig) -> str:
     """What happened to a process, and how to go on."""
     machine = config.machine
-    device, total = machine.machine_rank * machine.num_devices + error.error_index, world_of(config)
+    device = machine.machine_rank * machine.num_devices + error.error_index
+    total = machine.num_devices * machine.num_machines
     if isinstance(error, mp.ProcessRaisedException):
         what = "failed:\n" + re.split(r"\n  File .*\n(?:    .*\n)*", str(error).rstrip())[-1]  # without its traceback
     elif error.signal_name:
@@ -97,17 +98,15 @@ def launch(config: TrainerConfig) -> None:
         config: of the training, whose config.yml has been saved.
 
     Raises:
-        InputError: this machine has fewer GPUs, or several machines have no address to meet at.
+        InputError: this machine has fewer GPUs, or several machines are asked for.
         DeviceLost: a process has ended before its time; the others have been ended.
         SystemExit: the training was asked to stop; its state has been written.
     """
     check_devices(config)
     machine = config.machine
-    url = machine.dist_url
-    if url == "auto":
-        if machine.num_machines > 1:
-            raise InputError("machine.dist_url is 'auto', but several machines need one address: tcp://HOST:PORT.")
-        url = f"tcp://127.0.0.1:{free_port()}"
+    if machine.num_machines > 1:
+        raise InputError(f"machine.num_machines is {machine.num_machines}; only ns-train trains on several machines.")
+    url = f"tcp://127.0.0.1:{free_port()}"
     context = mp.spawn(work, args=(config, url), nprocs=machine.num_devices, join=False)
     request, is_passed_on = StopRequest(quiet=True), False
     try:
@@ -131,32 +130,22 @@ def launch(config: TrainerConfig) -> None:
         profiler.flush_profiler(config.logging)
 
 
-def world_of(config: TrainerConfig) -> int:
-    """Number of devices of all machines."""
-    return config.machine.num_devices * config.machine.num_machines
-
-
-def work(local_rank: int, config: TrainerConfig, url: str) -> None:
+def work(rank: int, config: TrainerConfig, url: str) -> None:
     """What one process does."""
-    machine, world = config.machine, world_of(config)
-    rank = machine.machine_rank * machine.num_devices + local_rank
-    join_group(rank, world, url, machine.device_type, machine.num_devices)
-    train_loop(local_rank, world, config, rank)
+    machine = config.machine
+    join_group(rank, machine.num_devices, url, machine.device_type)
+    train_loop(rank, machine.num_devices, config, rank)
     comms.synchronize()
     dist.destroy_process_group()
 
 
-def join_group(rank: int, world: int, url: str, device_type: str, per_machine: int | None = None) -> None:
-    """Meet the other processes, `per_machine` on each machine (None: there is one): NCCL on "cuda", gloo on "cpu"."""
-    per_machine = per_machine or world
+def join_group(rank: int, world: int, url: str, device_type: str) -> None:
+    """Meet the other processes of this machine: NCCL on "cuda", gloo on "cpu"."""
     if device_type == "cuda":
-        torch.cuda.set_device(rank % per_machine)
+        torch.cuda.set_device(rank)
     backend = "nccl" if device_type == "cuda" else "gloo"
     dist.init_process_group(backend, init_method=url, world_size=world, rank=rank, timeout=TIMEOUT)
-    for first in range(0, world, per_machine):
-        group = dist.new_group(list(range(first, first + per_machine)))
-        if first <= rank < first + per_machine:
-            comms.LOCAL_PROCESS_GROUP = group
+    comms.LOCAL_PROCESS_GROUP = dist.new_group()
 
 
 def free_port() -> int:

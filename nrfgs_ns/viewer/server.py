@@ -181,11 +181,12 @@ class GuardedServer(infra.WebsockServer):
         root = self._http_server_root.resolve()
         try:
             path = path.partition("?")[0]
-            asked = (root / path.removeprefix("/")).resolve()
-            found = path == "/" or (asked.is_relative_to(root) and asked.is_file())
+            file = (root / path.removeprefix("/")).resolve()
+            if path == "/" or (file.is_relative_to(root) and file.is_file()):
+                return None
         except (OSError, ValueError):  # too long, or not a path
-            found = False
-        return None if found else (HTTPStatus.NOT_FOUND, {}, b"404")
+            pass
+        return HTTPStatus.NOT_FOUND, {}, b"404"
 
     def _known(self, host: str) -> bool:
         """Whether a Host header names this server. Every address does: no name server can redirect one."""

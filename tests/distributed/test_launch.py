@@ -46,7 +46,7 @@ def test_what_cannot_start_is_refused_before_it_does(config, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(InputError, match="num_devices is 2, but this machine shows 1"):
         launch.prepare(replace(config, machine=replace(config.machine, device_type="cuda")))
-    with pytest.raises(InputError, match="dist_url"):
+    with pytest.raises(InputError, match="num_machines is 2"):
         launch.launch(replace(config, machine=replace(config.machine, num_machines=2)))
 
 
