@@ -38,7 +38,7 @@ SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)
 LEFT_OUT = (
     *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
     *("pipeline.model.appearance.distance-eps", "load-3D-points"),
-    *("viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact", "pipeline.sharding.schedules"),
+    *("viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact"),
 )
 """Options that few need, or that another page explains: `--help` has them."""
 HOST = "`--data`, `--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"

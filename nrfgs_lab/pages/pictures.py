@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 
 from nrfgs_lab.bench.crops import GAP, TITLE
 from nrfgs_lab.pages.browser import TRAIN, VIEWER, Page, Served, chromium
-from nrfgs_ns.viewer.pictures import Shown, modes, picture
+from nrfgs_ns.viewer.pictures import PictureOptions, legends, picture
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 WINDOW = 1180, 680
@@ -30,13 +30,13 @@ def viewer(config: Path, view: int = 1) -> None:
     _, pipeline, _, _ = eval_setup(config, test_mode="test")
     model = pipeline.model
     camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[view]
-    names = modes(model.field)
+    names = list(legends(model.field))
     height = round(WIDTH * camera.height.item() / camera.width.item())
     rows = -(-len(names) // COLUMNS)
     sheet = Image.new("RGB", (COLUMNS * (WIDTH + GAP) - GAP, rows * (TITLE + height + GAP) - GAP), "white")
     for i, name in enumerate(names):
         x, y = i % COLUMNS * (WIDTH + GAP), i // COLUMNS * (TITLE + height + GAP)
-        pixels = (255 * picture(model, camera, Shown(name))["rgb"]).round().byte().cpu().numpy()
+        pixels = (255 * picture(model, camera, PictureOptions(name))["rgb"]).round().byte().cpu().numpy()
         ImageDraw.Draw(sheet).text((x + 2, y + 3), name, fill="black")
         sheet.paste(Image.fromarray(pixels).resize((WIDTH, height), Image.Resampling.LANCZOS), (x, y + TITLE))
     sheet.save(IMAGES / "viewer-modes.jpg", quality=88)

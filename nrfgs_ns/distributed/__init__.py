@@ -3,15 +3,14 @@
 
 With W devices, a step is the step of one process on the mean of the losses of W cameras:
 
-1. Every device knows the cameras of all (`NrfgsDatamanager.next_train_views`: one order, drawn alike everywhere).
+1. Every device knows the cameras of all (`NrfgsDatamanager.next_train_views`: the same order everywhere).
 2. It projects its own splats into all of them, and asks the head about each (camera, visible splat) pair (`model.py`).
 3. What was projected travels to the device whose camera it was for (`exchange.py`), which blends it into an image and
    compares that with the photograph. Gradients travel back the same way, and with them what densification needs.
 4. Each device divides its loss by W. Gradients of a splat then arrive where it lives, complete; gradients of what all
    devices have (the head's shared weights, camera poses, bilateral grids) are partial, and summed (`trainer.py`).
 
-Densification, pruning, resets and Adam are the single device's, on the shard alone. `shards.py` cuts tables of splats
-up, moves rows when shards drift apart, and puts them together for checkpoints, which are those of one device.
-
-`comm.py` is all that talks to torch.distributed: NCCL on GPUs, gloo on CPUs, the same calls.
+Densification, pruning, resets and Adam are those of one device, on the shard alone. `shards.py` cuts tables of splats
+up, moves rows when shards drift apart, and puts them together for checkpoints, which are those of one device. Messages
+(`comm.py`) go by NCCL on GPUs and gloo on CPUs.
 """

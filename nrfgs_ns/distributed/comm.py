@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the devices say to each other. Every function here must be called on all of them, in the same order.
+"""Messages between devices. Every function here must be called on all of them, in the same order.
 
-gsplat has such functions too (`gsplat.distributed`), which serve NCCL alone: `all_gather_int32` insists on CUDA, and
-`all_to_all_tensor_list` is built on lists of tensors, which gloo does not exchange; it also divides by the number of
-rows, which is zero where a camera sees none of a device's splats, and its backward pass has no room for gsplat's
-`absgrad`. `dist.all_to_all_single`, which both back ends have, needs none of that.
+gsplat has such functions too (`gsplat.distributed`), but for NCCL alone; they also divide by the number of rows, which
+is zero where a camera sees none of a device's splats, and their backward pass has no room for gsplat's `absgrad`.
 """
 
 from typing import Any
@@ -14,11 +12,11 @@ import torch.distributed as dist
 from torch import Tensor
 
 ROWS_AT_ONCE = 2**18
-"""Rows of a device that are gathered at a time: what the main device needs beside its shard stays small."""
+"""Rows of a device gathered at a time, which bounds what the main device needs beside its shard."""
 
 
 def rank() -> int:
-    """This device's number among all, from 0. Device 0 is the main one."""
+    """This device's number, from 0. Device 0 is the main one."""
     return dist.get_rank()
 
 
@@ -32,8 +30,7 @@ def swap(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
 
     Args:
         rows: [M, ...], those for device 0 first.
-        sent: how many rows go to each device, [W], M in all.
-        received: how many rows come from each device, [W].
+        sent, received: rows that go to, and come from, each device, [W].
 
     Returns:
         The rows that have arrived, those of device 0 first, [sum(received), ...].
@@ -44,14 +41,8 @@ def swap(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
 
 
 def swap_counts(counts: Tensor) -> tuple[list[int], list[int]]:
-    """Tell each device how many rows it will get.
-
-    Args:
-        counts: how many go to each device, int64 [W].
-
-    Returns:
-        `counts`, and how many come from each device. The host waits for both.
-    """
+    """Tell each device how many rows it will get, given those that go to each, int64 [W]. Returns both numbers; the
+    host waits for them."""
     received = torch.empty_like(counts)
     dist.all_to_all_single(received, counts)
     return tuple(torch.stack([counts, received]).tolist())
@@ -72,31 +63,26 @@ def gather_objects(value: Any) -> list[Any]:
 
 
 def gather_rows(rows: Tensor, counts: list[int]) -> Tensor | None:
-    """Put a table together on the main device's host.
+    """A whole table on the main device's host, rows of device 0 first; None on the other devices.
 
     Args:
         rows: this device's part [N, ...].
         counts: every device's N.
-
-    Returns:
-        All rows, those of device 0 first, on the CPU; None on the other devices.
     """
     main = rank() == 0
     parts: list[list[Tensor]] = [[] for _ in counts]
-    for begin in range(0, max(counts), ROWS_AT_ONCE):
+    for begin in range(0, max(*counts, 1), ROWS_AT_ONCE):
         block = rows[begin : begin + ROWS_AT_ONCE]
         received = [min(max(count - begin, 0), ROWS_AT_ONCE) if main else 0 for count in counts]
         arrived = swap(block, [len(block)] + [0] * (len(counts) - 1), received)
         if main:
             for part, piece in zip(parts, arrived.cpu().split(received), strict=True):
                 part.append(piece)
-    if not main:
-        return None
-    return torch.cat([piece for part in parts for piece in part]) if max(counts) else rows.cpu()
+    return torch.cat([piece for part in parts for piece in part]) if main else None
 
 
 def sum_over_devices(tensors: list[Tensor]) -> None:
-    """Replace each tensor by its sum over the devices, all in one message. Every device must have the same shapes."""
+    """Replace each tensor by its sum over the devices, all in one message. Shapes are the same on all devices."""
     if not tensors:
         return
     flat = torch.cat([tensor.reshape(-1) for tensor in tensors])

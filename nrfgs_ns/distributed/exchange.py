@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projected splats travel to the device that owns the camera; gradients travel back.
 
-What is sent of a (camera, visible splat) pair is what the compositor needs: place, shape, depth, radius, opacity and
-colour, eleven numbers in one row of one message. Autograd carries the gradient of each number back to the row that it
-came from, with one exception: `absgrad`, the sum over pixels of |dL/dmean2d| that some densifications go by. The
-compositor leaves it beside the gradients, on the device of the camera, and it is sent along with them.
+Each (camera, visible splat) pair is one row of eleven numbers: place, shape, depth, radius, opacity and colour.
+Autograd carries the gradient of each number back to the row that it came from, except `absgrad`, the sum over pixels of
+|dL/dmean2d| that some densifications use. The compositor leaves it beside the gradients, on the camera's device, and it
+is sent along with them.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from nrfgs_ns.distributed import comm
 from nrfgs_ns.rasterizer import Projection
 
 COLUMNS = {"means2d": 2, "conics": 3, "depths": 1, "opacities": 1, "radii": 1, "colors": 3}
-"""Numbers of a row, in this order. Radii travel as floating point, exact up to 2^24 pixels."""
+"""Columns of a row, in this order. Radii travel as floating point, exact up to 2^24 pixels."""
 
 
 @dataclass
@@ -27,7 +27,7 @@ class AbsgradPost:
     owned: Tensor
     """means2d as projected on the device of the splats, [M, 2]"""
     arrived: Tensor | None = None
-    """means2d as the compositor got it, on the device of the camera; let go of by the backward pass"""
+    """means2d as the compositor got it, on the device of the camera; released by the backward pass"""
 
 
 class _Swap(torch.autograd.Function):
@@ -55,7 +55,7 @@ class _Swap(torch.autograd.Function):
 def send_to_cameras(
     projection: Projection, appearance: SplatAppearance, width: int, height: int, absgrad: bool
 ) -> tuple[Projection, SplatAppearance]:
-    """Give each camera's device what this device's splats look like from there, and take what others have for ours.
+    """Send each camera's device what this device's splats look like from there, and receive what others see from ours.
 
     Args:
         projection: this device's splats in all W cameras, camera i being that of device i; M rows.
@@ -99,21 +99,3 @@ def send_to_cameras(
         n_cameras=1,
     )
     return own, SplatAppearance(colors.contiguous(), opacities.squeeze(1).contiguous())
-
-
-class _ScaleGradient(torch.autograd.Function):
-    """The value as it is, its gradient times a factor."""
-
-    @staticmethod
-    def forward(ctx, value: Tensor, factor: float) -> Tensor:
-        ctx.factor = factor
-        return value.view_as(value)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor):
-        return gradient * ctx.factor, None
-
-
-def scale_gradient(value: Tensor, factor: float) -> Tensor:
-    """`value`, whose gradient is multiplied by `factor`: a loss that is logged whole and learnt from in part."""
-    return _ScaleGradient.apply(value, factor)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several processes for one training, and what is said when one of them is lost.
 
-`ns-train METHOD --machine.num-devices N` starts one process for each GPU by itself. On CPUs it refuses to; there
+`ns-train METHOD --machine.num-devices N` starts a process for each GPU, but refuses to on CPUs. There
 
     python -m nrfgs_ns.distributed.launch METHOD --machine.num-devices 2 --machine.device-type cpu ...
 
-starts them, with gloo between them. It takes the same options, and works on GPUs too.
+starts them, with gloo between them. It takes the same options, and works on the GPUs of one machine, too.
 
-When a process dies, the others would wait for it. The parent, nerfstudio's or ours, sees it at once and ends them. On
-other machines the connection breaks, or the time limit of `TIMEOUT` ends the wait.
+When a process dies, its parent, nerfstudio's or ours, sees it at once and ends the others. On other machines the
+connection breaks, or the wait ends after `TIMEOUT`.
 """
 
 import re
@@ -19,15 +19,13 @@ from datetime import timedelta
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
-import tyro
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import train_loop
 from nerfstudio.utils import comms, profiler
-from torch.multiprocessing import ProcessExitedException
 
 from nrfgs_ns.errors import ForTheUser, InputError
 from nrfgs_ns.training.stopping import SIGNALS, StopRequest, heard_signals
+from nrfgs_ns.training.trainer_config import parse
 
 TIMEOUT = timedelta(minutes=30)
 """Longest that a device waits for another: nerfstudio's. The main device may evaluate or write for a while."""
@@ -38,13 +36,12 @@ class DeviceLost(ForTheUser, RuntimeError):
 
 
 def prepare(config: TrainerConfig) -> None:
-    """Called by the parent process before it starts the others.
+    """Called by `ns-train` before it starts the processes, whose errors it would print with two tracebacks.
 
     Raises:
-        InputError: this machine has fewer GPUs than the training asks for.
+        InputError: the devices are CPUs, or this machine has fewer GPUs than the training asks for.
     """
-    machine = config.machine
-    if machine.device_type == "cpu":
+    if config.machine.device_type == "cpu":
         raise InputError(
             "ns-train starts several processes on GPUs only. On CPUs use python -m nrfgs_ns.distributed.launch with "
             "the same options."
@@ -64,76 +61,63 @@ def prepare(config: TrainerConfig) -> None:
 
 
 def was_asked_to(error: BaseException) -> bool:
-    """Whether a process has ended because of a signal that it had heard, and has said so (`training.stopping`)."""
-    return isinstance(error, ProcessExitedException) and error.exit_code in [128 + one for one in SIGNALS]
+    """Whether a process ended because of a signal that it heard, and said so (`training.stopping`)."""
+    return isinstance(error, mp.ProcessExitedException) and error.exit_code in [128 + number for number in SIGNALS]
 
 
 def check_devices(config: TrainerConfig) -> None:
-    """Raise InputError where this machine has fewer GPUs than are asked for."""
-    asked = config.machine.num_devices
-    if config.machine.device_type == "cuda" and torch.cuda.device_count() < asked:
-        raise InputError(f"machine.num_devices is {asked}, but this machine shows {torch.cuda.device_count()} GPUs.")
+    wanted, present = config.machine.num_devices, torch.cuda.device_count()
+    if config.machine.device_type == "cuda" and present < wanted:
+        raise InputError(f"machine.num_devices is {wanted}, but this machine shows {present} GPUs.")
 
 
-def explain(error: Exception, config: TrainerConfig) -> str:
+def explain(error: mp.ProcessExitedException | mp.ProcessRaisedException, config: TrainerConfig) -> str:
     """What happened to a process, and how to go on."""
     machine = config.machine
     device = machine.machine_rank * machine.num_devices + error.error_index
-    if isinstance(error, ProcessExitedException):
-        what = f"was killed by {error.signal_name}." if error.signal_name else f"ended with code {error.exit_code}."
+    total = machine.num_devices * machine.num_machines
+    if isinstance(error, mp.ProcessRaisedException):
+        what = "failed:\n" + re.split(r"\n  File .*\n(?:    .*\n)*", str(error).rstrip())[-1]  # without its traceback
+    elif error.signal_name:
         why = " Out of memory on the host is a common reason." if error.signal_name == "SIGKILL" else ""
+        what = f"was killed by {error.signal_name}.{why}"
     else:
-        what, why = "failed:", "\n" + _last_error(str(error))
+        what = f"ended with code {error.exit_code}."
     folder = config.get_checkpoint_dir()
     last = max(folder.glob("step-*.ckpt"), default=None)
-    rest = (
-        f"The last checkpoint is {last}, whole; with --load-dir {folder} training goes on from it, on any number of "
-        "devices."
-        if last
-        else "This training has written no checkpoint."
-    )
-    total = machine.num_devices * machine.num_machines
-    return f"Training stopped: the process of device {device} of {total} {what}{why}\nThe others were ended. {rest}"
+    rest = "This training has written no checkpoint."
+    if last:
+        rest = f"The last checkpoint is {last}; with --load-dir {folder} it goes on, on any number of devices."
+    return f"Training stopped: the process of device {device} of {total} {what}\nThe others were ended. {rest}"
 
 
-def _last_error(report: str) -> str:
-    """The exception and its message, without the traceback, of torch.multiprocessing's report."""
-    lines = report.rstrip().splitlines()
-    starts = [
-        at for at, line in enumerate(lines) if re.match(r"[A-Za-z_][\w.]*(Error|Exception|Stopped|Interrupt)\b", line)
-    ]
-    return "\n".join(lines[starts[-1] :] if starts else lines[-1:])
-
-
-def launch(config: TrainerConfig, timeout: timedelta = TIMEOUT) -> None:
+def launch(config: TrainerConfig) -> None:
     """Run a training as `ns-train` would, on `machine.num_devices` processes of this machine.
 
     Args:
         config: of the training, whose config.yml has been saved.
 
     Raises:
-        InputError: this machine has fewer GPUs, or several machines have no address to meet at.
+        InputError: this machine has fewer GPUs, or several machines are asked for.
         DeviceLost: a process has ended before its time; the others have been ended.
         SystemExit: the training was asked to stop; its state has been written.
     """
     check_devices(config)
     machine = config.machine
-    url = machine.dist_url
-    if url == "auto":
-        if machine.num_machines > 1:
-            raise InputError("machine.dist_url is 'auto', but several machines need one address: tcp://HOST:PORT.")
-        url = f"tcp://127.0.0.1:{free_port()}"
-    context = mp.spawn(work, args=(config, url, timeout), nprocs=machine.num_devices, join=False)
+    if machine.num_machines > 1:
+        raise InputError(f"machine.num_machines is {machine.num_machines}; only ns-train trains on several machines.")
+    url = f"tcp://127.0.0.1:{free_port()}"
+    context = mp.spawn(work, args=(config, url), nprocs=machine.num_devices, join=False)
     request, is_passed_on = StopRequest(quiet=True), False
     try:
         with heard_signals(request):
             while not context.join(timeout=0.2):
                 if request.signal is not None and not is_passed_on:
-                    for process in context.processes:  # those that have heard it from the terminal take no notice
+                    for process in context.processes:  # one that has heard it from the terminal ignores a second
                         process.terminate()
                     is_passed_on = True
     except (mp.ProcessExitedException, mp.ProcessRaisedException) as error:
-        # What is passed on ends a process that has just stopped by itself, and listens no longer.
+        # A process that has just stopped by itself no longer listens, and the signal that is passed on ends it.
         is_ours = is_passed_on and getattr(error, "signal_name", None) == "SIGTERM"
         if was_asked_to(error) or is_ours:
             raise SystemExit(request.exit_status or error.exit_code) from None
@@ -146,30 +130,22 @@ def launch(config: TrainerConfig, timeout: timedelta = TIMEOUT) -> None:
         profiler.flush_profiler(config.logging)
 
 
-def work(local_rank: int, config: TrainerConfig, url: str, timeout: timedelta) -> None:
+def work(rank: int, config: TrainerConfig, url: str) -> None:
     """What one process does."""
     machine = config.machine
-    world = machine.num_devices * machine.num_machines
-    rank = machine.machine_rank * machine.num_devices + local_rank
-    join_group(rank, world, url, machine.device_type, timeout, machine.num_devices)
-    train_loop(local_rank, world, config, rank)
+    join_group(rank, machine.num_devices, url, machine.device_type)
+    train_loop(rank, machine.num_devices, config, rank)
     comms.synchronize()
     dist.destroy_process_group()
 
 
-def join_group(
-    rank: int, world: int, url: str, device_type: str, timeout: timedelta = TIMEOUT, per_machine: int | None = None
-) -> None:
-    """Meet the other processes, `per_machine` on each machine (None: there is one): NCCL on "cuda", gloo on "cpu"."""
-    per_machine = per_machine or world
+def join_group(rank: int, world: int, url: str, device_type: str) -> None:
+    """Meet the other processes of this machine: NCCL on "cuda", gloo on "cpu"."""
     if device_type == "cuda":
-        torch.cuda.set_device(rank % per_machine)
+        torch.cuda.set_device(rank)
     backend = "nccl" if device_type == "cuda" else "gloo"
-    dist.init_process_group(backend, init_method=url, world_size=world, rank=rank, timeout=timeout)
-    for first in range(0, world, per_machine):
-        group = dist.new_group(list(range(first, first + per_machine)))
-        if first <= rank < first + per_machine:
-            comms.LOCAL_PROCESS_GROUP = group
+    dist.init_process_group(backend, init_method=url, world_size=world, rank=rank, timeout=TIMEOUT)
+    comms.LOCAL_PROCESS_GROUP = dist.new_group()
 
 
 def free_port() -> int:
@@ -179,11 +155,8 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def main(args: list[str] | None = None) -> None:
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=args)
-    if config.data:
-        config.pipeline.datamanager.data = config.data
-    config.set_timestamp()
+def main() -> None:
+    config = parse(sys.argv[1:])
     config.save_config()
     launch(config)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model on one of several devices: a shard of the splats, seen from the cameras of all."""
+"""The model on one of several devices: a shard of the splats, rendered from the cameras of all."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -11,9 +11,8 @@ from torch import Tensor
 
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
-from nrfgs_ns.distributed.exchange import scale_gradient, send_to_cameras
-from nrfgs_ns.distributed.schedules import fewer
-from nrfgs_ns.distributed.shards import cut_model_state, rebalance, rows_of, shard_counts
+from nrfgs_ns.distributed.exchange import send_to_cameras
+from nrfgs_ns.distributed.shards import map_model_rows, rebalance, rows_of, shard_counts
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
@@ -23,16 +22,6 @@ from nrfgs_ns.model.renderer import View, project_splats, project_view
 from nrfgs_ns.model.view_noise import ViewNoise
 from nrfgs_ns.rasterizer import Projection
 from nrfgs_ns.training.pipeline import ShardingConfig
-
-
-@dataclass
-class ScreenGradients:
-    """What densification reads of `info["means2d"]`."""
-
-    grad: Tensor
-    """dL/dmean2d of the loss of all cameras, [M, 2]"""
-    absgrad: Tensor | None
-    """sum over pixels of |dL/dmean2d|, [M, 2], if it is measured"""
 
 
 class ShardedModel(NrfgsModel):
@@ -45,22 +34,19 @@ class ShardedModel(NrfgsModel):
     counts: list[int]
     """every device's splats, [W]"""
     loaded: slice | None = None
-    """which rows of the checkpoint are this device's, once one has been loaded"""
+    """this device's rows of the checkpoint, once one has been loaded"""
 
     def populate_modules(self):
         self.sharding: ShardingConfig = self.kwargs["sharding"]
-        self.images_per_step = comm.world() if self.sharding.schedules == "images" else 1
-        """how many images a step counts for"""
         super().populate_modules()
         if self.trimming is not None:
-            raise InputError("pipeline.model.robust_loss is for one device. Leave it out, or use one.")
+            raise InputError("pipeline.model.robust_loss is for one device. Leave it out.")
         self.view_noise = ViewNoise(0.0, self.view_noise.seed + comm.rank())  # each device has other splats
         self.sizes: list[tuple[int, int]] = []
 
     def _strategy(self) -> Densification:
-        """Of this device's share of the budget; after a reset it waits for as many images as on one device."""
         config = self.config.densification.share_of(comm.rank(), comm.world())
-        strategy = config.build(fewer(self.num_train_data, self.images_per_step), self.scene_unit)
+        strategy = config.build(self.num_train_data, self.scene_unit)
         strategy.verbose = comm.rank() == 0
         return strategy
 
@@ -72,24 +58,23 @@ class ShardedModel(NrfgsModel):
         return {name: value[rows].clone() for name, value in whole.items()}
 
     def start_from(self, seed_points: tuple[Tensor, Tensor]) -> None:
-        """Start from other points, the main device's: others may round differently."""
+        """Start from the main device's points: others may round differently."""
         super().start_from(comm.gather_objects(tuple(table.cpu() for table in seed_points))[0])
 
     def learn_photographs(self, photographs: PhotographModel | None) -> None:
-        """Let each photograph's look be learnt, from where the main device starts: others may round differently."""
+        """Learn each photograph's exposure, starting from the main device's: others may round differently."""
         states = comm.gather_objects(None if photographs is None else photographs.state_dict())
         super().learn_photographs(None if states[0] is None else PhotographModel.from_state(states[0]))
 
     @property
     def parameter_bytes(self) -> int:
-        """Bytes of what a renderer needs of the whole model."""
         row = sum(value[:1].numel() * value.element_size() for value in self.gauss_params.values())
         return row * sum(self.counts) + sum(weight.numel() * weight.element_size() for weight in self.head.parameters())
 
     # Rendering.
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
-        """Render one camera, the same on all devices. See `NrfgsModel.get_outputs`."""
+        """Render one camera, the same on all devices."""
         return self.get_outputs_everywhere([camera] * comm.world())
 
     def get_outputs_everywhere(self, cameras: list[Cameras]) -> dict[str, Tensor]:
@@ -126,22 +111,20 @@ class ShardedModel(NrfgsModel):
         parts = [project_view(splats, one, self.projection_options).projection for one in pinholes]
         for index, part in enumerate(parts):
             part.camera_ids = torch.full_like(part.camera_ids, index)
-        names = ("camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics")
-        columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        compensations = None
-        if parts[0].compensations is not None:
-            compensations = torch.cat([part.compensations for part in parts])
+        names = ("camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "compensations")
+        columns = {name: [getattr(part, name) for part in parts] for name in names}
+        columns = {name: None if column[0] is None else torch.cat(column) for name, column in columns.items()}
         width, height = self.sizes[comm.rank()]
-        return Projection(**columns, compensations=compensations, width=width, height=height, n_cameras=len(parts))
+        return Projection(**columns, width=width, height=height, n_cameras=len(parts))
 
     # Training.
 
     def far_from_neutral(self, camera, weights):
-        """As for one device: the mean over all splats that the camera sees, whosever they are."""
-        found = super().far_from_neutral(camera, weights)
-        if found is None:
+        """As for one device: the mean over all visible splats, on whichever device."""
+        mine = super().far_from_neutral(camera, weights)
+        if mine is None:
             return None
-        visible, loss, gradients = found
+        visible, loss, gradients = mine
         if visible == 0:  # means over nothing are NaN
             loss, gradients = torch.zeros_like(loss), [torch.zeros_like(gradient) for gradient in gradients]
         sums = [loss.new_tensor(float(visible)), *(visible * part for part in (loss, *gradients))]
@@ -150,9 +133,9 @@ class ShardedModel(NrfgsModel):
         return int(total), loss / total, tuple(gradient / total for gradient in gradients)
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """This device's losses. Their gradients are divided by W: the sum over devices is that of the mean loss.
+        """This device's losses, whose gradients are divided by W: their sum over devices is that of the mean loss.
 
-        Terms that are means over splats are means over the shard here: each counts by the shard's share of the splats.
+        Means over splats are means over the shard here, and are weighted by the shard's share of the splats.
         """
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if not self.training:
@@ -169,7 +152,10 @@ class ShardedModel(NrfgsModel):
                 del losses[name]
             else:
                 losses[name] = losses[name] * share
-        return {name: scale_gradient(loss, 1.0 / devices) for name, loss in losses.items()}
+        for loss in losses.values():
+            if loss.requires_grad:
+                loss.register_hook(lambda gradient: gradient / devices)
+        return losses
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
@@ -180,7 +166,7 @@ class ShardedModel(NrfgsModel):
                 self.counts = rebalance(self.gauss_params, self.optimizers, self.densification.state, self.counts)
 
     def count(self) -> None:
-        """Ask all devices how many splats they have."""
+        """Update `counts` from all devices."""
         self.counts = comm.gather_counts(self.num_points, self.device)
 
     @torch.no_grad()
@@ -189,7 +175,7 @@ class ShardedModel(NrfgsModel):
 
         gsplat multiplies gradients by half the image's sides and by the number of cameras, which undoes the mean of the
         losses: each (camera, splat) pair counts as in a step of its own. Where cameras differ in size, gradients and
-        radii are brought to that of the first here. Of several radii of a splat gsplat would keep any; here all are the
+        radii are brought to that of the first here. gsplat would keep any one of a splat's radii; here all are the
         largest.
         """
         info = self.info
@@ -208,7 +194,7 @@ class ShardedModel(NrfgsModel):
         largest = radii.new_zeros(self.num_points).scatter_reduce_(0, rows, radii, "amax")
         return {
             **info,
-            "means2d": ScreenGradients(grad, absgrad),
+            "means2d": SimpleNamespace(grad=grad, absgrad=absgrad),
             "radii": largest.index_select(0, rows),
             "width": width,
             "height": height,
@@ -217,7 +203,6 @@ class ShardedModel(NrfgsModel):
 
     @torch.no_grad()
     def get_metrics_dict(self, outputs, batch) -> dict[str, Any]:
-        """As for one device, with the number of all splats."""
         return {**super().get_metrics_dict(outputs, batch), "gaussian_count": sum(self.counts)}
 
     # Checkpoints.
@@ -229,4 +214,5 @@ class ShardedModel(NrfgsModel):
         self.loaded = rows_of(comm.rank(), total, devices, written)
         known = written is not None and len(written) == devices and sum(written) == total
         self.counts = list(written) if known else shard_counts(total, devices)
-        return super().load_state_dict(cut_model_state(state, self.loaded), strict=strict, **kwargs)
+        mine = map_model_rows(state, lambda table: table[self.loaded])
+        return super().load_state_dict(mine, strict=strict, **kwargs)

@@ -3,25 +3,24 @@
 main one writes checkpoints of the whole."""
 
 import math
-import random
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import comms, profiler
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 from torch.optim import Optimizer
 
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.model import ShardedModel
-from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
-from nrfgs_ns.distributed.shards import cut_optimizer_state, gather_model_state, gather_optimizer_state
+from nrfgs_ns.distributed.shards import map_model_rows, map_moments
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched, WatchedOptimizers
@@ -41,9 +40,8 @@ class ShardedPipeline(NrfgsPipeline):
     """NrfgsPipeline around a ShardedModel, without nerfstudio's DistributedDataParallel, which cannot hold parameters
     that come and go.
 
-    Everything is seeded alike on all devices until the model is built, and so are Python's and numpy's generators
-    afterwards, from which the order of the cameras comes. torch's, from which splits, noise and backgrounds come, is
-    then seeded with the run's seed + 1 + rank.
+    All devices have the same seeds until the model is built. Python's and numpy's generators, which order the cameras,
+    keep them; torch's, which draws splits, noise and backgrounds, then gets the run's seed + 1 + rank.
     """
 
     model: ShardedModel
@@ -52,7 +50,7 @@ class ShardedPipeline(NrfgsPipeline):
         sharded = partial(ShardedModel, sharding=config.sharding)
         config = replace(config, model=replace(config.model, _target=sharded))
         super().__init__(config, device, test_mode, world_size=1, **kwargs)
-        self.world_size, self.images_per_step = world_size, self.model.images_per_step
+        self.world_size = world_size
         torch.manual_seed(torch.initial_seed() + 1 + comm.rank())
 
     @profiler.time_function
@@ -76,13 +74,12 @@ class ShardedPipeline(NrfgsPipeline):
         if len(devices) == comm.world():
             super().set_extra_state({**state, **devices[comm.rank()]})
         else:
-            self.check_schedules(state)
             self.datamanager.load_sampling_state(state["sampling"])
 
 
 class ShardedMean(ParameterMean):
-    """`ParameterMean` of one device's splats and of the shared weights. All but `install` and `state` must be called on
-    all devices, and all begin anew where one must: shared weights stay the same, and a checkpoint has one mean."""
+    """`ParameterMean` of one device's splats and of the shared weights. If one device must restart, all do, so that
+    shared weights stay the same. All methods except `install` and `state` must be called on all devices."""
 
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether the rows of all devices still denote the splats that were averaged. The host waits for the answer."""
@@ -90,15 +87,8 @@ class ShardedMean(ParameterMean):
         return all(comm.gather_counts(int(here), parameters_of(next(iter(optimizers.values())))[0].device))
 
     def whole_state(self, model, optimizers: Mapping[str, Optimizer]) -> dict[str, Any]:
-        """What a checkpoint of the whole must hold.
-
-        Args:
-            model: a ShardedModel, whose splats have been counted.
-
-        Returns:
-            "parameter_mean", `state` with the rows of all devices on the main one, None for the splats' rows elsewhere.
-            Nothing where any device has other splats than those that it is the mean of: the guard has taken some out.
-        """
+        """A checkpoint's "parameter_mean", with the splats' rows of all devices on the main one, and None elsewhere; {}
+        where the guard has removed splats of any device since. `model` is a ShardedModel whose splats are counted."""
         if not self.is_current(optimizers):
             return {}
         state = self.state()
@@ -124,21 +114,19 @@ def _is_per_splat(name: str, model) -> bool:
 
 
 class ShardedGuard(Guard):
-    """The guard of one device. What one device finds stops all of them, at the same step and with one message; so does
-    a signal that one of them has heard.
-    """
+    """The guard of one device. What stops one device, a signal included, stops all, at the same step and with one
+    message."""
 
     def __init__(self, pipeline, request: StopRequest):
         super().__init__(pipeline)
         self.request = request
         self.signal = 0
-        """the number of a signal that any device had heard before the last verdict that was read; the same on all"""
+        """a signal that any device had heard before the last verdict was read, the same on all; 0: none"""
 
     def _share(self, verdict: Verdict) -> Verdict:
         sizes = verdict.sizes
         bad = (~(sizes <= MAX_GRADIENT)).any().to(sizes.dtype)
-        here = torch.stack([bad, torch.full_like(bad, float(self.request.signal or 0))])
-        anywhere = here.clone()
+        anywhere = torch.stack([bad, torch.full_like(bad, float(self.request.signal or 0))])
         dist.all_reduce(anywhere, dist.ReduceOp.MAX)
         elsewhere = torch.where(anywhere[0] > bad, math.inf, 0.0)
         watched = [Watched(ELSEWHERE, "elsewhere", elsewhere), Watched(ASKED, "elsewhere", anywhere[1])]
@@ -151,7 +139,7 @@ class ShardedGuard(Guard):
         return sizes
 
     def _check_visibility(self) -> None:
-        """Nothing: one device's shard may be empty or out of sight, and others are not asked."""
+        """Nothing: one device's shard may be empty or out of sight."""
 
     def settle(self) -> None:
         try:
@@ -169,15 +157,14 @@ class ShardedGuard(Guard):
             raise self._together(stopped) from None
 
     def _together(self, stopped: TrainingStopped | None) -> TrainingStopped:
-        """One exception for all devices, with the message of the first whose own image or loss is bad, since from
-        there it spreads to the gradients of all; else of the first that found something itself."""
-        here = None if stopped is None else (str(stopped), stopped.step, stopped.origin, stopped.savable)
-        everywhere = comm.gather_objects(here)
-        found = [(device, *one) for device, one in enumerate(everywhere) if one is not None]
-        own = [one for one in found if one[3] != "elsewhere"]
-        device, message, _, origin, _ = next((one for one in own if one[3] == "rendering"), own[0])
-        savable = all(one[4] for one in found)
-        return TrainingStopped(f"On device {device} of {comm.world()}: {message}", found[0][2], origin, savable)
+        """One exception for all devices: that of the first whose own image or loss is bad, which spreads to all
+        gradients; otherwise of the first that found something itself."""
+        mine = None if stopped is None else (str(stopped), stopped.step, stopped.origin, stopped.savable)
+        stops = [(device, *stop) for device, stop in enumerate(comm.gather_objects(mine)) if stop is not None]
+        own = [stop for stop in stops if stop[3] != "elsewhere"]
+        device, message, step, origin, _ = next((stop for stop in own if stop[3] == "rendering"), own[0])
+        savable = all(stop[4] for stop in stops)
+        return TrainingStopped(f"On device {device} of {comm.world()}: {message}", step, origin, savable)
 
 
 class ShardedOptimizers(WatchedOptimizers):
@@ -195,42 +182,32 @@ class ShardedOptimizers(WatchedOptimizers):
         model = self.guard.model
         super().load_optimizers(
             {
-                name: cut_optimizer_state(state, model.loaded) if name in model.gauss_params else state
+                name: map_moments(state, lambda table: table[model.loaded]) if name in model.gauss_params else state
                 for name, state in loaded_state.items()
             }
         )
 
 
 class ShardedTrainer(NrfgsTrainer):
-    """The trainer of one device.
-
-    Raises:
-        InputError: an option cannot be had on several devices.
-    """
+    """The trainer of one device; InputError where an option is for one device only."""
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         for name in ("mixed_precision", "use_grad_scaler"):
             if getattr(config, name):
-                raise InputError(f"{name} is on, which training on several devices does not do. Leave it out.")
+                raise InputError(f"{name} does not work on several devices. Leave it out.")
         if config.machine.device_type == "cuda":
             torch.cuda.set_device(local_rank)
         CONSOLE.quiet = comm.rank() > 0
         vis = WITHOUT_VIEWER.get(config.vis, config.vis.removeprefix("viewer+"))
         if vis != config.vis:
             CONSOLE.print(f"No viewer while training on several devices: --vis {config.vis} is {vis} here.")
-        self.count_images = config.pipeline.sharding.schedules == "images"
-        if self.count_images:
-            config = with_fewer_steps(config, world_size)
         config = replace(config, vis=vis, pipeline=replace(config.pipeline, _target=ShardedPipeline))
         super().__init__(config, local_rank, world_size)
         self.request = StopRequest(quiet=comm.rank() > 0)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        # nerfstudio seeds each device differently; the initial splats and the order of the cameras must be the same.
-        seed = self.config.machine.seed
-        random.seed(seed)
-        np.random.seed(seed)
-        torch.manual_seed(seed)
+        # Nerfstudio seeds devices differently, but initial splats and the order of the cameras must be the same.
+        _set_random_seed(self.config.machine.seed)
         super().setup(test_mode)
 
     @property
@@ -245,27 +222,24 @@ class ShardedTrainer(NrfgsTrainer):
         self.guard = ShardedGuard(self.pipeline, self.request)
         self.mean = ShardedMean() if self.config.average_steps > 0 else None
         groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
-        optimizers = ShardedOptimizers(self.guard, self.optimizer_configs(), groups, every)
-        if self.count_images:
-            forget_faster(optimizers.optimizers, self.world_size)
-        return optimizers
+        return ShardedOptimizers(self.guard, self.optimizer_configs(), groups, every)
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
         """The whole, on the main device: what one device would write, and every device's generators and shard."""
         content = super()._checkpoint(step)
         model = self.pipeline.model
         model.count()
-        gather_model_state(content["pipeline"], model.counts, "_model.")
+
+        def gathered(table: Tensor) -> Tensor | None:
+            return comm.gather_rows(table, model.counts)
+
+        pipeline = content["pipeline"] = map_model_rows(content["pipeline"], gathered, "_model.")
+        pipeline["_model._extra_state"]["shards"] = model.counts
         for name in model.gauss_params:
-            content["optimizers"][name] = gather_optimizer_state(content["optimizers"][name], model.counts)
-        training, extra = content["training"], content["pipeline"]["_extra_state"]
+            content["optimizers"][name] = map_moments(content["optimizers"][name], gathered)
+        training, extra = content["training"], pipeline["_extra_state"]
         if training.pop("parameter_mean", None) is not None:  # on all devices, or on none
             training |= self.mean.whole_state(model, self.optimizers.optimizers)
         own = {name: extra[name] for name in ("torch_rng", "cuda_rng", "python_rng")}
-        images = self.world_size if self.count_images else 1
-        content["pipeline"]["_extra_state"] = {
-            **extra,
-            "devices": comm.gather_objects(own),
-            "images_per_step": images,
-        }
+        pipeline["_extra_state"] = {**extra, "devices": comm.gather_objects(own)}
         return content

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs eval`: the numbers and file of `ns-eval`, also for a training from somebody else."""
+"""`nrfgs eval`: what `ns-eval` reports, also for a training from somebody else."""
 
 import json
 from dataclasses import dataclass
@@ -32,11 +32,8 @@ class Eval(NamesTraining):
             trained = load_training(path, "test")
             threads.suit_to(trained.pipeline)
             results = trained.pipeline.get_average_eval_image_metrics(output_path=self.render_output_path, get_std=True)
-        numbers = {
-            "experiment_name": trained.config.experiment_name,
-            "method_name": trained.config.method_name,
-            "checkpoint": str(trained.checkpoint),
-            "results": results,
-        }
+        config = trained.config
+        names = {"experiment_name": config.experiment_name, "method_name": config.method_name}
+        numbers = {**names, "checkpoint": str(trained.checkpoint), "results": results}
         write_whole(self.output_path, json.dumps(numbers, indent=2) + "\n")
         CONSOLE.print(f"Saved results to: {self.output_path}", markup=False, soft_wrap=True)

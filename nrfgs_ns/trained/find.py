@@ -9,7 +9,7 @@ import tyro
 from nrfgs_ns.errors import InputError
 
 OUTPUTS = Path("outputs")
-"""Where ns-train writes unless it is told otherwise."""
+"""Where ns-train writes by default"""
 
 
 @dataclass
@@ -22,15 +22,15 @@ class NamesTraining:
     """the same, as ns-eval and ns-viewer call it"""
 
     def config(self) -> Path:
-        """The named config.yml (`config_of`); InputError if there is none, or two are named."""
+        """The named config.yml (`config_of`); InputError if two are named."""
         if self.model is not None and self.load_config is not None:
             raise InputError(f"{self.model} and --load-config {self.load_config} both name a training. Give one.")
         return config_of(self.model if self.load_config is None else self.load_config)
 
 
 def config_of(path: Path | None) -> Path:
-    """The file at a path; in a folder (None: outputs) or up to three levels below, the newest config.yml, which is
-    printed. InputError if there is none."""
+    """The file at a path, or the newest config.yml in a folder (None: outputs) or up to three levels below it, which is
+    printed; InputError if there is none."""
     if path is not None and path.is_file():
         return path
     folder = OUTPUTS if path is None else path

@@ -33,8 +33,8 @@ class Trained(NamedTuple):
 def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     """A finished training, set up as by nerfstudio's `eval_setup`, except that its config.yml runs no code.
 
-    Mode "test" reads the test images; "inference" none, and fits harmonics to the head. InputError if there is no such
-    training, or its method is not this project's.
+    Mode "test" reads the test images; "inference" reads none, and fits harmonics to the head. InputError if there is no
+    such training, or its method is not this project's.
     """
     from nrfgs_ns.training.checkpoint_files import find, read_latest
     from nrfgs_ns.training.config_file import read_config
@@ -59,22 +59,21 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
 
 
 def find_data(config: "TrainerConfig", path: Path) -> None:
-    """Set the data set's present place: as stored, or the same as seen from config.yml, since outputs and data may be
-    moved together; InputError if it is in neither."""
+    """Set the data set's present place: as stored, or, since outputs and data may be moved together, the same relative
+    to config.yml; InputError if it is in neither."""
     manager = config.pipeline.datamanager
     stored = manager.data or manager.dataparser.data
     if stored is None or stored.exists():
         return
     begin, now = config.output_dir.absolute(), path.absolute().parents[3:4]  # outputs/EXPERIMENT/METHOD/TIME/config.yml
     places = [(folder / os.path.relpath(stored.absolute(), begin)).resolve() for folder in now if folder != begin]
-    found = next((place for place in places if place.exists()), None)
-    if found is None:
+    place = next((place for place in places if place.exists()), None)
+    if place is None:
         tried = "".join(f", nor at {place}" for place in places)
         raise InputError(
             f"{path}: its data set is not at {stored}{tried}. Put it there, or change both `data` in the file."
         )
-    config.data = manager.data = found
-    manager.dataparser.data = found
+    config.data = manager.data = manager.dataparser.data = place
 
 
 def load_model(path: Path, mode: Literal["test", "inference"]) -> "NrfgsPipeline":
@@ -86,7 +85,7 @@ def load_model(path: Path, mode: Literal["test", "inference"]) -> "NrfgsPipeline
 
 
 def load_file(path: Path) -> "NrfgsModel":
-    """The model in a compact file, in evaluation mode, without config.yml and data set; InputError as `decode`."""
+    """The model in a compact file, in evaluation mode, without config.yml or data set; InputError as `decode`."""
     from nerfstudio.data.scene_box import SceneBox
 
     from nrfgs_ns.compact.decode import decode, model_state
@@ -119,25 +118,22 @@ def load_file(path: Path) -> "NrfgsModel":
 
 @torch.no_grad()
 def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict[str, Any]:
-    """Compare pictures with the photographs, on the test views.
+    """Compare pictures with the photographs of the test views; InputError if none has pixels inside its mask.
 
     Args:
         pictures: camera -> images [H, W, 3] by name, one of them "file".
 
     Returns:
         means over the images, dB, inside their masks: psnr_model, psnr_NAME; loss_db: model minus file; and per_image.
-
-    Raises:
-        InputError: no test image has pixels inside its mask.
     """
     from nrfgs_ns.image.metrics import psnr
     from nrfgs_ns.progress import progress
 
-    model = pipeline.model
-    names = [Path(name).name for name in pipeline.datamanager.eval_dataset.image_filenames]
+    model, data = pipeline.model, pipeline.datamanager
+    names = [Path(name).name for name in data.eval_dataset.image_filenames]
     per_image, scores = [], {}
     with progress("Measuring the loss", len(names)) as advance:
-        for image, (camera, batch) in zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True):
+        for image, (camera, batch) in zip(names, data.fixed_indices_eval_dataloader, strict=True):
             outputs = model.get_outputs_for_camera(camera)
             truth, mask = model.truth_of(batch, outputs["background"]), model.mask_of(batch)
             rendered = {"model": outputs["rgb"], **pictures(camera)}
@@ -152,7 +148,7 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
 
 
 def finish(lines: Iterable[str], numbers: dict[str, Any], report: Path | None) -> None:
-    """Print an export's result, and write its numbers as JSON if there is a path for them."""
+    """Print an export's result, and write its numbers as JSON into `report`, if given."""
     from nerfstudio.utils.rich_utils import CONSOLE
 
     for line in lines:

@@ -40,7 +40,7 @@ class View(NamesTraining):
 
             trained = load_training(path, "test")
             threads.suit_to(trained.pipeline)
-            # Where nerfstudio looks for the config.yml that its command for ns-render names; it writes nothing there.
+            # Nerfstudio looks here for the config.yml that its command for ns-render names; it writes nothing.
             config.relative_log_filename = str(path.absolute().parent / "viewer.log")
             trained.config.vis, trained.config.viewer = "viewer", config
             _start_viewer(trained.config, trained.pipeline, trained.step)
@@ -66,11 +66,11 @@ def view_file(path: Path, config):
     middle = means.median(dim=0).values
     spread = (means - middle).norm(dim=-1).median()
     stand = middle + spread * means.new_tensor((2.0, -2.0, 1.0))  # z is up
+    position, target = ((VISER_NERFSTUDIO_SCALE_RATIO * point).cpu().numpy() for point in (stand, middle))
 
     def welcome(client) -> None:
         with client.atomic():
-            client.camera.position = (stand * VISER_NERFSTUDIO_SCALE_RATIO).cpu().numpy()
-            client.camera.look_at = (middle * VISER_NERFSTUDIO_SCALE_RATIO).cpu().numpy()
+            client.camera.position, client.camera.look_at = position, target
 
     viewer.viser_server.on_client_connect(welcome)
     for line in viewer.viewer_info:

@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
 from nrfgs_ns.image.metrics import lpips_advice
-from nrfgs_ns.viewer.pictures import BASE, Shown, picture
+from nrfgs_ns.viewer.pictures import BASE, PictureOptions, picture
 
 GROUP = "Appearance"
 """Prefix of all entries."""
@@ -86,5 +86,5 @@ def track(pipeline: Pipeline, step: int, pictures: bool) -> None:
                 listener.tb_writer.add_histogram(f"{GROUP}/{name}", values, step)
     writer.put_dict(name=GROUP, scalar_dict=numbers, step=step)
     for mode in (BASE, *components) if pictures else ():
-        writer.put_image(name=f"{GROUP}/{mode}", image=picture(model, camera, Shown(mode))["rgb"], step=step)
+        writer.put_image(name=f"{GROUP}/{mode}", image=picture(model, camera, PictureOptions(mode))["rgb"], step=step)
     pipeline.train()

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
@@ -40,13 +40,10 @@ SMALLEST_SIDE = 2
 
 @dataclass
 class ShardingConfig:
-    """How the splats are spread over the devices, and what a step counts. Nothing of it is read with one device."""
+    """How the splats are spread over several devices."""
 
     rebalance_at: float = 1.1
     """splats move between devices when one has more than this many times the mean"""
-    schedules: Literal["steps", "images"] = "steps"
-    """what schedules count (docs/many-gpus.md). steps: steps, of one image on each device. images: images, so that
-    there are fewer steps"""
 
 
 @dataclass
@@ -60,7 +57,7 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
     model: NrfgsModelConfig = field(default_factory=NrfgsModelConfig)
     """specifies the model config"""
     sharding: ShardingConfig = field(default_factory=ShardingConfig)
-    """with several devices: how the splats are spread over them, and what a step counts"""
+    """with several devices: how the splats are spread over them"""
     compact: Path | None = None
     """read the model from a file of `nrfgs export compact` instead of the checkpoint; not for training"""
 
@@ -70,8 +67,6 @@ class NrfgsPipeline(VanillaPipeline):
     evaluates with null for a metric that cannot be had, and whose checkpoints resume exactly."""
 
     config: NrfgsPipelineConfig
-    images_per_step: int = 1
-    """images that a step counts for in the schedules (`distributed.schedules`)"""
     notes: tuple[str, ...] | list[str] = ()
     """numbers behind what was chosen automatically, in sentences"""
     steps_per_log: int = 1
@@ -201,21 +196,10 @@ class NrfgsPipeline(VanillaPipeline):
             "sampling": self.datamanager.sampling_state(),
         }
 
-    def check_schedules(self, state: dict[str, Any]) -> None:
-        """Raise InputError where a training goes on whose step numbers mean another number of images."""
-        written = state.get("images_per_step", 1)
-        if written != self.images_per_step:
-            raise InputError(
-                f"The checkpoint's steps count for {written} images of the schedules, this training's for "
-                f"{self.images_per_step}. Go on with --machine.num-devices {written} and the same "
-                "--pipeline.sharding.schedules."
-            )
-
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave, in a training; an evaluation ignores it."""
         if self.test_mode != "val":
             return
-        self.check_schedules(state)
         torch.set_rng_state(state["torch_rng"].cpu())
         if len(state["cuda_rng"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all([rng.cpu() for rng in state["cuda_rng"]])

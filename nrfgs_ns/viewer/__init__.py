@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the viewer shows: the pictures of a head, and the panel that chooses among them; and how it is served."""
+"""Nerfstudio's viewer: pictures of a head, the panel that chooses among them, and a guarded server."""

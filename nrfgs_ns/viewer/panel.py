@@ -20,7 +20,7 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 from viser.transforms import SO3
 
-from nrfgs_ns.viewer.pictures import FULL, LEGENDS, Shown, modes, offered_components, picture
+from nrfgs_ns.viewer.pictures import FULL, PictureOptions, legends, picture
 from nrfgs_ns.viewer.server import protect
 from nrfgs_ns.viewer.start import open_sooner
 
@@ -28,15 +28,16 @@ if TYPE_CHECKING:
     from nrfgs_ns.model.model import NrfgsModel
 
 STEP_FORWARD = 5.0
-"""In sizes of the little cameras that mark the photographs: those of up to 30 degrees and more are behind."""
+"""Distance of a browser's first view in front of the first photograph, in sizes of the frustums that mark photographs.
+Frustums of 30 degrees and more then lie behind it."""
 MEAN_LOOK = "all photographs' mean"
 MARKER_COLOR = (255, 211, 105)
-"""Of the frustum that stands where the view was frozen: the viewer's yellow."""
+"""The viewer's yellow, for the frustum that marks a frozen view"""
 
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Suspend nerfstudio's trace function, which interrupts a rendering by an exception at any line: in viser's code it
+    """Suspend nerfstudio's trace function, which interrupts a rendering by an exception at any line: inside viser that
     would leave a lock taken."""
     trace = sys.gettrace()
     sys.settrace(None)
@@ -57,25 +58,23 @@ class ViewerPanel(ViewerControl):
         """the viewer's background colour [3]"""
         self.frozen_center: Tensor | None = None
         """camera centre [3] where the view was frozen"""
-        self.installed = False
 
     def _setup(self, viewer) -> None:
         """Add the controls; nerfstudio calls this after its own."""
         super()._setup(viewer)
-        self.legends = self._legends()
+        self.legends = legends(self.model.field)
         gui = viewer.viser_server.gui
         with gui.add_folder("Appearance", order=viewer.stats_markdown.order + 0.5):
             self.mode = gui.add_dropdown("Show", list(self.legends), initial_value=FULL, hint="What is drawn")
             self.legend = gui.add_markdown(self.legends[FULL])
-            hint = "How much of what depends on the view is added: 0 nothing, 1 as trained"
+            hint = "How much of the view dependence is added: 0 nothing, 1 as trained"
             self.gain = gui.add_slider("Residual gain", 0.0, 2.0, 0.05, 1.0, hint=hint)
-            hint = "Stops by which the image is brighter"
-            self.stops = gui.add_slider("Exposure", -3.0, 3.0, 0.1, 0.0, hint=hint)
+            self.stops = gui.add_slider("Exposure", -3.0, 3.0, 0.1, 0.0, hint="Stops by which the image is brighter")
             self.look = None
             if self.model.photograph is not None:
                 names, hint = [MEAN_LOOK, *self.model.photograph.names], "The photograph whose exposure is shown"
                 self.look = gui.add_dropdown("Look", names, MEAN_LOOK, hint=hint)
-            hint = "Keep the looks that the splats have from here, and walk around them"
+            hint = "Keep the appearance that the splats have from here, and walk around them"
             self.freeze = gui.add_checkbox("Freeze view", initial_value=False, hint=hint)
             self.count = gui.add_text("Splats", initial_value=f"{self.model.num_points:,}", disabled=True)
         # One callback each: viser runs a control's callbacks in no particular order.
@@ -84,9 +83,8 @@ class ViewerPanel(ViewerControl):
             control.on_update(lambda _: viewer._trigger_rerender())
         self.freeze.on_update(lambda event: self._freeze(event.client))
         self.marker = None
-        self.waiting: list = []  # browsers that came before the scene
+        self.waiting: list = []  # browsers that connected before the scene was there
         viewer.viser_server.on_client_connect(self._welcome)
-        self.installed = True
 
     @staticmethod
     def is_asking() -> bool:
@@ -94,16 +92,16 @@ class ViewerPanel(ViewerControl):
         return isinstance(threading.current_thread(), RenderStateMachine)
 
     def set_background(self, background: Tensor) -> None:
-        """Set the viewer's background colour [3]."""
         self.background = background
 
     def _welcome(self, client) -> None:
-        """Let a browser begin a little in front of the first training photograph: nerfstudio's view may see nothing."""
-        taken = list(getattr(self.viewer, "camera_handles", {}).values())
-        if not taken:  # until the first picture
+        """Move a browser to a little in front of the first training photograph: nerfstudio's own first view may see
+        nothing."""
+        photographs = list(getattr(self.viewer, "camera_handles", {}).values())
+        if not photographs:  # until the first picture
             self.waiting.append(client)
             return
-        first = taken[0]
+        first = photographs[0]
         forward = SO3(first.wxyz).as_matrix()[:, 2]
         with client.atomic():
             client.camera.position = first.position + STEP_FORWARD * self.viewer.config.camera_frustum_scale * forward
@@ -114,34 +112,26 @@ class ViewerPanel(ViewerControl):
         for client in waiting:
             self._welcome(client)
 
-    def _legends(self) -> dict[str, str]:
-        """The line under the dropdown in each mode."""
-        kinds = offered_components(self.model.field)
-        return {mode: LEGENDS[kinds.get(mode, mode)] for mode in modes(self.model.field)}
-
     @property
-    def shown(self) -> Shown:
-        """The picture that the controls name; the image as trained without a viewer."""
-        if not self.installed:
-            return Shown()
+    def options(self) -> PictureOptions:
+        """The picture that the controls name."""
         center = self.frozen_center if self.freeze.value else None
         of_mean = self.look is None or self.look.value == MEAN_LOOK
         photograph = None if of_mean else self.model.photograph.names.index(self.look.value)
-        return Shown(self.mode.value, float(self.gain.value), center, float(self.stops.value), photograph)
+        return PictureOptions(self.mode.value, float(self.gain.value), center, float(self.stops.value), photograph)
 
     def render(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Render one camera, a batch of one, as the controls say (`picture`)."""
-        if self.installed:
-            with uninterrupted():
-                if self.count.value != (count := f"{self.model.num_points:,}"):
-                    self.count.value = count
-                self._welcome_waiting()
-        # As in nerfstudio: the viewer's background counts where the configuration leaves it open.
+        with uninterrupted():
+            if self.count.value != (count := f"{self.model.num_points:,}"):
+                self.count.value = count
+            self._welcome_waiting()
+        # As in nerfstudio, the viewer's background is used where the configuration leaves it open.
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)
         try:
             with contextlib.nullcontext() if self.is_slow else uninterrupted():
-                return picture(self.model, camera, self.shown, background)
+                return picture(self.model, camera, self.options, background)
         finally:
             self.model.set_crop(None)
 
@@ -155,7 +145,7 @@ class ViewerPanel(ViewerControl):
         self.viewer._trigger_rerender()
 
     def _freeze(self, client) -> None:
-        """Store and mark the place of the client's camera; None: a program sets `frozen_center` itself."""
+        """Store and mark the position of the client's camera; None: a program sets `frozen_center` itself."""
         if self.marker is not None:
             self.marker.remove()
             self.marker = None

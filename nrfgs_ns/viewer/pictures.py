@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of an appearance head: one camera rendered in one of several modes. No viewer is needed.
 
-Modes, beside those that the head itself offers (`AppearanceHead.components`):
+Modes, besides those that the head itself offers (`AppearanceHead.components`):
 
-    full              the image, with the gain's share of the residual: base + gain (trained - base), for colours and
-                      opacities alike
+    full              the image, with gain times the residual of colours and opacities: base + gain (trained - base)
     base colour       base colours with base opacities, as if the gain were 0
     view dependence   how much a splat's colour varies with the direction (`view_dependence`)
     depth             expected depth, dark near and bright far
@@ -21,7 +20,7 @@ from nerfstudio.utils.colormaps import apply_float_colormap
 from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import Component, SplatAppearance
+from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.rasterizer import composite
 
@@ -32,13 +31,13 @@ if TYPE_CHECKING:
 FULL, BASE, VIEW_DEPENDENCE, DEPTH = "full", "base colour", "view dependence", "depth"
 
 GREY = 0.5
-"""Where a change is drawn that is none."""
+"""Where no change is drawn"""
 AMPLIFICATION = 4.0
 """Factor of a change as drawn: a change of 1/8 of white uses up the whole range of colours."""
 OPACITY_AXIS = (1.0, 0.0, -1.0)
-"""The colour of a change of opacity: orange where the splat is more opaque than its base, blue where it is less."""
+"""Colour of a change of opacity: orange where the splat is more opaque than its base, blue where it is less."""
 FULL_DEVIATION = 0.1
-"""The standard deviation of colour that is drawn brightest."""
+"""Standard deviation of colour that is drawn brightest"""
 FAR_QUANTILE = 0.98
 """Share of the drawn pixels that set the range of depths: one floater must not flatten all else."""
 
@@ -51,45 +50,42 @@ LEGENDS = {
     "opacity": f"Grey: no change. Orange: more opaque, blue: less; times the gain, times {AMPLIFICATION:g}.",
     "weight": "Dark 0, bright 1.",
 }
-"""The line under the panel's dropdown, by mode or kind of component."""
+"""Explanations by mode or kind of component"""
 
 
 @dataclass(frozen=True)
-class Shown:
-    """Options of a picture."""
+class PictureOptions:
+    """What `picture` shows."""
 
     mode: str = FULL
-    """one of `modes(head)`"""
+    """a key of `legends(field)`"""
     gain: float = 1.0
-    """factor of the residuals, >= 0; 1 is as trained."""
+    """factor of the residuals, >= 0; 1 is as trained"""
     frozen_center: Tensor | None = None
     """point [3] from which splats are seen, in world units; None: the camera's"""
     stops: float = 0.0
     """additional exposure of the image"""
     photograph: int | None = None
-    """the training photograph whose exposure and colour the image has; None: the mean look"""
+    """the training photograph whose exposure the image has; None: the mean of all"""
 
 
-def offered_components(field: Field) -> dict[str, str]:
-    """Components that a head can show: name -> kind."""
+def legends(field: Field) -> dict[str, str]:
+    """The line under the panel's dropdown, for each mode in which a field can be options."""
     means = field.splats["means"]
     with torch.no_grad():
         components = field.head.components(field.splats, means.new_zeros(0, dtype=torch.int64), means.new_zeros(3))
-    return {name: component.kind for name, component in components.items()}
-
-
-def modes(field: Field) -> list[str]:
-    """All modes in which a field can be shown."""
-    return [FULL, BASE, *offered_components(field), VIEW_DEPENDENCE, DEPTH]
+    offered = {name: LEGENDS[component.kind] for name, component in components.items()}
+    first, last = ({mode: LEGENDS[mode] for mode in modes} for modes in ((FULL, BASE), (VIEW_DEPENDENCE, DEPTH)))
+    return first | offered | last
 
 
 @torch.no_grad()
-def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tensor | None = None) -> dict[str, Tensor]:
-    """Render one camera in one mode.
+def picture(
+    model: "NrfgsModel", camera: Cameras, options: PictureOptions, background: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Render one camera, a batch of [1], in one mode, with a model in evaluation mode.
 
     Args:
-        model: in evaluation mode.
-        camera: a batch of one camera, [1].
         background: a colour [3] behind the splats instead of the configuration's.
 
     Returns:
@@ -98,28 +94,29 @@ def picture(model: "NrfgsModel", camera: Cameras, shown: Shown, background: Tens
     """
     field = model.field
     view = model.project(camera, field.splats)
-    if shown.frozen_center is not None:
-        view = view._replace(center=shown.frozen_center.to(view.center))
-    appearance = with_gain(field, view, 0.0 if shown.mode == BASE else shown.gain)
-    outputs, _ = model.composite(view, appearance, background, shown.photograph)
-    if shown.mode in (FULL, BASE):
-        if shown.stops != 0.0:
-            outputs["rgb"] = exposed(outputs["rgb"], shown.stops)
+    if options.frozen_center is not None:
+        view = view._replace(center=options.frozen_center.to(view.center))
+    appearance = with_gain(field, view, 0.0 if options.mode == BASE else options.gain)
+    outputs, _ = model.composite(view, appearance, background, options.photograph)
+    if options.mode in (FULL, BASE):
+        if options.stops != 0.0:
+            outputs["rgb"] = exposed(outputs["rgb"], options.stops)
         return outputs
 
-    if shown.mode == DEPTH:
-        share = scaled_depth(outputs["depth"], outputs["accumulation"])
-    elif shown.mode == VIEW_DEPENDENCE:
-        deviation = view_dependence(field, view)
-        share = _blend(view, deviation / FULL_DEVIATION, appearance.opacities, outputs["accumulation"])
-    else:
-        component = field.components_of(view)[shown.mode]
-        if component.kind != "weight":
-            drawn = GREY + AMPLIFICATION * shown.gain * _as_colors(component)
-            outputs["rgb"] = _over_grey(view, drawn, appearance.opacities, outputs["accumulation"])
-            return outputs
-        share = _blend(view, component.values, appearance.opacities, outputs["accumulation"])
     accumulation, behind = outputs["accumulation"], outputs["background"]
+    if options.mode == DEPTH:
+        share = scaled_depth(outputs["depth"], accumulation)
+    elif options.mode == VIEW_DEPENDENCE:
+        share = _blend(view, view_dependence(field, view) / FULL_DEVIATION, appearance.opacities, accumulation)
+    else:
+        component = field.components_of(view)[options.mode]
+        if component.kind != "weight":
+            axis = 1.0 if component.kind == "color" else component.values.new_tensor(OPACITY_AXIS)
+            drawn = GREY + AMPLIFICATION * options.gain * component.values * axis
+            render, _, _ = composite(view.projection, drawn, appearance.opacities)
+            outputs["rgb"] = (render[0] + (1 - accumulation) * GREY).clamp(0.0, 1.0)
+            return outputs
+        share = _blend(view, component.values, appearance.opacities, accumulation)
     outputs["rgb"] = accumulation * apply_float_colormap(share.clamp(0.0, 1.0), "viridis") + (1 - accumulation) * behind
     return outputs
 
@@ -140,8 +137,8 @@ def with_gain(field: Field, view: "View", gain: float) -> SplatAppearance:
 
 
 def icosahedron() -> Tensor:
-    """Unit vectors to the 12 corners of an icosahedron, [12, 3]: a spherical 5-design, so that mean and variance of a
-    colour in harmonics up to degree 2 are exact."""
+    """Unit vectors to the 12 corners of an icosahedron, [12, 3]: a spherical 5-design, whose mean and variance of
+    harmonics up to degree 2 are exact."""
     golden = (1 + 5**0.5) / 2
     corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
     turned = [corner[i:] + corner[:i] for i in range(3) for corner in corners]
@@ -149,8 +146,8 @@ def icosahedron() -> Tensor:
 
 
 def view_dependence(field: Field, view: "View") -> Tensor:
-    """Standard deviation of the visible splats' colours over 12 directions, as far away as the camera is: root mean
-    square over the channels, in units of white. [M, 1]"""
+    """Standard deviation of the visible splats' colours over 12 directions at the camera's distance: root mean square
+    over the channels, in units of white. [M, 1]"""
     means = field.splats["means"].index_select(0, view.visible)
     distance = (view.center - means).norm(dim=-1, keepdim=True)
     around = [view._replace(center=means + distance * direction) for direction in icosahedron().to(means)]
@@ -163,23 +160,9 @@ def scaled_depth(depth: Tensor, accumulation: Tensor) -> Tensor:
     solid = depth[accumulation > 0.5]
     if solid.numel() == 0:
         return torch.zeros_like(depth)
-    # Sorted by hand: torch.quantile refuses more than 16 million numbers.
-    ranked = solid.sort().values
+    ranked = solid.sort().values  # torch.quantile refuses more than 16 million numbers
     near, far = ranked[0], ranked[int(FAR_QUANTILE * (len(ranked) - 1))]
     return ((depth - near) / (far - near).clamp_min(1e-10)).clamp(0.0, 1.0)
-
-
-def _as_colors(component: Component) -> Tensor:
-    """A change as a signed colour [M, 3]."""
-    if component.kind == "color":
-        return component.values
-    return component.values * component.values.new_tensor(OPACITY_AXIS)
-
-
-def _over_grey(view: "View", colors: Tensor, opacities: Tensor, accumulation: Tensor) -> Tensor:
-    """Blend signed colours [M, 3] over grey, [H, W, 3] in [0, 1]."""
-    render, _, _ = composite(view.projection, colors, opacities)
-    return (render[0] + (1 - accumulation) * GREY).clamp(0.0, 1.0)
 
 
 def _blend(view: "View", values: Tensor, opacities: Tensor, accumulation: Tensor) -> Tensor:

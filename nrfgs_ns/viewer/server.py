@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """A guard for nerfstudio's viewer, which viser 0.2.7 serves to all interfaces, with any file that a raw path leads to
 (`GET /../../etc/passwd`), to every web page that is open in the user's browser. From `protect` on, viewers listen on
-127.0.0.1 unless another host is chosen (`ns-viewer` cannot tell nerfstudio's default of 0.0.0.0 from a choice: there it
-counts as none), serve viser's page alone, to itself alone, and drop messages that this page would not send.
+127.0.0.1 unless another host is chosen, and serve viser's page alone, to itself alone. Messages that cannot be read, or
+that this page would not send, are dropped, and whatever a message does to the viewer, the training goes on.
 """
 
 import contextlib
 import functools
 import importlib.metadata
 import ipaddress
-import math
+import re
 import socket
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from http import HTTPStatus
-from typing import Any
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
+import numpy as np
+import websockets.exceptions
 import websockets.server
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.viewer.viewer import Viewer
@@ -31,12 +33,9 @@ VISER_READ = "0.2.7"
 LOCAL, ALL_INTERFACES = "127.0.0.1", "0.0.0.0"
 
 WIDEST = 8.0
-"""Largest ratio of a picture's sides."""
-FARTHEST, LONGEST_TEXT = 1e6, 200
-"""Largest number and text in a message: beyond it float32 has no room for a scene."""
-LARGEST = 1e4
-"""Largest value of a control with bounds: pixels, seconds."""
-
+"""Largest ratio of a picture's sides"""
+LENS = (0.01, 3.1)
+"""Smallest and largest field of view, radians"""
 SENT_BY_PAGES = (
     _messages.ViewerCameraMessage,
     _messages.GuiUpdateMessage,
@@ -44,7 +43,7 @@ SENT_BY_PAGES = (
     _messages.ScenePointerMessage,
     _messages.TransformControlsUpdateMessage,
 )
-"""Not among them: uploads, and the wish for a public link, which is the user's (`--viewer.make-share-url`)."""
+"""Not among them: uploads, and the request for a public link, which only the user makes (`--viewer.make-share-url`)."""
 
 
 @dataclass
@@ -69,8 +68,9 @@ def protect() -> None:
     infra.WebsockServer = GuardedServer
     # The page is built. To ask, viser looks through all processes of the machine, and fails if one of them ends then.
     _client_autobuild.ensure_client_is_built = lambda: None
-    _infra.websockets = _Websockets()
+    _infra.websockets = SimpleNamespace(server=SimpleNamespace(serve=_serve), exceptions=websockets.exceptions)
     Viewer.__init__ = _guarded(Viewer.__init__)
+    Viewer.update_scene = _harmless(Viewer.update_scene)
     ViewerLegacyState.__init__ = _refused
 
 
@@ -79,7 +79,7 @@ def _guarded(open_viewer):
 
     @functools.wraps(open_viewer)
     def open_guarded(self, config, *args, **options) -> None:
-        if type(config) is ViewerConfig and config.websocket_host == ALL_INTERFACES:
+        if type(config) is ViewerConfig and config.websocket_host == ALL_INTERFACES:  # nobody chose it
             config = replace(config, websocket_host=LOCAL)
         _check_address(config.websocket_host, config.websocket_port)
         open_viewer(self, config, *args, **options)
@@ -99,8 +99,20 @@ def _guarded(open_viewer):
     return open_guarded
 
 
+def _harmless(update_scene):
+    """Nerfstudio's `Viewer.update_scene`, which a training calls after each step, without exceptions: a browser that
+    leaves, or whose camera is odd, must not end the training."""
+
+    @functools.wraps(update_scene)
+    def update(self, *args, **options) -> None:
+        with contextlib.suppress(Exception):
+            update_scene(self, *args, **options)
+
+    return update
+
+
 def _check_address(host: str, port: int | None) -> None:
-    """Raise InputError where nothing can listen: viser would stand still."""
+    """Raise InputError where nothing can listen: viser would wait for ever."""
     if port is not None and not 0 < port < 2**16:
         raise InputError(f"The viewer's port is {port}; give one from 1 to {2**16 - 1}.")
     try:
@@ -121,20 +133,21 @@ class GuardedServer(infra.WebsockServer):
     """Viser's server, with checked requests and messages."""
 
     def __init__(self, host: str, *args, message_class=infra.Message, **options):
-        super().__init__(host, *args, message_class=_Admission(message_class, self), **options)
+        super().__init__(host, *args, message_class=SimpleNamespace(deserialize=self._admit), **options)
+        self._deserialize = message_class.deserialize
         self.names = {"localhost"}
-        """names by which this server may be asked for, lower case"""
+        """host names that this server answers to, lower case"""
         if host not in (LOCAL, "localhost"):
             machine = socket.gethostname().lower()
             self.names |= {host.lower(), machine, f"{machine}.local"}
-        self.bounds: dict[str, tuple[Any, Any]] = {}
-        """smallest and largest value of controls, by id; None: no bound"""
+        self.bounds: dict[str, tuple[float, float]] = {}
+        """smallest and largest value of sliders, by id"""
         self.file_names: set[str] = set()
-        """ids of text fields that become the name of a file"""
+        """ids of text fields that name a file"""
 
     def queue_message(self, message) -> None:
-        """Send a message, and remember the bounds of controls."""
-        if getattr(message, "min", None) is not None or getattr(message, "max", None) is not None:
+        """Send a message, and remember the bounds of sliders."""
+        if isinstance(message, _messages.GuiAddSliderMessage):
             self.bounds[message.id] = (message.min, message.max)
         elif isinstance(message, _messages.GuiAddTextMessage) and message.label == "Render name":
             self.file_names.add(message.id)
@@ -144,7 +157,7 @@ class GuardedServer(infra.WebsockServer):
 
     @contextlib.contextmanager
     def atomic(self) -> Iterator[None]:
-        """As viser's, except that an exception inside, as when a browser leaves, frees the lock."""
+        """Viser's, except that an exception inside, as when a browser leaves, frees the lock."""
         messages = super().atomic()
         messages.__enter__()
         try:
@@ -168,14 +181,15 @@ class GuardedServer(infra.WebsockServer):
         root = self._http_server_root.resolve()
         try:
             path = path.partition("?")[0]
-            asked = (root / path.removeprefix("/")).resolve()
-            found = path == "/" or (asked.is_relative_to(root) and asked.is_file())
+            file = (root / path.removeprefix("/")).resolve()
+            if path == "/" or (file.is_relative_to(root) and file.is_file()):
+                return None
         except (OSError, ValueError):  # too long, or not a path
-            found = False
-        return None if found else (HTTPStatus.NOT_FOUND, {}, b"404")
+            pass
+        return HTTPStatus.NOT_FOUND, {}, b"404"
 
     def _known(self, host: str) -> bool:
-        """Whether a Host header names this server. Every address does: no name server points it elsewhere."""
+        """Whether a Host header names this server. Every address does: no name server can redirect one."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:
@@ -184,102 +198,55 @@ class GuardedServer(infra.WebsockServer):
             return bool(ipaddress.ip_address(name))
         return name in self.names
 
-
-class _Admission:
-    """Viser's message class, with a `deserialize` that turns what no page would send into a message without listeners:
-    an exception would leave the client's render thread running for ever.
-    """
-
-    def __init__(self, message_class: type, server: GuardedServer):
-        self.message_class, self.server = message_class, server
-
-    def deserialize(self, raw: bytes):
+    def _admit(self, raw: bytes):
+        """The message in some bytes; one without listeners for what no page sends. An exception would leave the
+        client's render thread running for ever."""
         try:
-            message = self.message_class.deserialize(raw)
+            message = self._deserialize(raw)
             self._check(message)
         except Exception:  # whatever bytes may do to viser
             return _messages.ResetGuiMessage()
         return message
 
     def _check(self, message) -> None:
-        """Clamp a message's numbers to their bounds; ValueError if no page would send it."""
+        """Clamp what decides the size of a picture; ValueError if no page sends the message."""
         if not isinstance(message, SENT_BY_PAGES):
             raise ValueError(type(message).__name__)
-        for number in _numbers([getattr(message, field.name) for field in fields(message)]):
-            if not abs(number) <= FARTHEST:  # NaN, too
-                raise ValueError(number)
         if isinstance(message, _messages.ViewerCameraMessage):
-            lengths = [len(getattr(message, name)) for name in ("wxyz", "position", "look_at", "up_direction")]
-            if lengths != [4, 3, 3, 3] or math.hypot(*message.wxyz) < 1e-3 or message.aspect <= 0:
-                raise ValueError("no camera")
-            message.aspect = _held(message.aspect, 1 / WIDEST, WIDEST)
-            message.fov = _held(message.fov, 0.01, 3.1)
+            pose = np.array([*message.wxyz, *message.position], np.float32)
+            if len(pose) != 7 or not np.isfinite(pose).all() or not pose[:4].any():
+                raise ValueError("no pose, on which a GPU's kernels may fail")
+            message.aspect, message.fov = _clamped(message.aspect, 1 / WIDEST, WIDEST), _clamped(message.fov, *LENS)
         elif isinstance(message, _messages.GuiUpdateMessage):
-            if set(message.updates) != {"value"}:
-                raise ValueError("a page sets values")
             value = message.updates["value"]
-            if isinstance(value, str):
-                value = value[:LONGEST_TEXT]
-                if message.id in self.server.file_names:
-                    value = value.replace("/", "_").replace("\\", "_")
-            elif message.id in self.server.bounds:
-                value = _held(value, *self.server.bounds[message.id])
-            message.updates["value"] = value
+            if message.id in self.file_names:
+                value = re.sub(r"[/\\]", "_", value)
+            elif message.id in self.bounds:
+                value = _clamped(value, *self.bounds[message.id])
+            message.updates = {"value": value}
 
 
-def _numbers(value: Any) -> Iterator[float]:
-    """All numbers in nested tuples, lists and dictionaries."""
-    if isinstance(value, (int, float)):
-        yield value
-    elif isinstance(value, (dict, list, tuple)):
-        for part in value.values() if isinstance(value, dict) else value:
-            yield from _numbers(part)
-
-
-def _held(value: Any, low: Any, high: Any) -> Any:
-    """A number, or each of a tuple of numbers, between its bounds; None is no bound."""
-    if isinstance(value, tuple):
-        lows, highs = (bound if isinstance(bound, tuple) else (bound,) * len(value) for bound in (low, high))
-        return tuple(_held(*each) for each in zip(value, lows, highs, strict=True))
-    if high is not None:
-        value = min(value, high, LARGEST)
-    return value if low is None else max(value, low)
+def _clamped(value: float, low: float, high: float) -> float:
+    """A number between its bounds; NaN becomes `low`."""
+    return min(max(low, value), high)
 
 
 _serving = threading.local()
 
 
-class _Websockets:
-    """The module `websockets` for viser's server, with a `serve` that asks the guard."""
+def _serve(handler, host: str, port: int, process_request, **options):
+    """`websockets.server.serve` for viser, which asks the guard about requests."""
+    guard = _serving.server
 
-    def __getattr__(self, name: str):
-        return getattr(websockets, name)
+    async def answer(path: str, headers):
+        refusal = guard.refusal(path, headers)
+        return await process_request(path, headers) if refusal is None else refusal
 
-    @property
-    def server(self):
-        return self
+    async def handle(websocket) -> None:
+        async def recv() -> bytes:  # viser fails on messages of text
+            message = await websocket.recv()
+            return message if isinstance(message, bytes) else message.encode()
 
-    @staticmethod
-    def serve(handler, host: str, port: int, process_request, **options):
-        guard = _serving.server
+        await handler(SimpleNamespace(send=websocket.send, recv=recv))
 
-        async def answer(path: str, headers):
-            refusal = guard.refusal(path, headers)
-            return await process_request(path, headers) if refusal is None else refusal
-
-        async def handle(websocket) -> None:
-            await handler(_BytesAlone(websocket))
-
-        return websockets.server.serve(handle, host, port, process_request=answer, **options)
-
-
-class _BytesAlone:
-    """A connection that skips messages of text, on which viser fails."""
-
-    def __init__(self, websocket):
-        self.websocket, self.send = websocket, websocket.send
-
-    async def recv(self) -> bytes:
-        while not isinstance(message := await self.websocket.recv(), bytes):
-            pass
-        return message
+    return websockets.server.serve(handle, host, port, process_request=answer, **options)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A faster start of nerfstudio's viewer, which decodes all photographs once more, at full size, to show each 100 pixels
-high, and whose viser reads its archive of icons through for every button."""
+"""A faster start of nerfstudio's viewer, which decodes all photographs again, at full size, to show them 100 pixels
+high, and whose viser searches its archive of icons for every button."""
 
 import functools
 import tarfile
@@ -19,11 +19,10 @@ from nrfgs_ns.data.pictures import open_picture
 from nrfgs_ns.threads import few_threads
 
 SIDE = 100
-"""Pixels of the shorter side as shown."""
+"""Pixels of the shorter side as shown"""
 
 
 def open_sooner() -> None:
-    """Open all viewers of this process sooner from now on."""
     if _gui_api.svg_from_icon is not icon:
         _gui_api.svg_from_icon = _gui_handles.svg_from_icon = icon
         Viewer.init_scene = _with_small_photographs(Viewer.init_scene)
@@ -31,7 +30,7 @@ def open_sooner() -> None:
 
 @functools.cache
 def icon(name: str) -> str:
-    """The SVG of an icon, as `viser._icons.svg_from_icon` gives it."""
+    """`viser._icons.svg_from_icon`, with the archive opened once."""
     with _ARCHIVE_LOCK:
         return _archive().extractfile(f"{name}.svg").read().decode("utf-8")
 
@@ -55,12 +54,12 @@ class SmallPhotographs:
         return len(self._paths)
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """A photograph as "image" [h, w, 3], float32 in 0..1, at least SIDE pixels to a side if it has them."""
+        """A photograph as "image" [h, w, 3], float32 in [0, 1], with at least SIDE pixels to a side if it has them."""
         if self._read is not None:
             image = self._read[index]["image"]
         else:
             with open_picture(self._paths[index]) as picture:
-                picture.draft("RGB", (SIDE, SIDE))  # a JPEG has an eighth, a quarter and a half of itself ready
+                picture.draft("RGB", (SIDE, SIDE))  # JPEG decodes to an eighth, a quarter or a half directly
                 image = torch.from_numpy(np.array(picture.convert("RGB")))
         stride = max(min(image.shape[:2]) // SIDE, 1)
         small = image[::stride, ::stride, :3].cpu()
@@ -68,7 +67,7 @@ class SmallPhotographs:
 
 
 def _with_small_photographs(init_scene):
-    """Nerfstudio's `Viewer.init_scene`, whose photographs come small."""
+    """Nerfstudio's `Viewer.init_scene` with small photographs."""
 
     @functools.wraps(init_scene)
     def init_small_scene(self, train_dataset, *args, **options) -> None:

@@ -42,11 +42,6 @@ def two_devices(tiny_scene, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture
-def step_results(two_devices) -> Path:
-    return two_devices
-
-
 @pytest.fixture(scope="session")
 def run_together(tmp_path_factory, tiny_scene):
     """Run another job: name, processes, device type -> folder of its results."""

@@ -81,43 +81,33 @@ def one_step(options: dict, scene: Path, folder: Path, name: str) -> None:
 
 
 def step_together(trainer) -> dict:
-    model, pipeline = trainer.pipeline.model, trainer.pipeline
-    weights = list(model.head.parameters())
-    cameras = pipeline.datamanager.train_cameras
-    visible, neutral, slopes = model.far_from_neutral(cameras[0:1], weights)
-    model.step_cb(trainer.optimizers, 0)
-    outputs, losses, _ = pipeline.get_train_loss_dict(0)
-    sum(losses.values()).backward()
-    shared = {name: value for name, value in pipeline.named_parameters() if "gauss_params" not in name}
     from nrfgs_ns.distributed import comm
 
-    comm.sum_over_devices([value.grad for value in shared.values() if value.grad is not None])
-    screen = model._screen_info()
+    pipeline, model = trainer.pipeline, trainer.pipeline.model
+    neutral = far_from_neutral(trainer)
+    outputs, losses, _ = pipeline.get_train_loss_dict(0)
+    sum(losses.values()).backward()
+    shared = [value.grad for name, value in pipeline.named_parameters() if "gauss_params" not in name]
+    comm.sum_over_devices([gradient for gradient in shared if gradient is not None])
     return {
         "rgb": outputs["rgb"].detach(),
         "losses": {key: value.detach() for key, value in losses.items()},
-        "splats": {key: value.detach() for key, value in model.gauss_params.items()},
-        "gradients": {key: value.grad for key, value in model.gauss_params.items()},
-        "shared": {key: value.grad for key, value in shared.items()},
-        "statistics": statistics(model, screen),
-        "neutral": [visible, neutral, *slopes],
+        "statistics": statistics(model, model._screen_info()),
+        "neutral": neutral,
+        **values_and_gradients(pipeline),
     }
 
 
 def step_alone(trainer, cameras) -> dict:
     """The same cameras one after the other; gradients of the mean of their losses, statistics of each by itself."""
     pipeline, model = trainer.pipeline, trainer.pipeline.model
-    weights = list(model.head.parameters())
-    neutral = model.far_from_neutral(pipeline.datamanager.train_cameras[0:1], weights)
-    model.step_cb(trainer.optimizers, 0)
+    neutral = far_from_neutral(trainer)
     images, all_losses, stats = [], [], {}
     for camera in cameras:
         outputs = model(camera)
-        batch = pipeline.datamanager._image(camera.metadata["cam_idx"])
-        losses = model.get_loss_dict(outputs, batch, {})
+        losses = model.get_loss_dict(outputs, pipeline.datamanager._image(camera.metadata["cam_idx"]), {})
         before = {name: value.grad for name, value in pipeline.named_parameters()}
-        for value in pipeline.parameters():
-            value.grad = None
+        pipeline.zero_grad()
         sum(losses.values()).backward()
         stats = statistics(model, model.info)
         for name, value in pipeline.named_parameters():
@@ -127,14 +117,24 @@ def step_alone(trainer, cameras) -> dict:
                 value.grad = before[name]
         images.append(outputs["rgb"].detach())
         all_losses.append({key: value.detach() for key, value in losses.items()})
+    result = {"rgb": images, "losses": all_losses, "statistics": stats, "neutral": neutral}
+    return result | values_and_gradients(pipeline)
+
+
+def far_from_neutral(trainer) -> list:
+    """How far the head is from neutral in the first view; the trainer's first step begins."""
+    model, cameras = trainer.pipeline.model, trainer.pipeline.datamanager.train_cameras
+    visible, loss, slopes = model.far_from_neutral(cameras[0:1], list(model.head.parameters()))
+    model.step_cb(trainer.optimizers, 0)
+    return [visible, loss, *slopes]
+
+
+def values_and_gradients(pipeline) -> dict:
+    splats = pipeline.model.gauss_params
     return {
-        "rgb": images,
-        "losses": all_losses,
-        "splats": {key: value.detach() for key, value in model.gauss_params.items()},
-        "gradients": {key: value.grad for key, value in model.gauss_params.items()},
-        "shared": {key: value.grad for key, value in pipeline.named_parameters() if "gauss_params" not in key},
-        "statistics": stats,
-        "neutral": [neutral[0], neutral[1], *neutral[2]],
+        "splats": {key: value.detach() for key, value in splats.items()},
+        "gradients": {key: value.grad for key, value in splats.items()},
+        "shared": {name: value.grad for name, value in pipeline.named_parameters() if "gauss_params" not in name},
     }
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from device import PEAK, PLAIN, RICH, one_step, told, train, trainer_of
+from device import PEAK, PLAIN, RICH, one_step, step_alone, step_together, told, train, trainer_of
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -49,16 +49,17 @@ def fifty_steps(scene: Path, folder: Path) -> None:
 
     def watch(trainer) -> None:
         model = trainer.pipeline.model
-
-        def count(step: int) -> None:
-            counts.append((step, model.num_points, list(model.counts)))
-
-        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], count))
+        after_each(trainer, lambda step: counts.append((step, model.num_points, list(model.counts))))
 
     trainer = train(scene, folder / "fifty", dist.get_world_size(), 50, watch=watch, **PLAIN, **MORE)
     shared = {name: value.detach().cpu() for name, value in trainer.pipeline.model.head.named_parameters()}
     result = {"counts": counts, "shared": shared, "saved": str(told(trainer))}
     torch.save(result, folder / f"fifty-{dist.get_rank()}.pt")
+
+
+def after_each(trainer, do) -> None:
+    """Call `do(step)` after each step."""
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], do))
 
 
 def there_and_back(scene: Path, folder: Path) -> None:
@@ -105,8 +106,6 @@ def holds(trainer) -> dict:
 
 def fits_one_process(scene: Path, folder: Path) -> None:
     """Device 0's image and loss in the first step, and those of one process; in the devices' own precision."""
-    from device import step_alone, step_together
-
     world = dist.get_world_size()
     torch.save(step_together(trainer_of(scene, folder / "step", world, **PLAIN)), folder / f"step-{dist.get_rank()}.pt")
     if dist.get_rank() == 0:
@@ -151,9 +150,6 @@ def averaged(scene: Path, folder: Path) -> None:
     world, main = dist.get_world_size(), dist.get_rank() == 0
     after, counts = [], []
 
-    def note(trainer, then) -> None:
-        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], then))
-
     def lopsided(trainer) -> None:
         """Only the second device refines."""
         strategy = trainer.pipeline.model.densification.strategy
@@ -168,7 +164,7 @@ def averaged(scene: Path, folder: Path) -> None:
             after.append(parameters(trainer))
             counts.append(trainer.mean.count)
 
-        note(trainer, keep)
+        after_each(trainer, keep)
 
     def spoil(trainer) -> None:
         lopsided(trainer)
@@ -178,7 +174,7 @@ def averaged(scene: Path, folder: Path) -> None:
             if step == 9 and not main:
                 trainer.pipeline.model.means[0] = float("nan")
 
-        note(trainer, break_splat)
+        after_each(trainer, break_splat)
 
     options = {**PLAIN, **AVERAGED, "--pipeline.model.photographs": "on"}
     with CONSOLE.capture() as log:

@@ -27,24 +27,17 @@ def config(tmp_path):
     )
 
 
-def test_a_killed_process_is_named_and_the_checkpoint_shown(config):
-    error = ProcessExitedException("died", error_index=1, error_pid=7, exit_code=-9, signal_name="SIGKILL")
-    assert "This training has written no checkpoint." in launch.explain(error, config)
-    config.get_checkpoint_dir().mkdir(parents=True)
-    (config.get_checkpoint_dir() / "step-000000010.ckpt").touch()
-    said = launch.explain(error, config)
-    assert "process of device 1 of 2 was killed by SIGKILL. Out of memory" in said
-    assert "step-000000010.ckpt, whole; with --load-dir" in said
+KILLED = ProcessExitedException("died", error_index=1, error_pid=7, exit_code=-9, signal_name="SIGKILL")
 
 
 def test_of_a_failed_process_the_error_is_shown_without_its_traceback(config):
     report = (
         "\n\n-- Process 0 terminated with the following error:\nTraceback (most recent call last):\n"
-        '  File "x.py", line 1, in f\n    g()\nnrfgs_ns.errors.InputError: image.png cannot be decoded.\nReplace it.\n'
+        '  File "x.py", line 1, in f\n    g()\nnrfgs_ns.errors.InputError: a.png cannot be decoded.\n  Replace it.\n'
     )
     said = launch.explain(ProcessRaisedException(report, error_index=0, error_pid=7), config)
-    assert "device 0 of 2 failed:\nnrfgs_ns.errors.InputError: image.png cannot be decoded.\nReplace it." in said
-    assert "Traceback" not in said
+    assert "device 0 of 2 failed:\nnrfgs_ns.errors.InputError: a.png cannot be decoded.\n  Replace it.\n" in said
+    assert "Traceback" not in said and "This training has written no checkpoint." in said
 
 
 def test_what_cannot_start_is_refused_before_it_does(config, monkeypatch):
@@ -53,25 +46,26 @@ def test_what_cannot_start_is_refused_before_it_does(config, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(InputError, match="num_devices is 2, but this machine shows 1"):
         launch.prepare(replace(config, machine=replace(config.machine, device_type="cuda")))
-    with pytest.raises(InputError, match="dist_url"):
+    with pytest.raises(InputError, match="num_machines is 2"):
         launch.launch(replace(config, machine=replace(config.machine, num_machines=2)))
 
 
-def test_nerfstudio_s_launcher_says_it_in_one_message(config, monkeypatch, capsys):
-    """`ns-train` lets the exception of its children through to Python, which would print both their traceback and its
-    own."""
+def test_ns_train_says_in_one_message_which_process_is_lost(config, monkeypatch, capsys):
+    """It lets the exception of its children through to Python, which would print both their traceback and its own."""
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(sys, "excepthook", lambda kind, error, trace: print("as ever:", error, file=sys.stderr))
     replace(config, machine=replace(config.machine, device_type="cuda")).print_to_terminal()
-    error = ProcessExitedException("died", error_index=1, error_pid=7, exit_code=-9, signal_name="SIGKILL")
-    sys.excepthook(type(error), error, None)
+    config.get_checkpoint_dir().mkdir(parents=True)
+    (config.get_checkpoint_dir() / "step-000000010.ckpt").touch()
+    sys.excepthook(type(KILLED), KILLED, None)
     sys.excepthook(ValueError, ValueError("another"), None)
     asked = ProcessExitedException("ended", error_index=1, error_pid=7, exit_code=130)
     with pytest.raises(SystemExit) as ended:
         sys.excepthook(type(asked), asked, None)
     assert ended.value.code == 130
     said = capsys.readouterr().err
-    assert said.startswith("Training stopped: the process of device 1 of 2 was killed by SIGKILL.")
+    assert said.startswith("Training stopped: the process of device 1 of 2 was killed by SIGKILL. Out of memory")
+    assert "step-000000010.ckpt; with --load-dir" in said
     assert said.endswith("as ever: another\n")
 
 
@@ -109,11 +103,12 @@ def workers(parent: int) -> list[int]:
     return [int(pid) for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
-def endless(scene: Path, out: Path) -> list[str]:
-    """A command that trains on two CPU processes for longer than anybody waits."""
+@pytest.fixture
+def endless(tiny_scene, tmp_path):
+    """A training on two CPU processes that lasts longer than anybody waits, once it has written a checkpoint."""
     options = {
-        "--data": scene,
-        "--output-dir": out,
+        "--data": tiny_scene,
+        "--output-dir": tmp_path,
         "--machine.num-devices": 2,
         "--machine.device-type": "cpu",
         "--max-num-iterations": 100_000,
@@ -124,38 +119,31 @@ def endless(scene: Path, out: Path) -> list[str]:
         "--pipeline.model.densification": "splatfacto,stop_split_at=0",
     }
     words = [str(word) for option in options.items() for word in option]
-    return [sys.executable, "-m", "nrfgs_ns.distributed.launch", "nrfgs", *words]
-
-
-def until_a_checkpoint(process: subprocess.Popen, folder: Path) -> None:
-    """Wait for the first checkpoint below a folder, or the end of the process that writes it."""
-    while not list(folder.rglob("*.ckpt")) and process.poll() is None:
-        time.sleep(0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
-@pytest.mark.parametrize("to_all", [True, False])
-def test_a_signal_stops_all_devices_with_one_checkpoint(to_all, tiny_scene, tmp_path):
-    """From the terminal, which all processes hear, and sent to the second device alone."""
     process = subprocess.Popen(
-        endless(tiny_scene, tmp_path),
+        [sys.executable, "-m", "nrfgs_ns.distributed.launch", "nrfgs", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         start_new_session=True,
     )
-    try:
-        until_a_checkpoint(process, tmp_path)
-        if to_all:
-            os.killpg(process.pid, signal.SIGINT)
-        else:
-            os.kill(workers(process.pid)[1], signal.SIGTERM)
-        said, _ = process.communicate()
-    finally:
-        process.kill()
-    assert process.returncode == (130 if to_all else 143), said
+    while not list(tmp_path.rglob("*.ckpt")) and process.poll() is None:
+        time.sleep(0.1)
+    yield process
+    process.kill()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("to_all", [True, False])
+def test_a_signal_stops_all_devices_with_one_checkpoint(to_all, endless, tmp_path):
+    """From the terminal, which all processes hear, and sent to the second device alone."""
+    if to_all:
+        os.killpg(endless.pid, signal.SIGINT)
+    else:
+        os.kill(workers(endless.pid)[1], signal.SIGTERM)
+    said, _ = endless.communicate()
+    assert endless.returncode == (130 if to_all else 143), said
     assert said.count("Stopped at step") == 1 and "Traceback" not in said, said
     (folder,) = tmp_path.rglob("nerfstudio_models")
     _, content = read_latest(folder)
@@ -166,21 +154,14 @@ def test_a_signal_stops_all_devices_with_one_checkpoint(to_all, tiny_scene, tmp_
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 @pytest.mark.parametrize("victim", [0, 1])
-def test_a_killed_process_ends_the_others_and_leaves_the_checkpoint(victim, tiny_scene, tmp_path):
-    command, environment = endless(tiny_scene, tmp_path), {**os.environ, "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
-    try:
-        until_a_checkpoint(process, tmp_path)
-        ranks = workers(process.pid)
-        assert len(ranks) == 2
-        os.kill(ranks[victim], signal.SIGKILL)
-        _, stderr = process.communicate()  # which returns: nobody waits for a dead process
-    finally:
-        process.kill()
-    said = stderr[stderr.index("Training stopped") :]
+def test_a_killed_process_ends_the_others_and_leaves_the_checkpoint(victim, endless, tmp_path):
+    ranks = workers(endless.pid)
+    os.kill(ranks[victim], signal.SIGKILL)
+    said, _ = endless.communicate()  # which returns: nobody waits for a dead process
+    assert endless.returncode == 1 and len(ranks) == 2
+    said = said[said.index("Training stopped") :]
     assert said.startswith(f"Training stopped: the process of device {victim} of 2 was killed by SIGKILL.")
     assert "Traceback" not in said
-    assert process.returncode == 1
     for pid in ranks:
         assert not Path(f"/proc/{pid}").exists(), "a process was left behind"
     (folder,) = tmp_path.rglob("nerfstudio_models")

@@ -8,22 +8,14 @@ for which 100 is allowed: 1e-8 of the largest entry. A gradient that were lost, 
 be wrong by 1e-3 of it or more.
 """
 
-import math
-from dataclasses import replace
-from types import SimpleNamespace
-
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from nrfgs_ns.densification import CHANGE, STRATEGIES
-from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
+from nrfgs_ns.densification import CHANGE
 from nrfgs_ns.distributed.shards import rows_of, shard_counts, transfers
-from nrfgs_ns.errors import InputError
-from nrfgs_ns.method_config import nrfgs
-from nrfgs_ns.training.pipeline import NrfgsPipeline
 
 RELATIVE = 1e-8
 
@@ -33,17 +25,11 @@ def agree(name, ours, theirs) -> None:
 
 
 @pytest.fixture(params=["plain", "rich"])
-def results(request, step_results):
+def results(request, two_devices):
     """(device 0, device 1, one process) of a step: `plain` is splatfacto's densification with absgrad and the largest
     changes of opacity; `rich` has antialiasing, learnt poses, bilateral grids, and losses over splats (MCMC's, aspect
     ratios). The two cameras differ in size."""
-    read = lambda who: torch.load(step_results / f"{request.param}-{who}.pt")  # noqa: E731
-    return read(0), read(1), read("alone")
-
-
-def dealt(ours: dict, theirs: dict, name: str):
-    """Each device's rows and those of one process that they are: dealt out in turn."""
-    return [(part[name], theirs[name][rank::2]) for rank, part in enumerate(ours)]
+    return tuple(torch.load(two_devices / f"{request.param}-{who}.pt") for who in (0, 1, "alone"))
 
 
 def test_every_device_renders_its_own_camera(results):
@@ -128,39 +114,3 @@ def test_transfers_end_in_balance_and_lose_nobody(counts):
     for rank, row in enumerate(plan):
         assert not (sum(row) and sum(other[rank] for other in plan)), "somebody sends and receives"
         assert row[rank] == 0 and min(row) >= 0 and sum(row) <= counts[rank]
-
-
-@pytest.mark.parametrize("written, now", [(2, 1), (1, 2), (2, 4)])
-def test_a_step_that_counts_for_other_images_is_not_gone_on_from(written, now):
-    training = SimpleNamespace(images_per_step=now)
-    with pytest.raises(InputError, match=f"count for {written} images .* for {now}"):
-        NrfgsPipeline.check_schedules(training, {"images_per_step": written})
-    NrfgsPipeline.check_schedules(training, {"images_per_step": now})
-    NrfgsPipeline.check_schedules(SimpleNamespace(images_per_step=1), {})  # older checkpoints do not say
-
-
-def test_schedules_counted_in_images():
-    config = with_fewer_steps(replace(nrfgs.config, max_num_iterations=30_000, average_steps=200), 2)
-    rules, before = config.pipeline.model.densification, nrfgs.config.pipeline.model.densification
-    assert (config.max_num_iterations, rules.refine_every, rules.stop_split_at) == (15_000, 50, 7_500)
-    assert config.average_steps == 100
-    assert rules.reset_alpha_every == before.reset_alpha_every, "resets are counted in refinements"
-    assert (before.refine_every, nrfgs.config.average_steps) == (100, None), "the configuration was changed"
-    means, field = config.optimizers["means"], config.optimizers["field"]
-    assert means["optimizer"].lr == pytest.approx(1.6e-4 * math.sqrt(2))
-    assert (means["scheduler"].max_steps, means["scheduler"].lr_final) == (15_000, pytest.approx(1.6e-6 * math.sqrt(2)))
-    assert field["optimizer"].eps == pytest.approx(1e-15 / math.sqrt(2))
-    adam = torch.optim.Adam([torch.zeros(1, requires_grad=True)])
-    forget_faster({"means": adam}, 2)
-    assert adam.param_groups[0]["betas"] == pytest.approx((0.8, 0.998))
-    forget_faster({"means": adam}, 16)
-    assert adam.param_groups[0]["betas"][0] == 0.0
-
-
-@pytest.mark.parametrize("strategy", STRATEGIES.values())
-def test_every_number_of_steps_of_a_strategy_is_divided(strategy):
-    model = replace(nrfgs.config.pipeline.model, densification=strategy())
-    config = replace(nrfgs.config, pipeline=replace(nrfgs.config.pipeline, model=model))
-    rules = vars(with_fewer_steps(config, 2).pipeline.model.densification)
-    changed = {name for name, value in vars(strategy()).items() if rules[name] != value}
-    assert changed == {name for name in rules if name.endswith(("_at", "_length"))} | {"refine_every"}

@@ -13,7 +13,16 @@ from nrfgs_lab.training_run import evaluate, parse
 from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
-from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, Shown, modes, picture
+from nrfgs_ns.viewer.pictures import (
+    AMPLIFICATION,
+    BASE,
+    DEPTH,
+    FULL,
+    VIEW_DEPENDENCE,
+    PictureOptions,
+    legends,
+    picture,
+)
 
 pytestmark = [
     pytest.mark.gpu,
@@ -45,11 +54,13 @@ def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tens
     model.update_to_step(10**6)
     pipeline.eval()
     camera, elsewhere = cameras[0:1], cameras[4:5].camera_to_worlds[0, :3, 3]
-    shown = {mode: Shown(mode) for mode in modes(model.field)} | {FROZEN: Shown(frozen_center=elsewhere)}
-    pictures = {name: picture(model, camera, what)["rgb"] for name, what in shown.items()}
-    for name, drawn_picture in pictures.items():
-        assert drawn_picture.shape == (36, 48, 3) and drawn_picture.device.type == device, name
-        assert ((drawn_picture >= 0) & (drawn_picture <= 1)).all(), name  # NaN is in no interval
+    shown = {mode: PictureOptions(mode) for mode in legends(model.field)}
+    shown[FROZEN] = PictureOptions(frozen_center=elsewhere)
+    pictures = {}
+    for name, what in shown.items():
+        pictures[name] = picture(model, camera, what)["rgb"]
+        assert pictures[name].shape == (36, 48, 3) and pictures[name].device.type == device, name
+        assert ((pictures[name] >= 0) & (pictures[name] <= 1)).all(), name  # NaN is in no interval
     assert torch.equal(pictures[FULL], model.get_outputs_for_camera(camera)["rgb"])
     assert torch.equal(pictures[BASE], model.get_base_color(camera))
     for pair in combinations(pictures, 2):

@@ -6,7 +6,7 @@ import base64
 import os
 import socket
 import threading
-import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -16,6 +16,7 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.viewer.viewer import Viewer
 from short_trainings import command_line, set_up, trained
+from viser._messages import ResetGuiMessage, ViewerCameraMessage
 from websockets.asyncio.client import connect
 
 from nrfgs_ns.compact.format import MAGIC
@@ -23,7 +24,6 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact
 from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.trained.view import View, view_file
-from nrfgs_ns.training.trainer_config import parse
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -44,33 +44,15 @@ def interface() -> str:
 
 
 @pytest.fixture(scope="module")
-def pipeline(tiny_scene, tmp_path_factory):
-    words = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path_factory.mktemp("out"))]
-    pipeline = parse(words).pipeline.setup(device="cpu", test_mode="val")
-    pipeline.eval()
-    return pipeline
+def config(tiny_scene, tmp_path_factory) -> Path:
+    """config.yml of a finished training."""
+    return trained(command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("trained"), 2))
 
 
 @pytest.fixture(scope="module")
-def open_viewer(pipeline, tiny_scene, tmp_path_factory):
-    opened = []
-
-    def start(config) -> Viewer:
-        log = tmp_path_factory.mktemp("viewer") / "log.txt"
-        viewer = Viewer(config, log, datapath=tiny_scene, pipeline=pipeline, train_lock=threading.Lock())
-        viewer.init_scene(pipeline.datamanager.train_dataset, "completed", pipeline.datamanager.eval_dataset)
-        opened.append(viewer)
-        return viewer
-
-    yield start
-    for viewer in opened:
-        viewer.viser_server.stop()
-
-
-@pytest.fixture(scope="module")
-def to_all(open_viewer) -> Viewer:
+def to_all(open_viewer, pipeline) -> Viewer:
     """A viewer that listens on all interfaces, as was asked for."""
-    return open_viewer(LocalViewerConfig(websocket_host="0.0.0.0"))
+    return open_viewer(pipeline, LocalViewerConfig(websocket_host="0.0.0.0"))
 
 
 def reachable(address: str, port: int) -> bool:
@@ -81,15 +63,11 @@ def reachable(address: str, port: int) -> bool:
 def answer(address: str, port: int, path: str, *headers: str, host: str | None = None) -> tuple[int, bytes]:
     """Status and body of the answer to a GET whose path is sent as it is."""
     lines = [f"GET {path} HTTP/1.1", f"Host: {host or f'{address}:{port}'}", *headers, "", ""]
-    with socket.create_connection((address, port)) as connection:
+    with socket.create_connection((address, port)) as connection, connection.makefile("rb") as file:
         connection.sendall("\r\n".join(lines).encode())
-        received = b""
-        # A WebSocket stays open; all others are closed behind the body.
-        while not (received.startswith(b"HTTP/1.1 101") and b"\r\n\r\n" in received):
-            part = connection.recv(1 << 16)
-            received += part
-            if not part:
-                break
+        received = file.readline()
+        if b" 101 " not in received:  # a WebSocket stays open; all others are closed behind the body
+            received += file.read()
     head, _, body = received.partition(b"\r\n\r\n")
     return int(head.split()[1]), body
 
@@ -101,29 +79,29 @@ def upgrade(address: str, port: int, *headers: str, host: str | None = None) -> 
     return answer(address, port, "/", *wish, *headers, host=host)[0]
 
 
-@pytest.mark.parametrize("config", [LocalViewerConfig(), ViewerConfig()], ids=["ours", "nerfstudio's default"])
-def test_the_network_is_refused_unless_it_is_asked_for(open_viewer, interface, config):
-    viewer = open_viewer(config)
+@pytest.mark.parametrize("options", [LocalViewerConfig(), ViewerConfig()], ids=["ours", "nerfstudio's default"])
+def test_the_network_is_refused_unless_it_is_asked_for(open_viewer, pipeline, interface, options):
+    viewer = open_viewer(pipeline, options)
     port = viewer.viser_server.get_port()
     assert reachable("127.0.0.1", port)
     assert not reachable(interface, port)
     assert "127.0.0.1" in viewer.viewer_info[0] and f"ssh -L {port}:localhost:{port}" in viewer.viewer_info[-1]
 
 
-def test_processes_that_end_meanwhile_stop_no_viewer(open_viewer, monkeypatch):
+def test_processes_that_end_meanwhile_stop_no_viewer(open_viewer, pipeline, monkeypatch):
     def ended(self):
         raise psutil.NoSuchProcess(self.pid)
 
     monkeypatch.setattr(psutil.Process, "cwd", ended)
-    assert open_viewer(LocalViewerConfig()).viser_server.get_port()
+    assert open_viewer(pipeline).viser_server.get_port()
 
 
-def test_a_busy_port_is_named_with_the_one_instead(open_viewer):
+def test_a_busy_port_is_named_with_the_one_instead(open_viewer, pipeline):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         busy = other.getsockname()[1]
-        viewer = open_viewer(LocalViewerConfig(websocket_port=busy))
+        viewer = open_viewer(pipeline, LocalViewerConfig(websocket_port=busy))
     port = viewer.viser_server.get_port()
     assert port != busy and f"http://127.0.0.1:{port}" in viewer.viewer_info[0]
     assert f"Port {busy} is busy; the viewer is at {port}." in viewer.viewer_info
@@ -133,14 +111,13 @@ def test_a_busy_port_is_named_with_the_one_instead(open_viewer):
     "options, says",
     [
         ({"websocket_port": 65536}, "port is 65536"),
-        ({"websocket_port": -1}, "port is -1"),
         ({"websocket_host": "192.0.2.1"}, "cannot listen on '192.0.2.1'"),  # of no machine (RFC 5737)
         ({"websocket_host": "." * 70}, "cannot listen on"),
     ],
 )
-def test_where_nothing_can_listen_is_told(open_viewer, options, says):
+def test_where_nothing_can_listen_is_told(open_viewer, pipeline, options, says):
     with pytest.raises(InputError, match=says):
-        open_viewer(LocalViewerConfig(**options))
+        open_viewer(pipeline, LocalViewerConfig(**options))
 
 
 def test_the_network_is_served_if_it_is_asked_for(to_all, interface):
@@ -154,17 +131,13 @@ def test_the_network_is_served_if_it_is_asked_for(to_all, interface):
     "path",
     [
         "/../../../../../../../../../../etc/passwd",
-        "/assets/../../../../../../../../../../../etc/passwd",
         "//etc/passwd",
         "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
         "/../__init__.py",
-        "/../../_viser.py?x=1",
         "/assets",
-        "/assets/..",
         "/a\0b",
         "/" + "a" * 5000,
         "http://elsewhere/index.html",
-        "*",
     ],
 )
 def test_no_file_outside_the_page_is_served(to_all, interface, path):
@@ -224,7 +197,7 @@ def send(port: int, messages: list, until=lambda: True) -> None:
 
             reading = asyncio.create_task(read())
             for message in messages:
-                await client.send(msgspec.msgpack.encode(message) if isinstance(message, dict) else message)
+                await client.send(packed(message))
             while not until():  # as long as the machine needs; pytest ends what never comes
                 await asyncio.sleep(0.01)
             reading.cancel()
@@ -236,62 +209,93 @@ def update(handle, value) -> dict:
     return {"type": "GuiUpdateMessage", "id": handle._impl.id, "updates": {"value": value}}
 
 
-def test_sizes_of_pictures_are_held_within_bounds(to_all, pipeline, monkeypatch):
-    """A resolution of 20,000 and a window a thousand times as wide as it is high."""
-    drawn = []
-    render = pipeline.model.viewer_panel.render
+def watch(monkeypatch, panel) -> list:
+    """The cameras that a panel draws, from now on."""
+    cameras, render = [], panel.render
 
     def watched(camera, obb_box=None):
-        drawn.append((int(camera.width), int(camera.height)))
+        cameras.append(camera)
         return render(camera, obb_box)
 
-    monkeypatch.setattr(pipeline.model.viewer_panel, "render", watched)
-    slider = to_all.control_panel._max_res.gui_handle
-    largest = 2048
-    for wish, aspect in ((20_000, 1.0), (20_000, 1e5), (20_000, 1e-5), (-5, 1.0), (0, 1e5)):
+    monkeypatch.setattr(panel, "render", watched)
+    return cameras
+
+
+def test_sizes_of_pictures_are_held_within_bounds(to_all, pipeline, monkeypatch):
+    """A resolution of 20,000 and a window a thousand times as wide as it is high."""
+    slider, largest = to_all.control_panel._max_res.gui_handle, 2048
+    drawn = watch(monkeypatch, pipeline.model.viewer_panel)
+    for wish, aspect in ((20_000, 1.0), (20_000, 1e5), (20_000, 1e-5), (-5, 1.0), (0, float("nan"))):
         drawn.clear()
-        count = len(drawn) + 1
-        send(
-            to_all.viser_server.get_port(),
-            [{**CAMERA, "aspect": aspect}, update(slider, wish)],
-            lambda count=count: len(drawn) >= count and slider.value in (64, largest),
-        )
+        messages = [{**CAMERA, "aspect": aspect}, update(slider, wish)]
+        send(to_all.viser_server.get_port(), messages, lambda: drawn and slider.value in (64, largest))
         assert slider.value == (largest if wish > 0 else 64)
-        assert all(4 <= side <= largest for size in drawn for side in size), drawn
+        assert all(4 <= int(side) <= largest for camera in drawn for side in (camera.width, camera.height))
 
 
-def test_messages_that_no_page_sends_do_nothing(to_all):
-    viewer = to_all
-    port, slider = viewer.viser_server.get_port(), viewer.control_panel._max_res.gui_handle
-    slider.value = 512
-    nan = float("nan")
-    garbage = [
-        b"",
-        b"\xc1 not msgpack",
-        "text",
-        msgspec.msgpack.encode([1, 2, 3]),
-        {"type": "NoSuchMessage"},
-        {"type": "ViewerCameraMessage"},
-        {**CAMERA, "wxyz": [0.0, 0.0, 0.0, 0.0]},
-        {**CAMERA, "position": [nan, 0.0, 0.0]},
-        {**CAMERA, "position": [1e300, 0.0, 0.0]},
-        {**CAMERA, "position": [0.0, 0.0]},
-        {**CAMERA, "aspect": 0.0},
-        {**CAMERA, "aspect": nan},
-        {**CAMERA, "fov": float("inf")},
-        {"type": "ShareUrlRequest"},
-        {"type": "FileTransferStart", "source_component_id": slider._impl.id, "transfer_uuid": "a", "filename": "b",
-         "mime_type": "c", "part_count": 10**9, "size_bytes": 10**15},
-        {"type": "GuiUpdateMessage", "id": slider._impl.id, "updates": {"value": nan}},
-        {"type": "GuiUpdateMessage", "id": slider._impl.id, "updates": {"is_button": True}},
-        {"type": "GuiUpdateMessage", "id": slider._impl.id, "updates": [1]},
-    ]  # fmt: skip
-    # The last one is in order: when it has had its effect, all others have been read.
-    send(port, [*garbage, CAMERA, update(slider, 128)], lambda: slider.value == 128)
-    assert viewer.viser_server._share_tunnel is None
-    assert not viewer.viser_server.gui._current_file_upload_states
-    while viewer.render_statemachines:  # until the client that has gone is no longer drawn for
-        time.sleep(0.01)
+def packed(message: dict | bytes | str) -> bytes | str:
+    return msgspec.msgpack.encode(message) if isinstance(message, dict) else message
+
+
+UPLOAD = {"source_component_id": "", "transfer_uuid": "a", "filename": "b", "mime_type": "c", "part_count": 10**9}
+NAN = float("nan")
+ODD = [
+    b"",
+    b"\xc1 not msgpack",
+    b"\x93\x01\x02\x03",  # a list
+    {"type": "NoSuchMessage"},
+    {"type": "ViewerCameraMessage"},
+    {**CAMERA, "wxyz": [0.0, 0.0, 0.0, 0.0]},
+    {**CAMERA, "position": [NAN, 0.0, 0.0]},
+    {**CAMERA, "position": [1e300, 0.0, 0.0]},
+    {**CAMERA, "position": [0.0, 0.0]},
+    {"type": "ShareUrlRequest"},
+    {"type": "FileTransferStart", **UPLOAD, "size_bytes": 10**15},
+    {"type": "GuiUpdateMessage", "id": "none", "updates": {"is_button": True}},
+    {"type": "GuiUpdateMessage", "id": "none", "updates": [1]},
+]
+
+
+@pytest.mark.parametrize("message", ODD)
+def test_a_message_that_no_page_sends_is_dropped(to_all, message):
+    server = to_all.viser_server._websock_server
+    assert isinstance(server._admit(packed(message)), ResetGuiMessage)
+    assert isinstance(server._admit(packed(CAMERA)), ViewerCameraMessage)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_training_survives_odd_messages(tiny_scene, tmp_path):
+    """The last is let through, and breaks the viewer of its browser, whose camera the training asks for."""
+    messages = [*ODD, "text", {**CAMERA, "wxyz": [1.0, 0.0, 0.0], "position": [0.0, 0.0, 0.0, 0.0]}]
+    options = {"--vis": "viewer", "--viewer.quit-on-train-completion": True}
+    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, 20, options))
+    viewer, over, failures = trainer.viewer_state, threading.Event(), []
+    camera_of, update_state = viewer.get_camera_state, trainer._update_viewer_state
+    browser = threading.Thread(target=send, args=(viewer.viser_server.get_port(), messages, over.is_set))
+
+    def get_camera_state(client):
+        try:
+            return camera_of(client)
+        except Exception:
+            failures.append(threading.current_thread())
+            raise
+
+    def update_viewer_state(step):
+        if step == 3:
+            browser.start()
+        while step >= 3 and threading.current_thread() not in failures:
+            viewer.last_step = -1000
+            update_state(step)
+
+    viewer.get_camera_state, trainer._update_viewer_state = get_camera_state, update_viewer_state
+    try:
+        trainer.train()
+    finally:
+        over.set()
+        browser.join()
+        viewer.viser_server.stop()
+    assert trainer.step == 19
+    assert viewer.viser_server._share_tunnel is None and not viewer.viser_server.gui._current_file_upload_states
 
 
 def test_a_browser_that_leaves_while_its_camera_moves_stops_nobody(to_all):
@@ -305,13 +309,12 @@ def test_a_camera_path_is_saved_in_its_folder(to_all):
     """Its name is what the browser says, and becomes a file's."""
     (name,) = to_all.viser_server._websock_server.file_names
     handle = to_all.viser_server.gui._gui_input_handle_from_id[name]
-    send(to_all.viser_server.get_port(), [update(handle, "../../../a\\b" + "c" * 1000)], lambda: "a_b" in handle.value)
-    assert handle.value == (".._.._.._a_b" + "c" * 1000)[:200]
+    send(to_all.viser_server.get_port(), [update(handle, "../../../a\\bc")], lambda: "a_b" in handle.value)
+    assert handle.value == ".._.._.._a_bc"
 
 
-def test_ns_viewer_listens_to_this_machine_alone(tiny_scene, tmp_path, monkeypatch, interface):
+def test_ns_viewer_listens_to_this_machine_alone(config, monkeypatch, interface):
     """Its own main function, with its own default of 0.0.0.0."""
-    config = trained(command_line("nrfgs", tiny_scene, tmp_path, 2))
     opened = []
 
     def viewer(*args, **more):
@@ -322,7 +325,6 @@ def test_ns_viewer_listens_to_this_machine_alone(tiny_scene, tmp_path, monkeypat
         port = opened[0].viser_server.get_port()
         assert reachable("127.0.0.1", port) and not reachable(interface, port)
         assert answer("127.0.0.1", port, "/")[0] == 200
-        assert answer("127.0.0.1", port, "/../../../../../../../../../../../etc/passwd")[0] == 404
         raise KeyboardInterrupt
 
     monkeypatch.setattr(run_viewer, "ViewerState", viewer)
@@ -340,28 +342,20 @@ def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):
         set_up(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--vis", "viewer_legacy"])
 
 
-def test_nrfgs_view_opens_a_compact_file_alone(tiny_scene, tmp_path, monkeypatch):
-    """No config.yml, no data set; and what it draws is what the file's config.yml leads to."""
-    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "out", 2))
+def test_nrfgs_view_opens_a_compact_file_alone(config, tmp_path, monkeypatch):
+    """Without config.yml and data set it draws what the file's config.yml leads to."""
     Compact(config, output=tmp_path / "with" / "it.nrf", measure=False).main()
     original = load_model(next((tmp_path / "with").rglob("config.yml")), "test")
     (tmp_path / "alone").mkdir()
     (tmp_path / "with" / "it.nrf").rename(tmp_path / "alone" / "it.nrf")
 
-    drawn = []
     viewer = view_file(tmp_path / "alone" / "it.nrf", LocalViewerConfig())
     try:
         model = viewer.pipeline.model
         camera = original.datamanager.eval_dataset.cameras[:1]
         ours, theirs = (one.get_outputs_for_camera(camera)["rgb"] for one in (model, original.model))
         assert (ours - theirs).abs().max() < 1e-6 and ours.std() > 0.01
-        render = model.viewer_panel.render
-
-        def watched(camera, obb_box=None):
-            drawn.append(render(camera, obb_box))
-            return drawn[-1]
-
-        monkeypatch.setattr(model.viewer_panel, "render", watched)
+        drawn = watch(monkeypatch, model.viewer_panel)
         # A browser's first view looks away; it is moved to where there is something to see.
         away = {**CAMERA, "position": [0.0, 0.0, 900.0], "look_at": [0.0, 0.0, 1000.0]}
         moved = []
@@ -369,7 +363,7 @@ def test_nrfgs_view_opens_a_compact_file_alone(tiny_scene, tmp_path, monkeypatch
         async def be_moved():
             port = viewer.viser_server.get_port()
             async with connect(f"ws://127.0.0.1:{port}", max_size=None) as client:
-                await client.send(msgspec.msgpack.encode(away))
+                await client.send(packed(away))
                 while not {"SetCameraPositionMessage", "SetCameraLookAtMessage"} <= {one["type"] for one in moved}:
                     moved.extend(msgspec.msgpack.decode(await client.recv()))
                 while not drawn:

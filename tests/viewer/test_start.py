@@ -14,16 +14,9 @@ from viser import _icons
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.training.trainer_config import parse
 from nrfgs_ns.viewer import start
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
-
-
-@pytest.fixture(scope="module")
-def pipeline(tiny_scene, tmp_path_factory):
-    words = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path_factory.mktemp("out"))]
-    return parse(words).pipeline.setup(device="cpu", test_mode="val")
 
 
 def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_path, monkeypatch):

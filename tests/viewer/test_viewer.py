@@ -4,8 +4,6 @@
 `test_browser_viewer.py` clicks through the same in a real browser.
 """
 
-import threading
-import urllib.request
 from contextlib import nullcontext
 from itertools import combinations
 from pathlib import Path
@@ -19,7 +17,7 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
-from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from short_trainings import command_line, set_up
 from torch.testing import assert_close
@@ -28,12 +26,9 @@ from viser.transforms import SO3
 
 import nrfgs_ns.training.trainer
 from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.gsnb import GsnbConfig
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
-from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
@@ -43,8 +38,8 @@ from nrfgs_ns.viewer.pictures import (
     DEPTH,
     FULL,
     VIEW_DEPENDENCE,
-    Shown,
-    modes,
+    PictureOptions,
+    legends,
     picture,
     scaled_depth,
     view_dependence,
@@ -56,31 +51,29 @@ FIELD = ["residual", "low branch", "high branch", "gate weight", "opacity residu
 """What the default field shows of itself."""
 
 
-@pytest.fixture
-def build(tiny_scene, tmp_path):
-    """Pipeline of a method whose head has learnt something: its weights are drawn at random."""
+@pytest.fixture(scope="module")
+def build(tiny_scene, tmp_path_factory):
+    """Pipeline of a method whose head has learnt something: random output layers and latents, or harmonics; and
+    opacities at which a pixel shows few splats."""
 
     def pipeline(method="nrfgs", *options):
-        config = parse([method, "--data", str(tiny_scene), "--output-dir", str(tmp_path), *map(str, options)])
+        out = tmp_path_factory.mktemp("out")
+        config = parse([method, "--data", str(tiny_scene), "--output-dir", str(out), *map(str, options)])
         config.pipeline.model.few_views = "off"
         torch.manual_seed(0)
         pipeline = config.pipeline.setup(device="cpu", test_mode="val")
-        give_it_something_to_show(pipeline.model)
+        model = pipeline.model
+        for parameter in model.head.parameters():
+            torch.nn.init.normal_(parameter, std=0.5)
+        for name, parameter in model.gauss_params.items():
+            if name in ("latents", "features_rest", "sg_colors"):
+                torch.nn.init.normal_(parameter, std=0.3)
+        model.gauss_params["opacities"].data.fill_(1.0)
+        model.update_to_step(10**6)
         pipeline.eval()
         return pipeline
 
     return pipeline
-
-
-def give_it_something_to_show(model) -> None:
-    """Random output layers and latents, or harmonics; and opacities at which a pixel shows few splats."""
-    for parameter in model.head.parameters():
-        torch.nn.init.normal_(parameter, std=0.5)
-    for name, parameter in model.gauss_params.items():
-        if name in ("latents", "features_rest", "sg_colors"):
-            torch.nn.init.normal_(parameter, std=0.3)
-    model.gauss_params["opacities"].data.fill_(1.0)
-    model.update_to_step(10**6)
 
 
 def two_cameras(pipeline):
@@ -89,21 +82,26 @@ def two_cameras(pipeline):
     return cameras[0:1], cameras[4:5]
 
 
+@pytest.fixture(scope="module")
+def scene(build):
+    """A model, and two cameras."""
+    pipeline = build()
+    return pipeline.model, *two_cameras(pipeline)
+
+
 def test_a_head_offers_what_it_has():
     def offered(config):
         head = config.setup()
         splats = {"means": torch.zeros(4, 3), "opacities": torch.zeros(4, 1), **head.splat_params(torch.zeros(4, 3))}
-        shown = modes(Field(head, splats))
-        assert (shown[0], shown[1], shown[-2], shown[-1]) == (FULL, BASE, VIEW_DEPENDENCE, DEPTH)
-        return shown[2:-2]
+        modes = list(legends(Field(head, splats)))
+        assert (modes[0], modes[1], modes[-2], modes[-1]) == (FULL, BASE, VIEW_DEPENDENCE, DEPTH)
+        return modes[2:-2]
 
     assert offered(NrfConfig()) == FIELD
     assert offered(NrfConfig(split_bands=False)) == ["residual", "opacity residual"]
     assert offered(NrfConfig(num_bands=1)) == ["residual", "opacity residual"]
     assert offered(NrfConfig(opacity_residual=False)) == FIELD[:-1]
-    for config in (ShConfig(), GsnbConfig(), SgConfig()):
-        assert offered(config) == ["residual"]
-    assert offered(VdgsConfig()) == ["residual", "opacity residual"]
+    assert offered(ShConfig()) == ["residual"]
 
 
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"])
@@ -111,8 +109,8 @@ def test_every_mode_is_a_picture_of_its_own(build, method):
     pipeline = build(method)
     model, (camera, _) = pipeline.model, two_cameras(pipeline)
     pictures = {}
-    for mode in modes(model.field):
-        outputs = picture(model, camera, Shown(mode))
+    for mode in legends(model.field):
+        outputs = picture(model, camera, PictureOptions(mode))
         assert outputs.keys() == model.get_outputs(camera).keys()
         rgb = outputs["rgb"]
         assert rgb.shape == (36, 48, 3) and torch.isfinite(rgb).all() and 0 <= rgb.min() and rgb.max() <= 1
@@ -122,12 +120,11 @@ def test_every_mode_is_a_picture_of_its_own(build, method):
         assert (pictures[one] - pictures[other]).abs().mean() > 1 / 255, (one, other)
 
 
-def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(build):
-    pipeline = build()
-    model, (camera, _) = pipeline.model, two_cameras(pipeline)
-    assert torch.equal(picture(model, camera, Shown(gain=0.0))["rgb"], model.get_base_color(camera))
-    assert torch.equal(picture(model, camera, Shown(BASE, gain=2.0))["rgb"], model.get_base_color(camera))
-    assert torch.equal(picture(model, camera, Shown(gain=1.0))["rgb"], model.get_outputs(camera)["rgb"])
+def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(scene):
+    model, camera, _ = scene
+    assert torch.equal(picture(model, camera, PictureOptions(gain=0.0))["rgb"], model.get_base_color(camera))
+    assert torch.equal(picture(model, camera, PictureOptions(BASE, gain=2.0))["rgb"], model.get_base_color(camera))
+    assert torch.equal(picture(model, camera, PictureOptions(gain=1.0))["rgb"], model.get_outputs(camera)["rgb"])
     view = model.project(camera)
     base, trained = model.field.base_of(view), model.field.seen_from(view)
     doubled = SplatAppearance(
@@ -135,33 +132,31 @@ def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(build):
     )
     # The same to rounding: 2^-24 in each of at most 300 splats that a pixel adds up.
     by_hand = model.composite(view, doubled)[0]["rgb"]
-    assert_close(picture(model, camera, Shown(gain=2.0))["rgb"], by_hand, rtol=0, atol=300 * 2**-24)
+    assert_close(picture(model, camera, PictureOptions(gain=2.0))["rgb"], by_hand, rtol=0, atol=300 * 2**-24)
 
 
 @pytest.mark.parametrize("mode", ["residual", "low branch", "high branch", "opacity residual"])
-def test_gain_scales_what_it_shows(build, mode):
+def test_gain_scales_what_it_shows(scene, mode):
     """Without any gain a change is grey, where the splats are as where they are not."""
-    pipeline = build()
-    model, (camera, _) = pipeline.model, two_cameras(pipeline)
+    model, camera, _ = scene
     # alpha + (1 - alpha), summed over at most 300 splats
-    grey = picture(model, camera, Shown(mode, gain=0.0))["rgb"]
+    grey = picture(model, camera, PictureOptions(mode, gain=0.0))["rgb"]
     assert_close(grey, torch.full_like(grey, 0.5), rtol=0, atol=300 * 2**-24)
-    half, whole = (picture(model, camera, Shown(mode, gain=gain))["rgb"] - 0.5 for gain in (0.5, 1.0))
+    half, whole = (picture(model, camera, PictureOptions(mode, gain=gain))["rgb"] - 0.5 for gain in (0.5, 1.0))
     assert half.abs().mean() < whole.abs().mean()
 
 
-def test_frozen_view_is_the_head_seen_from_elsewhere(build):
-    pipeline = build()
-    model, (here, there) = pipeline.model, two_cameras(pipeline)
+def test_frozen_view_is_the_head_seen_from_elsewhere(scene):
+    model, here, there = scene
     center = model.project(there).center
     view = model.project(here)
     expected = model.composite(view, model.field.seen_from(view._replace(center=center)))[0]["rgb"]
-    frozen = picture(model, here, Shown(frozen_center=center))["rgb"]
+    frozen = picture(model, here, PictureOptions(frozen_center=center))["rgb"]
     assert torch.equal(frozen, expected)
-    unfrozen = picture(model, here, Shown())["rgb"]
+    unfrozen = picture(model, here, PictureOptions())["rgb"]
     assert (frozen - unfrozen).abs().mean() > 1 / 255
-    assert torch.equal(picture(model, here, Shown(frozen_center=view.center))["rgb"], unfrozen)
-    residuals = [picture(model, here, Shown("residual", frozen_center=o))["rgb"] for o in (None, center)]
+    assert torch.equal(picture(model, here, PictureOptions(frozen_center=view.center))["rgb"], unfrozen)
+    residuals = [picture(model, here, PictureOptions("residual", frozen_center=o))["rgb"] for o in (None, center)]
     assert (residuals[0] - residuals[1]).abs().mean() > 1 / 255
 
 
@@ -234,34 +229,9 @@ class Browser(RenderStateMachine):
         return thread.outputs
 
 
-@pytest.fixture
-def open_viewer(tiny_scene, tmp_path):
-    opened = []
-
-    def start(pipeline):
-        viewer = Viewer(
-            ViewerConfig(websocket_host="127.0.0.1"),
-            log_filename=tmp_path / "viewer.txt",
-            datapath=tiny_scene,
-            pipeline=pipeline,
-            train_lock=threading.Lock(),
-        )
-        opened.append(viewer)
-        viewer.init_scene(pipeline.datamanager.train_dataset, "completed", pipeline.datamanager.eval_dataset)
-        return viewer
-
-    yield start
-    for viewer in opened:
-        viewer.viser_server.stop()
-
-
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
-def test_page_is_served_and_every_output_can_be_shown(build, open_viewer, method):
+def test_every_output_can_be_shown(build, open_viewer, method):
     viewer = open_viewer(build(method))
-    url = f"http://127.0.0.1:{viewer.viser_server.get_port()}"
-    with urllib.request.urlopen(url) as page:
-        assert page.status == 200 and b"<html" in page.read(4096).lower()
-
     model, pose = viewer.pipeline.model, two_cameras(viewer.pipeline)[0].camera_to_worlds[0]
     model.train()
     for mode in model.viewer_panel.legends:
@@ -293,7 +263,7 @@ def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
     panel.frozen_center, panel.freeze.value = model.project(elsewhere).center, True
     viewer.control_panel.background_color = (255, 0, 0)
     viewer.control_panel.crop_viewport = True
-    assert panel.shown.mode == "residual" and panel.shown.gain == 1.5
+    assert panel.options.mode == "residual" and panel.options.gain == 1.5
     assert (coarse(Browser.sees(viewer, pose)["rgb"]) - plain).abs().mean() > 0.05
     assert model.crop_box is None
     # The viewer's crop box is one unit wide, and the scene is larger: there is less to see.
@@ -329,20 +299,20 @@ def test_exposure_and_a_photographs_look(build, open_viewer):
     model, (camera, _) = pipeline.model, two_cameras(pipeline)
     with torch.no_grad():
         model.photograph.shots[3] = torch.tensor([-1.0, 0.5, 0.0])
-    plain = picture(model, camera, Shown())["rgb"]
+    plain = picture(model, camera, PictureOptions())["rgb"]
     assert torch.equal(plain, model.get_outputs_for_camera(camera)["rgb"])  # the mean look
-    assert_close(picture(model, camera, Shown(stops=1.0))["rgb"], exposed(plain, 1.0))
-    third = picture(model, camera, Shown(photograph=3))["rgb"]
+    assert_close(picture(model, camera, PictureOptions(stops=1.0))["rgb"], exposed(plain, 1.0))
+    third = picture(model, camera, PictureOptions(photograph=3))["rgb"]
     assert_close(third, exposed(plain, model.photograph.stops()[3]))
     assert third.mean() < plain.mean() - 0.02
 
     viewer, panel, pose = open_viewer(pipeline), model.viewer_panel, camera.camera_to_worlds[0]
     seen = coarse(Browser.sees(viewer, pose)["rgb"])
     panel.look.value = model.photograph.names[3]
-    assert panel.shown.photograph == 3
+    assert panel.options.photograph == 3
     assert coarse(Browser.sees(viewer, pose)["rgb"]).mean() < seen.mean() - 0.01
     panel.stops.value = 1.5
-    assert panel.shown.stops == 1.5
+    assert panel.options.stops == 1.5
     assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], plain)
 
 
@@ -350,7 +320,7 @@ STEPS = 18
 """Two refinements and a change of resolution."""
 
 
-def watched_training(scene, out, each_step, **more) -> dict:
+def watched_training(scene, out, each_step) -> dict:
     """Train for STEPS and call each_step(trainer) after each; parameters, optimisers and random state at the end."""
     options = {
         "--pipeline.model.densification": Splatfacto(
@@ -359,26 +329,20 @@ def watched_training(scene, out, each_step, **more) -> dict:
         "--pipeline.model.resolution-schedule": 9,
         "--pipeline.model.num-downscales": 1,
         "--pipeline.model.few-views": "off",
-        **more,
+        # Nerfstudio draws the images to evaluate with the generator that orders the training's.
+        "--steps-per-eval-image": 4,
+        "--steps-per-eval-all-images": 8,
     }
     trainer = set_up(command_line("nrfgs", scene, out, STEPS, options))
     trainer._update_viewer_state = lambda step: each_step(trainer)
     trainer.train()
-    held = [p for o in trainer.optimizers.optimizers.values() for s in o.state.values() for p in s.values()]
+    states = [state for o in trainer.optimizers.optimizers.values() for state in o.state.values()]
+    tensors = [*trainer.pipeline.model.state_dict().values(), *(value for state in states for value in state.values())]
     return {
-        "parameters": dict(trainer.pipeline.model.state_dict()),
-        "optimisers": [value for value in held if isinstance(value, torch.Tensor)],
-        "random": torch.get_rng_state(),
+        "tensors": [*(value for value in tensors if isinstance(value, torch.Tensor)), torch.get_rng_state()],
+        "splats": trainer.pipeline.model.num_points,
         "folder": trainer.base_dir,
     }
-
-
-def assert_same_training(a: dict, b: dict) -> None:
-    tensors = [name for name, value in a["parameters"].items() if isinstance(value, torch.Tensor)]
-    assert all(torch.equal(a["parameters"][name], b["parameters"][name]) for name in tensors)
-    assert len(a["optimisers"]) == len(b["optimisers"]) > 0
-    assert all(torch.equal(one, other) for one, other in zip(a["optimisers"], b["optimisers"], strict=True))
-    assert torch.equal(a["random"], b["random"])
 
 
 def test_a_training_does_not_notice_who_watches_and_tensorboard_shows_the_head(
@@ -404,41 +368,30 @@ def test_a_training_does_not_notice_who_watches_and_tensorboard_shows_the_head(
         viewers[0].control_panel.background_color = (255, 0, 0)
         seen.append(Browser.sees(viewers[0], cameras.camera_to_worlds[len(seen) % 8])["rgb"].mean().item())
 
-    # The same evaluations in both, since nerfstudio draws their images with the generator that orders the training's.
-    often = {"--steps-per-eval-image": 4, "--steps-per-eval-all-images": 8}
-    tracked = watched_training(tiny_scene, tmp_path / "tracked", watch, **often)
+    tracked = watched_training(tiny_scene, tmp_path / "tracked", watch)
     monkeypatch.setattr(nrfgs_ns.training.trainer, "track", lambda *_: None)
-    quiet = watched_training(tiny_scene, tmp_path / "quiet", lambda trainer: None, **often)
+    quiet = watched_training(tiny_scene, tmp_path / "quiet", lambda trainer: None)
     assert len(seen) == STEPS // 2 and len(set(seen)) > 1
-    assert len(quiet["parameters"]["gauss_params.means"]) != 300, "nothing was densified: the test would prove less"
-    assert_same_training(quiet, tracked)
+    assert quiet["splats"] != 300, "nothing was densified: the test would prove less"
+    assert len(quiet["tensors"]) == len(tracked["tensors"]) > 20
+    assert all(torch.equal(one, other) for one, other in zip(quiet["tensors"], tracked["tensors"], strict=True))
 
-    def logged(run):
-        events = EventAccumulator(str(run["folder"])).Reload()
-        ours = {
-            kind: sorted(tag for tag in events.Tags()[kind] if tag.startswith("Appearance/"))
-            for kind in ("scalars", "histograms", "images")
-        }
-        return events, ours
-
-    events, ours = logged(tracked)
-    numbers = [f"{name} ({'mean' if name == 'gate weight' else 'rms'})" for name in FIELD]
-    expected = sorted(f"Appearance/{name}" for name in [*numbers, "splats", "visible splats"])
-    assert ours == {
-        "scalars": expected,
-        "histograms": sorted(f"Appearance/{name}" for name in FIELD),
-        "images": sorted(f"Appearance/{name}" for name in [BASE, *FIELD]),
+    events = EventAccumulator(str(tracked["folder"])).Reload()
+    ours = {
+        kind: {tag.removeprefix("Appearance/") for tag in events.Tags()[kind] if tag.startswith("Appearance/")}
+        for kind in ("scalars", "histograms", "images")
     }
+    numbers = {f"{name} ({'mean' if name == 'gate weight' else 'rms'})" for name in FIELD}
+    assert ours["scalars"] == numbers | {"splats", "visible splats"}
+    assert ours["histograms"] == set(FIELD) and ours["images"] == {BASE, *FIELD}
     assert [event.step for event in events.Images("Appearance/residual")] == [8, 16]
     assert [event.step for event in events.Scalars("Appearance/splats")] == [4, 8, 12, 16]
     splats = [event.value for event in events.Scalars("Appearance/splats")]
-    assert splats[0] == 300 and splats[-1] == len(tracked["parameters"]["gauss_params.means"])
-    residual = [event.value for event in events.Scalars("Appearance/residual (rms)")]
-    assert 0 < residual[-1] <= 0.2 * 3**0.5
-    visible = events.Scalars("Appearance/visible splats")[-1].value
+    assert splats[0] == 300 and splats[-1] == tracked["splats"]
+    assert 0 < events.Scalars("Appearance/residual (rms)")[-1].value <= 0.2 * 3**0.5
     histogram = events.Histograms("Appearance/gate weight")[-1].histogram_value
-    assert histogram.num == visible and 0 < histogram.min < histogram.max < 1
-    assert logged(quiet)[1] == {"scalars": [], "histograms": [], "images": []}
+    assert histogram.num == events.Scalars("Appearance/visible splats")[-1].value
+    assert 0 < histogram.min < histogram.max < 1
 
 
 def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):

@@ -26,7 +26,7 @@ from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import commands
 from nrfgs_ns.densification import strategy_from
-from nrfgs_ns.viewer.pictures import modes
+from nrfgs_ns.viewer.pictures import legends
 
 CONTRIBUTING = Path(__file__).resolve().parents[3] / "docs" / "contributing.md"
 
@@ -56,7 +56,7 @@ def test_its_colours_are_linear_in_the_direction(my_head):
         assert torch.allclose(head(splats, rows, center).colors[0], expected, atol=1e-6)
     with pytest.raises(ValueError, match="distance_eps"):
         my_head.LinearConfig(distance_eps=0.0).setup()
-    assert modes(Field(head, splats)) == ["full", "base colour", "residual", "view dependence", "depth"]
+    assert list(legends(Field(head, splats))) == ["full", "base colour", "residual", "view dependence", "depth"]
 
 
 def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tmp_path, monkeypatch):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Registers the methods with nerfbaselines, which reads this file where it is installed (entry point
-`nerfbaselines.specs`), or where NERFBASELINES_REGISTER names it. Nothing heavy is imported.
+"""Registers the methods with nerfbaselines, which reads this file by the entry point `nerfbaselines.specs`, or by
+NERFBASELINES_REGISTER. Nothing heavy is imported.
 
-There is no recipe for an environment: the methods run in that in which they are installed (`--backend python`).
+The methods run in the environment that they are installed in (`--backend python`).
 """
 
 from nerfbaselines import register
@@ -17,17 +17,14 @@ METHODS = {
     "nrfgs-sg": ("NrfgsSg", "NRF-GS host with SG", "The same host with three spherical Gaussians per splat."),
 }
 """Method -> its class in `method.py`, its name, and a description."""
+LICENSE = {"name": "Apache 2.0", "url": "https://www.apache.org/licenses/LICENSE-2.0"}
 
 for _method, (_class, _name, _description) in METHODS.items():
     register(
         {
             "id": _method,
-            "method_class": f"nrfgs_ns.nerfbaselines.method:{_class}",
+            "method_class": f"nrfgs_lab.nerfbaselines.method:{_class}",
             "backends_order": ["python"],
-            "metadata": {
-                "name": _name,
-                "description": _description,
-                "licenses": [{"name": "Apache 2.0", "url": "https://www.apache.org/licenses/LICENSE-2.0"}],
-            },
+            "metadata": {"name": _name, "description": _description, "licenses": [LICENSE]},
         }
     )

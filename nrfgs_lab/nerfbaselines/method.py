@@ -1,35 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nerfbaselines' `Method` around this project's trainer; nothing of nerfbaselines is needed to import it.
 
-A checkpoint is a folder:
+Nerfbaselines' poses are camera-to-world with y down and z forwards (OpenCV), in the data set's own world; nerfstudio's
+have y up and z backwards, in a world that is turned upright, centred and scaled to the cameras. A checkpoint is a
+folder:
 
     config.yml                    the training's configuration, as nerfstudio writes it
-    world.json                    the way from the data set's world to the model's, and what else the images decide
+    world.json                    the transform from the data set's world, and what else depends on the images
     nerfstudio_models/step-*.ckpt parameters, optimisers and generators, as `ns-train` writes them
 
-With the training set a training goes on from it as if it had never stopped; without, it renders.
+With the training set a training resumes from it exactly; without, it renders.
 """
 
 import contextlib
 import copy
 import json
+import math
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import yaml
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
+from torch import Tensor
 
+from nrfgs_ns.data.datamanager import NrfgsDatamanager, NrfgsDatamanagerConfig, NrfgsInputDataset
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.views import different_views
+from nrfgs_ns.data.world import place
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.nerfbaselines.photos import World, background_of, hold_in_memory
 from nrfgs_ns.training.checkpoint_files import read_or_refuse
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.identity import leaves
@@ -43,13 +51,11 @@ class Nrfgs:
     """`ns-train nrfgs`.
 
     Args:
-        train_dataset: nerfbaselines' data set with its images; only rendering can do without.
-        config_overrides: options of `ns-train`, with their dots: {"pipeline.model.appearance.latent_dim": 16}. Not
-            read with a checkpoint, which has its own.
+        checkpoint: folder to resume or render from.
+        train_dataset: nerfbaselines' data set with its images; only rendering from a checkpoint can do without.
+        config_overrides: options of `ns-train`, with their dots: {"pipeline.model.appearance.latent_dim": 16}. A
+            checkpoint has its own.
 
-    Raises:
-        InputError: an option is unknown or out of range, the data cannot be used, or there is neither data nor
-            checkpoint.
     """
 
     method = "nrfgs"
@@ -61,21 +67,23 @@ class Nrfgs:
         train_dataset: dict[str, Any] | None = None,
         config_overrides: dict[str, Any] | None = None,
     ):
-        if checkpoint is None and train_dataset is None:
-            raise InputError("Give a training data set to train on, or a checkpoint to render from.")
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.trainer: NrfgsTrainer | None = None
         if self.checkpoint is None:
+            poses = train_dataset["cameras"].poses
             config = configure(self.method, config_overrides or {}, train_dataset["metadata"])
-            self.config = config.for_views(different_views(torch.from_numpy(train_dataset["cameras"].poses)))
-            self.world = World.around(train_dataset["cameras"].poses, self.config.pipeline.datamanager.dataparser)
+            self.config = config.for_views(different_views(torch.from_numpy(poses)))
+            self.world = World.around(poses, self.config.pipeline.datamanager.dataparser)
         else:
-            self.config, self.record, self.file = _read_checkpoint(self.checkpoint)
+            self.config = read_config(self.checkpoint / "config.yml")
+            self.config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+            (self.file,) = (self.checkpoint / MODELS).glob("*.ckpt")
+            self.record = json.loads((self.checkpoint / "world.json").read_text(encoding="utf-8"))
             self.world = World(torch.tensor(self.record["transform"], dtype=torch.float64), self.record["scale"])
         if train_dataset is None:
-            loaded = read_or_refuse(self.file)
-            self.model = _build_model(copy.deepcopy(self.config), self.record, loaded)
-            self.step = loaded["step"] + 1
+            content = read_or_refuse(self.file)
+            self.model = _build_model(copy.deepcopy(self.config), self.record, content)
+            self.step = content["step"] + 1
         else:
             self._set_up_training(train_dataset)
         self.loaded_step = None if self.checkpoint is None else self.step
@@ -127,19 +135,8 @@ class Nrfgs:
         }
 
     def train_iteration(self, step: int) -> dict[str, float]:
-        """One step.
-
-        Args:
-            step: from 0, or from the loaded step.
-
-        Returns:
-            loss, its terms and metrics, every `logging.steps_per_log` steps; {} between: no step waits for a GPU.
-
-        Raises:
-            TrainingStopped: a number is not finite.
-        """
-        if self.trainer is None:
-            raise InputError("This method was loaded without a training data set. Give one to train.")
+        """One step, counted from 0: the loss, its terms and metrics every `logging.steps_per_log` steps; {} between,
+        so that no step waits for a GPU."""
         trainer = self.trainer
         trainer.step = step
         trainer.pipeline.train()
@@ -174,11 +171,9 @@ class Nrfgs:
         """There are no appearance embeddings."""
 
     def optimize_embedding(self, dataset: dict[str, Any], *, embedding: np.ndarray | None = None) -> dict[str, Any]:
-        """Raise NotImplementedError: there are no appearance embeddings."""
         raise NotImplementedError
 
     def save(self, path: str) -> None:
-        """Write a checkpoint into a folder."""
         folder = Path(path)
         models = folder / MODELS
         models.mkdir(parents=True, exist_ok=True)
@@ -212,39 +207,29 @@ def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) 
         overrides: options and their values, which win over the data set's background in `metadata`.
 
     Raises:
-        InputError: an option is unknown, or belongs to a loop that nerfbaselines does not run.
+        InputError: an option belongs to what nerfbaselines does itself, or the background is neither black nor white.
+        SystemExit: an option is unknown; tyro has said which.
     """
-    background = background_of(metadata)
-    words = [] if background is None else ["--pipeline.model.background_color", background]
+    words = []
+    if (color := metadata.get("background_color")) is not None:
+        names = {(0, 0, 0): "black", (255, 255, 255): "white"}
+        name = names.get(tuple(np.asarray(color).tolist()))
+        if name is None:
+            raise InputError(f"The data set's background is {np.asarray(color)}; only black and white are known.")
+        words = ["--pipeline.model.background_color", name]
     for name, value in overrides.items():
         values = value if isinstance(value, (list, tuple)) else [value]
         words += [f"--{name}", *map(str, values)]
-    try:
-        config = parse([method, *words])
-    except SystemExit as error:  # tyro has said on the screen which one, and what there is
-        raise InputError(f"These are not options of ns-train {method}: {overrides}") from error
-    if config.time_budget is not None or config.machine.num_devices > 1:
-        raise InputError("time_budget and machine.num_devices are ns-train's: here nerfbaselines counts the steps.")
+    config = parse([method, *words])
+    resized = config.pipeline.datamanager.camera_res_scale_factor != 1.0
+    if config.time_budget is not None or config.machine.num_devices > 1 or resized:
+        raise InputError(
+            "time_budget, machine.num_devices and camera_res_scale_factor are ns-train's: here nerfbaselines counts "
+            "the steps, starts the process and sizes the images."
+        )
     config.vis, config.logging.profiler, config.logging.local_writer.enable = "", "none", False
     config.timestamp, config.data = "nerfbaselines", None
     return config
-
-
-def _read_checkpoint(folder: Path) -> tuple[NrfgsTrainerConfig, dict[str, Any], Path]:
-    """The configuration for this machine's device, the content of world.json, and the file of the parameters."""
-    files = list((folder / MODELS).glob("*.ckpt"))
-    try:
-        record = json.loads((folder / "world.json").read_text(encoding="utf-8"))
-        record = {name: record[name] for name in ("transform", "scale", "scene_unit", "training_images")}
-        (file,) = files
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{folder} is not a whole checkpoint of nrfgs, a world.json and one file in {MODELS} ({error!r}). Copy it "
-            "again."
-        ) from error
-    config = read_config(folder / "config.yml")
-    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
-    return config, record, file
 
 
 def _build_model(config: NrfgsTrainerConfig, record: dict[str, Any], content: dict[str, Any]) -> NrfgsModel:
@@ -264,3 +249,100 @@ def _build_model(config: NrfgsTrainerConfig, record: dict[str, Any], content: di
         {name.removeprefix(own): value for name, value in content["pipeline"].items() if name.startswith(own)}
     )
     return model.to(config.machine.device_type)
+
+
+class World(NamedTuple):
+    """The map from the data set's world to the one that is trained in, x -> scale (R x + t)."""
+
+    transform: Tensor
+    """[R | t], float64 [3, 4], R a rotation"""
+    scale: float
+    """> 0"""
+
+    @classmethod
+    def around(cls, poses: np.ndarray, options: NrfgsDataParserConfig) -> "World":
+        """The world that nerfstudio's parser, with these options, makes of nerfbaselines' poses [V, 3 or 4, 4]."""
+        rows = np.tile(np.eye(4), (len(poses), 1, 1))
+        rows[:, :3] = _opengl(poses).numpy()
+        how = (options.orientation_method, options.center_method, options.auto_scale_poses, options.scale_factor)
+        _, transform, scale = place(rows, *how)
+        return cls(transform.double(), scale)
+
+    def points(self, xyz: Tensor) -> Tensor:
+        """Points float64 [N, 3] of the data set's world in this one."""
+        return self.scale * (xyz @ self.transform[:, :3].T + self.transform[:, 3])
+
+    def cameras(self, given: Any) -> Cameras:
+        """Nerfbaselines' pinhole cameras [V] as nerfstudio's."""
+        poses = _opengl(given.poses)
+        rotation = self.transform[:, :3] @ poses[:, :, :3]
+        center = self.points(poses[:, :, 3])
+        intrinsics = torch.from_numpy(np.array(given.intrinsics, dtype=np.float32))
+        sizes = torch.from_numpy(np.array(given.image_sizes, dtype=np.int64))
+        return Cameras(
+            camera_to_worlds=torch.cat([rotation, center[..., None]], dim=-1).float(),
+            **{name: intrinsics[:, i].contiguous() for i, name in enumerate(("fx", "fy", "cx", "cy"))},
+            **{name: sizes[:, i].contiguous() for i, name in enumerate(("width", "height"))},
+            camera_type=CameraType.PERSPECTIVE,
+        )
+
+
+def _opengl(poses: np.ndarray) -> Tensor:
+    """Poses [V, 3 or 4, 4] with y up and z backwards, float64 [V, 3, 4]."""
+    flip = np.array([1.0, -1.0, -1.0, 1.0])
+    return torch.from_numpy(np.asarray(poses, dtype=np.float64)[:, :3] * flip)
+
+
+def hold_in_memory(config: NrfgsDatamanagerConfig, dataset: dict[str, Any], world: World) -> None:
+    """Let a datamanager's configuration hold nerfbaselines' training set in memory: its classes are replaced, because
+    nerfstudio copies configurations."""
+    cameras, images, masks = world.cameras(dataset["cameras"]), dataset["images"], dataset.get("masks")
+    metadata: dict[str, Tensor] = {}
+    if (xyz := dataset.get("points3D_xyz")) is not None:
+        metadata["points3D_xyz"] = world.points(torch.from_numpy(np.array(xyz, dtype=np.float64))).float()
+        metadata["points3D_rgb"] = torch.from_numpy(dataset["points3D_rgb"])
+    outputs = DataparserOutputs([Path(path) for path in dataset["image_paths"]], cameras, metadata=metadata)
+
+    class GivenParser(DataParser):
+        """The same for all splits."""
+
+        def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+            return outputs
+
+    class GivenImages(NrfgsInputDataset):
+        """The images in memory, which nerfbaselines may have padded to one size."""
+
+        def _cropped(self, images, index: int) -> np.ndarray:
+            width, height = self._sizes[index]
+            return _as_bytes(np.asarray(images[index])[:height, :width])
+
+        def get_numpy_image(self, image_idx: int) -> np.ndarray:
+            image = self._cropped(images, image_idx)
+            return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=-1)
+
+        def get_data(self, image_idx: int, image_type="float32") -> dict[str, Any]:
+            data = super().get_data(image_idx, image_type)
+            if masks is not None:
+                data["mask"] = torch.from_numpy(self._cropped(masks, image_idx) > 127)[..., None]
+            return data
+
+    class GivenDatamanager(NrfgsDatamanager):
+        """The training set alone: nerfbaselines evaluates."""
+
+        dataset_type = GivenImages
+
+        def create_eval_dataset(self):
+            return self.train_dataset
+
+        def load_all_images(self) -> tuple[int, int]:
+            return len(self.cached_train), 0
+
+    config._target, config.dataparser._target = GivenDatamanager, GivenParser
+    config.image_memory = math.inf  # they are in memory
+
+
+def _as_bytes(image: np.ndarray) -> np.ndarray:
+    """Bytes as they are, truth values as 0 and 255, floats in [0, 1] times 255, rounded."""
+    if image.dtype == np.uint8:
+        return image
+    return np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
