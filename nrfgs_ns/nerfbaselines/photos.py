@@ -37,15 +37,9 @@ class World(NamedTuple):
         """The world that nerfstudio's parser, with these options, makes of nerfbaselines' poses [V, 3 or 4, 4]."""
         rows = np.tile(np.eye(4), (len(poses), 1, 1))
         rows[:, :3] = _opengl(poses).numpy()
-        method = options.orientation_method
-        if len(poses) == 1 and method == "vertical":  # needs two cameras
-            method = "up"
-        _, transform, scale = place(rows, method, options.center_method, options.auto_scale_poses, options.scale_factor)
-        if not torch.isfinite(transform).all():
-            raise InputError(
-                "The data set's poses cannot be oriented (their up directions cancel). Set "
-                "pipeline.datamanager.dataparser.orientation_method to none."
-            )
+        _, transform, scale = place(
+            rows, options.orientation_method, options.center_method, options.auto_scale_poses, options.scale_factor
+        )
         return cls(transform.double(), scale)
 
     def points(self, xyz: Tensor) -> Tensor:

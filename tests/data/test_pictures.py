@@ -64,7 +64,7 @@ def test_large_photographs_of_colmap_need_no_answer(tmp_path, monkeypatch):
     assert manager.train_dataset[0]["image"].shape == (4, 850, 3)
 
 
-TAKEN = {"exposure_time": 1 / 250, "f_number": 2.4, "iso": 50.0, "focal_length": 4.3, "make": "Maker", "model": "Phone"}
+TAKEN = {"exposure_time": 1 / 250, "f_number": 2.4, "iso": 50.0, "focal_length": 4.3, "model": "Phone"}
 
 
 def rounded(found: dict) -> dict:
