@@ -257,8 +257,8 @@ class NrfgsDataParser(DataParser):
     # Different for COLMAP models.
 
     def _read(self) -> tuple[dict[str, Any], Path]:
-        """The data set as a transforms.json, checked by `check_frames`, its frames in the order of splitting (by name, as
-        in nerfstudio); and the file that messages name."""
+        """The data set as a transforms.json, checked by `check_frames`, its frames sorted by name for splitting, as
+        in nerfstudio; and the file that messages name."""
         meta, source = read_transforms(self.config.data)
         check_frames(meta["frames"], source)
         meta["frames"].sort(key=lambda frame: self._file(frame["file_path"]).parts)

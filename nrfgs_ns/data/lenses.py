@@ -89,8 +89,8 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
         named = holder.get("camera_model", model)
         if named not in drawn or CAMERA_MODEL_TO_TYPE[named] != CAMERA_MODEL_TO_TYPE[model]:
             raise InputError(
-                f"{source}: camera_model {where} is {shown(repr(named))}. Use one of {', '.join(drawn)} for all frames, at "
-                "the top level, or undistort the photographs to one of them."
+                f"{source}: camera_model {where} is {shown(repr(named))}. Use one of {', '.join(drawn)} at the "
+                "top level for all frames, or undistort the photographs to one of them."
             )
         for key in UNREAD if CAMERA_MODEL_TO_TYPE[model] != CameraType.FISHEYE else UNREAD[:-1]:
             if holder.get(key, 0) != 0:
