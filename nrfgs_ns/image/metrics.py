@@ -4,23 +4,22 @@
 Conventions, for every function of this module:
 
 - `pred` and `gt` are images [H, W, 3] in [0, 1] of a floating dtype; `mask` is [H, W, 1] bool, True inside, or None.
-- The result is a Python float, or None where the metric is undefined: an empty mask, or an image (or a mask) too small
-  for the window. It is NaN only if the prediction is not finite, so that a diverged model is seen.
+- The result is a Python float; None where the metric is undefined (an empty mask, or an image or mask too small for the
+  window); NaN only if the prediction is not finite.
 - Without a mask the values are those of torchmetrics and pytorch_msssim.
 - Under a mask PSNR and L1 are means over the pixels inside. The windowed metrics first replace the prediction outside
-  the mask by the truth; SSIM and MS-SSIM then average over the windows whose centre is inside. LPIPS cannot leave
-  pixels out of its average: under a mask it is a lower bound.
-- Colour-corrected metrics (cc_psnr, cc_ssim, ...) are those of the prediction after `fit_colors`: the error that is
-  left without the test photograph's exposure and white balance, which no method can know. Never quote them alone.
-- Arithmetic is float32 on a CPU; it is float64 if the images are, and on CUDA, where a float32 convolution may run in
-  TF32, whose 10 bits of mantissa SSIM's differences of squares cannot stand. No gradient is recorded.
+  by the truth; SSIM and MS-SSIM average over the windows whose centre is inside; LPIPS, which averages over all pixels,
+  is a lower bound.
+- Colour-corrected metrics (cc_psnr, cc_ssim, ...) are those of the prediction after `fit_colors`, without the error of
+  the test photograph's exposure and white balance, which no method can know. Never quote them alone.
+- Arithmetic is float32 on a CPU, float64 if the images are, and on CUDA, where a float32 convolution may run in TF32,
+  which is too coarse for SSIM's differences of squares. No gradient is recorded.
 """
 
 from __future__ import annotations
 
 import functools
 import os
-import pickle
 
 import torch
 import torch.nn.functional as F
@@ -70,10 +69,7 @@ def l1(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
 
 @torch.no_grad()
 def ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
-    """Structural similarity (Wang et al. 2004), mean over channels and valid windows; 1 is identical.
-
-    None if a side is shorter than 11 pixels, or if no valid window has its centre inside the mask.
-    """
+    """Structural similarity (Wang et al. 2004), mean over channels and valid windows; 1 is identical."""
     pred, gt, mask = _planes(pred, gt, mask)
     if min(gt.shape[-2:]) < WINDOW_SIZE:
         return None
@@ -86,9 +82,8 @@ def ms_ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | Non
     """Multi-scale SSIM (Wang et al. 2003) over five scales: prod_j cs_j^w_j, times ssim^w at the coarsest scale.
 
     Each channel's means are clamped at zero before the powers, and the product is averaged over the channels. Scales
-    are averages over 2 x 2 pixels; a coarse pixel is inside the mask if any of its fine pixels is.
-
-    None if a side is shorter than 161 pixels, or if at some scale no valid window has its centre inside the mask.
+    are averages over 2 x 2 pixels; a coarse pixel is inside the mask if any of its fine pixels is. None if a side is
+    shorter than 161 pixels, or if at some scale no window has its centre inside the mask.
     """
     pred, gt, mask = _planes(pred, gt, mask)
     if min(gt.shape[-2:]) < MS_SSIM_MIN_SIDE:
@@ -109,18 +104,15 @@ def ms_ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | Non
 
 
 def ssim_maps(pred: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
-    """The SSIM map and its contrast-structure factor, one value per channel and valid window.
+    """The SSIM map and its contrast-structure factor of images [3, H, W], sides of at least 11.
 
     With the moments mu, var, cov under an 11 x 11 Gaussian of sigma 1.5:
     cs = (2 cov + C2) / (var_p + var_g + C2), ssim = cs (2 mu_p mu_g + C1) / (mu_p^2 + mu_g^2 + C1).
 
-    Args:
-        pred, gt: [3, H, W], sides of at least 11.
-
     Returns:
         ssim and cs, [3, H - 10, W - 10] each; entry (i, j) is the window centred on pixel (i + 5, j + 5).
     """
-    taps = torch.arange(WINDOW_SIZE, dtype=gt.dtype, device=gt.device) - WINDOW_SIZE // 2
+    taps = torch.arange(WINDOW_SIZE, dtype=gt.dtype, device=gt.device) - REACH
     gauss = torch.exp(-taps.square() / (2 * WINDOW_SIGMA**2))
     gauss = gauss / gauss.sum()
     moments = blur(torch.cat([pred, gt, pred * pred, gt * gt, pred * gt]), gauss)
@@ -138,13 +130,10 @@ def blur(planes: Tensor, window: Tensor) -> Tensor:
 
 
 def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[str, float | None]:
-    """All metrics of one image at once, on the device of `pred`.
+    """The metrics of an image by `METRIC_NAMES`, on the device of `pred`.
 
-    LPIPS (Zhang et al. 2018, AlexNet) needs backbone weights that torchvision would download. They are used if they are
-    on disk and never fetched: without them `lpips` is None, and `lpips_advice` says how to get them.
-
-    Returns:
-        psnr (dB), ssim, ms_ssim, l1 and lpips, and the same colour-corrected; None where undefined.
+    LPIPS (Zhang et al. 2018, AlexNet) uses torchvision's backbone weights if they are on disk and never downloads them:
+    without them it is None, and `lpips_advice` says how to get them.
     """
     gt = gt.to(pred.device)
     mask = None if mask is None else mask.to(pred.device)
@@ -156,10 +145,8 @@ def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[
 
 @torch.no_grad()
 def fit_colors(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The prediction after the affine map of colours that takes it nearest to the truth, clamped to [0, 1].
-
-    Least squares over the pixels inside the mask. Returned as it is: a prediction not finite, or with nothing inside.
-    """
+    """The prediction after the affine map of colours nearest to the truth (least squares inside the mask), clamped to
+    [0, 1]. A prediction that is not finite, or has nothing inside, stays as it is."""
     colors = torch.cat([pred.double(), torch.ones_like(pred[..., :1], dtype=torch.float64)], dim=-1)
     inside, target = (
         image.reshape(-1, image.shape[-1]) if mask is None else image[mask[..., 0]] for image in (colors, gt.double())
@@ -185,7 +172,7 @@ def _lpips(pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
 @functools.cache
 def _lpips_net() -> torch.nn.Module | str:
     """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else how to get them."""
-    # Both imports cost seconds, and only evaluation needs them.
+    # These imports cost seconds, and only evaluation needs them.
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     from torchvision.models import AlexNet_Weights
 
@@ -196,11 +183,11 @@ def _lpips_net() -> torch.nn.Module | str:
         try:
             # The bare network: the metric around it would keep every score it ever gave.
             return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).net
-        except (OSError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
+        except Exception as error:  # whatever a damaged file leads to
             problem = f"{path} cannot be loaded ({type(error).__name__}): delete it"
     return (
-        f"LPIPS is not reported: {problem}. To get it, run this on a connected machine, and copy the file here if that "
-        f'is another one:\n  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"'
+        f"LPIPS is not reported: {problem}. To get it, run this on a connected machine, and copy the file here:\n"
+        f'  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"'
     )
 
 
