@@ -272,7 +272,7 @@ def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 def _split(places: list[tuple[Tensor, Tensor]], precision: Tensor, seen: Tensor) -> tuple[float, Tensor, Tensor]:
-    """Variance of s, covariance of d, patterns of g; the likeliest brightness solves precision [V, V] @ d = seen [V]."""
+    """Variance of s, covariance of d, patterns of g; likeliest brightness: precision [V, V] @ d = seen [V]."""
     count = len(seen)
     eye = torch.eye(count, dtype=torch.float64)
     own_precision = precision.diagonal().clamp_min(1e-9)

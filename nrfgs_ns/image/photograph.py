@@ -73,8 +73,7 @@ class PhotographModel(nn.Module):
         return {"names": self.names}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        if state["names"] != self.names:
-            raise ValueError("the checkpoint has other photographs")
+        self.names = state["names"]
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> "PhotographModel":

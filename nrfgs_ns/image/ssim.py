@@ -53,7 +53,7 @@ class SsimInTorch(torch.autograd.Function):
     def forward(ctx, prediction: Tensor, truth: Tensor) -> Tensor:
         x, y = (image.detach().permute(2, 0, 1).contiguous() for image in (prediction, truth))
         moments = blur(torch.cat([x, y, x * x, y * y, x * y]), x.new_tensor(WEIGHTS)).split(3)
-        similarity, *slopes = _similarity(*moments, slopes=ctx.needs_input_grad[0])
+        similarity, *slopes = _similarity(*moments)
         ctx.save_for_backward(x, y, *slopes)
         return similarity.mean()
 
@@ -68,15 +68,13 @@ class SsimInTorch(torch.autograd.Function):
         return gradient.permute(1, 2, 0), None
 
 
-def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor, slopes: bool) -> tuple[Tensor, ...]:
-    """S and, on demand, its slopes by E[x], E[xx], E[xy], from the moments; all [3, h, w]."""
+def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tuple[Tensor, ...]:
+    """S and its slopes by E[x], E[xx], E[xy], from the moments; all [3, h, w]."""
     product, squares = x * y, x * x + y * y
     A, B = 2 * product + SSIM_C1, 2 * (xy - product) + SSIM_C2
     C, D = squares + SSIM_C1, xx + yy - squares + SSIM_C2
     scale = 1 / (C * D)
     S = A * B * scale
-    if not slopes:
-        return (S,)
     by_xx, by_xy = -S / D, 2 * A * scale
     by_x = 2 * (y * B * scale - x * (S / C + by_xx)) - y * by_xy
     return S, by_x, by_xx, by_xy

@@ -23,13 +23,13 @@ VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 KEPT = (".jpg", ".jpeg", ".png")
 """Suffixes of files that are copied; others become PNG."""
 FEWEST, FEW = 3, 15
-"""Fewer photographs are refused, or get a warning."""
+"""Minimum number of photographs, and number below which a warning appears."""
 SHARPNESS_WIDTH = 320
 """Width at which the sharpness of frames is compared, pixels: motion blur counts, not noise."""
 SMALLEST = 16
-"""Pixels of the shorter side, at least."""
+"""Minimum of the shorter side, pixels."""
 LONGEST_STEM = 120
-"""Letters of a stored name, at most."""
+"""Maximum length of a stored name, letters."""
 
 
 def reads_heif() -> bool:
@@ -59,13 +59,10 @@ def find_inputs(source: Path) -> list[Path]:
     files = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
     photos = [path for path in files if path.suffix.lower() in suffixes]
     if len(photos) < FEWEST:
-        kinds = {path.suffix.lower() for path in files if path not in photos}
-        hint = (
-            CONVERT if kinds & set(HEIF) else "It holds a video: name that file itself." if kinds & set(VIDEOS) else ""
-        )
         raise InputError(
             f"{source} directly holds {len(photos)} photographs ({', '.join(PHOTOS)}); at least {FEWEST} are needed, "
-            f"better 30 or more, from different places, each seeing most of what the one before it sees. {hint}"
+            "better 30 or more, from different places, each seeing most of what the one before it sees. "
+            f"{left_out(source, photos)}"
         )
     return photos
 
@@ -74,12 +71,12 @@ def left_out(source: Path, photos: list[Path]) -> str:
     """A sentence about other contents of a folder, by suffix; "" without any."""
     others = [path for path in source.iterdir() if not path.name.startswith(".") and path not in set(photos)]
     kinds = {"folders" if path.is_dir() else path.suffix.lower() or "no suffix" for path in others}
-    hint = CONVERT if kinds & set(HEIF) else ""
+    hint = CONVERT if kinds & set(HEIF) else "To use a video, name that file itself." if kinds & set(VIDEOS) else ""
     return f"Left out, since they are not read here: {', '.join(sorted(kinds))}. {hint}" if kinds else ""
 
 
 def digest(paths: list[Path]) -> str:
-    """SHA-256 over names and contents."""
+    """SHA-256 of names and contents."""
     total = hashlib.sha256()
     for path in paths:
         total.update(os.fsencode(path.name))
@@ -158,7 +155,7 @@ def open_video(video: Path) -> tuple[Any, int]:
 
 
 def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:
-    """Write the sharpest frame (by the variance of the Laplacian) of each of `frames` equal pieces of a video as JPEG,
+    """Write the sharpest frame (by the variance of the Laplacian) of each of `frames` equal pieces of a video, as
     frame_00000.jpg and so on; InputError if it cannot be used."""
     import cv2
 

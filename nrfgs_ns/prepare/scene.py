@@ -27,8 +27,8 @@ DOWNSCALES = (2, 4, 8)
 
 
 def write_scene(undistorted: Path, photos: Path, out: Path, advance: Advance) -> None:
-    """Write a scene from the undistorted images/, which are linked, and sparse/ of a COLMAP model, and from the EXIF of
-    `photos` by the same names. `advance` is called for each."""
+    """Write a scene from the undistorted images/, which are linked, and sparse/ of a COLMAP model, with the EXIF of
+    `photos` by the same names."""
     model = colmap().Reconstruction(undistorted / "sparse")
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     for folder in ("images", *(f"images_{factor}" for factor in DOWNSCALES)):
@@ -54,7 +54,7 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Advance) ->
 
 
 def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float | str]]) -> dict[str, Any]:
-    """The content of transforms.json for images sorted by name, with their EXIF. Shared intrinsics are at the top."""
+    """The content of transforms.json for images sorted by name; intrinsics that all share are at the top level."""
     cameras = [_intrinsics(model.cameras[image.camera_id]) for image in images]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
     names = [f"images/{image.name}" for image in images]

@@ -23,10 +23,11 @@ LARGE = 1.5e6
 PAIRS_AT_ONCE = 64
 """Pairs between two updates of the progress; an interruption loses no more."""
 SMALLEST_MODEL = 3
-"""Photographs of a model, at least."""
+"""Minimum number of photographs of a model."""
 FEWEST_POINTS = 10
-"""Points for each photograph of a globally mapped model, at least."""
+"""Minimum number of points per photograph of a globally mapped model."""
 SEED = 0
+CUT = "was not written whole: the disk may be full. Make room, and run this again."
 
 
 def colmap():
@@ -52,13 +53,8 @@ def extract_features(
     longest_side: int,
     features: int,
 ) -> None:
-    """SIFT features of every photograph, on the CPU.
-
-    Args:
-        one_camera: all photographs share their intrinsics.
-        longest_side: larger photographs are shrunk to it for this step, pixels.
-        features: largest number of features in a photograph.
-    """
+    """Find at most `features` SIFT features in every photograph, shrunk to `longest_side` pixels, on the CPU; with
+    `one_camera` all share their intrinsics."""
     pycolmap = colmap()
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = longest_side
@@ -143,14 +139,12 @@ def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path,
 
 
 def find_cameras(database: Path, photos: Path, folder: Path, enough: float, advance: Advance) -> tuple[int, str]:
-    """Find cameras and points, and write the largest model to `folder`.
+    """Find cameras and points, and write the largest model to `folder`; the number of separate models (0: nothing is
+    written) and the mapping.
 
     Incremental mapping begins with two photographs from well separated places that share much, which a walk straight
     ahead lacks. If it places fewer than `enough` photographs, global mapping, which solves for all positions at once,
-    is tried, too, and the larger model wins. `advance` is called with 1 for each photograph that is placed.
-
-    Returns:
-        The number of separate models (0: nothing is written), and the mapping.
+    is tried, too, and the larger model wins.
     """
     shutil.rmtree(folder, ignore_errors=True)
     models, mapping = _map_incrementally(database, photos, folder, advance), "incremental"
@@ -176,11 +170,7 @@ def _check_model(folder: Path, model: Any) -> None:
     except Exception:  # whatever cut files lead to
         written = None
     if written != _size([model]):
-        raise _not_whole(folder)
-
-
-def _not_whole(path: Path) -> InputError:
-    return InputError(f"{path} was not written whole: the disk may be full. Make room, and run this again.")
+        raise InputError(f"{folder} {CUT}")
 
 
 def _size(models: list[Any]) -> tuple[int, int]:
@@ -240,5 +230,5 @@ def undistort(model: Path, photos: Path, folder: Path, advance: Advance) -> None
         try:
             read_picture(path)
         except InputError as error:
-            raise _not_whole(path) from error
+            raise InputError(f"{path} {CUT}") from error
     advance(1)

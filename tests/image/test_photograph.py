@@ -95,8 +95,6 @@ def test_a_checkpoint_brings_it_back(tmp_path):
     image = torch.rand(5, 6, 3)
     for index in range(5):
         assert torch.equal(again(image, index), model(image, index))
-    with pytest.raises(ValueError, match="other photographs"):
-        PhotographModel(["x"] * 5).load_state_dict(model.state_dict())
 
 
 def test_a_checkpoint_brings_its_own_patterns():
