@@ -16,7 +16,7 @@ from broken_captures import FILES
 from hypothesis import strategies as st
 from PIL import Image
 from small_capture import Capture
-from values import damage, damages
+from values import DAMAGES, damage
 
 AREA = "images and masks"
 EPS = (
@@ -43,17 +43,21 @@ def png_claiming(width: int, height: int, kind: int = 2) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
 
 
-def holding(name: str, content: bytes, file: str = "images/003.png", **meta) -> Case:
+def lens(width: int, height: int) -> dict[str, float]:
+    return {"w": width, "h": height, "cx": width / 2, "cy": height / 2, "fl_x": width, "fl_y": width}
+
+
+def holding(name: str, content: bytes, file: str = "images/003.png", size: tuple[int, int] = (12, 9)) -> Case:
     def change(capture: Capture) -> None:
         (capture.folder / file).write_bytes(content)
-        capture.meta |= meta
+        capture.meta |= lens(*size)
 
     return broken(name, change)
 
 
 def sized(width: int, height: int) -> Case:
     def change(capture: Capture) -> None:
-        capture.meta |= {"w": width, "h": height, "cx": width / 2, "cy": height / 2, "fl_x": 10.0, "fl_y": 10.0}
+        capture.meta |= lens(width, height)
         for one in capture.meta["frames"]:
             Image.new("RGB", (width, height)).save(capture.folder / one["file_path"])
             Image.new("L", (width, height), 255).save(capture.folder / one["mask_path"])
@@ -88,7 +92,7 @@ def no_memory(folder: Path):
     import nrfgs_ns.data.pictures as pictures
 
     capture, side = capture_in(folder), 12_000
-    capture.meta |= {"w": side, "h": side, "cx": 6e3, "cy": 6e3, "fl_x": 1e4, "fl_y": 1e4}
+    capture.meta |= lens(side, side)
     for one in capture.meta["frames"]:
         for key in ("file_path", "mask_path"):
             (capture.folder / one[key]).write_bytes(png_claiming(side, side, 2 if key == "file_path" else 0))
@@ -119,29 +123,25 @@ CASES = [
         holding(f"{kind} that is EPS", EPS, file)
         for kind, file in (("image", "images/003.png"), ("mask", "masks/003.png"))
     ),
-    holding("PDF", b"%PDF-1.4\n%%EOF\n"),
     holding("GIF", encoded("GIF")),
     holding("SVG", b'<svg xmlns="http://www.w3.org/2000/svg" width="12" height="9"/>'),
-    holding("ICO", encoded("ICO", (16, 16))),
     *(holding(f"{mode} of more than 8 bits", encoded("TIFF", mode=mode)) for mode in ("I", "F")),
     *(
         holding(f"{form} cut in the middle", encoded(form)[: len(encoded(form)) // 2])
         for form in ("PNG", "TIFF", "BMP", "WEBP", "PPM")
     ),
-    holding("bomb of 4 gigapixels", png_claiming(65000, 65000), w=65000, h=65000, fl_x=5e4, fl_y=5e4, cx=3e4, cy=3e4),
-    holding("bomb of 170 megapixels", png_claiming(13000, 13000), w=13000, h=13000, fl_x=1e4, fl_y=1e4, cx=6e3, cy=6e3),
+    holding("bomb of 4 gigapixels", png_claiming(65000, 65000), size=(65000, 65000)),
+    holding("bomb of 170 megapixels", png_claiming(13000, 13000), size=(13000, 13000)),
     Case("ten masks of 12,000 x 12,000", no_memory),
     *(deep(f"images/003.{ending}") for ending in ("png", "tif")),
     broken("all images transparent", transparent),
     broken("JPEG masks all but black", ringing),
     holding("PNG of 0 x 0", png_claiming(0, 0)),
-    holding("text of 100 MB when unpacked", b"\x89PNG\r\n\x1a\n" + bytes(50)),
-    *(sized(*size) for size in ((1, 1), (1, 9), (12, 1), (2, 2))),
+    *(sized(*size) for size in ((1, 1), (12, 1), (2, 2))),
     odd_file("a folder", Path.mkdir),
     odd_file("a pipe", os.mkfifo),
     odd_file("a link to itself", lambda path: path.symlink_to(path)),
     odd_file("a link to /dev/zero", lambda path: path.symlink_to("/dev/zero")),
-    odd_file("a link to nowhere", lambda path: path.symlink_to("/nowhere")),
     holding("mask cut in the middle", encoded("PNG", mode="L")[:60], "masks/003.png"),
     holding("mask empty", b"", "masks/003.png"),
     holding("mask in colours", encoded("PNG"), "masks/003.png"),
@@ -163,4 +163,4 @@ def inputs() -> st.SearchStrategy[Case]:
         return Case(f"{form} {kind} {chosen}"[:200], build, hostile=False)
 
     forms = st.sampled_from(["PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM"])
-    return st.builds(case, forms, st.sampled_from(["images", "masks"]), damages())
+    return st.builds(case, forms, st.sampled_from(["images", "masks"]), DAMAGES)

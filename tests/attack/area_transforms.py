@@ -10,7 +10,7 @@ from attempt import Case
 from broken_captures import META
 from hypothesis import strategies as st
 from small_capture import Capture
-from values import replace_in, replacements
+from values import REPLACEMENTS, replace_in
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
@@ -58,8 +58,9 @@ def frame(name: str, **fields) -> Case:
     return broken(name, lambda capture: capture.meta["frames"][3].update(fields))
 
 
-def option(name: str, **options) -> Case:
-    return broken(name, lambda capture: None, **options)
+def option(key: str, values, **options) -> list[Case]:
+    title = f"--{key.replace('_', '-')}"
+    return [broken(f"{title} {value}", lambda capture: None, **{key: value}, **options) for value in values]
 
 
 def text(name: str, content: bytes) -> Case:
@@ -94,8 +95,7 @@ FIELDS = {
     "cx": (1e30,),
     "cy": (math.nan,),
     "w": (1e300, -12, None),
-    "camera_model": ("EQUIRECTANGULAR", "ORTHOPHOTO", "VR180_L", "OMNIDIRECTIONALSTEREO_R", "FISHEYE624", "FULL_OPENCV")
-    + (["OPENCV"], None, {}, 3, "", "opencv", LONG),
+    "camera_model": ("EQUIRECTANGULAR", "FISHEYE624", ["OPENCV"], None, {}, "opencv", LONG),
     "orientation_override": ("sideways", None, [], 3),
     "ply_file_path": (None, 3, [], {}, True, "", ".", "no.ply", "\0", "\ud800", LONG, "/dev/zero", "images/000.png"),
     "distortion_params": ([0.1, 0.2, 0.3], [math.nan] * 6, "abc", {}, None, 0.1, [[0.0] * 6], ["x"] * 6, [0.0] * 12),
@@ -135,29 +135,19 @@ CASES = [
     broken("points of another unit", lambda c: add_points(c, lambda xyz: xyz * 100)),
     broken("points of another world", lambda c: add_points(c, lambda xyz: xyz + 300)),
     broken("points behind the cameras", lambda c: add_points(c, lambda xyz: xyz + (0, 0, 1000))),
-    text("empty", b""),
     text("a number", b"3"),
-    text("a word", b'"frames"'),
     text("not closed", b'{"frames": ['),
-    text("deep", b"[" * 200_000),
     text("deep in frames", b'{"frames": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"),
     text("5,000 digits", b'{"frames": [' + b"9" * 5000 + b"]}"),
     text("UTF-16", '{"frames": []}'.encode("utf-16")),
     text("bytes", bytes(range(256))),
-    text("zeros", bytes(1000)),
     Case("two gigabytes", large_file),
-    *(option(f"--scale-factor {value}", scale_factor=value) for value in (0.0, -1.0, math.nan, math.inf)),
-    *(option(f"--downscale-factor {value}", downscale_factor=value) for value in (0, -1, 4, 10**9)),
-    *(option(f"--eval-interval {value}", eval_mode="interval", eval_interval=value) for value in (0, -1, 1)),
-    *(
-        option(f"--train-split-fraction {value}", eval_mode="fraction", train_split_fraction=value)
-        for value in (0.0, -1.0, 2.0, math.nan)
-    ),
-    *(
-        option(f"--camera-res-scale-factor {value}", manager={"camera_res_scale_factor": value})
-        for value in (0.0, -1.0, math.nan, 1e-9, 1e9)
-    ),
-    option("--eval-mode filename", eval_mode="filename"),
+    *option("scale_factor", (0.0, -1.0, math.nan, math.inf)),
+    *option("downscale_factor", (0, 4, 10**9)),
+    *option("eval_interval", (0, 1), eval_mode="interval"),
+    *option("train_split_fraction", (0.0, -1.0, 2.0, math.nan), eval_mode="fraction"),
+    *option("manager", [{"camera_res_scale_factor": value} for value in (0.0, -1.0, math.nan, 1e-9, 1e9)]),
+    *option("eval_mode", ("filename",)),
     Case("--data not there", lambda folder: partial(load, folder / "nowhere")),
     Case("--data empty", lambda folder: partial(load, folder)),
     Case("--data too long", lambda folder: partial(load, folder / LONG)),
@@ -175,4 +165,4 @@ def inputs() -> st.SearchStrategy[Case]:
 
         return Case(f"fields {chosen}"[:200], build, hostile=False)
 
-    return replacements().map(case)
+    return REPLACEMENTS.map(case)
