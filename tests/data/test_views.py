@@ -15,9 +15,7 @@ from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.data.views import different_views, evenly_spaced, scene_unit
 
 
-@pytest.mark.parametrize(
-    "total, wanted, expected", [(10, 4, [0, 2, 5, 7]), (3, 5, [0, 1, 2]), (5, 5, [0, 1, 2, 3, 4]), (5, 0, [])]
-)
+@pytest.mark.parametrize("total, wanted, expected", [(10, 4, [0, 2, 5, 7]), (3, 5, [0, 1, 2]), (5, 0, [])])
 def test_evenly_spaced(total, wanted, expected):
     assert evenly_spaced(total, wanted) == expected
 
