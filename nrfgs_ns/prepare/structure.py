@@ -165,9 +165,11 @@ def write_model(model: Any, folder: Path) -> None:
 
 
 def _check_model(folder: Path, model: Any) -> None:
+    from nrfgs_ns.data.colmap import read_model, read_points  # slow to import; pycolmap reads beyond a file's end
+
     try:
-        written = _size([colmap().Reconstruction(folder)])
-    except Exception:  # whatever cut files lead to
+        written = len(read_model(folder)[1]), len(read_points(folder)[0])
+    except InputError:
         written = None
     if written != _size([model]):
         raise InputError(f"{folder} {CUT}")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from attempt import Case
-from broken_captures import META
 from hypothesis import strategies as st
 from small_capture import Capture
 from values import REPLACEMENTS, replace_in
@@ -124,7 +123,6 @@ def titled(key: str, value) -> str:
 
 
 CASES = [
-    *(broken(name, change) for name, (change, _) in META.items() if "mask" not in name),
     *(meta(titled(key, value), **{key: value}) for key, values in FIELDS.items() for value in values),
     *(frame(f"of one frame: {titled(key, value)}", **{key: value}) for key, vs in OF_A_FRAME.items() for value in vs),
     broken("20,000 copies of a frame", lambda c: c.meta.update(frames=c.meta["frames"][:1] * 20_000)),

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import io
-import os
-import subprocess
-import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -171,30 +167,6 @@ def test_states_of_other_runs_are_refused(capture):
 
 
 # Where images are kept.
-
-
-LOCALE = """
-import os
-from pathlib import Path
-from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-folder = Path(os.fsdecode({!r}))
-for memory in (None, 0.0):
-    config = NrfgsDatamanagerConfig(
-        dataparser=NrfgsDataParserConfig(data=folder, downscale_factor=2), image_memory=memory
-    )
-    assert config.setup(device="cpu").load_all_images() == (9, 1)
-"""
-
-
-def test_a_folder_of_another_encoding(tmp_path):
-    """An ASCII locale, a folder in UTF-8."""
-    folder = os.fsencode(tmp_path) + "/café".encode()
-    Capture(Path(os.fsdecode(folder)), images=10).save()
-    settings = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "XDG_CACHE_HOME": folder + b"/cache"}
-    command = [sys.executable, "-W", "ignore", "-c", LOCALE.format(folder)]
-    done = subprocess.run(command, env={**os.environ, **settings}, capture_output=True)
-    assert done.returncode == 0, done.stderr.decode("ascii", "replace")
 
 
 @pytest.mark.parametrize("distorted", [False, True])

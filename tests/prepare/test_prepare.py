@@ -310,32 +310,27 @@ def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, c
         Prepare(walls, out).main()
 
 
-@pytest.fixture
-def full_disk():
-    """Files end after so many bytes, as on a disk that is full."""
-    resource = pytest.importorskip("resource")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def test_what_colmap_could_not_write_whole_is_not_built_on(prepared, tmp_path, full_disk, monkeypatch):
+def test_what_colmap_could_not_write_whole_is_not_built_on(prepared, tmp_path, monkeypatch):
+    """As on a disk that is full, of which COLMAP says nothing."""
     work, pycolmap = prepared / "work", structure.colmap()
     model, undistort = pycolmap.Reconstruction(work / "model"), pycolmap.undistort_images
 
-    def cut_one(folder: Path, *args, **options) -> None:
-        undistort(folder, *args, **options)
-        path = min((folder / "images").iterdir())
+    def cut(path: Path) -> None:
         path.write_bytes(path.read_bytes()[:20_000])
 
-    with monkeypatch.context() as patch, pytest.raises(InputError, match=r"IMG_00.png was not written whole"):
-        patch.setattr(pycolmap, "undistort_images", cut_one)
-        structure.undistort(work / "model", work / "photos", tmp_path / "cut", lambda steps: None)
-    full_disk(20_000)
+    broken = Mock(wraps=model)
+    broken.write.side_effect = lambda folder: (model.write(folder), cut(folder / "points3D.bin"))
     with pytest.raises(InputError, match="model was not written whole: the disk may be full"):
-        structure.write_model(model, tmp_path / "model")
-    with pytest.raises(InputError, match="sparse was not written whole"):
-        structure.undistort(work / "model", work / "photos", tmp_path / "first", lambda steps: None)
+        structure.write_model(broken, tmp_path / "model")
+    for name, found in (("images/IMG_00.png", "IMG_00.png"), ("sparse/points3D.bin", "sparse")):
+
+        def cut_one(folder: Path, *args, name=name, **options) -> None:
+            undistort(folder, *args, **options)
+            cut(folder / name)
+
+        monkeypatch.setattr(pycolmap, "undistort_images", cut_one)
+        with pytest.raises(InputError, match=f"{found} was not written whole"):
+            structure.undistort(work / "model", work / "photos", tmp_path / "cut", lambda steps: None)
 
 
 # Collecting.
