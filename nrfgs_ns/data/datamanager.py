@@ -112,7 +112,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         if config.image_memory is not None and not config.image_memory >= 0:
             raise InputError(f"--pipeline.datamanager.image-memory is {config.image_memory}. Give 0 or more gigabytes.")
         self._views: dict[int, Cameras] = {}
-        """training cameras by index, from their first turn on"""
+        """training cameras by index, kept since moving one to a GPU takes as long as a step"""
         self._reader = ThreadPoolExecutor(1)
         """reads the next image while this one is trained on"""
         try:
@@ -124,11 +124,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             ) from error
 
     def load_all_images(self) -> tuple[int, int]:
-        """Decode all images, and return the numbers of training and evaluation images.
-
-        Raises:
-            InputError: an image or a mask cannot be used, or nothing is visible in any training image.
-        """
+        """Decode all images; return the numbers of training and evaluation images. InputError if an image or a mask
+        cannot be used, or nothing is visible in any training image."""
         names = [path.name for path in self.train_dataset.image_filenames]
         empty = [name for name, data in zip(names, self.cached_train, strict=True) if not _shows_anything(data)]
         if empty:
@@ -139,16 +136,16 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return len(names), len(self.cached_eval)
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        """The next camera in turn, [1] on the device with "cam_idx" in its metadata, and its "image" [H, W, 3 or 4],
-        "image_idx" and "mask". Cameras are kept: moving one to a GPU takes as long as a step."""
+        """The next `train_view` in turn."""
         return self.train_view(self._next_index())
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """A training camera and its image, as by `next_train`, out of turn."""
+        """A training camera, [1] on the device with "cam_idx" in its metadata, and its "image" [H, W, 3 or 4],
+        "image_idx" and "mask"."""
         return self._view(index), self._image(index)
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
-        """The next `count` cameras in turn, as by `next_train`, and the image of number `own`."""
+        """The next `count` cameras in turn, and the image of number `own`."""
         indices = [self._next_index() for _ in range(count)]
         return [self._view(index) for index in indices], self._image(indices[own])
 

@@ -84,24 +84,16 @@ class Scene(NamedTuple):
     to_frames: torch.Tensor | None
     """[3, 4], from the original world to the frames'"""
     scale: float
-    """of the cameras' world"""
 
 
 class NrfgsDataParser(DataParser):
-    """nerfstudio's parser, except that
-
-    - the data set is checked first; what cannot be used raises InputError;
-    - val and test stand in for each other, and the training images for both, with a warning;
-    - a single image keeps its own scale, having no extent to normalise by;
-    - points are read by plyfile, or straight from colmap/sparse/0 without a question at the terminal;
-    - cameras far from the origin are moved there in float64 (`world`);
-    - with a downscale_factor of which there is no folder, images are resized when they are read;
-    - neither images nor points need exist where nerfstudio sets `downscale_factor`, to render from a checkpoint.
-    """
+    """nerfstudio's parser, except that the data set is checked first, with InputError for what cannot be used; val and
+    test stand in for each other, and the training images for both; points are read without open3d or a question at the
+    terminal; and images without a folder for downscale_factor are resized when they are read."""
 
     config: NerfstudioDataParserConfig
     downscale_factor: int | None = None
-    """set by nerfstudio, before the parsing, if no image is needed"""
+    """set by nerfstudio, before the parsing, to render from a checkpoint: neither images nor points need exist"""
     _resizes = False
     """whether large images are resized without an option"""
 
@@ -120,11 +112,11 @@ class NrfgsDataParser(DataParser):
             if masks:
                 self._check_sizes(scene, rows, "mask_path", masks, cameras)
         copies = all(self._has_copies(key, scene.factor) for key in FOLDERS if key in frames[0])
-        box = self.config.scene_scale * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        corner = torch.full((3,), self.config.scene_scale)
         outputs = PlacedOutputs(
             image_filenames=images,
             cameras=cameras,
-            scene_box=SceneBox(aabb=box),
+            scene_box=SceneBox(aabb=torch.stack([-corner, corner])),
             mask_filenames=masks or None,
             dataparser_scale=scene.scale,
             dataparser_transform=after(scene.transform, scene.to_frames),

@@ -36,23 +36,14 @@ LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
 
 
 def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
-    """Intrinsics of every frame; what the top level has holds for all.
-
-    Returns:
-        float64 [V, 12]: `PIXELS`, then `DISTORTION`.
-
-    Raises:
-        InputError: a number is missing or out of range, or given twice with two values.
-    """
+    """Intrinsics of every frame, float64 [V, 12]: `PIXELS`, then `DISTORTION`; those of the top level hold for all."""
     _check_model(meta, source)
     shared = {key: meta[key] for key in (*PIXELS, *DISTORTION, "distortion_params") if key in meta}
     for key, value in shared.items():
         other = [frame["file_path"] for frame in meta["frames"] if key in frame and frame[key] != value]
         if other:
-            raise InputError(
-                f"{source}: {key} of {some(other)} is not the one at the top level, which would be used for all "
-                "frames. Remove it at the top level, or in these frames."
-            )
+            finding = f"{source}: {key} of {some(other)} is not the one at the top level, which holds for all frames"
+            raise InputError(f"{finding}. Remove one of them.")
     return np.array([_lens({**frame, **shared}, source) for frame in meta["frames"]])
 
 
@@ -102,11 +93,8 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
 
 
 def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: torch.Tensor, source: Path) -> Cameras:
-    """The cameras in full size, with intrinsics by `read_lenses` and poses [V, 3, 4].
-
-    Raises:
-        InputError: undistorting would leave next to nothing of an image.
-    """
+    """The cameras in full size, with intrinsics by `read_lenses` and poses [V, 3, 4]; InputError if undistorting would
+    leave next to nothing of an image."""
     kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
     table = torch.from_numpy(lenses)
     fx, fy, cx, cy = table[:, :4].float().unbind(1)

@@ -63,7 +63,7 @@ def distinct_places(centers: Tensor) -> Tensor:
 def _in_reaches(centers: Tensor) -> np.ndarray:
     """Camera centres [V, 3] about their mean, in distances from there to the farthest."""
     away = centers.double().cpu().numpy()
-    away = away - away.mean(axis=0) if len(away) else away
+    away = away - away.mean(axis=0)
     return away / np.linalg.norm(away, axis=1).max(initial=1e-300)
 
 
@@ -72,7 +72,7 @@ def _first_of_each(rows: np.ndarray) -> list[int]:
     from scipy.spatial import cKDTree
 
     kept, near = [], np.zeros(len(rows), dtype=bool)
-    tree = cKDTree(rows) if len(rows) else None
+    tree = cKDTree(rows)
     for i in range(len(rows)):
         if not near[i]:
             kept.append(i)

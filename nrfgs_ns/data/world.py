@@ -36,9 +36,6 @@ def place(
     Returns:
         The poses, float32 [V, 3, 4]; the transform [3, 4] before scaling, float64 if they were far from the origin and
         otherwise float32; and the scale.
-
-    Raises:
-        InputError: the poses cannot be oriented.
     """
     if len(poses) == 1 and orientation == "vertical":  # needs two cameras
         orientation = "up"
@@ -56,10 +53,8 @@ def place(
             "The poses cannot be oriented, since their up directions cancel. Set the data parser's option "
             "--orientation-method none, or recompute the poses."
         )
-    scale, reach = 1.0, float(torch.max(torch.abs(placed[:, :3, 3])))
-    if auto_scale and reach > 0:
-        scale /= reach
-    scale *= factor
+    reach = float(torch.max(torch.abs(placed[:, :3, 3])))
+    scale = (1.0 / reach if auto_scale and reach > 0 else 1.0) * factor
     placed[:, :3, 3] *= scale
     if far:
         transform = transform.double()

@@ -28,7 +28,7 @@ from torch import Tensor
 
 AS_THEY_ARE = ("psnr", "ssim", "ms_ssim", "l1", "lpips")
 METRIC_NAMES = (*AS_THEY_ARE, *(f"cc_{name}" for name in AS_THEY_ARE))
-"""The keys of `image_metrics`, in the order of reports; cc: colour-corrected."""
+"""Keys of `image_metrics`, in the order of reports; cc: colour-corrected."""
 WINDOW_SIZE = 11
 """Side of the SSIM window, pixels (Wang et al. 2004)."""
 WINDOW_SIGMA = 1.5
@@ -192,7 +192,7 @@ def _lpips_net() -> torch.nn.Module | str:
 
 
 def lpips_advice() -> str | None:
-    """Why LPIPS is not reported, and how to change that; None if it is."""
+    """Why LPIPS is not reported, and how to get it; None if it is."""
     net = _lpips_net()
     return net if isinstance(net, str) else None
 
@@ -203,13 +203,13 @@ def _precise(image: Tensor) -> Tensor:
 
 
 def _errors_inside(pred: Tensor, gt: Tensor, mask: Tensor | None) -> Tensor:
-    """Pred - gt of the N pixels inside, [N, 3]."""
+    """Errors of the N pixels inside, [N, 3]."""
     error = _precise(pred) - _precise(gt)
     return error.reshape(-1, 3) if mask is None else error[mask[..., 0]]
 
 
 def _planes(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Images channel-first [3, H, W] and the mask [H, W], with the truth in place of the prediction outside."""
+    """Images channel-first [3, H, W] and the mask [H, W]; outside, the truth replaces the prediction."""
     pred, gt = (_precise(image).movedim(-1, 0).contiguous() for image in (pred, gt))
     if mask is None:
         return pred, gt, None
