@@ -138,7 +138,11 @@ KEPT_EXIF = (*NUMBERS.values(), ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Ba
 def read_exif(path: Path) -> dict[str, float | str]:
     """A photograph's EXIF, as far as known: exposure_time (seconds), f_number, iso, focal_length (mm), each finite and
     above 0, and model. Empty for a file that is not an image."""
-    return known(_exif_at(path)[0])
+    exif, _ = _exif_at(path)
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    values = {name: _number(details.get(tag)) for name, tag in NUMBERS.items()}
+    values["model"] = str(exif.get(ExifTags.Base.Model) or "").strip(" \0")
+    return {name: value for name, value in values.items() if value}
 
 
 def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, Any]:
@@ -172,14 +176,6 @@ def _exif_at(path: Path) -> tuple[Image.Exif, tuple[int, int]]:
             return exif_of(image), image.size
     except InputError:
         return Image.Exif(), (0, 0)
-
-
-def known(exif: Image.Exif) -> dict[str, float | str]:
-    """The result of `read_exif`, from PIL's EXIF."""
-    details = exif.get_ifd(ExifTags.IFD.Exif)
-    values = {name: _number(details.get(tag)) for name, tag in NUMBERS.items()}
-    values["model"] = str(exif.get(ExifTags.Base.Model) or "").strip(" \0")
-    return {name: value for name, value in values.items() if value}
 
 
 def _number(value: Any) -> float | None:

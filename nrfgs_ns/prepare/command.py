@@ -81,8 +81,6 @@ class Run:
         self.options, self.screen = options, screen or Console()
         self.inputs = files.find_inputs(options.photos)
         self.is_video = options.photos.is_file()
-        if self.is_video:
-            files.open_video(options.photos)[0].release()
         structure.colmap()  # reports a missing package before any work
         self.out, self.work = options.out, options.out / "work"
         self.stored, self.database, self.model, self.undistorted, self.pairs_file, self.state_file = (
@@ -135,12 +133,8 @@ class Run:
             raise InputError(
                 f"--camera is single, but {options.photos} has photographs of {count} sizes. Leave it out."
             )
-        chosen = {
-            "camera_model": options.camera_model,
-            "one_camera": one,
-            "longest_side": options.feature_size,
-            "features": options.features,
-        }
+        chosen = {"camera_model": options.camera_model, "one_camera": one}
+        chosen |= {"longest_side": options.feature_size, "features": options.features}
         database = [self.database, *(self.database.with_name(self.database.name + end) for end in ("-wal", "-shm"))]
         find = partial(structure.extract_features, self.database, self.stored, names, **chosen)
         self.stage("features", "find features", database, len(names), find, **chosen)

@@ -82,10 +82,7 @@ def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float 
 
 def _camera_to_world(image: Any) -> np.ndarray:
     """The pose [4, 4] of a registered image, y up and z backwards (OpenGL)."""
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().inverse().matrix()
-    pose[:3, 1:3] *= -1.0
-    return pose
+    return np.vstack([image.cam_from_world().inverse().matrix() * (1.0, -1.0, -1.0, 1.0), (0, 0, 0, 1)])
 
 
 def _intrinsics(camera: Any) -> dict[str, Any]:

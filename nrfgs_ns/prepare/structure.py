@@ -56,8 +56,7 @@ def extract_features(
     """Find at most `features` SIFT features in every photograph, shrunk to `longest_side` pixels, on the CPU; with
     `one_camera` all share their intrinsics."""
     pycolmap = colmap()
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = longest_side
+    options = pycolmap.FeatureExtractionOptions(max_image_size=longest_side)
     options.sift.max_num_features = features
     reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
     batch = max(os.cpu_count() or 1, 4)
@@ -122,13 +121,12 @@ def positions(database: Path, names: list[str]) -> np.ndarray:
 def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance) -> int:
     """Match and verify pairs of photographs, and return the number of verified ones."""
     pycolmap = colmap()
-    pairing, verification = pycolmap.ImportedPairingOptions(), pycolmap.TwoViewGeometryOptions()
-    pairing.match_list_path = folder / "pairs.txt"
+    listed, verification = folder / "pairs.txt", pycolmap.TwoViewGeometryOptions()
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     verification.ransac.random_seed = SEED
     for first in range(0, len(pairs), PAIRS_AT_ONCE):
         part = pairs[first : first + PAIRS_AT_ONCE]
-        lines = [f"{names[a]} {names[b]}\n" for a, b in part]
-        (folder / "pairs.txt").write_text("".join(lines), encoding="utf-8")
+        listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in part), encoding="utf-8")
         pycolmap.match_image_pairs(
             database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
         )
@@ -182,9 +180,7 @@ def _size(models: list[Any]) -> tuple[int, int]:
 
 def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Advance) -> list[Any]:
     pycolmap = colmap()
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = SMALLEST_MODEL
-    options.random_seed = SEED
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED)
     with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = pycolmap.incremental_mapping(
             database,
@@ -200,9 +196,7 @@ def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Adva
 def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
     """Global mapping, whose points (up to 15 pixels off) are triangulated again, as by incremental mapping."""
     pycolmap = colmap()
-    options = pycolmap.GlobalPipelineOptions()
-    options.min_model_size = SMALLEST_MODEL
-    options.random_seed = SEED
+    options = pycolmap.GlobalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED)
     with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = list(pycolmap.global_mapping(database, photos, attempts, options=options).values())
         models = [model for model in models if model.num_reg_images() >= SMALLEST_MODEL]

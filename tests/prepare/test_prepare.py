@@ -467,7 +467,7 @@ def test_the_sharpest_frame_of_each_piece_of_a_video_is_taken(tmp_path):
     assert [path.name for path in frames] == [f"frame_{i:05d}.jpg" for i in range(4)] and len(done) == 4
     assert all(np.asarray(Image.open(path)).std() > 30 for path in frames)
     (tmp_path / "broken.mp4").write_bytes(b"no video")
-    with pytest.raises(InputError, match=r"broken\.mp4: OpenCV finds 0 frames"):
+    with pytest.raises(InputError, match=r"broken\.mp4: OpenCV decodes 0 frames"):
         photos.import_video(tmp_path / "broken.mp4", tmp_path / "none", 4, lambda _: None)
 
 
