@@ -179,6 +179,6 @@ def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> No
         advance(1)
     if written < FEWEST:
         raise InputError(
-            f"{video}: OpenCV decodes {written} frames of it. Convert it to MP4 (H.264), or extract frames yourself and "
+            f"{video}: OpenCV decodes {written} frames of it. Convert it to MP4 (H.264), or extract frames and "
             "name their folder."
         )
