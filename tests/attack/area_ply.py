@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The .ply of points that a training starts from."""
 
-from functools import partial
-from pathlib import Path
-
 import numpy as np
-from area_transforms import add_points, broken, capture_in, load
+from area_transforms import add_points, broken
 from attempt import Case
 from hypothesis import strategies as st
+from small_capture import Capture
 from values import DAMAGES, damage
 
 AREA = ".ply of points"
@@ -60,13 +58,10 @@ def inputs() -> st.SearchStrategy[Case]:
     """A point cloud, damaged."""
 
     def case(text: bool, chosen) -> Case:
-        def build(folder: Path):
-            capture = capture_in(folder)
+        def change(capture: Capture) -> None:
             path = add_points(capture, text=text)
             path.write_bytes(damage(path.read_bytes(), chosen))
-            capture.save()
-            return partial(load, capture.folder)
 
-        return Case(f"{'text' if text else 'binary'} {chosen}"[:200], build, hostile=False)
+        return broken(f"{'text' if text else 'binary'} {chosen}"[:200], change)._replace(hostile=False)
 
     return st.builds(case, st.booleans(), DAMAGES)

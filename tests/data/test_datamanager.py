@@ -115,6 +115,8 @@ def test_free_memory_bounds_the_threads_that_decode(monkeypatch, free, threads):
     barrier = threading.Barrier(threads)
     list(in_parallel(read, [(12, 9)] * 12, "Reading", workers=4))
     assert max(most) == threads
+    with pytest.raises(InputError, match="image of 9000 x 9000 takes about"):
+        list(in_parallel(read, [(12, 9), (9000, 9000)], "Reading"))
 
 
 def test_undistorted_images_can_be_read_again(capture):
