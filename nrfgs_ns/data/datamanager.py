@@ -29,9 +29,6 @@ from nrfgs_ns.data.pixels import from_files, look_through, undistorted
 from nrfgs_ns.data.views import different_views, scene_unit
 from nrfgs_ns.errors import InputError
 
-LARGEST_SCALE = 16.0
-"""Largest enlargement of images."""
-
 
 class NrfgsInputDataset(InputDataset):
     """nerfstudio's dataset, with errors that name the file and the fix, and images of any mode as RGB or RGBA."""
@@ -41,10 +38,8 @@ class NrfgsInputDataset(InputDataset):
         for name in ("width", "height"):  # as images and masks are rounded; nerfstudio does it in float32
             sides = (getattr(dataparser_outputs.cameras, name).double() * scale_factor).int()
             if (sides < 1).any():
-                raise InputError(
-                    f"--pipeline.datamanager.camera-res-scale-factor {scale_factor} leaves nothing of the images. Give "
-                    "a larger one."
-                )
+                option = f"--pipeline.datamanager.camera-res-scale-factor {scale_factor}"
+                raise InputError(f"{option} leaves nothing of the images. Give a larger one.")
             setattr(self.cameras, name, sides.to(getattr(self.cameras, name)))
         # The datamanager removes entries from the list, which all datasets share.
         self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
@@ -104,13 +99,13 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def __init__(self, config: NrfgsDatamanagerConfig, *args: Any, **kwargs: Any):
         config.dataparser = checked(config.dataparser)
-        scale = config.camera_res_scale_factor
-        if not 0 < scale <= LARGEST_SCALE:
+        scale, memory = config.camera_res_scale_factor, config.image_memory
+        if not 0 < scale <= 16:
             raise InputError(
-                f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, at most {LARGEST_SCALE}."
+                f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, at most 16."
             )
-        if config.image_memory is not None and not config.image_memory >= 0:
-            raise InputError(f"--pipeline.datamanager.image-memory is {config.image_memory}. Give 0 or more gigabytes.")
+        if memory is not None and not memory >= 0:
+            raise InputError(f"--pipeline.datamanager.image-memory is {memory}. Give 0 or more gigabytes.")
         self._views: dict[int, Cameras] = {}
         """training cameras by index, kept since moving one to a GPU takes as long as a step"""
         self._reader = ThreadPoolExecutor(1)

@@ -26,23 +26,18 @@ import torch.nn.functional as F
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-AS_THEY_ARE = ("psnr", "ssim", "ms_ssim", "l1", "lpips")
-METRIC_NAMES = (*AS_THEY_ARE, *(f"cc_{name}" for name in AS_THEY_ARE))
+METRIC_NAMES = tuple(f"{cc}{name}" for cc in ("", "cc_") for name in ("psnr", "ssim", "ms_ssim", "l1", "lpips"))
 """Keys of `image_metrics`, in the order of reports; cc: colour-corrected."""
-WINDOW_SIZE = 11
-"""Side of the SSIM window, pixels (Wang et al. 2004)."""
-WINDOW_SIGMA = 1.5
-"""Standard deviation of the Gaussian inside the window, pixels."""
+WINDOW_SIZE, WINDOW_SIGMA = 11, 1.5
+"""Side of the SSIM window and standard deviation of the Gaussian inside, pixels (Wang et al. 2004)."""
 REACH = WINDOW_SIZE // 2
 """Pixels from a window's centre to its edge."""
 LIBRARY = SSIM(data_range=1.0, size_average=True, channel=3, win_size=WINDOW_SIZE, win_sigma=WINDOW_SIGMA)
 """SSIM of pytorch_msssim, of images [1, 3, H, W]."""
 WEIGHTS = tuple(LIBRARY.win[0].flatten().tolist())
 """The window along one axis, rounded to float32 like the library's, which bright flat images feel."""
-SSIM_C1 = 0.01**2
-"""Stabiliser of the luminance term, (K1 * data range)^2."""
-SSIM_C2 = 0.03**2
-"""Stabiliser of the contrast-structure term, (K2 * data range)^2."""
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+"""Stabilisers of the luminance and the contrast-structure term, (K * data range)^2."""
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the five scales, finest first (Wang et al. 2003)."""
 MS_SSIM_MIN_SIDE = (WINDOW_SIZE - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1) + 1
@@ -137,10 +132,9 @@ def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[
     """
     gt = gt.to(pred.device)
     mask = None if mask is None else mask.to(pred.device)
-    every = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "l1": l1, "lpips": _lpips}
-    corrected = fit_colors(pred, gt, mask)
-    values = {name: metric(pred, gt, mask) for name, metric in every.items()}
-    return values | {f"cc_{name}": metric(corrected, gt, mask) for name, metric in every.items()}
+    images, metrics = (pred, fit_colors(pred, gt, mask)), (psnr, ssim, ms_ssim, l1, _lpips)
+    values = [metric(image, gt, mask) for image in images for metric in metrics]
+    return dict(zip(METRIC_NAMES, values, strict=True))
 
 
 @torch.no_grad()
@@ -198,7 +192,6 @@ def lpips_advice() -> str | None:
 
 
 def _precise(image: Tensor) -> Tensor:
-    """The image in the dtype of this module's arithmetic."""
     return image.to(torch.promote_types(image.dtype, torch.float64 if image.is_cuda else torch.float32))
 
 

@@ -26,8 +26,8 @@ MAX_NUMBERS = 2**31
 def photometric_loss(prediction: Tensor, truth: Tensor, ssim_lambda: float) -> Tensor:
     """(1 - ssim_lambda) mean |prediction - truth| + ssim_lambda (1 - SSIM), a scalar; ssim_lambda in [0, 1].
 
-    Images are [H, W, 3] in [0, 1], of one floating dtype and on one device. The truth gets no gradient. Images with a
-    side shorter than the window go to pytorch_msssim, which warns and leaves that side unblurred.
+    Images are [H, W, 3] in [0, 1]; the truth gets no gradient. Those with a side shorter than the window go to
+    pytorch_msssim, which warns and leaves that side unblurred.
     """
     if min(prediction.shape[:2]) < WINDOW_SIZE:
         similarity = LIBRARY(prediction.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None])
@@ -89,7 +89,6 @@ def kernels_run_on(device: torch.device) -> bool:
 
 
 def _try_kernels(device: torch.device) -> None:
-    """Compile and run both kernels on one window; raise whatever goes wrong."""
     from nrfgs_ns.image.ssim_triton import WeightedSum
 
     image = torch.zeros(WINDOW_SIZE, WINDOW_SIZE, 3, device=device, requires_grad=True)
