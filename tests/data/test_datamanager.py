@@ -195,6 +195,7 @@ def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, pri
             camera, batch = in_files.next_train(step)
             kept = in_memory.cached_train[camera.metadata["cam_idx"]]
             torch.testing.assert_close(batch["image"], kept["image"])
+        in_files.cached_train[0]["image"].zero_()  # in memory, not in the file
     assert len(list((tmp_path / "cache").rglob("*.npy"))) == 10 * 3, "an image, a mask and a lens, each made once"
 
     picture = Image.open(capture.folder / "images/004.png").convert("RGB")
@@ -209,9 +210,7 @@ def test_files_that_are_lost_or_cut_are_made_anew(capture, tmp_path, monkeypatch
     """As those who clean a cache leave them, or a system that stopped."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     capture.add_masks()
-    images = [data["image"] for data in manager(capture, image_memory=0.0).cached_train]
-    before = [image.clone() for image in images]
-    images[0].zero_()  # not in the file
+    before = [data["image"].clone() for data in manager(capture, image_memory=0.0).cached_train]
     for path in (tmp_path / "cache").rglob(name):
         path.unlink() if content is None else path.write_bytes(content)
     torch.testing.assert_close([data["image"] for data in manager(capture, image_memory=0.0).cached_train], before)
