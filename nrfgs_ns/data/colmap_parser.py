@@ -24,11 +24,8 @@ LISTS = (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "te
 
 
 class NrfgsColmapDataParser(NrfgsDataParser):
-    """nerfstudio's `colmap` parser, with the checks of `NrfgsDataParser` and without questions at the terminal.
-
-    Images larger than 1600 pixels are resized by a power of two, as nerfstudio proposes. Cameras are all pinholes or
-    all fisheyes.
-    """
+    """nerfstudio's `colmap` parser, with the checks of `NrfgsDataParser` and without questions at the terminal: images
+    larger than 1600 pixels are resized by a power of two, as nerfstudio proposes."""
 
     config: ColmapDataParserConfig
     _resizes = True

@@ -95,11 +95,9 @@ def free_memory() -> float:
 def in_parallel(
     read: Callable[[int], Result], sizes: Sequence[tuple[int, int]], what: str, workers: int | None = None
 ) -> Iterator[Result]:
-    """Results of `read(0)`, `read(1)`, ..., which decode pictures of these sizes (width, height), on `workers` threads.
-
-    By default there is a thread for each processor; half of the free memory bounds their number. The first failure ends
-    the reading. `what` labels the progress bar. InputError if there is no memory for decoding the largest picture.
-    """
+    """Results of `read(0)`, `read(1)`, ..., which decode pictures of these sizes (width, height), on `workers` threads
+    (default: one for each processor), as far as half of the free memory allows. The first failure ends the reading; so
+    does, with InputError, a lack of memory for the largest picture. `what` labels the progress bar."""
     from nerfstudio.utils.rich_utils import CONSOLE  # slow to import, and not needed by `nrfgs prepare`
 
     width, height = max(sizes, key=math.prod, default=(1, 1))

@@ -52,12 +52,8 @@ def _choose_best(chosen: np.ndarray, scores: np.ndarray, number: int) -> None:
 
 
 def shared_features(descriptors: list[np.ndarray], advance: Advance) -> np.ndarray:
-    """Numbers of shared features (mutual best matches that look the same), int [N, N], symmetric, 0 on the diagonal.
-
-    Args:
-        descriptors: for each photograph [n, 128], largest feature first.
-        advance: called with 1 for each photograph.
-    """
+    """Numbers of shared features (mutual best matches that look the same), int [N, N], symmetric, 0 on the diagonal, by
+    each photograph's descriptors [n, 128], largest feature first."""
     count = len(descriptors)
     size = max(min(LARGEST, 1000 * LARGEST // count), LARGEST // 4)
     table = np.zeros((count, size, 128), dtype=np.float32)

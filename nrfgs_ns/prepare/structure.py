@@ -194,7 +194,7 @@ def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Adva
 
 
 def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
-    """Global mapping, whose points (up to 15 pixels off) are triangulated again, as by incremental mapping."""
+    """Global mapping, whose points, up to 15 pixels off, are triangulated again."""
     pycolmap = colmap()
     options = pycolmap.GlobalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED)
     with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
