@@ -22,11 +22,11 @@ ROTATION_TOLERANCE = 1e-2
 """Largest entry of |R^T R - 1| of a rotation: rounding to three decimals leaves 3e-3, a scale of 1 % gives 2e-2."""
 LAST_ROW_TOLERANCE = 1e-6
 POSITION_TOLERANCE = 1e-8
-"""Camera positions that agree to this share of their size are one place; in UTM coordinates it is 5 cm."""
+"""Relative difference of camera positions that count as one place; in UTM coordinates it is 5 cm."""
 FAR_OUTSIDE = 100.0
 """A camera this many times as far from the middle as three in four has a wrong pose: the farthest scales the scene."""
 LONGEST_JSON = 2**26
-"""Bytes of a transforms.json, at most: a hundred thousand frames."""
+"""Largest transforms.json, bytes: a hundred thousand frames."""
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".dng")
 """Suffixes of a camera's files."""
 SHOWN, LONGEST = 3, 160
@@ -34,7 +34,7 @@ SHOWN, LONGEST = 3, 160
 
 
 def warn(message: str) -> None:
-    """Print one warning as plain text: brackets in a file name are not markup."""
+    """Print a warning as plain text: brackets in a file name are not markup."""
     CONSOLE.print(f"Warning: {message}", style="bold yellow", markup=False, soft_wrap=True)
 
 
@@ -51,7 +51,7 @@ def shown(value: Any) -> str:
 
 
 def number(value: Any) -> float:
-    """The value as a float, NaN if it is no number."""
+    """The value as a float; NaN if it is not a number."""
     try:
         return math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
@@ -59,7 +59,7 @@ def number(value: Any) -> float:
 
 
 def matrix(value: Any) -> np.ndarray:
-    """The value as a float64 array, empty if it is ragged or not of numbers."""
+    """The value as a float64 array; empty if it is ragged or not of numbers."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -67,17 +67,14 @@ def matrix(value: Any) -> np.ndarray:
 
 
 def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
-    """The content of the transforms.json of `data`, a folder or the file itself, whose `frames` are a non-empty list of
-    objects; and its path."""
+    """The content of the transforms.json of `data`, a folder or the file itself, with at least one frame; its path."""
     if not os.path.exists(data):
         raise InputError(f"{shown(str(data))}: no such file or folder. Check the path that --data names.")
     source = data if data.suffix == ".json" else data / "transforms.json"
     if not source.is_file():
         raise InputError(f"{source} is missing. {_advice_without_transforms(data)}")
     if source.stat().st_size > LONGEST_JSON:
-        raise InputError(
-            f"{source} has {source.stat().st_size} bytes, more than the {LONGEST_JSON} that are read. Make it anew."
-        )
+        raise InputError(f"{source} is larger than {LONGEST_JSON} bytes. Make it anew.")
     try:
         meta = json.loads(source.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
@@ -89,15 +86,11 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
 
 
 def _advice_without_transforms(folder: Path) -> str:
-    """Next step for a path without a transforms.json, by its content."""
-    if not folder.is_dir():
-        return "Point --data at a folder that holds a transforms.json, or at the file."
-    if model := find_colmap(folder):
-        return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
-    if any(file.suffix.lower() in PHOTOGRAPHS for pattern in ("*", "images/*") for file in folder.glob(pattern)):
-        return (
-            f"There are photographs without poses: `nrfgs prepare {folder} SCENE` finds the poses; then train on SCENE."
-        )
+    if folder.is_dir():
+        if model := find_colmap(folder):
+            return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
+        if any(file.suffix.lower() in PHOTOGRAPHS for pattern in ("*", "images/*") for file in folder.glob(pattern)):
+            return f"For photographs without poses: run `nrfgs prepare {folder} SCENE`, then train on SCENE."
     return "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
 
 
@@ -111,61 +104,58 @@ def find_colmap(folder: Path) -> str | None:
 
 def check_options(config: Any) -> None:
     """The parser's numbers are in their ranges."""
-    for name, least, fix in (
-        ("scale_factor", 0, "a positive number"),
-        ("scene_scale", 0, "a positive number"),
-        ("downscale_factor", 1, "1 or more, or leave it out"),
-        ("eval_interval", 1, "1 or more"),
-    ):
+    for name, least in (("scale_factor", 0), ("scene_scale", 0), ("downscale_factor", 1), ("eval_interval", 1)):
         value = getattr(config, name)
         if value is not None and not (0 < value < math.inf and value >= least):
+            fix = "1 or more" if least else "a positive number"
             raise InputError(f"--{name.replace('_', '-')} is {value}. Give {fix}.")
 
 
 def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
     """Every frame names an image of its own; masks are named by all frames or by none."""
-    nameless = [f"frames[{i}]" for i, frame in enumerate(frames) if not _is_name(frame.get("file_path"))]
-    if nameless:
+
+    def without(key: str) -> list[int]:
+        names = [frame.get(key) for frame in frames]
+        return [row for row, name in enumerate(names) if not (isinstance(name, str) and name)]
+
+    if nameless := [f"frames[{row}]" for row in without("file_path")]:
         raise InputError(f"{source}: {some(nameless)} without a file_path. Name the image, or remove the frame.")
     check_unique((os.path.normpath(frame["file_path"]) for frame in frames), f"{source}: frames")
-    without = [frame["file_path"] for frame in frames if not _is_name(frame.get("mask_path"))]
-    if without and any("mask_path" in frame for frame in frames):
+    unmasked = [frames[row]["file_path"] for row in without("mask_path")]
+    if unmasked and any("mask_path" in frame for frame in frames):
         raise InputError(
-            f"{source}: mask_path is given for some frames but not for {some(without)}. Give one for every frame (an "
+            f"{source}: mask_path is given for some frames but not for {some(unmasked)}. Give one for every frame (an "
             "all-white mask keeps the whole image), or for none."
         )
 
 
-def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and bool(value)
-
-
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
-    """The poses, float64 [V, 4, 4]: rigid camera-to-world matrices; with `need_spread`, of more than one place."""
+    """Rigid camera-to-world matrices, float64 [V, 4, 4]; with `need_spread`, not all at one place."""
     names = np.array([frame["file_path"] for frame in frames])
     matrices = [matrix(frame.get("transform_matrix")) for frame in frames]
 
-    def reject(bad: Any, finding: str, fix: str) -> None:
+    def reject(bad: Any, finding: str) -> None:
         if np.any(bad):
-            raise InputError(f"{source}: transform_matrix of {some(names[np.flatnonzero(bad)])} {finding}. {fix}")
+            where = some(names[np.flatnonzero(bad)])
+            raise InputError(f"{source}: transform_matrix of {where} {finding}, or remove the frame.")
 
-    remove = "Recompute the pose, or remove the frame."
+    last_row = (0, 0, 0, 1)
     reject(
-        [pose.shape != (4, 4) for pose in matrices],
-        "is missing or not a 4 x 4 matrix of numbers",
-        "Give the camera-to-world matrix with its last row 0 0 0 1, or remove the frame.",
+        [
+            pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(pose[3] - last_row).max() > LAST_ROW_TOLERANCE
+            for pose in matrices
+        ],
+        "is not a 4 x 4 matrix of finite numbers with the last row 0 0 0 1. Give the camera-to-world matrix",
     )
     poses = np.stack(matrices)
-    reject(~np.isfinite(poses).all((1, 2)), "holds NaN or Inf", remove)
-    reject(np.abs(poses[:, 3] - (0, 0, 0, 1)).max(1) > LAST_ROW_TOLERANCE, "has a last row that is not 0 0 0 1", remove)
     rotation = poses[:, :3, :3]
-    skew = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max((1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        skew = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max((1, 2))
     reject(
-        skew > ROTATION_TOLERANCE,
-        f"is not rigid (R^T R differs from 1 by {skew.max():.2g}, allowed {ROTATION_TOLERANCE:g})",
-        "Take scale and shear out of the rotation.",
+        ~(skew <= ROTATION_TOLERANCE),
+        f"is not rigid (R^T R differs from 1 by {skew.max():.2g}). Take scale and shear out of the rotation",
     )
-    reject(np.linalg.det(rotation) < 0, "mirrors (its rotation has determinant -1)", "Flip one camera axis.")
+    reject(np.linalg.det(rotation) < 0, "mirrors (its rotation has determinant -1). Flip one camera axis")
 
     position = poses[:, :3, 3]
     if need_spread and np.ptp(position, axis=0).max() <= POSITION_TOLERANCE * np.abs(position).max():
@@ -177,14 +167,14 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
     usual = np.quantile(distance, 0.75)
     reject(
         (distance > FAR_OUTSIDE * usual) & (usual > 0),
-        f"is more than {FAR_OUTSIDE:g} times as far from the middle of the cameras as three quarters of them",
-        "Correct the pose, or remove the frame: the scene would shrink to a speck.",
+        f"is more than {FAR_OUTSIDE:g} times as far from the middle of the cameras as three quarters of them, so the "
+        "scene would shrink to a speck. Correct the pose",
     )
     return poses
 
 
 def check_applied(meta: dict[str, Any], source: Path) -> None:
-    """applied_transform is a 3 x 4 matrix and applied_scale a positive number, if there."""
+    """If present, applied_transform is a 3 x 4 matrix and applied_scale a positive number."""
     if "applied_transform" in meta:
         applied = matrix(meta["applied_transform"])
         if applied.shape != (3, 4) or not np.isfinite(applied).all():
@@ -202,8 +192,8 @@ def check_unique(names: Iterable[Any], where: str) -> None:
 
 
 def check_exist(paths: Sequence[Path], source: Path, what: str) -> None:
-    """Every file is there; `what` is their kind."""
-    missing = [path for path in paths if not os.path.isfile(path)]  # False, too, for a name that cannot be
+    """Every file exists; `what` is their kind."""
+    missing = [path for path in paths if not os.path.isfile(path)]  # unlike Path's, False for a name too long
     if missing:
         raise InputError(
             f"{source}: {len(missing)} of {len(paths)} {what} are missing: {some(missing)}. Restore them, or correct "

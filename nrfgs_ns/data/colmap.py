@@ -6,7 +6,7 @@ binary ones of images and points reserve gigabytes where a damaged file announce
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -34,6 +34,7 @@ MODELS = {
 """Camera models that can be undistorted, and their parameters as transforms.json names them."""
 QUATERNION_TOLERANCE = 1e-2
 """Largest difference of a rotation quaternion's length from 1."""
+EXPORT = "Export the COLMAP model again."
 
 
 class View(NamedTuple):
@@ -47,26 +48,16 @@ class View(NamedTuple):
 
 
 def read_model(folder: Path) -> tuple[dict[int, dict[str, Any]], list[View], Path]:
-    """The cameras and photographs of a model.
-
-    Returns:
-        Cameras by id (camera_model, w, h and parameters, named as in transforms.json), the photographs by id, and the
-        file of the photographs, for messages.
-
-    Raises:
-        InputError: a file is missing or damaged, or has a camera model that cannot be undistorted.
-    """
+    """Cameras by id (camera_model, w, h and parameters, named as in transforms.json), photographs in the order of their
+    ids, and the file of the photographs; InputError also where a camera model cannot be undistorted."""
     path = _file(folder, "cameras")
     stored = _read(read_cameras_text if path.suffix == ".txt" else read_cameras_binary, path)
     cameras = {id: _lens(camera, path) for id, camera in stored.items()}
     path = path.with_stem("images")
-    images = _read(_images_text, path) if path.suffix == ".txt" else _read(_entries, path, _image)
-    views = sorted((_view(image, path) for image in images), key=lambda view: view.id)
-    if not views:
-        raise InputError(f"{path} holds no photograph. Export the COLMAP model again.")
-    strangers = [view.name for view in views if view.camera not in cameras]
-    if strangers:
-        raise InputError(f"{path}: the camera of {shown(strangers[0])} is missing. Export the COLMAP model again.")
+    views = _read(_images_text, path) if path.suffix == ".txt" else _read(_entries, path, _image)
+    views.sort(key=lambda view: view.id)
+    if not views or any(view.camera not in cameras for view in views):
+        raise InputError(f"{path} holds no photograph, or one whose camera is missing. {EXPORT}")
     return cameras, views, path
 
 
@@ -96,22 +87,15 @@ def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
     try:
         return read(path, *rest)
     except Exception as error:  # whatever damaged bytes lead to
-        raise InputError(
-            f"{path} cannot be read ({type(error).__name__}: {shown(str(error))}). Restore it, or export the COLMAP "
-            "model again."
-        ) from error
+        raise InputError(f"{path} cannot be read ({type(error).__name__}: {shown(str(error))}). {EXPORT}") from error
 
 
 def _lens(camera: Any, path: Path) -> dict[str, Any]:
-    names = MODELS.get(camera.model)
-    if names is None:
-        raise InputError(
-            f"{path}: camera model {shown(camera.model)} is not supported. Undistort the photographs (colmap "
-            f"image_undistorter), or use one of {', '.join(MODELS)}."
-        )
+    names = MODELS.get(camera.model, ())
     if len(camera.params) != len(names):
         raise InputError(
-            f"{path}: a {camera.model} camera has {len(camera.params)} parameters instead of {len(names)}. Correct it."
+            f"{path}: a camera of model {shown(camera.model)} with {len(camera.params)} parameters is not supported. "
+            f"Undistort the photographs (colmap image_undistorter), or use one of {', '.join(MODELS)}."
         )
     lens = dict(zip(names, map(float, camera.params), strict=True))
     if "f" in lens:
@@ -120,33 +104,28 @@ def _lens(camera: Any, path: Path) -> dict[str, Any]:
     return {"camera_model": kind, "w": camera.width, "h": camera.height, **lens}
 
 
-def _view(image: tuple, path: Path) -> View:
-    id, quaternion, position, camera, name = image
-    length = np.linalg.norm(quaternion)
-    if not (abs(length - 1) <= QUATERNION_TOLERANCE and np.isfinite(position).all()):
-        raise InputError(
-            f"{path}: the pose of {shown(name)} holds NaN or Inf, or a quaternion that is not of length 1. Export the "
-            "COLMAP model again."
-        )
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = qvec2rotmat(quaternion), position
-    return View(id, name, camera, pose)
+def _view(id: int, pose: Sequence[float], camera: int, name: str) -> View:
+    """A photograph with a pose of a unit quaternion and a position."""
+    quaternion, position = np.split(np.array(pose, dtype=np.float64).reshape(7), [4])
+    if not (abs(np.linalg.norm(quaternion) - 1) <= QUATERNION_TOLERANCE and np.isfinite(position).all()):
+        raise ValueError(f"the pose of {name} holds NaN or Inf, or a quaternion that is not of length 1")
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = qvec2rotmat(quaternion), position
+    return View(id, name, camera, world_to_camera)
 
 
-def _images_text(path: Path) -> list[tuple]:
-    """Id, quaternion, position, camera and name of each photograph, as `_image` reads them."""
-    images = []
+def _images_text(path: Path) -> list[View]:
+    views = []
     lines = iter(path.read_text(encoding="utf-8").splitlines())
     for line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
             id, *pose, camera, name = line.split(maxsplit=9)
-            pose = np.array(pose, dtype=np.float64).reshape(7)
-            images.append((int(id), pose[:4], pose[4:], int(camera), name.strip()))
+            views.append(_view(int(id), pose, int(camera), name.strip()))
             next(lines, None)  # features
-    return images
+    return views
 
 
-def _entries(path: Path, read: Callable[[BinaryIO], tuple]) -> list[tuple]:
+def _entries(path: Path, read: Callable[[BinaryIO], Any]) -> list[Any]:
     """The entries of a binary file, which end where the file does."""
     with path.open("rb") as file:
         entries = [read(file) for _ in range(_take(file, "<Q")[0])]
@@ -155,11 +134,11 @@ def _entries(path: Path, read: Callable[[BinaryIO], tuple]) -> list[tuple]:
     return entries
 
 
-def _image(file: BinaryIO) -> tuple:
+def _image(file: BinaryIO) -> View:
     id, *pose, camera = _take(file, "<i7di")
     name = b"".join(iter(lambda: _take(file, "c")[0], b"\0")).decode("utf-8")
     file.seek(24 * _take(file, "<Q")[0], 1)  # features
-    return id, np.array(pose[:4]), np.array(pose[4:]), camera, name
+    return _view(id, pose, camera, name)
 
 
 def _point(file: BinaryIO) -> tuple:

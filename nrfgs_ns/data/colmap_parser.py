@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""nerfstudio's `colmap` parser with the checks of `nrfgs-data`, and which parsers stand in for nerfstudio's."""
+"""nerfstudio's `colmap` parser with the checks of `nrfgs-data`, and the parsers in place of nerfstudio's."""
 
 import os
 from dataclasses import replace
@@ -7,17 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from nrfgs_ns.data.checks import check_frames, shown
 from nrfgs_ns.data.colmap import read_model
-from nrfgs_ns.data.dataparser import NrfgsDataParser, Scene
-from nrfgs_ns.data.points import read_colmap
+from nrfgs_ns.data.dataparser import NrfgsDataParser
 from nrfgs_ns.data.splits import Named
-from nrfgs_ns.data.world import after
 from nrfgs_ns.errors import InputError
 
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -27,11 +24,8 @@ LISTS = (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "te
 
 
 class NrfgsColmapDataParser(NrfgsDataParser):
-    """nerfstudio's `colmap` parser, with the checks of `NrfgsDataParser` and without questions at the terminal.
-
-    Images that are larger than 1600 pixels are resized by a power of two, as nerfstudio proposes. Multiple cameras may
-    be of several models if all are pinholes or all are fisheyes.
-    """
+    """nerfstudio's `colmap` parser, with the checks of `NrfgsDataParser` and without questions at the terminal: images
+    larger than 1600 pixels are resized by a power of two, as nerfstudio proposes."""
 
     config: ColmapDataParserConfig
     _resizes = True
@@ -45,14 +39,16 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         if len(kinds) > 1:
             raise InputError(f"{source}: some cameras are fisheyes and some are not. Undistort the photographs.")
         upright = UPRIGHT if config.assume_colmap_world_coordinate_convention else np.eye(4)
-        frames = []
-        for view in views:
-            frame = {"file_path": view.name, **cameras[view.camera]}
-            pose = upright @ np.linalg.inv(view.world_to_camera)
-            frame["transform_matrix"] = pose * np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backwards
-            if config.masks_path is not None:
-                frame["mask_path"] = view.name
-            frames.append(frame)
+        flip = np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backwards
+        frames = [
+            {
+                "file_path": view.name,
+                **cameras[view.camera],
+                "transform_matrix": upright @ np.linalg.inv(view.world_to_camera) * flip,
+                **({} if config.masks_path is None else {"mask_path": view.name}),
+            }
+            for view in views
+        ]
         check_frames(frames, source)
         return {"frames": frames, "camera_model": kinds.pop(), "applied_transform": upright[:3].tolist()}, source
 
@@ -70,9 +66,6 @@ class NrfgsColmapDataParser(NrfgsDataParser):
     def _copy(self, name: str, key: str, factor: int) -> Path:
         return self._copies(key, factor) / self._file(name, key).relative_to(self._root(key))
 
-    def _order(self, frames: list[dict[str, Any]]) -> list[int]:
-        return list(range(len(frames)))  # by COLMAP's numbers
-
     def _named_splits(self, meta: dict[str, Any]) -> Named:
         named = {}
         for split, file in LISTS:
@@ -85,11 +78,8 @@ class NrfgsColmapDataParser(NrfgsDataParser):
                 named[split] = path.name, [line.strip() for line in lines if line.strip()]
         return named
 
-    def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
-
 
 def checked(config: DataParserConfig) -> DataParserConfig:
-    """The configuration of a parser that checks what it reads, for nerfstudio's own two, and any other unchanged."""
+    """A parser's configuration; of nerfstudio's own two, that of our parser in its place."""
     parsers = {NerfstudioDataParserConfig: NrfgsDataParser, ColmapDataParserConfig: NrfgsColmapDataParser}
     return replace(config, _target=parsers[type(config)]) if type(config) in parsers else config

@@ -6,6 +6,7 @@ import random
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -28,28 +29,19 @@ from nrfgs_ns.data.pixels import from_files, look_through, undistorted
 from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
 from nrfgs_ns.errors import InputError
 
-LARGEST_SCALE = 16.0
-"""Largest enlargement of images."""
-
 
 class NrfgsInputDataset(InputDataset):
-    """nerfstudio's dataset, whose errors name the file and the fix.
-
-    Images of any mode are converted to RGB or RGBA, where nerfstudio takes a palette's indices for grey and CMYK for
-    RGBA. Images of more than 8 bits are refused: their range is unknown.
-    """
+    """nerfstudio's dataset, with errors that name the file and the fix, and images of any mode as RGB or RGBA."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
         super().__init__(dataparser_outputs, scale_factor)
         for name in ("width", "height"):  # as images and masks are rounded; nerfstudio does it in float32
             sides = (getattr(dataparser_outputs.cameras, name).double() * scale_factor).int()
             if (sides < 1).any():
-                raise InputError(
-                    f"--pipeline.datamanager.camera-res-scale-factor {scale_factor} leaves nothing of the images. Give "
-                    "a larger one."
-                )
+                option = f"--pipeline.datamanager.camera-res-scale-factor {scale_factor}"
+                raise InputError(f"{option} leaves nothing of the images. Give a larger one.")
             setattr(self.cameras, name, sides.to(getattr(self.cameras, name)))
-        # A copy: the datamanager removes entries from the list, which all datasets share.
+        # The datamanager removes entries from the list, which all datasets share.
         self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
         self.metadata["scene_unit"] = scene_unit(self.cameras.camera_to_worlds[:, :3, 3])
         self.metadata["different_views"] = different_views(self.cameras.camera_to_worlds)
@@ -64,18 +56,16 @@ class NrfgsInputDataset(InputDataset):
         """A decoded image, uint8 [H, W, 3 or 4], of its camera's size."""
         path = self.image_filenames[image_idx]
         sampling = Image.Resampling.BILINEAR if self.downscale == 1 else Image.Resampling.LANCZOS
-        pixels = self._smaller(read_picture(path), image_idx, sampling)
-        width, height = self._sizes[image_idx]
-        if pixels.size != (width, height):
-            raise InputError(
-                f"{path} is {pixels.width} x {pixels.height}, but its camera {width} x {height}. "
-                "Use the image that the pose was computed from, or scale the intrinsics with it."
-            )
-        return np.array(pixels)
+        return np.array(self._smaller(read_picture(path), image_idx, sampling, path))
 
-    def _smaller(self, picture: Image.Image, index: int, sampling: Image.Resampling) -> Image.Image:
-        """A picture in full size, made smaller by `downscale` and `scale_factor`."""
+    def _smaller(self, picture: Image.Image, index: int, sampling: Image.Resampling, path: Path) -> Image.Image:
+        """A picture in full size, made as small as its camera by `downscale` and `scale_factor`."""
         size = [int(side * self.scale_factor) for side in picture.size] if self.downscale == 1 else self._sizes[index]
+        if list(size) != self._sizes[index]:
+            raise InputError(
+                f"{path} is {size[0]} x {size[1]}, but its camera {' x '.join(map(str, self._sizes[index]))}. Use the "
+                "image that the pose was computed from, or scale the intrinsics with it; masks are as large."
+            )
         return picture.resize(size, sampling)
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
@@ -83,19 +73,15 @@ class NrfgsInputDataset(InputDataset):
         image = self.get_image_float32(image_idx) if image_type == "float32" else self.get_image_uint8(image_idx)
         data = {"image_idx": image_idx, "image": image}
         if (masks := self._dataparser_outputs.mask_filenames) is not None:
-            mask = self._smaller(read_mask(masks[image_idx]), image_idx, Image.Resampling.NEAREST)
-            if mask.size != (image.shape[1], image.shape[0]):
-                raise InputError(
-                    f"{masks[image_idx]} is {mask.width} x {mask.height}, but its image {image.shape[1]} x "
-                    f"{image.shape[0]}. Make the mask as large as the image."
-                )
+            path = masks[image_idx]
+            mask = self._smaller(read_mask(path), image_idx, Image.Resampling.NEAREST, path)
             data["mask"] = torch.from_numpy(np.array(mask)).unsqueeze(-1).bool()
         return data
 
 
 @dataclass
 class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's full-image datamanager, keeping images as uint8, in a quarter of the memory."""
+    """nerfstudio's full-image datamanager, with images as uint8, in a quarter of the memory."""
 
     _target: type = field(default_factory=lambda: NrfgsDatamanager)
     """target class to instantiate"""
@@ -109,19 +95,23 @@ class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
 
 
 class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
-    """nerfstudio's datamanager, which can load everything at once, run on a CPU, and save and restore its order."""
+    """nerfstudio's datamanager, except that it can load everything at once, run on a CPU, and restore its order."""
 
     config: NrfgsDatamanagerConfig
 
     def __init__(self, config: NrfgsDatamanagerConfig, *args: Any, **kwargs: Any):
         config.dataparser = checked(config.dataparser)
-        scale = config.camera_res_scale_factor
-        if not 0 < scale <= LARGEST_SCALE:
+        scale, memory = config.camera_res_scale_factor, config.image_memory
+        if not 0 < scale <= 16:
             raise InputError(
-                f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, at most {LARGEST_SCALE}."
+                f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, at most 16."
             )
-        if config.image_memory is not None and not config.image_memory >= 0:
-            raise InputError(f"--pipeline.datamanager.image-memory is {config.image_memory}. Give 0 or more gigabytes.")
+        if memory is not None and not memory >= 0:
+            raise InputError(f"--pipeline.datamanager.image-memory is {memory}. Give 0 or more gigabytes.")
+        self._views: dict[int, Cameras] = {}
+        """training cameras by index, kept since moving one to a GPU takes as long as a step"""
+        self._reader = ThreadPoolExecutor(1)
+        """reads the next image while this one is trained on"""
         try:
             super().__init__(config, *args, **kwargs)
         except (FileNotFoundError, LookupError) as error:  # of nerfstudio's own parsers
@@ -131,35 +121,28 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             ) from error
 
     def load_all_images(self) -> tuple[int, int]:
-        """Decode all images, and return the numbers of training and evaluation images.
-
-        Raises:
-            InputError: an image or a mask cannot be used, or nothing is visible in any training image.
-        """
-        count = len(self.cached_train)
+        """Decode all images; return the numbers of training and evaluation images. InputError if an image or a mask
+        cannot be used, or nothing is visible in any training image."""
         names = [path.name for path in self.train_dataset.image_filenames]
         empty = [name for name, data in zip(names, self.cached_train, strict=True) if not _shows_anything(data)]
         if empty:
             finding = f"{self.get_datapath()}: masks or transparency leave nothing of {some(empty)}"
-            if len(empty) == count:
-                raise InputError(
-                    f"{finding}, so there is nothing to learn. Masks are 0 outside and 255 inside; opaque pixels have "
-                    "alpha 255."
-                )
+            if len(empty) == len(names):
+                raise InputError(f"{finding}. Masks are 0 outside and 255 inside; opaque pixels have alpha 255.")
             warn(f"{finding}.")
-        return count, len(self.cached_eval)
+        return len(names), len(self.cached_eval)
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        """The next camera in turn, [1] on the device with "cam_idx" in its metadata, and its "image" [H, W, 3 or 4],
-        "image_idx" and "mask". The camera is the same object each time: moving it to a GPU takes as long as a step."""
+        """The next `train_view` in turn."""
         return self.train_view(self._next_index())
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """A training camera and its image, as by `next_train`, out of turn."""
+        """A training camera, [1] on the device with "cam_idx" in its metadata, and its "image" [H, W, 3 or 4],
+        "image_idx" and "mask"."""
         return self._view(index), self._image(index)
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
-        """The next `count` cameras in turn, as by `next_train`, and the image of number `own`."""
+        """The next `count` cameras in turn, and the image of number `own`."""
         indices = [self._next_index() for _ in range(count)]
         return [self._view(index) for index in indices], self._image(indices[own])
 
@@ -183,16 +166,6 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
             self._views[index] = camera
         return self._views[index]
-
-    @cached_property
-    def _views(self) -> dict[int, Cameras]:
-        """Training cameras by index, from their first turn on."""
-        return {}
-
-    @cached_property
-    def _reader(self) -> ThreadPoolExecutor:
-        """Reads the next image while this one is trained on."""
-        return ThreadPoolExecutor(1)
 
     @cached_property
     def _place(self) -> Literal["device", "memory", "files"]:
@@ -221,18 +194,16 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     ) -> list[dict[str, Tensor]]:
         """All images of a split, decoded and undistorted; `_place` decides where, not `cache_images_device`."""
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        on_gpu = torch.device(self.device).type != "cpu"
         place, kind = self._place, self.config.cache_images_type
         read = from_files if place == "files" else undistorted
 
         def placed(data: dict[str, Any]) -> dict[str, Any]:
-            if not on_gpu or place == "files":
+            if torch.device(self.device).type == "cpu" or place == "files":
                 return data
             move = Tensor.pin_memory if place == "memory" else lambda values: values.to(self.device)
             return data | {name: move(data[name]) for name in ("image", "mask") if name in data}
 
-        widths, heights = (dataset.downscale * side[:, 0] for side in (dataset.cameras.width, dataset.cameras.height))
-        sizes = list(zip(widths.tolist(), heights.tolist(), strict=True))
+        sizes = [(dataset.downscale * width, dataset.downscale * height) for width, height in dataset._sizes]
         workers = self.config.max_thread_workers
         pictures = in_parallel(lambda index: read(dataset, index, kind), sizes, f"Reading {split} images", workers)
         images = [placed(data) for data in pictures]
@@ -242,34 +213,27 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return images
 
     def sampling_state(self) -> dict[str, Any]:
-        """State of the order of training cameras, in plain numbers, strings, lists and tuples; for the strategy `fps`
-        with numpy's global generator, from which nerfstudio draws."""
+        """State of the order of training cameras, of plain numbers, strings, lists and tuples; nerfstudio draws from
+        numpy's global generator for the strategy `fps`."""
         state = {
             "strategy": self.config.train_cameras_sampling_strategy,
             "num_images": len(self.train_dataset),
             "unseen_cameras": list(self.train_unseen_cameras),
         }
         if state["strategy"] == "random":
-            return {**state, "generator": self.random_generator.getstate()}
-        name, keys, position, has_gauss, gauss = np.random.get_state()
-        return {
-            **state,
-            "generator": (name, keys.tolist(), int(position), int(has_gauss), float(gauss)),
-            "epochs_unsampled": self.train_unsampled_epoch_count.tolist(),
-        }
+            return state | {"generator": self.random_generator.getstate()}
+        name, keys, *rest = np.random.get_state()
+        epochs = self.train_unsampled_epoch_count.tolist()
+        return state | {"generator": (name, keys.tolist(), *rest), "epochs_unsampled": epochs}
 
     def load_sampling_state(self, state: dict[str, Any]) -> None:
         """Continue the order of cameras from `sampling_state()`; InputError if images or strategy are others."""
-        if state["num_images"] != len(self.train_dataset):
+        now = self.sampling_state()
+        if (state["num_images"], state["strategy"]) != (now["num_images"], now["strategy"]):
             raise InputError(
-                f"{self.get_datapath()}: the checkpoint was trained on {state['num_images']} images, but there are "
-                f"{len(self.train_dataset)} now. Continue with the same images and split, or train anew."
-            )
-        strategy = self.config.train_cameras_sampling_strategy
-        if state["strategy"] != strategy:
-            raise InputError(
-                f"train_cameras_sampling_strategy is {strategy}, but the checkpoint was trained with "
-                f"{state['strategy']}. Set it back, or train anew."
+                f"{self.get_datapath()}: the checkpoint was trained on {state['num_images']} images with "
+                f"train_cameras_sampling_strategy {state['strategy']}, but now these are {now['num_images']} and "
+                f"{now['strategy']}. Continue with the same images, split and strategy, or train anew."
             )
         self.train_unseen_cameras = list(state["unseen_cameras"])
         if state["strategy"] == "random":

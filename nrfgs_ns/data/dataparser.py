@@ -87,23 +87,15 @@ class Scene(NamedTuple):
 
 
 class NrfgsDataParser(DataParser):
-    """nerfstudio's parser, with these differences.
-
-    - The data set is checked before it is parsed; what cannot be used raises InputError.
-    - If val or test has no images, the other stands in; if both have none, the training images are evaluated, with a
-      warning.
-    - A data set of one image loads. It keeps its own scale, having no extent to normalise by.
-    - Points are read by plyfile, or straight from colmap/sparse/0 without a question at the terminal.
-    - Cameras far from the origin are moved there in float64 (see `world`).
-    - With a downscale_factor of which there is no folder, images are resized when they are read.
-    - To render from a checkpoint, nerfstudio presets `downscale_factor`: neither images nor points need be there.
-    """
+    """nerfstudio's parser, except that the data set is checked first, with InputError for what cannot be used; val and
+    test stand in for each other, and the training images for both; points are read without open3d or a question at the
+    terminal; and images without a folder for downscale_factor are resized when they are read."""
 
     config: NerfstudioDataParserConfig
     downscale_factor: int | None = None
-    """set by nerfstudio, before the parsing, if no image is needed"""
+    """set by nerfstudio, before the parsing, to render from a checkpoint: neither images nor points need exist"""
     _resizes = False
-    """Whether images are made smaller without being asked for."""
+    """whether large images are resized without an option"""
 
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
         """Parse one split; the first call checks the whole data set."""
@@ -116,15 +108,17 @@ class NrfgsDataParser(DataParser):
         images, masks = (self._files(frames, key, scene.factor) for key in FOLDERS)
         cameras = scene.cameras[torch.from_numpy(rows)]
         if self.downscale_factor is None:
-            self._check_sizes(scene, rows, images, masks, cameras)
+            self._check_sizes(scene, rows, "file_path", images, cameras)
+            if masks:
+                self._check_sizes(scene, rows, "mask_path", masks, cameras)
         copies = all(self._has_copies(key, scene.factor) for key in FOLDERS if key in frames[0])
-        box = self.config.scene_scale * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        corner = torch.full((3,), self.config.scene_scale)
         outputs = PlacedOutputs(
             image_filenames=images,
             cameras=cameras,
-            scene_box=SceneBox(aabb=box),
+            scene_box=SceneBox(aabb=torch.stack([-corner, corner])),
             mask_filenames=masks or None,
-            dataparser_scale=scene.scale * number(scene.meta.get("applied_scale", 1.0)),
+            dataparser_scale=scene.scale,
             dataparser_transform=after(scene.transform, scene.to_frames),
             metadata={
                 "exif": [stored_exif(frame, scene.source) for frame in frames],
@@ -144,13 +138,17 @@ class NrfgsDataParser(DataParser):
         frames = meta["frames"]
         lenses = read_lenses(meta, source)
         check_applied(meta, source)
-        poses = check_poses(frames, source, need_spread=config.auto_scale_poses and len(frames) > 1)
+        scaled = config.auto_scale_poses and len(frames) > 1
+        poses = check_poses(frames, source, need_spread=scaled)
         factor = self._factor(frames, source) if self.downscale_factor is None else self.downscale_factor
-        order = self._order(frames)
-        frames = meta["frames"] = [frames[row] for row in order]
-        lenses, poses = lenses[order], poses[order]
         splits = self._splits(meta, source)
-        placed, transform, scale = self._placed(poses, meta, source)
+        orientation = meta.get("orientation_override", config.orientation_method)
+        if orientation not in ORIENTATIONS:
+            raise InputError(
+                f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, "
+                "or remove it."
+            )
+        placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
         cameras = cameras_of(meta, lenses, placed, source)
         rounding = getattr(config, "downscale_rounding_mode", "floor")
         cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
@@ -162,6 +160,7 @@ class NrfgsDataParser(DataParser):
         to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
         if "applied_transform" in meta:
             to_frames = torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
+        scale *= number(meta.get("applied_scale", 1.0))
         return Scene(meta, source, splits, factor, lenses, cameras, transform, to_frames, scale)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
@@ -182,47 +181,21 @@ class NrfgsDataParser(DataParser):
     def _splits(self, meta: dict[str, Any], source: Path) -> Rows:
         """Rows of the training and the evaluation images, by the data set's own lists or by rule."""
         paths = [self._file(frame["file_path"]) for frame in meta["frames"]]
-        if named := self._named_splits(meta):
-            splits = split_by_names(named, paths, self._file, source)
-        else:
-            splits = split_by_rule(self.config, paths, source)
+        named = self._named_splits(meta)
         if named and "train" not in named:
             there = next(iter(named.values()))[0]  # test_filenames, test_list.txt
             raise InputError(
                 f"{source}: there is {there}, but no train_{there.partition('_')[2]}. Name the training images, too."
             )
+        splits = (
+            split_by_names(named, paths, self._file, source) if named else split_by_rule(self.config, paths, source)
+        )
         if not len(splits["train"]):
             raise InputError(
                 f"{source}: no image is left for training. Correct train_filenames if it is there, else --eval-mode, "
                 "--eval-interval or --train-split-fraction."
             )
         return splits
-
-    def _placed(
-        self, poses: np.ndarray, meta: dict[str, Any], source: Path
-    ) -> tuple[torch.Tensor, torch.Tensor, float]:
-        """Poses in the training world, and the way there (`world.place`)."""
-        config = self.config
-        orientation = meta.get("orientation_override", config.orientation_method)
-        if orientation not in ORIENTATIONS:
-            raise InputError(
-                f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, "
-                "or remove it."
-            )
-        single = len(poses) == 1
-        placed = place(
-            poses,
-            "up" if single and orientation == "vertical" else orientation,  # which needs two cameras
-            config.center_method,
-            config.auto_scale_poses and not single,
-            config.scale_factor,
-        )
-        if not torch.isfinite(placed[0]).all():
-            raise InputError(
-                f"{source}: the poses cannot be oriented (their up directions cancel). "
-                "Set --orientation-method none, or recompute the poses."
-            )
-        return placed
 
     def _files(self, frames: list[dict[str, Any]], key: str, factor: int) -> list[Path]:
         """Files of some frames, in full size or the data set's own smaller copies."""
@@ -239,27 +212,22 @@ class NrfgsDataParser(DataParser):
         root = self._root(key)
         return root.with_name(f"{root.name}_{factor}")
 
-    def _check_sizes(
-        self, scene: Scene, rows: np.ndarray, images: list[Path], masks: list[Path], cameras: Cameras
-    ) -> None:
-        """Images and masks have the size of their cameras, or the full one where the data set has no smaller copies."""
-        small = [(int(width), int(height)) for width, height in zip(cameras.width, cameras.height, strict=True)]
-        full = [(int(width), int(height)) for width, height in scene.lenses[rows, 4:6]]
-        for key, paths, what, fix in (
-            ("file_path", images, "images", "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy alike."),
-            ("mask_path", masks, "masks", "Make them as large as the images."),
-        ):
-            if paths and self._has_copies(key, scene.factor):
-                check_unique(paths, f"{scene.source}: frames")
-                rounding = "Remove {}, or with `colmap` give --downscale-rounding-mode round or ceil."
-                check_headers(paths, small, what, rounding.format(self._copies(key, scene.factor)))
-            elif paths:
-                check_headers(paths, full, what, fix)
+    def _check_sizes(self, scene: Scene, rows: np.ndarray, key: str, paths: list[Path], cameras: Cameras) -> None:
+        """Images or masks have the size of their cameras, or the full one where the data set has no smaller copies."""
+        what = FOLDERS[key]
+        if self._has_copies(key, scene.factor):
+            check_unique(paths, f"{scene.source}: frames")
+            folder = self._copies(key, scene.factor)
+            fix = f"Remove {folder}, or with `colmap` give --downscale-rounding-mode round or ceil."
+            check_headers(paths, torch.cat([cameras.width, cameras.height], dim=1).tolist(), what, fix)
+        else:
+            fix = "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy with them; masks are as large."
+            check_headers(paths, scene.lenses[rows, 4:6].astype(int), what, fix)
 
     @cached_property
     def _placed_points(self) -> dict[str, torch.Tensor]:
-        """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; empty, with a warning,
-        without points."""
+        """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; nothing, with a warning, if
+        there are too few."""
         scene = self._scene
         points = self._points(scene)
         count = 0 if points is None else len(points[0])
@@ -269,10 +237,8 @@ class NrfgsDataParser(DataParser):
                 finding = f"the point cloud holds {count} usable points, fewer than {MIN_POINTS}"
             warn(f"{scene.source}: {finding}. Training starts from random points, which costs quality.")
             return {}
-        xyz, rgb, transform = (torch.as_tensor(table) for table in points)
-        transform = transform.double()
-        scale = scene.scale * number(scene.meta.get("applied_scale", 1.0))
-        xyz = scale * (xyz @ transform[:, :3].T + transform[:, 3])
+        xyz, rgb, transform = torch.from_numpy(points[0]), torch.from_numpy(points[1]), points[2].double()
+        xyz = scene.scale * (xyz @ transform[:, :3].T + transform[:, 3])
         near = torch.from_numpy(in_reach(xyz.numpy(), scene.cameras, scene.source))
         xyz, rgb = xyz[near].float(), rgb[near]
         rows = scene.splits["train"]
@@ -283,9 +249,11 @@ class NrfgsDataParser(DataParser):
     # Different for COLMAP models.
 
     def _read(self) -> tuple[dict[str, Any], Path]:
-        """The data set as a transforms.json, checked by `check_frames`, and the file that messages name."""
+        """The data set as a transforms.json, checked by `check_frames`, its frames sorted by name for splitting, as
+        in nerfstudio; and the file that messages name."""
         meta, source = read_transforms(self.config.data)
         check_frames(meta["frames"], source)
+        meta["frames"].sort(key=lambda frame: self._file(frame["file_path"]).parts)
         return meta, source
 
     @property
@@ -310,11 +278,6 @@ class NrfgsDataParser(DataParser):
         """Its copy at 1 / factor of the size, which need not be there."""
         return self._copies(key, factor) / Path(name).name
 
-    def _order(self, frames: list[dict[str, Any]]) -> list[int]:
-        """Rows in the order of splitting: by name, as in nerfstudio."""
-        parts = [self._file(frame["file_path"]).parts for frame in frames]
-        return sorted(range(len(frames)), key=parts.__getitem__)
-
     def _named_splits(self, meta: dict[str, Any]) -> Named:
         """Splits listed by the data set itself."""
         fields = {split: f"{split}_filenames" for split in SPLITS}
@@ -324,10 +287,7 @@ class NrfgsDataParser(DataParser):
         """Positions [N, 3] and colours [N, 3] as stored, and the transform [3, 4] from their world to the cameras'
         before scaling; None without."""
         if "ply_file_path" in scene.meta:
-            name = scene.meta["ply_file_path"]
-            if not isinstance(name, str):
-                raise InputError(f"{scene.source}: ply_file_path is {shown(repr(name))}. Name a file, or remove it.")
-            return *read_ply(self._file(name)), scene.transform
+            return *read_ply(self._file(str(scene.meta["ply_file_path"]))), scene.transform
         if self._colmap.is_dir():
             return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
         return None

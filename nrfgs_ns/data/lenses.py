@@ -17,8 +17,8 @@ from nrfgs_ns.errors import InputError
 PIXELS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """nerfstudio's order of the parameters."""
-UNKNOWN = ("k5", "k6", "s1", "s2", "s3", "s4")
-"""Parameters of OpenCV's larger models, which neither nerfstudio nor we undistort."""
+UNREAD = ("k5", "k6", "s1", "s2", "s3", "s4", "is_fisheye")
+"""OpenCV's larger models, which neither nerfstudio nor we undistort, and instant-ngp's name of a fisheye."""
 DRAWN = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
 """Pinholes, and cameras whose photographs are undistorted to a pinhole's."""
 SMALLEST, LARGEST = 4, 2**16
@@ -36,42 +36,30 @@ LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
 
 
 def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
-    """Intrinsics of every frame: the top level's where it has them.
-
-    Returns:
-        float64 [V, 12]: `PIXELS`, then `DISTORTION`.
-
-    Raises:
-        InputError: a number is missing or out of range, or given twice with two values.
-    """
+    """Intrinsics of every frame, float64 [V, 12]: `PIXELS`, then `DISTORTION`; those of the top level hold for all."""
     _check_model(meta, source)
     shared = {key: meta[key] for key in (*PIXELS, *DISTORTION, "distortion_params") if key in meta}
     for key, value in shared.items():
         other = [frame["file_path"] for frame in meta["frames"] if key in frame and frame[key] != value]
         if other:
-            raise InputError(
-                f"{source}: {key} of {some(other)} is not the one at the top level, which would be used for all "
-                "frames. Remove it at the top level, or in these frames."
-            )
-    return np.array([_lens({**frame, **shared}, f"of {shown(frame['file_path'])}", source) for frame in meta["frames"]])
+            finding = f"{source}: {key} of {some(other)} is not the one at the top level, which holds for all frames"
+            raise InputError(f"{finding}. Remove one of them.")
+    return np.array([_lens({**frame, **shared}, source) for frame in meta["frames"]])
 
 
-def _lens(values: dict[str, Any], of: str, source: Path) -> list[float]:
-    for key in PIXELS:
-        if not np.isfinite(number(values.get(key))):
-            what = f"is {shown(repr(values[key]))}" if key in values else "is missing"
-            hint = " (from a field of view: w / (2 tan(camera_angle_x / 2)))" if key in ("fl_x", "fl_y") else ""
-            raise InputError(f"{source}: {key} {of} {what}. Add it, a number of pixels{hint}.")
-    fl_x, fl_y, cx, cy, w, h = pixels = [number(values[key]) for key in PIXELS]
+def _lens(values: dict[str, Any], source: Path) -> list[float]:
+    of = f"of {shown(values['file_path'])}"
+    fl_x, fl_y, cx, cy, w, h = pixels = [number(values.get(key)) for key in PIXELS]
     size = max(w, h)
     if not (
         all(SMALLEST <= side <= LARGEST for side in (w, h))
         and all(WIDEST * size <= focal <= NARROWEST * size for focal in (fl_x, fl_y))
         and all(abs(center - side / 2) <= FARTHEST_CENTER * side for center, side in ((cx, w), (cy, h)))
     ):
+        found = ", ".join(f"{key} {shown(repr(values[key])) if key in values else 'missing'}" for key in PIXELS)
         raise InputError(
-            f"{source}: the lens {of} has fl_x {fl_x:g}, fl_y {fl_y:g}, cx {cx:g}, cy {cy:g} for an image of {w:g} x "
-            f"{h:g}: no lens does that. Give them in pixels of this image, of {SMALLEST} to {LARGEST} a side."
+            f"{source}: the lens {of} has {found}: no lens does that. Give all in pixels of one image, {SMALLEST} to "
+            f"{LARGEST} a side (from a field of view: fl_x = w / (2 tan(camera_angle_x / 2)))."
         )
     stored = values.get("distortion_params", [values.get(key, 0.0) for key in DISTORTION])
     distortion = [number(value) for value in stored] if isinstance(stored, list) else []
@@ -84,38 +72,29 @@ def _lens(values: dict[str, Any], of: str, source: Path) -> list[float]:
 
 
 def _check_model(meta: dict[str, Any], source: Path) -> None:
-    """The camera model is one that is drawn, and has no parameters beyond its own."""
+    """The camera model of the top level, which holds for all frames, can be drawn, and no other is named."""
     model = meta.get("camera_model", "OPENCV")
     drawn = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in DRAWN]
-    if model not in drawn:
-        raise InputError(
-            f"{source}: camera_model {shown(repr(model))} is not drawn here. Use one of {', '.join(drawn)}, or "
-            "undistort the photographs to one of them."
-        )
-    kind = CAMERA_MODEL_TO_TYPE[model]
     for holder in (meta, *meta["frames"]):
-        where = f"of {shown(holder['file_path'])} is" if holder is not meta else "of the top level is"
-        if CAMERA_MODEL_TO_TYPE.get(str(holder.get("camera_model", model))) != kind:
+        where = "of the top level" if holder is meta else f"of {shown(holder['file_path'])}"
+        named = holder.get("camera_model", model)
+        if named not in drawn or CAMERA_MODEL_TO_TYPE[named] != CAMERA_MODEL_TO_TYPE[model]:
             raise InputError(
-                f"{source}: camera_model {where} not {model}, the top level's, which is used for all frames. "
-                "Undistort the photographs, or correct it."
+                f"{source}: camera_model {where} is {shown(repr(named))}. Use one of {', '.join(drawn)} at the "
+                "top level for all frames, or undistort the photographs to one of them."
             )
-        if holder.get("is_fisheye") and kind != CameraType.FISHEYE:
-            raise InputError(f"{source}: is_fisheye {where} not read. Set camera_model to OPENCV_FISHEYE.")
-        for key in UNKNOWN:
-            if holder.get(key, 0.0) != 0.0:
+        for key in UNREAD if CAMERA_MODEL_TO_TYPE[model] != CameraType.FISHEYE else UNREAD[:-1]:
+            if holder.get(key, 0) != 0:
                 raise InputError(
-                    f"{source}: {key} {where} {shown(repr(holder[key]))}, a distortion that cannot be undone here. "
-                    f"Undistort the photographs, or fit a model of {', '.join(DISTORTION)}."
+                    f"{source}: {key} {where} is {shown(repr(holder[key]))}, which is not read. For a fisheye set "
+                    "camera_model to OPENCV_FISHEYE; otherwise undistort the photographs, or fit a model of "
+                    f"{', '.join(DISTORTION)}."
                 )
 
 
 def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: torch.Tensor, source: Path) -> Cameras:
-    """The cameras in full size, with intrinsics by `read_lenses` and poses [V, 3, 4].
-
-    Raises:
-        InputError: undistorting would leave next to nothing of an image.
-    """
+    """The cameras in full size, with intrinsics by `read_lenses` and poses [V, 3, 4]; InputError if undistorting would
+    leave next to nothing of an image."""
     kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
     table = torch.from_numpy(lenses)
     fx, fy, cx, cy = table[:, :4].float().unbind(1)
@@ -155,8 +134,8 @@ def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
 
 
 def _folds(K: np.ndarray, distortion: np.ndarray, size: tuple[int, int], flat: np.ndarray, part: Sequence[int]) -> bool:
-    """Whether undistortion takes pixels of `part` (x, y, width, height) of the pinhole `flat`'s image in another order
-    than in the photograph, or from beside it: the polynomial turns around before the edge."""
+    """Whether the polynomial turns around before the edge: undistortion takes pixels of `part` (x, y, width, height) of
+    the pinhole `flat`'s image from beside the photograph, or in another order than there."""
     left, top, columns, rows = part
     u, v = np.meshgrid(np.linspace(left, left + columns, 17), np.linspace(top, top + rows, 17))
     rays = np.stack([(u - flat[0, 2]) / flat[0, 0], (v - flat[1, 2]) / flat[1, 1], np.ones_like(u)], axis=-1)

@@ -17,7 +17,7 @@ from rich.progress import track
 from nrfgs_ns.errors import InputError
 
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "PPM")
-"""Formats that PIL may open. It goes by a file's first bytes, and starts Ghostscript for one of the others."""
+"""Formats that PIL may open, by a file's first bytes; for some others it would start Ghostscript."""
 MASK_MODES = ("1", "L", "I", "I;16")
 """PIL modes of masks: one value for each pixel, no palette index."""
 HALF = 127
@@ -29,18 +29,14 @@ Result = TypeVar("Result")
 
 
 def open_picture(path: Path, formats: Sequence[str] = FORMATS) -> Image.Image:
-    """An image whose header is read and whose pixels are not.
-
-    Raises:
-        InputError: it is not an image of these formats.
-    """
+    """An image whose header alone is read; InputError if it is not of these formats."""
     with naming(path, "is not a readable image"):
         return Image.open(path, formats=formats)
 
 
 @contextlib.contextmanager
 def naming(path: Path, finding: str) -> Iterator[None]:
-    """PIL lets out whatever its readers meet in a broken file: make it InputError."""
+    """Turn what PIL raises for a broken file, which can be anything, into InputError."""
     try:
         yield
     except Exception as error:
@@ -51,7 +47,7 @@ def naming(path: Path, finding: str) -> Iterator[None]:
 
 
 def read_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image, without decoding it."""
+    """Width and height of an image, by its header."""
     with open_picture(path) as image:
         return image.size
 
@@ -65,7 +61,8 @@ def check_depth(image: Image.Image, path: Path) -> None:
 
 
 def read_picture(path: Path) -> Image.Image:
-    """A photograph of any mode with 8 bits, decoded to RGB, or to RGBA if it has transparency."""
+    """A photograph of any mode with 8 bits, decoded to RGB, or to RGBA if it has transparency: nerfstudio takes a
+    palette's indices for grey, and CMYK for RGBA."""
     with open_picture(path) as image:
         check_depth(image, path)
         transparent = image.mode.endswith(("A", "a")) or (image.mode == "P" and "transparency" in image.info)
@@ -98,14 +95,9 @@ def free_memory() -> float:
 def in_parallel(
     read: Callable[[int], Result], sizes: Sequence[tuple[int, int]], what: str, workers: int | None = None
 ) -> Iterator[Result]:
-    """Results of `read(0)`, `read(1)`, ..., which decode pictures of these sizes (width, height), on `workers` threads.
-
-    By default there is a thread for each processor; half of the free memory bounds their number. The first failure ends
-    the reading. `what` labels the progress bar.
-
-    Raises:
-        InputError: there is no memory for decoding the largest picture.
-    """
+    """Results of `read(0)`, `read(1)`, ..., which decode pictures of these sizes (width, height), on `workers` threads
+    (default: one for each processor), as far as half of the free memory allows. The first failure ends the reading; so
+    does, with InputError, a lack of memory for the largest picture. `what` labels the progress bar."""
     from nerfstudio.utils.rich_utils import CONSOLE  # slow to import, and not needed by `nrfgs prepare`
 
     width, height = max(sizes, key=math.prod, default=(1, 1))
@@ -136,31 +128,29 @@ NUMBERS = {
     "iso": ExifTags.Base.ISOSpeedRatings,
     "focal_length": ExifTags.Base.FocalLength,
 }
-NAMES = {"make": ExifTags.Base.Make, "model": ExifTags.Base.Model}
-KEPT = (*NAMES.values(), ExifTags.Base.DateTime)
+KEPT = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.DateTime)
 KEPT_EXIF = (*NUMBERS.values(), ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DateTimeOriginal)
 """Tags of the main and the photographic directory that hold for a turned or smaller copy, too."""
 
 
 def read_exif(path: Path) -> dict[str, float | str]:
     """A photograph's EXIF, as far as known: exposure_time (seconds), f_number, iso, focal_length (mm), each finite and
-    above 0, make, model. Empty for a file that is no image."""
-    return known(_exif_at(path)[0])
+    above 0, and model. Empty for a file that is not an image."""
+    exif, _ = _exif_at(path)
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    values = {name: _number(details.get(tag)) for name, tag in NUMBERS.items()}
+    values["model"] = str(exif.get(ExifTags.Base.Model) or "").strip(" \0")
+    return {name: value for name, value in values.items() if value}
 
 
-def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, float | str]:
+def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, Any]:
     """The same from a frame's "exif" in transforms.json, as `nrfgs prepare` writes it; InputError for another type."""
     stored = frame.get("exif", {})
-    good = isinstance(stored, dict) and all(
-        isinstance(value, str) if name in NAMES else isinstance(value, int | float) and 0 < value < math.inf
-        for name, value in stored.items()
-        if name in NUMBERS or name in NAMES
-    )
-    if not good:
-        raise InputError(
-            f'{source}: "exif" of {frame.get("file_path")} must hold numbers above 0 ({", ".join(NUMBERS)}) and text '
-            f"({', '.join(NAMES)}). Correct or remove it."
-        )
+    numbers = [stored.get(name, 1.0) for name in NUMBERS] if isinstance(stored, dict) else [None]
+    good = all(isinstance(value, int | float) and 0 < value < math.inf for value in numbers)
+    if not good or not isinstance(stored.get("model", ""), str):
+        where = f'{source}: "exif" of {frame.get("file_path")}'
+        raise InputError(f"{where} must hold numbers above 0 ({', '.join(NUMBERS)}) and model. Correct or remove it.")
     return stored
 
 
@@ -178,7 +168,7 @@ def exif_of(image: Image.Image) -> Image.Exif:
 
 
 def _exif_at(path: Path) -> tuple[Image.Exif, tuple[int, int]]:
-    """EXIF and size of a file; empty if it is no image."""
+    """EXIF and size of a file; empty if it is not an image."""
     try:
         with open_picture(path) as image:
             return exif_of(image), image.size
@@ -186,16 +176,8 @@ def _exif_at(path: Path) -> tuple[Image.Exif, tuple[int, int]]:
         return Image.Exif(), (0, 0)
 
 
-def known(exif: Image.Exif) -> dict[str, float | str]:
-    """The result of `read_exif`, from PIL's EXIF."""
-    details = exif.get_ifd(ExifTags.IFD.Exif)
-    numbers = {name: _number(details.get(tag)) for name, tag in NUMBERS.items()}
-    names = {name: str(exif.get(tag) or "").strip(" \0") for name, tag in NAMES.items()}
-    return {name: value for name, value in (numbers | names).items() if value}
-
-
 def _number(value: Any) -> float | None:
-    """A tag's (first) value, if it is a finite number above 0."""
+    """A tag's (first) value if it is a finite number above 0."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, IndexError, ZeroDivisionError):
@@ -204,7 +186,7 @@ def _number(value: Any) -> float | None:
 
 
 def exif_of_copy(exif: Image.Exif) -> bytes:
-    """EXIF, for PIL's `exif` option, of a turned copy: camera, exposure, date, position."""
+    """The camera, exposure, date and position of a turned copy, for PIL's `exif` option."""
     copy, details = Image.Exif(), exif.get_ifd(ExifTags.IFD.Exif)
     copy.update({tag: exif[tag] for tag in KEPT if tag in exif})
     copy.get_ifd(ExifTags.IFD.Exif).update({tag: details[tag] for tag in KEPT_EXIF if tag in details})
@@ -213,9 +195,10 @@ def exif_of_copy(exif: Image.Exif) -> bytes:
 
 
 def share_of_size(path: Path) -> float:
-    """Width of an image over its width in EXIF, which the sensor's resolution refers to; 1 if that is unknown, or not
-    needed because EXIF has the focal length for 35 mm film."""
+    """Width of an image over its width in EXIF, to which the sensor's resolution refers; 1 where COLMAP needs or knows
+    neither of them."""
     exif, size = _exif_at(path)
     details = exif.get_ifd(ExifTags.IFD.Exif)
     sides = [_number(details.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
-    return 1.0 if None in sides or ExifTags.Base.FocalLengthIn35mmFilm in details else max(size) / max(sides)
+    needed = ExifTags.Base.FocalPlaneXResolution in details and ExifTags.Base.FocalLengthIn35mmFilm not in details
+    return max(size) / max(sides) if needed and None not in sides else 1.0

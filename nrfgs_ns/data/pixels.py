@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoded and undistorted photographs, and files of their pixels where there is not enough memory.
-
-Files are mapped: the system may drop what was read. They are made once, and anew where the photograph, its mask or its
-camera has changed.
-"""
+"""Decoded and undistorted photographs; where memory is short, mapped files of their pixels, made anew where photograph,
+mask or camera has changed."""
 
 import hashlib
 import json
@@ -27,23 +24,17 @@ PAGE = 4096
 
 
 def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
-    """A photograph, undistorted; its camera in the data set becomes the pinhole that would have taken it.
+    """Undistort a photograph; its camera in the data set becomes the pinhole that would have taken it.
 
     Returns:
-        "image" [H, W, 3 or 4] of `image_type` (uint8 or float32), "image_idx", and "mask" bool [H, W, 1] if there are
-        masks.
+        "image" [H, W, 3 or 4] of `image_type` (uint8 or float32), "image_idx", and with masks "mask" bool [H, W, 1].
     """
     data = dataset.get_data(index, image_type=image_type)
     camera = dataset.cameras[index].reshape(())
     if camera.distortion_params is None or not camera.distortion_params.any():
         return data
-    K, image, mask = _undistort_image(
-        camera,
-        camera.distortion_params.numpy(),
-        data,
-        data["image"].numpy(),
-        camera.get_intrinsics_matrices().numpy(),
-    )
+    intrinsics = camera.get_intrinsics_matrices().numpy()
+    K, image, mask = _undistort_image(camera, camera.distortion_params.numpy(), data, data["image"].numpy(), intrinsics)
     data["image"] = torch.from_numpy(image)
     if mask is not None:
         data["mask"] = mask
@@ -52,11 +43,7 @@ def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
 
 
 def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
-    """The same from files, which are made if they are not there.
-
-    Raises:
-        InputError: there is no room for them.
-    """
+    """The same from files, which are made if they are missing; InputError if there is no room for them."""
     folder = _folder(dataset, index, image_type)
     mapped = ("image",) if dataset._dataparser_outputs.mask_filenames is None else ("image", "mask")
     try:
@@ -79,7 +66,7 @@ def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
 
 
 def _read(folder: Path, mapped: Sequence[str]) -> tuple[dict[str, torch.Tensor], np.ndarray]:
-    """Mapped files, whose tensors may be written to without changing them, and `LENS`."""
+    """Pixels of mapped files, which writing to the tensors does not change, and `LENS`."""
     pixels = {name: torch.from_numpy(np.load(folder / f"{name}.npy", mmap_mode="c")) for name in mapped}
     return pixels, np.load(folder / "lens.npy")
 
@@ -90,7 +77,7 @@ def look_through(image: torch.Tensor) -> None:
 
 
 def _folder(dataset: Any, index: int, image_type: str) -> Path:
-    """Folder of a photograph's files, named after everything that decides its pixels."""
+    """Folder of a photograph's files, named by a digest of all that decides its pixels."""
     outputs, cameras = dataset._dataparser_outputs, dataset.cameras
     paths = [names[index] for names in (outputs.image_filenames, outputs.mask_filenames) if names is not None]
     files = [(str(path.resolve()), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in paths]

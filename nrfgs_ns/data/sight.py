@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the training views see the initial points: poses, intrinsics and points of different reconstructions, axes or
-units each look sane, and training cannot know."""
+"""Whether the training views see the initial points: of different reconstructions, axes or units, poses, intrinsics and
+points each look sane."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.errors import InputError
 
 FARTHEST = 1e5
-"""Points this many times as far from the cameras' middle as the farthest camera are no part of the scene."""
+"""Points this many times as far from the cameras' middle as the farthest camera are left out."""
 MOST_POINTS = 10_000
 """Points that are projected, evenly spread over the list."""
 MARGIN = 0.25
@@ -28,24 +28,21 @@ ONE_WORLD = "Poses, intrinsics and points must be of one reconstruction, in one 
 
 
 def in_reach(xyz: np.ndarray, cameras: Cameras, source: Path) -> np.ndarray:
-    """Which points [N, 3] are near enough to belong to the scene, bool [N]; a warning counts the others."""
+    """Points [N, 3] near enough to belong to the scene, bool [N]; a warning counts the others."""
     positions = cameras.camera_to_worlds[:, :3, 3].double().numpy()
     middle = positions.mean(axis=0)
     distance = np.abs(xyz - middle).max(axis=1, initial=0)
     reach = np.abs(positions - middle).max() or np.median(distance)  # of cameras at one place, the points' own
     near = distance <= FARTHEST * reach
-    lost = np.count_nonzero(~near)
-    if lost:
-        warn(
-            f"{source}: {lost} of {len(xyz)} points are {FARTHEST:,.0f} times as far away as the farthest camera and "
-            "are left out."
-        )
+    if not near.all():
+        finding = f"{np.count_nonzero(~near)} of {len(xyz)} points are {FARTHEST:,.0f} times as far away"
+        warn(f"{source}: {finding} as the farthest camera and are left out.")
     return near
 
 
 def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], source: Path) -> None:
-    """Enough points [N, 3] are in some of the named training views, at more than one place, and most views have some; a
-    warning names views without any."""
+    """Enough points [N, 3] at different places are in some of the named training views, and most views have some; a
+    warning names the views without any."""
     points = xyz[:: max(len(xyz) // MOST_POINTS, 1)].float()
     visible = [_in_view(points, cameras[index]) for index in range(len(names))]
     blind = [name for name, seen in zip(names, visible, strict=True) if not seen.any()]
@@ -70,7 +67,7 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
 
 
 def _in_view(points: torch.Tensor, camera: Cameras) -> torch.Tensor:
-    """Which points [N, 3] are in front of a camera and in its image or a margin about it, bool [N]."""
+    """Points [N, 3] in front of a camera, in its image or a margin about it, bool [N]."""
     rotation, position = camera.camera_to_worlds[:3, :3], camera.camera_to_worlds[:3, 3]
     x, y, z = ((points - position) @ rotation).unbind(-1)
     depth = -z

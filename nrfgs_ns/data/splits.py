@@ -24,11 +24,8 @@ Rows = dict[str, np.ndarray]
 
 
 def split_by_names(named: Named, images: list[Path], path_of: Callable[[str], Path], source: Path) -> Rows:
-    """Rows of listed parts; `path_of` leads from a listed name to one of `images`.
-
-    Raises:
-        InputError: a list is not one of names, repeats one, or names an image that the data set lacks.
-    """
+    """Rows of listed parts; `path_of` leads from a listed name to one of `images`. InputError if a list does not hold
+    names, repeats one, or names an image that the data set lacks."""
     members = dict.fromkeys(SPLITS, frozenset())
     for split, (where, names) in named.items():
         where = f"{source}: {where}"
@@ -37,11 +34,9 @@ def split_by_names(named: Named, images: list[Path], path_of: Callable[[str], Pa
         paths = [path_of(name) for name in names]
         check_unique(paths, where)
         members[split] = frozenset(paths)
-        unknown = sorted(members[split].difference(images))
-        if unknown:
+        if unknown := sorted(members[split].difference(images)):
             raise InputError(f"{where} names {some(unknown)}, of which there is no frame. Use each frame's file_path.")
-    shared = sorted(members["train"] & (members["val"] | members["test"]))
-    if shared:
+    if shared := sorted(members["train"] & (members["val"] | members["test"])):
         warn(f"{source}: {some(shared)} are for training and for evaluation, whose results this flatters.")
     return {
         split: np.array([row for row, path in enumerate(images) if path in paths], dtype=np.int64)
@@ -50,11 +45,8 @@ def split_by_names(named: Named, images: list[Path], path_of: Callable[[str], Pa
 
 
 def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
-    """Rows of the parts by the parser's `eval_mode`. A single image is for training.
-
-    Raises:
-        InputError: the mode cannot split these images.
-    """
+    """Rows of the parts by the parser's `eval_mode`; InputError if it cannot split these images. A single image is for
+    training."""
     count, mode, every = len(images), config.eval_mode, config.eval_interval
     if count == 1:
         train, evaluated = [0], []

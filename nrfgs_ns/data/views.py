@@ -21,8 +21,8 @@ def evenly_spaced(total: int, wanted: int) -> list[int]:
 
 
 def interior_test_images(count: int, every: int = 8) -> range:
-    """Indices of the test images among `count` sorted by name: every eighth from index 4, neither end of a path, whose
-    images would test extrapolation. (Of one or two images it is the first.)"""
+    """Indices of the test images among `count` sorted by name: every eighth from index 4, without the ends of a path,
+    which would test extrapolation. Of one or two images it is the first."""
     first = min(every // 2, (count - 1) // 2)
     return range(first, max(count - 1, first + 1), every)
 
@@ -35,9 +35,9 @@ def scene_unit(positions: Tensor) -> float:
     """World units in one scene unit, for training cameras at `positions` [V, 3].
 
     Splatfacto's lengths (near plane, learning rate of the means, sizes at which splats split or go) and the field's
-    distance are made for cameras that fill [-1, 1], where nerfstudio's auto-scaling puts them: there, and for cameras
-    at one place, it is 1. Otherwise it is the power of two (scaling by it is exact) nearest to the cameras' largest
-    coordinate about their mean.
+    distance assume cameras that fill [-1, 1], as after nerfstudio's auto-scaling: there, and for cameras at one place,
+    it is 1. Otherwise it is the power of two (an exact scale) nearest to the cameras' largest coordinate about their
+    mean.
     """
     if len(positions) == 0 or SCALED[0] <= positions.abs().max().item() <= SCALED[1]:
         return 1.0
@@ -51,9 +51,10 @@ SAME_PLACE = 0.01
 
 
 def different_views(poses: Tensor) -> int:
-    """Number of views among camera-to-world poses [V, 3 or 4, 4]: those with the place and the direction of an earlier
-    one (copies, frames of a camera that stands still) do not count."""
-    return len(_first_of_each(_places_and_directions(poses)))
+    """Number of views among camera-to-world poses [V, 3 or 4, 4] without those at the place and in the direction of an
+    earlier one (copies, frames of a camera that stands still)."""
+    directions = poses[:, :3, 2].double().cpu().numpy()
+    return len(_first_of_each(np.concatenate([_in_reaches(poses[:, :3, 3]), directions], axis=1)))
 
 
 NEAREST_SHARE = 0.01
@@ -86,15 +87,10 @@ def distinct_places(centers: Tensor) -> Tensor:
     return centers[_first_of_each(_in_reaches(centers))]
 
 
-def _places_and_directions(poses: Tensor) -> np.ndarray:
-    """Positions and viewing directions, float64 [V, 6], in units that make `SAME_PLACE` hold for both."""
-    return np.concatenate([_in_reaches(poses[:, :3, 3]), poses[:, :3, 2].double().cpu().numpy()], axis=1)
-
-
 def _in_reaches(centers: Tensor) -> np.ndarray:
     """Camera centres [V, 3] about their mean, in distances from there to the farthest."""
     away = centers.double().cpu().numpy()
-    away = away - away.mean(axis=0) if len(away) else away
+    away = away - away.mean(axis=0)
     return away / np.linalg.norm(away, axis=1).max(initial=1e-300)
 
 
@@ -103,7 +99,7 @@ def _first_of_each(rows: np.ndarray) -> list[int]:
     from scipy.spatial import cKDTree
 
     kept, near = [], np.zeros(len(rows), dtype=bool)
-    tree = cKDTree(rows) if len(rows) else None
+    tree = cKDTree(rows)
     for i in range(len(rows)):
         if not near[i]:
             kept.append(i)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the capture's world to the training world, and back.
 
-Numbers of ten million are a metre apart in float32. So cameras far from the origin, as georeferenced ones are, are
-moved there in float64 before anything else, and the way back is float64, too.
+In float32, numbers near ten million are a metre apart. Cameras far from the origin, such as georeferenced ones, are
+therefore moved there in float64 first, and the way back is float64, too.
 """
 
 import numpy as np
@@ -11,9 +11,11 @@ from nerfstudio.cameras import camera_utils
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs, transform_poses_to_original_space
 from torch import Tensor
 
+from nrfgs_ns.errors import InputError
+
 FAR = 100.0
 """Distance of the cameras' mean from the origin, in their extents, above which they are moved in float64. Nearer ones
-lose less than a hundredth of a pixel to float32, and stay to the bit where nerfstudio puts them."""
+lose less than a hundredth of a pixel, and stay to the bit where nerfstudio puts them."""
 
 
 class PlacedOutputs(DataparserOutputs):
@@ -35,6 +37,8 @@ def place(
         The poses, float32 [V, 3, 4]; the transform [3, 4] before scaling, float64 if they were far from the origin and
         otherwise float32; and the scale.
     """
+    if len(poses) == 1 and orientation == "vertical":  # needs two cameras
+        orientation = "up"
     positions = poses[:, :3, 3]
     center, extent = positions.mean(axis=0), np.ptp(positions, axis=0).max()
     far = centering != "none" and np.abs(center).max() > FAR * extent > 0
@@ -44,10 +48,13 @@ def place(
     placed, transform = camera_utils.auto_orient_and_center_poses(
         torch.from_numpy(near.astype(np.float32)), method=orientation, center_method=centering
     )
-    scale, reach = 1.0, float(torch.max(torch.abs(placed[:, :3, 3])))
-    if auto_scale and reach > 0:
-        scale /= reach
-    scale *= factor
+    if not torch.isfinite(transform).all():
+        raise InputError(
+            "The poses cannot be oriented, since their up directions cancel. Set the data parser's option "
+            "--orientation-method none, or recompute the poses."
+        )
+    reach = float(torch.max(torch.abs(placed[:, :3, 3])))
+    scale = (1.0 / reach if auto_scale and reach > 0 else 1.0) * factor
     placed[:, :3, 3] *= scale
     if far:
         transform = transform.double()

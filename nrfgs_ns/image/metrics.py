@@ -4,46 +4,40 @@
 Conventions, for every function of this module:
 
 - `pred` and `gt` are images [H, W, 3] in [0, 1] of a floating dtype; `mask` is [H, W, 1] bool, True inside, or None.
-- The result is a Python float, or None where the metric is undefined: an empty mask, or an image (or a mask) too small
-  for the window. It is NaN only if the prediction is not finite, so that a diverged model is seen.
+- The result is a Python float; None where the metric is undefined (an empty mask, or an image or mask too small for the
+  window); NaN only if the prediction is not finite.
 - Without a mask the values are those of torchmetrics and pytorch_msssim.
 - Under a mask PSNR and L1 are means over the pixels inside. The windowed metrics first replace the prediction outside
-  the mask by the truth; SSIM and MS-SSIM then average over the windows whose centre is inside. LPIPS cannot leave
-  pixels out of its average: under a mask it is a lower bound.
-- Colour-corrected metrics (cc_psnr, cc_ssim, ...) are those of the prediction after `fit_colors`: the error that is
-  left without the test photograph's exposure and white balance, which no method can know. Never quote them alone.
-- Arithmetic is float32 on a CPU; it is float64 if the images are, and on CUDA, where a float32 convolution may run in
-  TF32, whose 10 bits of mantissa SSIM's differences of squares cannot stand. No gradient is recorded.
+  by the truth; SSIM and MS-SSIM average over the windows whose centre is inside; LPIPS, which averages over all pixels,
+  is a lower bound.
+- Colour-corrected metrics (cc_psnr, cc_ssim, ...) are those of the prediction after `fit_colors`, without the error of
+  the test photograph's exposure and white balance, which no method can know. Never quote them alone.
+- Arithmetic is float32 on a CPU, float64 if the images are, and on CUDA, where a float32 convolution may run in TF32,
+  which is too coarse for SSIM's differences of squares. No gradient is recorded.
 """
 
 from __future__ import annotations
 
 import functools
 import os
-import pickle
 
 import torch
 import torch.nn.functional as F
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-AS_THEY_ARE = ("psnr", "ssim", "ms_ssim", "l1", "lpips")
-METRIC_NAMES = (*AS_THEY_ARE, *(f"cc_{name}" for name in AS_THEY_ARE))
-"""The keys of `image_metrics`, in the order of reports; cc: colour-corrected."""
-WINDOW_SIZE = 11
-"""Side of the SSIM window, pixels (Wang et al. 2004)."""
-WINDOW_SIGMA = 1.5
-"""Standard deviation of the Gaussian inside the window, pixels."""
+METRIC_NAMES = tuple(f"{cc}{name}" for cc in ("", "cc_") for name in ("psnr", "ssim", "ms_ssim", "l1", "lpips"))
+"""Keys of `image_metrics`, in the order of reports; cc: colour-corrected."""
+WINDOW_SIZE, WINDOW_SIGMA = 11, 1.5
+"""Side of the SSIM window and standard deviation of the Gaussian inside, pixels (Wang et al. 2004)."""
 REACH = WINDOW_SIZE // 2
 """Pixels from a window's centre to its edge."""
 LIBRARY = SSIM(data_range=1.0, size_average=True, channel=3, win_size=WINDOW_SIZE, win_sigma=WINDOW_SIGMA)
 """SSIM of pytorch_msssim, of images [1, 3, H, W]."""
 WEIGHTS = tuple(LIBRARY.win[0].flatten().tolist())
 """The window along one axis, rounded to float32 like the library's, which bright flat images feel."""
-SSIM_C1 = 0.01**2
-"""Stabiliser of the luminance term, (K1 * data range)^2."""
-SSIM_C2 = 0.03**2
-"""Stabiliser of the contrast-structure term, (K2 * data range)^2."""
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+"""Stabilisers of the luminance and the contrast-structure term, (K * data range)^2."""
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the five scales, finest first (Wang et al. 2003)."""
 MS_SSIM_MIN_SIDE = (WINDOW_SIZE - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1) + 1
@@ -70,10 +64,7 @@ def l1(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
 
 @torch.no_grad()
 def ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | None:
-    """Structural similarity (Wang et al. 2004), mean over channels and valid windows; 1 is identical.
-
-    None if a side is shorter than 11 pixels, or if no valid window has its centre inside the mask.
-    """
+    """Structural similarity (Wang et al. 2004), mean over channels and valid windows; 1 is identical."""
     pred, gt, mask = _planes(pred, gt, mask)
     if min(gt.shape[-2:]) < WINDOW_SIZE:
         return None
@@ -86,9 +77,8 @@ def ms_ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | Non
     """Multi-scale SSIM (Wang et al. 2003) over five scales: prod_j cs_j^w_j, times ssim^w at the coarsest scale.
 
     Each channel's means are clamped at zero before the powers, and the product is averaged over the channels. Scales
-    are averages over 2 x 2 pixels; a coarse pixel is inside the mask if any of its fine pixels is.
-
-    None if a side is shorter than 161 pixels, or if at some scale no valid window has its centre inside the mask.
+    are averages over 2 x 2 pixels; a coarse pixel is inside the mask if any of its fine pixels is. None if a side is
+    shorter than 161 pixels, or if at some scale no window has its centre inside the mask.
     """
     pred, gt, mask = _planes(pred, gt, mask)
     if min(gt.shape[-2:]) < MS_SSIM_MIN_SIDE:
@@ -109,18 +99,15 @@ def ms_ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | Non
 
 
 def ssim_maps(pred: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
-    """The SSIM map and its contrast-structure factor, one value per channel and valid window.
+    """The SSIM map and its contrast-structure factor of images [3, H, W], sides of at least 11.
 
     With the moments mu, var, cov under an 11 x 11 Gaussian of sigma 1.5:
     cs = (2 cov + C2) / (var_p + var_g + C2), ssim = cs (2 mu_p mu_g + C1) / (mu_p^2 + mu_g^2 + C1).
 
-    Args:
-        pred, gt: [3, H, W], sides of at least 11.
-
     Returns:
         ssim and cs, [3, H - 10, W - 10] each; entry (i, j) is the window centred on pixel (i + 5, j + 5).
     """
-    taps = torch.arange(WINDOW_SIZE, dtype=gt.dtype, device=gt.device) - WINDOW_SIZE // 2
+    taps = torch.arange(WINDOW_SIZE, dtype=gt.dtype, device=gt.device) - REACH
     gauss = torch.exp(-taps.square() / (2 * WINDOW_SIGMA**2))
     gauss = gauss / gauss.sum()
     moments = blur(torch.cat([pred, gt, pred * pred, gt * gt, pred * gt]), gauss)
@@ -138,28 +125,22 @@ def blur(planes: Tensor, window: Tensor) -> Tensor:
 
 
 def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[str, float | None]:
-    """All metrics of one image at once, on the device of `pred`.
+    """The metrics of an image by `METRIC_NAMES`, on the device of `pred`.
 
-    LPIPS (Zhang et al. 2018, AlexNet) needs backbone weights that torchvision would download. They are used if they are
-    on disk and never fetched: without them `lpips` is None, and `lpips_advice` says how to get them.
-
-    Returns:
-        psnr (dB), ssim, ms_ssim, l1 and lpips, and the same colour-corrected; None where undefined.
+    LPIPS (Zhang et al. 2018, AlexNet) uses torchvision's backbone weights if they are on disk and never downloads them:
+    without them it is None, and `lpips_advice` says how to get them.
     """
     gt = gt.to(pred.device)
     mask = None if mask is None else mask.to(pred.device)
-    every = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "l1": l1, "lpips": _lpips}
-    corrected = fit_colors(pred, gt, mask)
-    values = {name: metric(pred, gt, mask) for name, metric in every.items()}
-    return values | {f"cc_{name}": metric(corrected, gt, mask) for name, metric in every.items()}
+    images, metrics = (pred, fit_colors(pred, gt, mask)), (psnr, ssim, ms_ssim, l1, _lpips)
+    values = [metric(image, gt, mask) for image in images for metric in metrics]
+    return dict(zip(METRIC_NAMES, values, strict=True))
 
 
 @torch.no_grad()
 def fit_colors(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The prediction after the affine map of colours that takes it nearest to the truth, clamped to [0, 1].
-
-    Least squares over the pixels inside the mask. Returned as it is: a prediction not finite, or with nothing inside.
-    """
+    """The prediction after the affine map of colours nearest to the truth (least squares inside the mask), clamped to
+    [0, 1]. A prediction that is not finite, or has nothing inside, stays as it is."""
     colors = torch.cat([pred.double(), torch.ones_like(pred[..., :1], dtype=torch.float64)], dim=-1)
     inside, target = (
         image.reshape(-1, image.shape[-1]) if mask is None else image[mask[..., 0]] for image in (colors, gt.double())
@@ -185,7 +166,7 @@ def _lpips(pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
 @functools.cache
 def _lpips_net() -> torch.nn.Module | str:
     """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else how to get them."""
-    # Both imports cost seconds, and only evaluation needs them.
+    # These imports cost seconds, and only evaluation needs them.
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     from torchvision.models import AlexNet_Weights
 
@@ -196,33 +177,32 @@ def _lpips_net() -> torch.nn.Module | str:
         try:
             # The bare network: the metric around it would keep every score it ever gave.
             return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).net
-        except (OSError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
+        except Exception as error:  # whatever a damaged file leads to
             problem = f"{path} cannot be loaded ({type(error).__name__}): delete it"
     return (
-        f"LPIPS is not reported: {problem}. To get it, run this on a connected machine, and copy the file here if that "
-        f'is another one:\n  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"'
+        f"LPIPS is not reported: {problem}. To get it, run this on a connected machine, and copy the file here:\n"
+        f'  python -c "import torch; torch.hub.load_state_dict_from_url({url!r})"'
     )
 
 
 def lpips_advice() -> str | None:
-    """Why LPIPS is not reported, and how to change that; None if it is."""
+    """Why LPIPS is not reported, and how to get it; None if it is."""
     net = _lpips_net()
     return net if isinstance(net, str) else None
 
 
 def _precise(image: Tensor) -> Tensor:
-    """The image in the dtype of this module's arithmetic."""
     return image.to(torch.promote_types(image.dtype, torch.float64 if image.is_cuda else torch.float32))
 
 
 def _errors_inside(pred: Tensor, gt: Tensor, mask: Tensor | None) -> Tensor:
-    """Pred - gt of the N pixels inside, [N, 3]."""
+    """Errors of the N pixels inside, [N, 3]."""
     error = _precise(pred) - _precise(gt)
     return error.reshape(-1, 3) if mask is None else error[mask[..., 0]]
 
 
 def _planes(pred: Tensor, gt: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Images channel-first [3, H, W] and the mask [H, W], with the truth in place of the prediction outside."""
+    """Images channel-first [3, H, W] and the mask [H, W]; outside, the truth replaces the prediction."""
     pred, gt = (_precise(image).movedim(-1, 0).contiguous() for image in (pred, gt))
     if mask is None:
         return pred, gt, None

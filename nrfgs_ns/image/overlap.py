@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exposure and white balance of photographs, estimated from the points that they share.
 
-Photographs taken next to each other share most points of the reconstruction, seen under almost the same angle. Their
-light differs by a shift, in stops. If exposure or white balance changed, the shift is the same all over the image; if
-surfaces shine, points are occluded or the sun has moved, it varies.
-
-So an image is divided into regions. The shift of a pair of photographs is the median over the regions' medians, and its
-noise is the spread of the regions. Differences that the camera positions explain do not count (`estimate`).
+Neighbouring photographs share most points of the reconstruction, seen under almost the same angle. If exposure or white
+balance changed, their light differs by the same shift, in stops, all over the image; if surfaces shine, points are
+occluded or the sun has moved, the shift varies. So an image is divided into regions: the shift of a pair of photographs
+is the median over the regions' medians, and its noise is their spread. Differences that the camera positions explain do
+not count (`estimate`).
 """
 
+import functools
 import itertools
 import math
 import os
@@ -22,11 +22,11 @@ from torch import Tensor
 from nrfgs_ns.image.photograph import GAMMA, TOE
 
 LONGEST_SIDE = 400
-"""Pixels of the longest side after averaging around each point: its position is not exact to the pixel."""
+"""Pixels of the longest side after averaging around each point, whose position is not exact to the pixel."""
 MOST_POINTS = 20_000
 """Points of the reconstruction; a larger one is sampled."""
 CELL, NEARER = 8, 0.02
-"""Side of a cell in averaged pixels; a point is hidden if another in its cell is nearer by more than this share."""
+"""Side of a cell, in averaged pixels; a point is hidden if another in its cell is nearer by more than this share."""
 DARKEST, BRIGHTEST = 0.06, 0.94
 """Range of usable pixel values: noise below, clipping above."""
 REGIONS = 4
@@ -35,7 +35,6 @@ FEWEST_POINTS, FEWEST_REGIONS = 12, 4
 """Minimum points in a region, and regions of a pair."""
 NEIGHBOURS, CANDIDATES = 4, 12
 """Photographs that each is compared with, and nearest ones that are tried."""
-
 ENOUGH_STOPS = 0.12, 0.06, 0.06
 """Minimum spread of exposure, log2(R/G) or log2(B/G) between photographs, beyond what their positions explain, for them
 to be learnt. Captures that do not need it have up to 0.05 stops of exposure and 0.02 of colour; one that does, 0.26."""
@@ -45,7 +44,6 @@ FEWEST_PAIRS = 8
 """Minimum number of pairs needed to decide."""
 MOST_PHOTOGRAPHS = 1000
 """Larger captures: the spread is estimated from the first 1,000, and only the mean is held; the cost is cubic."""
-
 SMALLEST_SPREAD = 0.02
 """Smallest noise of a pair, in stops: regions that agree by chance do not make it certain."""
 USUAL_STOPS = 0.3, 0.1, 0.1
@@ -55,16 +53,15 @@ SIZES = tuple(0.01 * 1.5**step for step in range(12))
 SCALES = 2.0, 8.0, 32.0
 """Candidate distances over which brightness changes with the position, in camera spacings."""
 MOST_PATTERNS = 128
-"""Largest number of held patterns in a column."""
+"""Maximum number of held patterns in a column."""
 
 
 class Pairs(NamedTuple):
     """Shifts of E pairs of neighbouring photographs. Columns: mean log2 light, log2(R/G), log2(B/G)."""
 
     first: Tensor
-    """[E]"""
     second: Tensor
-    """[E]"""
+    """rows of the photographs, [E]"""
     shift: Tensor
     """stops by which the second is above the first, [E, 3]"""
     spread: Tensor
@@ -133,26 +130,19 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
     """Compare photographs, from their sightings [V] and camera centres [V, 3], with those taken next to them."""
     distance = torch.cdist(centers.double(), centers.double())
     distance.fill_diagonal_(torch.inf)
-    nearest = distance.argsort(dim=1)[:, : min(CANDIDATES, len(centers) - 1)].tolist() if len(centers) > 1 else []
+    order = distance.argsort(dim=1)[:, : min(CANDIDATES, len(centers) - 1)].tolist() if len(centers) > 1 else []
+    nearest = [[(min(a, b), max(a, b)) for b in row] for a, row in enumerate(order)]
 
+    @functools.cache
     def shift_of(pair: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
-        return _shift(*(sightings[photograph] for photograph in pair))
+        return _shift(sightings[pair[0]], sightings[pair[1]])
 
-    # In parallel: the pairs needed below, except where one of them has too few common points.
-    near = sorted({(min(a, b), max(a, b)) for a, row in enumerate(nearest) for b in row[:NEIGHBOURS]})
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        shifts = dict(zip(near, pool.map(shift_of, near), strict=True))
-    compared: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
-    for a, candidates in enumerate(nearest):
-        neighbours = 0
-        for pair in ((min(a, b), max(a, b)) for b in candidates):
-            if neighbours == NEIGHBOURS:
-                break
-            if pair not in shifts:
-                shifts[pair] = shift_of(pair)
-            if shifts[pair] is not None:
-                compared[pair] = shifts[pair]
-                neighbours += 1
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # compute ahead what is needed unless a pair has too few points
+        list(pool.map(shift_of, {pair for row in nearest for pair in row[:NEIGHBOURS]}))
+    compared = {}
+    for row in nearest:
+        usable = (pair for pair in row if shift_of(pair) is not None)
+        compared |= {pair: shift_of(pair) for pair in itertools.islice(usable, NEIGHBOURS)}
     if not compared:
         return Pairs(*torch.zeros(2, 0, dtype=torch.int64), *torch.zeros(2, 0, 3))
     return Pairs(*torch.tensor(list(compared)).T, *map(torch.stack, zip(*compared.values(), strict=True)))
@@ -160,7 +150,7 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
 
 def _shift(first: Sighting, second: Sighting) -> tuple[Tensor, Tensor] | None:
     """Shift from the first to the second and disagreement of the regions, [3] each; None: too few common points."""
-    if len(second.points) == 0 or len(first.points) == 0:
+    if min(len(first.points), len(second.points)) < FEWEST_POINTS * FEWEST_REGIONS:
         return None
     place = torch.searchsorted(second.points, first.points).clamp_max(len(second.points) - 1)
     common = second.points[place] == first.points
@@ -194,8 +184,8 @@ def slope(pairs: Pairs, known: Tensor) -> tuple[float, float | None]:
     """Regression of the photographs' brightness on their known exposures (stops, NaN where unknown, [V]).
 
     Returns:
-        Stops of brightness for a stop of known exposure, 0 to 1; and the share of the shifts' squares that this
-        explains, 0 to 1. (1, None) if there are too few pairs.
+        Stops of brightness for a stop of known exposure, and the share of the shifts' squares that this explains, both
+        0 to 1; (1, None) if there are too few pairs.
     """
     expected = known[pairs.second] - known[pairs.first]
     both = torch.isfinite(expected) & (expected.abs() > 0)
@@ -214,7 +204,7 @@ class Looks(NamedTuple):
     stops: Tensor
     """maximum-likelihood value of each photograph, mean 0, [V, 3]"""
     held: tuple[Tensor, Tensor, Tensor]
-    """for each column, orthonormal patterns over the photographs that belong to the scene, with the constant, [V, K]"""
+    """for each column, orthonormal patterns over the photographs that are the scene's, with the constant, [V, K]"""
     random: tuple[float, float, float]
     """standard deviation between photographs beyond what positions explain, in stops; 0 with too few pairs"""
 
@@ -224,12 +214,12 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
 
     A photograph's brightness is d = s + g: its exposure s, independent for each photograph (variance a), and a part g
     that changes slowly with the position (a Gaussian process over the cameras, covariance b exp(-distance / scale)):
-    light, gloss, and exposure that follows the scene. a, b and the scale maximise the likelihood of the pairs' shifts,
-    and b = 0 unless Schwarz's criterion favours b > 0. Patterns with more variance in g than in s belong to the scene.
+    light, gloss, and exposure that follows the scene. a, b and the scale maximise the likelihood of the pairs' shifts;
+    b = 0 unless Schwarz's criterion favours b > 0. Patterns with more variance in g than in s belong to the scene.
 
     Args:
-        known: exposure of each in stops, NaN where it is not known. [V]
-        centers: where they were taken. [V, 3]
+        known: exposures in stops, NaN where unknown. [V]
+        centers: of the cameras. [V, 3]
     """
     count = len(known)
     expected = torch.zeros(count, 3, dtype=torch.float64)
@@ -282,12 +272,7 @@ def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 def _split(places: list[tuple[Tensor, Tensor]], precision: Tensor, seen: Tensor) -> tuple[float, Tensor, Tensor]:
-    """Variance of s, covariance of d, and patterns that belong to g.
-
-    Args:
-        places: of `_places`.
-        precision, seen: the likeliest brightness solves precision @ d = seen. [V, V], [V]
-    """
+    """Variance of s, covariance of d, patterns of g; likeliest brightness: precision [V, V] @ d = seen [V]."""
     count = len(seen)
     eye = torch.eye(count, dtype=torch.float64)
     own_precision = precision.diagonal().clamp_min(1e-9)

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exposure and white balance of each photograph, learnt with the scene.
 
-The scene's colours x are those of the photographs' mean look. In a photograph, the light of each channel is multiplied
-by 2^s, s in stops. Under sRGB's curve above its linear toe a pixel becomes
+The scene's colours x are those of the photographs' mean look. A photograph multiplies the light of each channel by 2^s,
+s in stops. Under sRGB's curve above its linear toe a pixel becomes
 
     y = k (x + a) - a,    k = 2^(s / GAMMA),    a = TOE,
 
-which is affine in x, and y = x where s = 0. A photograph has three numbers: exposure, the same in all channels, and
-white balance, log2(R/G) and log2(B/G), with mean zero over the channels.
-
-Changes that all photographs have in common belong to the scene: each number has mean zero over the photographs
-(`center_`, after each step). Patterns over the photographs that more likely belong to the scene, such as brightness
-that changes slowly with the position (`overlap.estimate`), keep their initial values.
+which is y = x where s = 0. A photograph has three numbers: exposure, the same in all channels, and white balance,
+log2(R/G) and log2(B/G), with mean zero over the channels. Their means over the photographs belong to the scene and stay
+zero (`center_`); other patterns that more likely belong to it, such as brightness that changes slowly with the position
+(`overlap.estimate`), keep their initial values.
 
 This is the exposure and color part of PPISP (Deutsch et al., arXiv 2601.18336), on pixels instead of linear light.
 """
@@ -57,15 +55,12 @@ class PhotographModel(nn.Module):
         self.register_buffer("kept", self.held @ self.shots.detach().flatten())
 
     def forward(self, image: Tensor, index: int) -> Tensor:
-        """Apply a photograph's exposure and white balance: [H, W, 3] in [0, 1].
-
-        The image, in the mean look, need not be clamped: white can be darker in another photograph.
-        """
+        """The image [H, W, 3], in the mean look and not clamped, as the photograph exposed it; in [0, 1]."""
         return with_gain(image, (self.exponents @ self.shots[index]).exp2()).clamp(0.0, 1.0)
 
     @torch.no_grad()
     def center_(self) -> None:
-        """Reset the held patterns to their initial values, after a step."""
+        """Reset the held patterns to their initial values; called after each step."""
         flat = self.shots.view(-1)
         flat.addmv_(self.held.T, torch.addmv(self.kept, self.held, flat, alpha=-1.0))
 
@@ -78,8 +73,7 @@ class PhotographModel(nn.Module):
         return {"names": self.names}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        if state["names"] != self.names:
-            raise ValueError("the checkpoint has other photographs")
+        self.names = state["names"]
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> "PhotographModel":

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trimming: pixels of a photograph that show what the scene does not, such as passers-by, lose their weight.
+"""Trimming: pixels that show something other than the scene, such as passers-by, lose their weight.
 
 The statistics of SpotLessSplats (Sabour et al., arXiv 2406.20055), without its features: a pixel is trimmed if its
 residual is among the largest of recent photographs, unless most pixels around it are not. The photographs share one
-threshold, so that much is trimmed of a photograph in which much has moved. So that a scene is not kept from learning:
-
-- Only residuals far above the usual one count, so that of a clean capture almost nothing is trimmed.
-- What moved is large: a pixel is kept where many in a patch around it are (as in RobustNeRF, arXiv 2302.00833).
-- Trimmed pixels lose their weight little by little.
+threshold: much is trimmed where much has moved. To let the scene be learnt, only residuals far above the median count,
+what moved must be large (a pixel is kept where many in a patch around it are, as in RobustNeRF, arXiv 2302.00833), and
+trimmed pixels lose their weight gradually.
 """
 
 import torch
@@ -31,7 +29,7 @@ FADE_STEPS = 1500
 
 
 class Trimming(nn.Module):
-    """Remembers how large residuals are, and trims the largest; at most a `share` of the pixels, in (0, 1)."""
+    """A memory of residuals by which the largest are trimmed: at most a `share` of the pixels, in (0, 1)."""
 
     def __init__(self, share: float):
         super().__init__()
@@ -40,15 +38,9 @@ class Trimming(nn.Module):
 
     @torch.no_grad()
     def forward(self, prediction: Tensor, truth: Tensor, step: int, mask: Tensor | None = None) -> Tensor:
-        """Weights of the pixels, 1.0 for those that are kept. Nothing waits for a GPU.
+        """Weights [H, W, 1] of the pixels of images [H, W, 3] in [0, 1]; 1.0 is kept. Nothing waits for a GPU.
 
-        Args:
-            prediction, truth: [H, W, 3] in [0, 1].
-            step: in the schedule, `FIRST_STEP` or later.
-            mask: [H, W, 1], what counts; None: everything.
-
-        Returns:
-            [H, W, 1].
+        `step` of the schedule is `FIRST_STEP` or later; pixels outside `mask` [H, W, 1] are not remembered.
         """
         error = (prediction - truth).abs().mean(dim=-1)
         counted = error if mask is None else torch.where(mask[..., 0] >= 0.5, error, -1.0)  # beyond the bins
@@ -57,7 +49,7 @@ class Trimming(nn.Module):
 
     @torch.no_grad()
     def kept(self, prediction: Tensor, truth: Tensor) -> Tensor:
-        """1.0 for pixels that the remembered residuals keep, else 0.0; remembers nothing. [H, W, 1]"""
+        """1.0 for pixels that the remembered residuals keep, else 0.0, without remembering these. [H, W, 1]"""
         error = (prediction - truth).abs().mean(dim=-1)
         threshold = torch.maximum(self._quantile(1.0 - self.share), USUAL * self._quantile(0.5))
         kept = (error <= threshold).to(prediction.dtype)

@@ -26,8 +26,8 @@ MAX_NUMBERS = 2**31
 def photometric_loss(prediction: Tensor, truth: Tensor, ssim_lambda: float) -> Tensor:
     """(1 - ssim_lambda) mean |prediction - truth| + ssim_lambda (1 - SSIM), a scalar; ssim_lambda in [0, 1].
 
-    Images are [H, W, 3] in [0, 1], of one floating dtype and on one device. The truth gets no gradient. Images with a
-    side shorter than the window go to pytorch_msssim, which warns and leaves that side unblurred.
+    Images are [H, W, 3] in [0, 1]; the truth gets no gradient. Those with a side shorter than the window go to
+    pytorch_msssim, which warns and leaves that side unblurred.
     """
     if min(prediction.shape[:2]) < WINDOW_SIZE:
         similarity = LIBRARY(prediction.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None])
@@ -53,7 +53,7 @@ class SsimInTorch(torch.autograd.Function):
     def forward(ctx, prediction: Tensor, truth: Tensor) -> Tensor:
         x, y = (image.detach().permute(2, 0, 1).contiguous() for image in (prediction, truth))
         moments = blur(torch.cat([x, y, x * x, y * y, x * y]), x.new_tensor(WEIGHTS)).split(3)
-        similarity, *slopes = _similarity(*moments, slopes=ctx.needs_input_grad[0])
+        similarity, *slopes = _similarity(*moments)
         ctx.save_for_backward(x, y, *slopes)
         return similarity.mean()
 
@@ -68,15 +68,13 @@ class SsimInTorch(torch.autograd.Function):
         return gradient.permute(1, 2, 0), None
 
 
-def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor, slopes: bool) -> tuple[Tensor, ...]:
-    """S and, on demand, its slopes by E[x], E[xx], E[xy], from the moments; all [3, h, w]."""
+def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tuple[Tensor, ...]:
+    """S and its slopes by E[x], E[xx], E[xy], from the moments; all [3, h, w]."""
     product, squares = x * y, x * x + y * y
     A, B = 2 * product + SSIM_C1, 2 * (xy - product) + SSIM_C2
     C, D = squares + SSIM_C1, xx + yy - squares + SSIM_C2
     scale = 1 / (C * D)
     S = A * B * scale
-    if not slopes:
-        return (S,)
     by_xx, by_xy = -S / D, 2 * A * scale
     by_x = 2 * (y * B * scale - x * (S / C + by_xx)) - y * by_xy
     return S, by_x, by_xx, by_xy
@@ -91,7 +89,6 @@ def kernels_run_on(device: torch.device) -> bool:
 
 
 def _try_kernels(device: torch.device) -> None:
-    """Compile and run both kernels on one window; raise whatever goes wrong."""
     from nrfgs_ns.image.ssim_triton import WeightedSum
 
     image = torch.zeros(WINDOW_SIZE, WINDOW_SIZE, 3, device=device, requires_grad=True)

@@ -2,7 +2,7 @@
 """`nrfgs prepare PHOTOS OUT`: the stages in order, their dependencies, and the verdict.
 
 OUT/work/state.json has the key of each stage that was begun: a digest of the input's bytes, the stage's options and
-the previous stage. A finished stage with the same key is skipped, an unfinished one continues; files of another key are
+the previous key. A finished stage with the same key is skipped, an unfinished one continues; files of another key are
 removed. Running a stage forgets the later ones.
 """
 
@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.errors import InputError
@@ -81,13 +81,12 @@ class Run:
         self.options, self.screen = options, screen or Console()
         self.inputs = files.find_inputs(options.photos)
         self.is_video = options.photos.is_file()
-        if self.is_video:
-            files.open_video(options.photos)[0].release()
         structure.colmap()  # reports a missing package before any work
         self.out, self.work = options.out, options.out / "work"
-        self.stored, self.database, self.model = self.work / "photos", self.work / "database.db", self.work / "model"
-        self.undistorted, self.pairs_file = self.work / "undistorted", self.work / "likely_pairs.json"
-        self.state_file = self.work / "state.json"
+        self.stored, self.database, self.model, self.undistorted, self.pairs_file, self.state_file = (
+            self.work / name
+            for name in ("photos", "database.db", "model", "undistorted", "likely_pairs.json", "state.json")
+        )
         if self.out.exists() and not self.state_file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
         try:
@@ -97,7 +96,7 @@ class Run:
         self.key = files.digest(self.inputs)
 
     def all(self) -> None:
-        """Every stage, then the verdict."""
+        """Run every stage, and print the verdict."""
         self.import_input()
         self.find_features()
         self.choose_pairs()
@@ -132,14 +131,10 @@ class Run:
         one = options.camera == "single" or options.camera == "auto" and files.same_camera(self.stored, names)
         if one and (count := len({read_size(self.stored / name) for name in names})) > 1:
             raise InputError(
-                f"--camera is single, but {self.options.photos} has photographs of {count} sizes. Leave it out."
+                f"--camera is single, but {options.photos} has photographs of {count} sizes. Leave it out."
             )
-        chosen = {
-            "camera_model": options.camera_model,
-            "one_camera": one,
-            "longest_side": options.feature_size,
-            "features": options.features,
-        }
+        chosen = {"camera_model": options.camera_model, "one_camera": one}
+        chosen |= {"longest_side": options.feature_size, "features": options.features}
         database = [self.database, *(self.database.with_name(self.database.name + end) for end in ("-wal", "-shm"))]
         find = partial(structure.extract_features, self.database, self.stored, names, **chosen)
         self.stage("features", "find features", database, len(names), find, **chosen)
@@ -191,20 +186,17 @@ class Run:
     def write(self) -> None:
         from nrfgs_ns.prepare.scene import DOWNSCALES, write_scene
 
-        made = [self.out / "transforms.json", self.out / "sparse.ply", self.out / "images"]
-        made += [self.out / f"images_{factor}" for factor in DOWNSCALES]
+        folders = ["images", *(f"images_{factor}" for factor in DOWNSCALES)]
+        made = [self.out / name for name in ("transforms.json", "sparse.ply", *folders)]
         registered = len(list((self.undistorted / "images").iterdir()))
-
         write = partial(write_scene, self.undistorted, self.stored, self.out)
         self.stage("write", "write the scene", made, registered, write)
 
     def stage(
         self, slot: str, name: str, made: list[Path], total: int, work: Callable[[Advance], None], **depends_on: Any
     ) -> None:
-        """Do one stage, with a progress bar of `total` pieces, unless it is finished.
-
-        `made` are the stage's files, which are removed if they are of another input or other options.
-        """
+        """Run a stage with a progress bar up to `total`, unless it is finished; its files `made` are removed first if
+        they are of another input or other options."""
         self.key = hashlib.sha256(json.dumps([self.key, slot, depends_on], sort_keys=True).encode()).hexdigest()
         before = self.state.get(slot, {})
         if before == {"key": self.key, "done": True} and all(path.exists() for path in made[:1]):
@@ -213,15 +205,14 @@ class Run:
             for path in made:
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         self._remember(slot, done=False)
-        begun = time.monotonic(), time.process_time()
-        columns = [TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn()]
-        columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
-        with Progress(*columns, console=self.screen) as progress:
+        clocks = time.monotonic, time.process_time
+        begun = [clock() for clock in clocks]
+        with Progress(console=self.screen) as progress:
             task = progress.add_task(name, total=total)
             work(lambda steps: progress.advance(task, steps))
             progress.update(task, completed=total)
-        spent = time.monotonic() - begun[0], time.process_time() - begun[1]
-        self.state.setdefault("seconds", {})[slot] = [round(each, 1) for each in spent]
+        spent = [round(clock() - start, 1) for clock, start in zip(clocks, begun, strict=True)]
+        self.state.setdefault("seconds", {})[slot] = spent
         self._remember(slot, done=True)
 
     def _remember(self, slot: str, done: bool) -> None:
@@ -231,7 +222,7 @@ class Run:
         write_whole(self.state_file, json.dumps(self.state, indent=1) + "\n")
 
     def verdict(self) -> None:
-        """Print results and the next step; the numbers go to OUT/prepare.json."""
+        """Print results and the next step, and write the numbers to OUT/prepare.json."""
         model = structure.colmap().Reconstruction(self.model)
         total, registered = len(self.names), model.num_reg_images()
         numbers = {
@@ -240,23 +231,22 @@ class Run:
             "points": model.num_points3D(),
             "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
             "mean_track_length": model.compute_mean_track_length(),
-            "models": self.state.get("models", 1),
-            "mapping": self.state.get("mapping", "incremental"),
+            "models": self.state["models"],
+            "mapping": self.state["mapping"],
             "pairs": len(json.loads(self.pairs_file.read_text())),
-            "seconds_and_cpu_seconds": self.state.get("seconds", {}),
+            "seconds_and_cpu_seconds": self.state["seconds"],
             "options": {name: value for name, value in asdict(self.options).items() if name not in ("photos", "out")},
         }
         write_whole(self.out / "prepare.json", json.dumps(numbers, indent=1) + "\n")
         error = numbers["mean_reprojection_error_px"]
-        self.screen.print(
-            f"{registered} of {total} photographs have a camera, {numbers['points']:,} points, mean reprojection error "
-            f"{error:.2f} px.",
-            soft_wrap=True,
-        )
-        for advice in self._advice(registered, total, error):
-            self.screen.print(f"- {advice}", markup=False, soft_wrap=True)
+        found = f"{registered} of {total} photographs have a camera, {numbers['points']:,} points"
         command = shlex.join(["ns-train", "nrfgs", "--data", str(self.out)])
-        self.screen.print(f"Train with: {command}", markup=False, highlight=False, soft_wrap=True)
+        for line in (
+            f"{found}, mean reprojection error {error:.2f} px.",
+            *(f"- {advice}" for advice in self._advice(registered, total, error)),
+            f"Train with: {command}",
+        ):
+            self.screen.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def _advice(self, registered: int, total: int, error: float) -> Iterator[str]:
         """Faults of a reconstruction and their fixes."""
@@ -264,7 +254,7 @@ class Run:
             placed = {path.name for path in (self.out / "images").iterdir()}
             left = [name for name in self.names if name not in placed]
             yield f"Without a camera: {', '.join(left[:5])}{' ...' if len(left) > 5 else ''}. They are left out."
-            if self.state.get("models", 1) > 1:
+            if self.state["models"] > 1:
                 yield f"They fall into {self.state['models']} groups; the largest is used. Take some in between."
             if self.options.matching != "exhaustive" and total > pairs.ALIKE + 1:
                 yield "Try --matching exhaustive: slower, but it finds every overlap."

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of photographs that are worth matching.
-
-A pair is likely if one of the two is among the ALIKE photographs whose largest features look most like the other's (Wu,
-Towards linear-time incremental structure from motion, 2013: a hundredth of the cost of matching all features), the
+"""Pairs of photographs worth matching: one is among the ALIKE whose largest features look most like the other's (Wu,
+Towards linear-time incremental structure from motion, 2013, a hundredth of the cost of matching all features), the
 NEAREST by the positions in EXIF, or the FOLLOWING in a video or in a row of numbered names.
 """
 
@@ -15,13 +13,13 @@ import numpy as np
 
 ALIKE, NEAREST, FOLLOWING = 10, 5, 5
 LARGEST = 256
-"""Features of a photograph that are compared, at most; fewer of more than a thousand photographs."""
+"""Largest number of features of a photograph that are compared; fewer from a thousand photographs on."""
 SAME = 0.8
 """Descriptors with a cosine above this look the same."""
 NUMBERED_SHARE = 0.9
-"""Share of neighbours by name with close numbers from which a folder counts as one walk."""
+"""Minimum share of neighbours by name with close numbers in a folder that is one walk."""
 LARGEST_GAP = 3
-"""Difference of close numbers: a blurred photograph or two may be missing."""
+"""Largest difference of close numbers: a blurred photograph or two may be missing."""
 AT_ONCE = 32
 """Photographs compared with one at once: bounds the memory."""
 
@@ -32,8 +30,8 @@ Pairs = list[tuple[int, int]]
 
 
 def likely_pairs(alike: np.ndarray, positions: np.ndarray | None, in_a_row: bool) -> Pairs:
-    """The pairs that are worth matching, by `shared_features` [N, N], positions [N, 2] in metres (NaN where unknown),
-    and whether photographs follow each other along a path."""
+    """Pairs worth matching, by `shared_features` [N, N], positions [N, 2] in metres (NaN where unknown), and whether
+    photographs follow each other along a path."""
     count = len(alike)
     chosen = np.zeros((count, count), dtype=bool)
     _choose_best(chosen, np.where(alike > 0, alike, -np.inf), ALIKE)
@@ -54,15 +52,10 @@ def _choose_best(chosen: np.ndarray, scores: np.ndarray, number: int) -> None:
 
 
 def shared_features(descriptors: list[np.ndarray], advance: Advance) -> np.ndarray:
-    """Numbers of shared features (mutual best matches that look the same), int [N, N], symmetric, 0 on the diagonal.
-
-    Args:
-        descriptors: for each photograph [n, 128], largest feature first.
-        advance: called with 1 for each photograph.
-    """
+    """Numbers of shared features (mutual best matches that look the same), int [N, N], symmetric, 0 on the diagonal, by
+    each photograph's descriptors [n, 128], largest feature first."""
     count = len(descriptors)
-    most = max(min(LARGEST, 1000 * LARGEST // count), LARGEST // 4)
-    size = max(min(most, max((len(each) for each in descriptors), default=0)), 1)
+    size = max(min(LARGEST, 1000 * LARGEST // count), LARGEST // 4)
     table = np.zeros((count, size, 128), dtype=np.float32)
     for row, each in zip(table, descriptors, strict=True):
         part = each[:size].astype(np.float32)

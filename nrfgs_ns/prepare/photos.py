@@ -2,16 +2,28 @@
 """Photographs, found, checked and turned upright, and the frames of a video."""
 
 import hashlib
+import itertools
 import os
 import re
 import shlex
 import shutil
+from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from nrfgs_ns.data.pictures import FORMATS, check_depth, exif_of, exif_of_copy, known, naming, open_picture
+from nrfgs_ns.data.pictures import (
+    FORMATS,
+    check_depth,
+    exif_of,
+    exif_of_copy,
+    naming,
+    open_picture,
+    read_exif,
+    read_size,
+)
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.prepare.pairs import Advance
 
@@ -23,13 +35,13 @@ VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 KEPT = (".jpg", ".jpeg", ".png")
 """Suffixes of files that are copied; others become PNG."""
 FEWEST, FEW = 3, 15
-"""Fewer photographs are refused, or get a warning."""
+"""Minimum number of photographs, and number below which a warning appears."""
 SHARPNESS_WIDTH = 320
 """Width at which the sharpness of frames is compared, pixels: motion blur counts, not noise."""
 SMALLEST = 16
-"""Pixels of the shorter side, at least."""
+"""Minimum of the shorter side, pixels."""
 LONGEST_STEM = 120
-"""Letters of a stored name, at most."""
+"""Maximum length of a stored name, letters."""
 
 
 def reads_heif() -> bool:
@@ -59,13 +71,10 @@ def find_inputs(source: Path) -> list[Path]:
     files = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
     photos = [path for path in files if path.suffix.lower() in suffixes]
     if len(photos) < FEWEST:
-        kinds = {path.suffix.lower() for path in files if path not in photos}
-        hint = (
-            CONVERT if kinds & set(HEIF) else "It holds a video: name that file itself." if kinds & set(VIDEOS) else ""
-        )
         raise InputError(
             f"{source} directly holds {len(photos)} photographs ({', '.join(PHOTOS)}); at least {FEWEST} are needed, "
-            f"better 30 or more, from different places, each seeing most of what the one before it sees. {hint}"
+            "better 30 or more, from different places, each seeing most of what the one before it sees. "
+            f"{left_out(source, photos)}"
         )
     return photos
 
@@ -74,12 +83,12 @@ def left_out(source: Path, photos: list[Path]) -> str:
     """A sentence about other contents of a folder, by suffix; "" without any."""
     others = [path for path in source.iterdir() if not path.name.startswith(".") and path not in set(photos)]
     kinds = {"folders" if path.is_dir() else path.suffix.lower() or "no suffix" for path in others}
-    hint = CONVERT if kinds & set(HEIF) else ""
+    hint = CONVERT if kinds & set(HEIF) else "To use a video, name that file itself." if kinds & set(VIDEOS) else ""
     return f"Left out, since they are not read here: {', '.join(sorted(kinds))}. {hint}" if kinds else ""
 
 
 def digest(paths: list[Path]) -> str:
-    """SHA-256 over names and contents."""
+    """SHA-256 of names and contents."""
     total = hashlib.sha256()
     for path in paths:
         total.update(os.fsencode(path.name))
@@ -134,57 +143,42 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
 
 def same_camera(folder: Path, names: list[str]) -> bool:
     """Whether all photographs agree in size and, by EXIF, in camera model and focal length."""
-    seen = set()
-    for name in names:
-        with open_picture(folder / name) as image:
-            taken = known(exif_of(image))
-            seen.add((image.size, taken.get("model"), round(float(taken.get("focal_length", 0)), 2)))
-    return len(seen) == 1
-
-
-def open_video(video: Path) -> tuple[Any, int]:
-    """OpenCV's reader of a video, and its number of frames; InputError if it cannot be used."""
-    import cv2  # slow
-
-    reader = cv2.VideoCapture(str(video))
-    total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
-    if total < FEWEST or not reader.read()[0]:
-        raise InputError(
-            f"{video}: OpenCV finds {max(total, 0)} frames in it, of which it decodes none or too few. Convert it to "
-            "MP4 (H.264), or extract frames with another program and name their folder."
-        )
-    reader.set(cv2.CAP_PROP_POS_FRAMES, 0)
-    return reader, total
+    taken = {name: read_exif(folder / name) for name in names}
+    lenses = {name: (exif.get("model"), round(float(exif.get("focal_length", 0)), 2)) for name, exif in taken.items()}
+    return len({(read_size(folder / name), *lens) for name, lens in lenses.items()}) == 1
 
 
 def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:
-    """Write the sharpest frame (by the variance of the Laplacian) of each of `frames` equal pieces of a video as JPEG,
+    """Write the sharpest frame (by the variance of the Laplacian) of each of `frames` equal pieces of a video, as
     frame_00000.jpg and so on; InputError if it cannot be used."""
-    import cv2
+    import cv2  # slow
 
-    reader, total = open_video(video)
+    reader = cv2.VideoCapture(str(video))
+    total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
+    frames, written = min(frames, total), 0
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    frames = min(frames, total)
-    sharpest, piece, written = (-1.0, None), 0, 0
-    try:
-        for index in range(total + 1):
-            decoded, frame = reader.read() if index < total else (False, None)
-            if not decoded or index * frames // total != piece:
-                if sharpest[1] is not None:
-                    coded = cv2.imencode(".jpg", sharpest[1], [cv2.IMWRITE_JPEG_QUALITY, 97])[1]
-                    (folder / f"frame_{written:05d}.jpg").write_bytes(coded)  # imwrite is silent where the disk is full
-                    written += 1
-                    advance(1)
-                sharpest, piece = (-1.0, None), index * frames // total
-            if not decoded:
-                break
-            height = max(round(frame.shape[0] * SHARPNESS_WIDTH / frame.shape[1]), 1)
-            small = cv2.resize(frame, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA)
-            sharpness = cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var()
-            if sharpness > sharpest[0]:
-                sharpest = sharpness, frame
-    finally:
-        reader.release()
+
+    def decoded() -> Iterator[tuple[int, np.ndarray]]:
+        for index in range(total):
+            there, frame = reader.read()
+            if not there:
+                return
+            yield index * frames // total, frame
+
+    def sharpness(frame: np.ndarray) -> float:
+        height = max(round(frame.shape[0] * SHARPNESS_WIDTH / frame.shape[1]), 1)
+        small = cv2.resize(frame, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA)
+        return cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var()
+
+    for _, piece in itertools.groupby(decoded(), key=itemgetter(0)):
+        sharpest = max((frame for _, frame in piece), key=sharpness)
+        coded = cv2.imencode(".jpg", sharpest, [cv2.IMWRITE_JPEG_QUALITY, 97])[1]
+        (folder / f"frame_{written:05d}.jpg").write_bytes(coded)  # imwrite is silent where the disk is full
+        written += 1
+        advance(1)
     if written < FEWEST:
-        raise InputError(f"{video}: only {written} frames could be decoded. Convert it to MP4 (H.264).")
+        raise InputError(
+            f"{video}: OpenCV decodes {written} frames of it. Convert it to MP4 (H.264), or extract frames and "
+            "name their folder."
+        )

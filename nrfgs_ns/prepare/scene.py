@@ -27,8 +27,8 @@ DOWNSCALES = (2, 4, 8)
 
 
 def write_scene(undistorted: Path, photos: Path, out: Path, advance: Advance) -> None:
-    """Write a scene from the undistorted images/, which are linked, and sparse/ of a COLMAP model, and from the EXIF of
-    `photos` by the same names. `advance` is called for each."""
+    """Write a scene from the undistorted images/, which are linked, and sparse/ of a COLMAP model, with the EXIF of
+    `photos` by the same names."""
     model = colmap().Reconstruction(undistorted / "sparse")
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     for folder in ("images", *(f"images_{factor}" for factor in DOWNSCALES)):
@@ -54,7 +54,7 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Advance) ->
 
 
 def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float | str]]) -> dict[str, Any]:
-    """The content of transforms.json for images sorted by name, with their EXIF. Shared intrinsics are at the top."""
+    """The content of transforms.json for images sorted by name; intrinsics that all share are at the top level."""
     cameras = [_intrinsics(model.cameras[image.camera_id]) for image in images]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
     names = [f"images/{image.name}" for image in images]
@@ -82,10 +82,7 @@ def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float 
 
 def _camera_to_world(image: Any) -> np.ndarray:
     """The pose [4, 4] of a registered image, y up and z backwards (OpenGL)."""
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().inverse().matrix()
-    pose[:3, 1:3] *= -1.0
-    return pose
+    return np.vstack([image.cam_from_world().inverse().matrix() * (1.0, -1.0, -1.0, 1.0), (0, 0, 0, 1)])
 
 
 def _intrinsics(camera: Any) -> dict[str, Any]:

@@ -23,10 +23,11 @@ LARGE = 1.5e6
 PAIRS_AT_ONCE = 64
 """Pairs between two updates of the progress; an interruption loses no more."""
 SMALLEST_MODEL = 3
-"""Photographs of a model, at least."""
+"""Minimum number of photographs of a model."""
 FEWEST_POINTS = 10
-"""Points for each photograph of a globally mapped model, at least."""
+"""Minimum number of points per photograph of a globally mapped model."""
 SEED = 0
+CUT = "was not written whole: the disk may be full. Make room, and run this again."
 
 
 def colmap():
@@ -52,16 +53,10 @@ def extract_features(
     longest_side: int,
     features: int,
 ) -> None:
-    """SIFT features of every photograph, on the CPU.
-
-    Args:
-        one_camera: all photographs share their intrinsics.
-        longest_side: larger photographs are shrunk to it for this step, pixels.
-        features: largest number of features in a photograph.
-    """
+    """Find at most `features` SIFT features in every photograph, shrunk to `longest_side` pixels, on the CPU; with
+    `one_camera` all share their intrinsics."""
     pycolmap = colmap()
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = longest_side
+    options = pycolmap.FeatureExtractionOptions(max_image_size=longest_side)
     options.sift.max_num_features = features
     reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
     batch = max(os.cpu_count() or 1, 4)
@@ -126,13 +121,12 @@ def positions(database: Path, names: list[str]) -> np.ndarray:
 def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance) -> int:
     """Match and verify pairs of photographs, and return the number of verified ones."""
     pycolmap = colmap()
-    pairing, verification = pycolmap.ImportedPairingOptions(), pycolmap.TwoViewGeometryOptions()
-    pairing.match_list_path = folder / "pairs.txt"
+    listed, verification = folder / "pairs.txt", pycolmap.TwoViewGeometryOptions()
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     verification.ransac.random_seed = SEED
     for first in range(0, len(pairs), PAIRS_AT_ONCE):
         part = pairs[first : first + PAIRS_AT_ONCE]
-        lines = [f"{names[a]} {names[b]}\n" for a, b in part]
-        (folder / "pairs.txt").write_text("".join(lines), encoding="utf-8")
+        listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in part), encoding="utf-8")
         pycolmap.match_image_pairs(
             database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
         )
@@ -143,14 +137,12 @@ def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path,
 
 
 def find_cameras(database: Path, photos: Path, folder: Path, enough: float, advance: Advance) -> tuple[int, str]:
-    """Find cameras and points, and write the largest model to `folder`.
+    """Find cameras and points, and write the largest model to `folder`; the number of separate models (0: nothing is
+    written) and the mapping.
 
     Incremental mapping begins with two photographs from well separated places that share much, which a walk straight
     ahead lacks. If it places fewer than `enough` photographs, global mapping, which solves for all positions at once,
-    is tried, too, and the larger model wins. `advance` is called with 1 for each photograph that is placed.
-
-    Returns:
-        The number of separate models (0: nothing is written), and the mapping.
+    is tried, too, and the larger model wins.
     """
     shutil.rmtree(folder, ignore_errors=True)
     models, mapping = _map_incrementally(database, photos, folder, advance), "incremental"
@@ -171,16 +163,14 @@ def write_model(model: Any, folder: Path) -> None:
 
 
 def _check_model(folder: Path, model: Any) -> None:
+    from nrfgs_ns.data.colmap import read_model, read_points  # slow to import; pycolmap reads beyond a file's end
+
     try:
-        written = _size([colmap().Reconstruction(folder)])
-    except Exception:  # whatever cut files lead to
+        written = len(read_model(folder)[1]), len(read_points(folder)[0])
+    except InputError:
         written = None
     if written != _size([model]):
-        raise _not_whole(folder)
-
-
-def _not_whole(path: Path) -> InputError:
-    return InputError(f"{path} was not written whole: the disk may be full. Make room, and run this again.")
+        raise InputError(f"{folder} {CUT}")
 
 
 def _size(models: list[Any]) -> tuple[int, int]:
@@ -190,9 +180,7 @@ def _size(models: list[Any]) -> tuple[int, int]:
 
 def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Advance) -> list[Any]:
     pycolmap = colmap()
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = SMALLEST_MODEL
-    options.random_seed = SEED
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED)
     with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = pycolmap.incremental_mapping(
             database,
@@ -206,11 +194,9 @@ def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Adva
 
 
 def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
-    """Global mapping, whose points (up to 15 pixels off) are triangulated again, as by incremental mapping."""
+    """Global mapping, whose points, up to 15 pixels off, are triangulated again."""
     pycolmap = colmap()
-    options = pycolmap.GlobalPipelineOptions()
-    options.min_model_size = SMALLEST_MODEL
-    options.random_seed = SEED
+    options = pycolmap.GlobalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED)
     with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = list(pycolmap.global_mapping(database, photos, attempts, options=options).values())
         models = [model for model in models if model.num_reg_images() >= SMALLEST_MODEL]
@@ -240,5 +226,5 @@ def undistort(model: Path, photos: Path, folder: Path, advance: Advance) -> None
         try:
             read_picture(path)
         except InputError as error:
-            raise _not_whole(path) from error
+            raise InputError(f"{path} {CUT}") from error
     advance(1)

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The .ply of points that a training starts from."""
 
-from functools import partial
-from pathlib import Path
-
 import numpy as np
-from area_transforms import add_points, broken, capture_in, load
+from area_transforms import add_points, broken
 from attempt import Case
 from hypothesis import strategies as st
-from values import damage, damages
+from small_capture import Capture
+from values import DAMAGES, damage
 
 AREA = ".ply of points"
 
@@ -37,7 +35,7 @@ CASES = [
     *(
         holding(f"{form.decode()} of {n} vertices", HEAD % (form, n, b"float") + ROWS)
         for form in (b"ascii", BINARY)
-        for n in (10**3, 10**7, 10**10, 10**18, 10**30)
+        for n in (10**3, 10**7, 10**10, 10**30)
     ),
     holding("negative count", HEAD % (BINARY, -3, b"float") + ROWS),
     holding("unknown type", HEAD % (BINARY, 9, b"quad") + bytes(1000)),
@@ -48,14 +46,11 @@ CASES = [
     holding("words", HEAD % (b"ascii", 9, b"float") + b"a b c\n" * 9),
     holding("unknown format", HEAD % (b"base64", 9, b"float") + ROWS),
     holding("bytes", bytes(range(256)) * 9),
-    stored("all NaN", np.full((40, 3), np.nan)),
-    stored("all infinite", np.full((40, 3), np.inf)),
-    stored("at 1e300", np.full((40, 3), 1e300)),
-    stored("at -1e30", np.full((40, 3), -1e30)),
-    stored("colours of 300", FINE, np.full((40, 3), 300, dtype=np.int32)),
-    stored("colours of -1", FINE, np.full((40, 3), -1, dtype=np.int32)),
-    stored("colours of 1e300", FINE, np.full((40, 3), 1e300)),
-    stored("colours all NaN", FINE, np.full((40, 3), np.nan)),
+    *(stored(f"all {value}", np.full((40, 3), value)) for value in (np.nan, np.inf, 1e300, -1e30)),
+    *(
+        stored(f"colours of {value}", FINE, np.full((40, 3), value))
+        for value in (np.int32(300), np.int32(-1), 1e300, np.nan)
+    ),
 ]
 
 
@@ -63,13 +58,10 @@ def inputs() -> st.SearchStrategy[Case]:
     """A point cloud, damaged."""
 
     def case(text: bool, chosen) -> Case:
-        def build(folder: Path):
-            capture = capture_in(folder)
+        def change(capture: Capture) -> None:
             path = add_points(capture, text=text)
             path.write_bytes(damage(path.read_bytes(), chosen))
-            capture.save()
-            return partial(load, capture.folder)
 
-        return Case(f"{'text' if text else 'binary'} {chosen}"[:200], build, hostile=False)
+        return broken(f"{'text' if text else 'binary'} {chosen}"[:200], change)._replace(hostile=False)
 
-    return st.builds(case, st.booleans(), damages())
+    return st.builds(case, st.booleans(), DAMAGES)

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One hostile input, and what comes of it.
+"""The outcome of one hostile input.
 
-The promise (docs/stability.md): an input that cannot be used is refused with one clear sentence, at once, before
-anything is written, with a bounded number of calls and less than a gigabyte of memory. Work is counted, not timed, so
-that the outcome does not depend on the machine. Attempts are made in a child process, which may be killed.
+The promise (docs/stability.md): an input that cannot be used is refused with one clear sentence, before anything is
+written, with a bounded number of calls (counted, so that the outcome does not depend on the machine) and less than a
+gigabyte of memory. Attempts are made in a child process, which may be killed.
 """
 
 import contextlib
 import functools
+import itertools
 import json
 import os
 import resource
@@ -16,7 +17,7 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,48 +42,36 @@ class Case(NamedTuple):
     build: Callable[[Path], Callable[[], Any]]
     """Writes the input into an empty folder; returns what reads it as a user's command would."""
     hostile: bool = True
-    """It cannot be used and must be refused. Otherwise it may be read as well, but no third thing."""
+    """It must be refused; otherwise it may be read as well."""
 
 
 class Outcome(NamedTuple):
-    """What came of it."""
+    """What happened, and the message."""
 
     kind: str
     """refused (one clear sentence); read; silent (hostile, and read without a word); traceback; unclear (refused, but
-    not in one printable sentence); slow (too many calls); large; wrote; hang"""
+    not in one printable sentence); slow (too many calls); large; wrote; hang; broken case"""
     said: str = ""
-    calls: int = 0
-    """calls of functions in the main thread"""
-    size: int = 0
-    """growth of the process's memory, bytes"""
 
 
 class TooManyCalls(BaseException):
     """Reading takes more than `CALLS`. No `except Exception` stops it."""
 
 
-class _Counter:
-    """Count calls of functions in this thread."""
+@contextlib.contextmanager
+def limited_calls() -> Iterator[None]:
+    """Raise TooManyCalls in this thread."""
+    calls = itertools.count()
 
-    def __init__(self):
-        self.calls = 0
-
-    def __enter__(self):
-        sys.setprofile(self._on_event)
-        return self
-
-    def __exit__(self, *_):
-        sys.setprofile(None)
-
-    def _on_event(self, frame, event, arg) -> None:
-        self.calls += event in ("call", "c_call")
-        if self.calls > CALLS:
+    def count(frame, event, arg) -> None:
+        if event in ("call", "c_call") and next(calls) > CALLS:
             raise TooManyCalls
 
-
-def attempt(case: Case) -> Outcome:
-    """Let a child process read one input."""
-    return attempts([case])[0]
+    sys.setprofile(count)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
 
 
 def attempts(cases: Sequence[Case]) -> list[Outcome]:
@@ -114,7 +103,6 @@ def _in_one_process(cases: Sequence[Case]) -> list[Outcome]:
     child = os.fork()
     if child == 0:
         try:
-            os.close(receive)
             _child(cases, send)
         finally:
             os._exit(0)
@@ -168,9 +156,9 @@ def _read(case: Case, folder: Path) -> Outcome:
         return Outcome("broken case", f"{type(error).__name__}: {error}")
     os.chdir(work)
     before, largest = listing(folder), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    kind, said = "read", ""
+    kind, said = "silent" if case.hostile else "read", ""
     try:
-        with _Counter() as counter:
+        with limited_calls():
             read()
     except InputError as error:
         said = str(error)
@@ -181,11 +169,8 @@ def _read(case: Case, folder: Path) -> Outcome:
     except BaseException as error:  # SystemExit of a library, too
         kind, said = "traceback", f"{type(error).__name__}: {error}"
     size = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest)
-    if kind in GOOD:
-        if kind == "read" and case.hostile:
-            kind = "silent"
-        elif size > BYTES:
-            kind, said = "large", f"{size / 2**20:.0f} MiB; {said}"
-        elif listing(folder) != before:
-            kind = "wrote"
-    return Outcome(kind, said.replace(str(folder), "FOLDER")[: 2 * LONGEST], counter.calls, size)
+    if kind in GOOD and size > BYTES:
+        kind, said = "large", f"{size / 2**20:.0f} MiB; {said}"
+    elif kind in GOOD and listing(folder) != before:
+        kind = "wrote"
+    return Outcome(kind, said.replace(str(folder), "FOLDER")[: 2 * LONGEST])

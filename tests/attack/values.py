@@ -27,10 +27,8 @@ def put(tree: Any, place: tuple, value: Any) -> None:
     tree[place[-1]] = value
 
 
-@st.composite
-def replacements(draw) -> list[tuple[float, Any]]:
-    """A few odd values, and where to put each: a number in [0, 1) that chooses one of all places."""
-    return draw(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), ODD), min_size=1, max_size=3))
+REPLACEMENTS = st.lists(st.tuples(st.floats(0, 1, exclude_max=True), ODD), min_size=1, max_size=3)
+"""A few odd values, and where to put each: a number in [0, 1) that chooses one of all places."""
 
 
 def replace_in(tree: Any, chosen: list[tuple[float, Any]]) -> None:
@@ -41,15 +39,12 @@ def replace_in(tree: Any, chosen: list[tuple[float, Any]]) -> None:
             put(tree, every[int(share * len(every))], deepcopy(value))
 
 
-@st.composite
-def damages(draw) -> list[tuple[str, float, bytes]]:
-    """What is done to the bytes of a file, and where, as a share of its length."""
-    how = st.sampled_from(["overwrite", "insert", "cut", "delete"])
-    content = st.one_of(
-        st.binary(min_size=1, max_size=8),
-        st.sampled_from([b"\xff" * 8, b"\0" * 8, b"\xff" * 7 + b"\x7f", b"\0\0\0\0\0\0\xf0\x7f", b"\n", b"9" * 20]),
-    )
-    return draw(st.lists(st.tuples(how, st.floats(0, 1), content), min_size=1, max_size=3))
+HOW = st.sampled_from(["overwrite", "insert", "cut", "delete"])
+CONTENT = st.binary(min_size=1, max_size=8) | st.sampled_from(
+    [b"\xff" * 8, b"\0" * 8, b"\xff" * 7 + b"\x7f", b"\0\0\0\0\0\0\xf0\x7f", b"\n", b"9" * 20]
+)
+DAMAGES = st.lists(st.tuples(HOW, st.floats(0, 1), CONTENT), min_size=1, max_size=3)
+"""What is done to the bytes of a file, and where, as a share of its length."""
 
 
 def damage(data: bytes, chosen: list[tuple[str, float, bytes]]) -> bytes:

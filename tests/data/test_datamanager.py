@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import io
-import os
-import subprocess
-import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,16 +23,6 @@ def manager(capture, parser_options=None, **options) -> NrfgsDatamanager:
 
 
 # Images.
-
-
-@pytest.mark.parametrize("cache_images", ["cpu", "gpu"])
-def test_no_pinned_memory_on_a_cpu(capture, monkeypatch, cache_images):
-    """nerfstudio's cache for "cpu" pins memory, which fails without an accelerator's driver."""
-    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda *_: pytest.fail("memory was pinned"))
-    data = manager(capture, cache_images=cache_images)
-    data.load_all_images()
-    camera, batch = data.next_train(0)
-    assert camera.device.type == batch["image"].device.type == "cpu"
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
@@ -87,7 +73,6 @@ def test_images_are_made_smaller_to_the_size_of_their_cameras(tmp_path):
     capture.meta |= {"fl_x": 40.0, "fl_y": 40.0, "cx": 25.0}
     capture.add_masks()
     data = manager(capture, camera_res_scale_factor=0.58)
-    data.load_all_images()
     assert data.cached_train[0]["image"].shape == (5, 28, 3) and data.cached_train[0]["mask"].shape == (5, 28, 1)
     assert (data.train_dataset.cameras.width == 28).all() and (data.train_dataset.cameras.height == 5).all()
 
@@ -130,13 +115,14 @@ def test_free_memory_bounds_the_threads_that_decode(monkeypatch, free, threads):
     barrier = threading.Barrier(threads)
     list(in_parallel(read, [(12, 9)] * 12, "Reading", workers=4))
     assert max(most) == threads
+    with pytest.raises(InputError, match="image of 9000 x 9000 takes about"):
+        list(in_parallel(read, [(12, 9), (9000, 9000)], "Reading"))
 
 
 def test_undistorted_images_can_be_read_again(capture):
     """Undistortion crops the cameras; the file keeps its size, and the viewer reads it a second time."""
     capture.meta |= {"k1": 0.3, "fl_x": 12.0, "fl_y": 12.0}
     data = manager(capture)
-    data.load_all_images()
     heights = {cache["image"].shape[0] for cache in data.cached_train}
     assert heights == {int(data.train_dataset.cameras.height[0])} and heights != {9}
     assert data.train_dataset[0]["image"].shape == (9, 12, 3)
@@ -157,7 +143,7 @@ def through_a_checkpoint(state: dict) -> dict:
 
 
 @pytest.mark.parametrize("strategy", ["random", "fps"])
-@pytest.mark.parametrize("steps", [0, 3, 7, 8, 20])  # 8 cameras: before, at and after the end of a round
+@pytest.mark.parametrize("steps", [7, 8, 20])  # 8 cameras: before, at and after the end of a round
 def test_order_continues_after_a_restore(capture, strategy, steps):
     # Rounds of 3 for fps, so that cameras miss whole rounds, which it remembers; random goes round all 8.
     options = {"train_cameras_sampling_strategy": strategy, "fps_reset_every": 3}
@@ -176,37 +162,13 @@ def test_order_continues_after_a_restore(capture, strategy, steps):
 
 def test_states_of_other_runs_are_refused(capture):
     state = manager(capture).sampling_state()
-    with pytest.raises(InputError, match=r"train_cameras_sampling_strategy is fps.*random"):
+    with pytest.raises(InputError, match=r"strategy random, but now.*fps"):
         manager(capture, train_cameras_sampling_strategy="fps").load_sampling_state(state)
-    with pytest.raises(InputError, match=r"trained on 8 images, but there are 5 now"):
+    with pytest.raises(InputError, match=r"trained on 8 images.*now these are 5"):
         manager(capture, {"eval_interval": 2}).load_sampling_state(state)
 
 
 # Where images are kept.
-
-
-LOCALE = """
-import os
-from pathlib import Path
-from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-folder = Path(os.fsdecode({!r}))
-for memory in (None, 0.0):
-    config = NrfgsDatamanagerConfig(
-        dataparser=NrfgsDataParserConfig(data=folder, downscale_factor=2), image_memory=memory
-    )
-    assert config.setup(device="cpu").load_all_images() == (9, 1)
-"""
-
-
-def test_a_folder_of_another_encoding(tmp_path):
-    """ASCII is the locale's, the folder is UTF-8."""
-    folder = os.fsencode(tmp_path) + "/café".encode()
-    Capture(Path(os.fsdecode(folder)), images=10).save()
-    settings = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "XDG_CACHE_HOME": folder + b"/cache"}
-    command = [sys.executable, "-W", "ignore", "-c", LOCALE.format(folder)]
-    done = subprocess.run(command, env={**os.environ, **settings}, capture_output=True)
-    assert done.returncode == 0, done.stderr.decode("ascii", "replace")
 
 
 @pytest.mark.parametrize("distorted", [False, True])
@@ -215,36 +177,30 @@ def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, pri
     capture.add_masks()
     if distorted:
         capture.meta |= {"k1": 0.3, "fl_x": 12.0, "fl_y": 12.0}
-    in_memory = manager(capture)
-    in_memory.load_all_images()
+
+    def loaded(**options):
+        data = manager(capture, **options)
+        data.load_all_images()
+        sets = (data.train_dataset.cameras, data.eval_dataset.cameras)
+        lenses = [getattr(cameras, name) for cameras in sets for name in ("fx", "fy", "cx", "cy", "width", "height")]
+        return data, [data.cached_train, data.cached_eval, lenses]
+
+    in_memory, expected = loaded()
     assert not (tmp_path / "cache").exists()
     for _ in range(2):
-        in_files = manager(capture, image_memory=0.0)
-        in_files.load_all_images()
+        in_files, found = loaded(image_memory=0.0)
         assert "read from files" in printed()
-        for name in ("cached_train", "cached_eval"):
-            for one, other in zip(getattr(in_memory, name), getattr(in_files, name), strict=True):
-                assert one.keys() == other.keys()
-                torch.testing.assert_close(one, other, rtol=0, atol=0)
-        for part in ("fx", "fy", "cx", "cy", "width", "height"):
-            for one, other in zip(
-                (in_memory.train_dataset, in_memory.eval_dataset),
-                (in_files.train_dataset, in_files.eval_dataset),
-                strict=True,
-            ):
-                torch.testing.assert_close(getattr(one.cameras, part), getattr(other.cameras, part))
+        torch.testing.assert_close(found, expected, rtol=0, atol=0)
         for step in range(20):
             camera, batch = in_files.next_train(step)
             kept = in_memory.cached_train[camera.metadata["cam_idx"]]
             torch.testing.assert_close(batch["image"], kept["image"])
-    assert len(list((tmp_path / "cache").rglob("*.npy"))) == 10 * 3, (
-        "an image, a mask and what they are, each made once"
-    )
+        in_files.cached_train[0]["image"].zero_()  # in memory, not in the file
+    assert len(list((tmp_path / "cache").rglob("*.npy"))) == 10 * 3, "an image, a mask and a lens, each made once"
 
     picture = Image.open(capture.folder / "images/004.png").convert("RGB")
     Image.eval(picture, lambda value: 255 - value).save(capture.folder / "images/004.png")
-    anew = manager(capture, image_memory=0.0)
-    anew.load_all_images()
+    anew, _ = loaded(image_memory=0.0)
     assert len(list((tmp_path / "cache").rglob("*.npy"))) == 10 * 3 + 3
     assert not torch.equal(anew.cached_train[3]["image"], in_memory.cached_train[3]["image"])
 
@@ -257,16 +213,7 @@ def test_files_that_are_lost_or_cut_are_made_anew(capture, tmp_path, monkeypatch
     before = [data["image"].clone() for data in manager(capture, image_memory=0.0).cached_train]
     for path in (tmp_path / "cache").rglob(name):
         path.unlink() if content is None else path.write_bytes(content)
-    for one, other in zip(manager(capture, image_memory=0.0).cached_train, before, strict=True):
-        torch.testing.assert_close(one["image"], other)
-
-
-def test_training_does_not_write_into_the_files(capture, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    image = manager(capture, image_memory=0.0).cached_train[0]["image"]
-    before = image.clone()
-    image.zero_()
-    torch.testing.assert_close(manager(capture, image_memory=0.0).cached_train[0]["image"], before)
+    torch.testing.assert_close([data["image"] for data in manager(capture, image_memory=0.0).cached_train], before)
 
 
 def test_no_room_for_files_is_said(capture, tmp_path, monkeypatch):

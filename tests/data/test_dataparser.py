@@ -77,13 +77,10 @@ def test_cameras_are_those_of_nerfstudio(capture, split, distortion):
 # Splits.
 
 
-@pytest.mark.parametrize("kept", ["val", "test"])
-@pytest.mark.parametrize("other", [{}, "empty"])
+@pytest.mark.parametrize("kept, other", [("val", {}), ("val", {"test_filenames": []}), ("test", {})])
 def test_val_and_test_stand_in_for_each_other(capture, printed, kept, other):
     path = [frame["file_path"] for frame in capture.meta["frames"]]
-    capture.meta |= {"train_filenames": path[3:], f"{kept}_filenames": path[:3]}
-    if other == "empty":
-        capture.meta[{"val": "test", "test": "val"}[kept] + "_filenames"] = []
+    capture.meta |= {"train_filenames": path[3:], f"{kept}_filenames": path[:3], **other}
     parser = capture.parser()
     assert names(parser.get_dataparser_outputs("train")) == list(range(7))
     assert names(parser.get_dataparser_outputs("val")) == [7, 8, 9]
@@ -99,11 +96,10 @@ def test_without_eval_images_the_training_images_are_evaluated(capture, printed)
 
 @pytest.mark.parametrize("orientation", ["pca", "up", "vertical", "none"])
 @pytest.mark.parametrize("center", ["poses", "focus", "none"])
-@pytest.mark.parametrize("mode", ["interior", "interval", "fraction", "all"])
-def test_one_image(tmp_path, printed, orientation, center, mode):
+def test_one_image(tmp_path, printed, orientation, center):
     single = Capture(tmp_path / "single", images=1)
     single.add_ply(*cloud())
-    parser = single.parser(orientation_method=orientation, center_method=center, eval_mode=mode)
+    parser = single.parser(orientation_method=orientation, center_method=center)
     train, val = (parser.get_dataparser_outputs(split) for split in ("train", "val"))
     assert names(train) == names(val) == [0]
     assert "The training images are evaluated instead" in printed()
@@ -153,11 +149,10 @@ def test_without_points_one_warning(capture, printed, points):
     assert "random points" not in printed()
 
 
-@pytest.mark.parametrize("applied", [None, [[0, 0, 1, 3], [1, 0, 0, 4], [0, 1, 0, 5]]])
-@pytest.mark.parametrize("as_file", [False, True])
-@pytest.mark.parametrize(
-    "write, name", [(write_points3D_binary, "points3D.bin"), (write_points3D_text, "points3D.txt")]
-)
+@pytest.mark.parametrize("write, name, as_file, applied", [
+    (write_points3D_binary, "points3D.bin", False, None),
+    (write_points3D_text, "points3D.txt", True, [[0, 0, 1, 3], [1, 0, 0, 4], [0, 1, 0, 5]]),
+])  # fmt: skip
 def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, as_file, applied):
     """They land where nerfstudio's own conversion to a .ply puts them: moved into the world of the poses first."""
     monkeypatch.setattr("rich.prompt.Confirm.ask", lambda *_, **__: pytest.fail("asked a question"))
@@ -195,23 +190,14 @@ def test_rendering_from_a_checkpoint_needs_no_files(capture):
         assert len(parser.get_dataparser_outputs(split).cameras) > 0
 
 
-def test_the_users_configuration_is_left_alone(tmp_path):
-    config = NrfgsDataParserConfig(data=Capture(tmp_path, images=1).save(), orientation_method="vertical")
-    before = repr(config)
-    parser = config.setup()
-    parser.get_dataparser_outputs("train")
-    assert parser.config is config and repr(config) == before
-
-
 @pytest.mark.parametrize("first", ["nrfgs_ns.data.dataparser", "nerfstudio.configs.dataparser_configs"])
 def test_nerfstudio_finds_the_plugin_whichever_is_imported_first(first):
     """nerfstudio loads plugins while it imports itself: a circle of imports would show in one of the two orders."""
-    found = "from nerfstudio.configs.dataparser_configs import all_dataparsers as a; print(a['nrfgs-data'])"
-    code = f"import {first}; {found}"
+    code = f"import {first}; from nerfstudio.configs.dataparser_configs import all_dataparsers as a; a['nrfgs-data']"
     plugin = "nrfgs-data=nrfgs_ns.data.dataparser:nrfgs_dataparser"
     environment = {**os.environ, "NERFSTUDIO_DATAPARSER_CONFIGS": plugin, "PYTHONPATH": os.pathsep.join(sys.path)}
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
-    assert result.returncode == 0 and "NrfgsDataParserConfig" in result.stdout, result.stdout + result.stderr
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 @pytest.mark.parametrize("name, train, test, points, masks", [

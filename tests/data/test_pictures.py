@@ -64,11 +64,7 @@ def test_large_photographs_of_colmap_need_no_answer(tmp_path, monkeypatch):
     assert manager.train_dataset[0]["image"].shape == (4, 850, 3)
 
 
-TAKEN = {"exposure_time": 1 / 250, "f_number": 2.4, "iso": 50.0, "focal_length": 4.3, "make": "Maker", "model": "Phone"}
-
-
-def rounded(found: dict) -> dict:
-    return {key: round(value, 6) if isinstance(value, float) else value for key, value in found.items()}
+TAKEN = {"exposure_time": 1 / 250, "f_number": 2.4, "iso": 50.0, "focal_length": 4.3, "model": "Phone"}
 
 
 def photographed(path, **details):
@@ -91,7 +87,7 @@ def photographed(path, **details):
 
 
 def test_a_photograph_says_how_it_was_taken(tmp_path):
-    assert rounded(read_exif(photographed(tmp_path / "a.jpg"))) == TAKEN
+    assert read_exif(photographed(tmp_path / "a.jpg")) == pytest.approx(TAKEN)
 
 
 def test_what_is_no_number_is_left_out(tmp_path):
@@ -106,7 +102,7 @@ def test_what_is_no_number_is_left_out(tmp_path):
 def test_a_copy_keeps_what_holds_for_it(tmp_path, suffix):
     with Image.open(photographed(tmp_path / "a.jpg")) as image:
         image.resize((4, 3)).save(tmp_path / f"b.{suffix}", exif=exif_of_copy(image.getexif()))
-    assert rounded(read_exif(tmp_path / f"b.{suffix}")) == TAKEN
+    assert read_exif(tmp_path / f"b.{suffix}") == pytest.approx(TAKEN)
     with Image.open(tmp_path / f"b.{suffix}") as image:
         exif = image.getexif()
     assert exif.get_ifd(ExifTags.IFD.GPSInfo)[4] == (13.0, 11.0, 43.4)

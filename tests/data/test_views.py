@@ -16,9 +16,7 @@ from nrfgs_ns.appearance.vdgs import VdgsConfig
 from nrfgs_ns.data.views import different_views, evenly_spaced, nearest_depth, scene_unit
 
 
-@pytest.mark.parametrize(
-    "total, wanted, expected", [(10, 4, [0, 2, 5, 7]), (3, 5, [0, 1, 2]), (5, 5, [0, 1, 2, 3, 4]), (5, 0, [])]
-)
+@pytest.mark.parametrize("total, wanted, expected", [(10, 4, [0, 2, 5, 7]), (3, 5, [0, 1, 2]), (5, 0, [])])
 def test_evenly_spaced(total, wanted, expected):
     assert evenly_spaced(total, wanted) == expected
 
@@ -78,7 +76,6 @@ def test_a_view_that_another_one_is_does_not_count():
     assert different_views(torch.cat([ring, moved(ring, 1e-3)])) == 44, "posed by themselves they stand almost there"
     assert different_views(torch.cat([ring[:1].expand(100, 3, 4), ring])) == 44, "a video that stands still for a while"
     assert different_views(ring_of_poses(300).repeat(20, 1, 1)) == 300
-    assert different_views(ring[:0]) == 0
     assert different_views(ring[:1]) == different_views(ring[:1].expand(7, 3, 4)) == 1
     far = torch.cat([ring, ring])
     far[:, :, 3] = 1e6 + 1e-3 * far[:, :, 3]

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from small_capture import Capture
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
@@ -16,8 +17,8 @@ from nrfgs_ns.export.frames import to_capture
 UTM = np.array([448_262.3, 5_412_345.6, 311.2])
 
 
-def with_points(folder, offset=0.0, images=10) -> tuple[Capture, np.ndarray]:
-    capture = Capture(folder, images)
+def with_points(folder, offset=0.0) -> tuple[Capture, np.ndarray]:
+    capture = Capture(folder, images=10)
     xyz = np.random.default_rng(1).normal((5, 6, 7), 0.5, (40, 3)) + offset
     for frame in capture.meta["frames"]:
         matrix = np.array(frame["transform_matrix"])
@@ -25,6 +26,12 @@ def with_points(folder, offset=0.0, images=10) -> tuple[Capture, np.ndarray]:
         frame["transform_matrix"] = matrix.tolist()
     capture.add_ply(xyz)
     return capture, xyz
+
+
+def datamanager(capture):
+    capture.save()
+    config = NrfgsDataParserConfig(data=capture.folder, load_3D_points=False)
+    return NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
 
 
 @pytest.mark.parametrize("orientation", ["up", "pca", "vertical", "none"])
@@ -85,24 +92,19 @@ def turn_away(frame) -> None:
     frame["transform_matrix"] = matrix.tolist()
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_views_without_a_point_are_named(tmp_path, printed, count):
+def test_views_without_a_point_are_named_and_most_views_must_have_some(tmp_path, printed):
     capture, _ = with_points(tmp_path / "scene")
-    for frame in capture.meta["frames"][:count]:
+    for frame in capture.meta["frames"][:3]:
         turn_away(frame)
     capture.parse(eval_mode="all")
-    assert f"{count} of 10 training views see none of the 40 points" in (text := printed()) and "009.png" in text
-
-
-def test_most_views_must_see_something(tmp_path):
-    capture, _ = with_points(tmp_path / "scene")
-    for frame in capture.meta["frames"][:7]:
+    assert "3 of 10 training views see none of the 40 points" in (text := printed()) and "009.png" in text
+    for frame in capture.meta["frames"][3:7]:
         turn_away(frame)
     with pytest.raises(InputError, match="7 of 10 training views see none of the 40 points"):
         capture.parse(eval_mode="all")
 
 
-@pytest.mark.parametrize("spread", [0.0, 1e-9, 0.01])
+@pytest.mark.parametrize("spread", [0.0, 0.01])
 def test_points_of_hardly_any_spread_start_nothing(tmp_path, spread):
     capture, xyz = with_points(tmp_path / "scene")
     capture.add_ply(np.concatenate([(5, 6, 7) + spread * (xyz[:30] - (5, 6, 7)), xyz[30:]]))
@@ -112,33 +114,16 @@ def test_points_of_hardly_any_spread_start_nothing(tmp_path, spread):
     assert len(capture.parse().metadata["points3D_xyz"]) == 40
 
 
-def test_a_camera_far_outside_is_named(tmp_path):
-    capture, _ = with_points(tmp_path / "scene", images=24)
-    matrix = np.array(capture.meta["frames"][5]["transform_matrix"])
-    matrix[:3, 3] = (5, 6, 7) + 1000 * (matrix[:3, 3] - (5, 6, 7))
-    capture.meta["frames"][5]["transform_matrix"] = matrix.tolist()
-    with pytest.raises(InputError, match=r"images/018.png is more than 100 times as far.*remove the frame"):
-        capture.parse()
-
-
 def test_empty_masks_are_named(tmp_path, printed):
-    from PIL import Image
-
     capture = Capture(tmp_path / "scene", images=10)
     capture.add_masks()
-    capture.save()
-
-    def load():
-        config = NrfgsDataParserConfig(data=capture.folder, load_3D_points=False)
-        NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu").load_all_images()
-
     Image.new("L", (12, 9)).save(capture.folder / "masks/003.png")
-    load()
+    datamanager(capture).load_all_images()
     assert "masks or transparency leave nothing of 003.png" in printed()
     for path in (capture.folder / "masks").iterdir():
         Image.new("L", (12, 9)).save(path)
     with pytest.raises(InputError, match="leave nothing of 000.png, 001.png, 002.png and 6 more"):
-        load()
+        datamanager(capture).load_all_images()
 
 
 # Fisheyes.
@@ -147,8 +132,6 @@ def test_empty_masks_are_named(tmp_path, printed):
 @pytest.mark.parametrize("k1", [0.0, 0.05])
 def test_a_fisheye_is_undistorted(tmp_path, k1):
     """What is in memory is what a pinhole sees of a world whose colour depends on direction."""
-    from PIL import Image
-
     side, focal = 96, 60.0
 
     def seen(x, y):  # smooth in the direction (x, y, 1)
@@ -164,19 +147,13 @@ def test_a_fisheye_is_undistorted(tmp_path, k1):
     for _ in range(20):  # distance = angle (1 + k1 angle^2)
         angle = distance / (1 + k1 * angle**2)
     stretch = np.tan(angle) / distance
+    picture = Image.fromarray(seen(x * stretch, y * stretch).round().astype(np.uint8))
     for frame in capture.meta["frames"]:
-        Image.fromarray(seen(x * stretch, y * stretch).round().astype(np.uint8)).save(
-            capture.folder / frame["file_path"]
-        )
-    capture.save()
-    config = NrfgsDataParserConfig(data=capture.folder, load_3D_points=False)
-    manager = NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
+        picture.save(capture.folder / frame["file_path"])
+    manager = datamanager(capture)
     manager.load_all_images()
-    for images, dataset in (
-        (manager.cached_train, manager.train_dataset),
-        (manager.cached_eval, manager.eval_dataset),
-    ):
-        check_is_what_a_pinhole_sees(images[0]["image"].numpy().astype(float), dataset.cameras[0], side, focal, seen)
+    for images, set in ((manager.cached_train, manager.train_dataset), (manager.cached_eval, manager.eval_dataset)):
+        check_is_what_a_pinhole_sees(images[0]["image"].numpy().astype(float), set.cameras[0], side, focal, seen)
 
 
 def check_is_what_a_pinhole_sees(image, camera, side, focal, seen):

@@ -30,24 +30,19 @@ def photographs(stops, gloss: float = 0.0):
 
     With gloss, a light that is brightest to the right of the camera adds stops, other ones in each place.
     """
-    cameras, images = [], []
-    for index, of_one in enumerate(stops):
-        offset = 0.05 * index
-        viewmat = torch.eye(4)
-        viewmat[:3, 3] = torch.tensor([-offset, 0.0, 3.0])
-        column, row = torch.meshgrid(torch.arange(WIDTH) + 0.5, torch.arange(HEIGHT) + 0.5, indexing="xy")
+    viewmats, images = torch.eye(4).repeat(len(stops), 1, 1), []
+    viewmats[:, :3, 3] = -places(len(stops))
+    column, row = torch.meshgrid(torch.arange(WIDTH) + 0.5, torch.arange(HEIGHT) + 0.5, indexing="xy")
+    for own, offset in zip(stops, places(len(stops))[:, 0], strict=True):
         x, y = (column - WIDTH / 2) / FOCAL * 3 + offset, (row - HEIGHT / 2) / FOCAL * 3
-        shine = gloss * torch.sin(25 * (x - 3 * offset))[..., None]
-        light = of_one + shine
-        images.append(
-            torch.stack([exposed(painted(x, y)[..., [c]], light[..., c : c + 1])[..., 0] for c in range(3)], -1)
-        )
-        cameras.append(viewmat)
-    return torch.stack(cameras), images
+        light = own + gloss * torch.sin(25 * (x - 3 * offset))[..., None]
+        channels = zip(painted(x, y).split(1, dim=-1), light.split(1, dim=-1), strict=True)
+        images.append(torch.cat([exposed(color, stop) for color, stop in channels], dim=-1))
+    return viewmats, images
 
 
 def looks_of(stops, gloss: float = 0.0, known=None):
-    """What photographs with these stops [V, 3] say of them."""
+    """Exposures estimated from photographs with these stops [V, 3]."""
     pairs = pairs_of(stops, gloss)
     known = torch.full((len(stops),), UNKNOWN) if known is None else known
     return estimate(pairs, known, places(len(stops)))

@@ -11,6 +11,8 @@ from ssim_cases import MOMENT_ROUNDINGS, TOLERANCE, ULP, assert_near, pair, refe
 from nrfgs_ns.image.metrics import SSIM_C2
 from nrfgs_ns.image.ssim import photometric_loss
 
+FLAT = 2 * MOMENT_ROUNDINGS * ULP / SSIM_C2
+"""Error on images of next to no variance."""
 DOUBLE_TOLERANCE = TOLERANCE * 2.0**-29
 """The same bound for float64's 2^-53 instead of 2^-24."""
 
@@ -42,10 +44,9 @@ def test_flat_images_in_float32(value):
     prediction = truth.clone().requires_grad_()
     loss = photometric_loss(prediction, truth, 1.0)
     loss.backward()
-    flat = 2 * MOMENT_ROUNDINGS * ULP / SSIM_C2
-    assert loss.abs() <= flat
-    # Slopes are at most 2 / C2; the gradient is made of three of them, which cancel but for their relative errors.
-    assert (prediction.grad * 3 * 20 * 30).abs().max() <= 3 * 2 / SSIM_C2 * flat
+    assert loss.abs() <= FLAT
+    # Slopes are at most 2 / C2; the gradient is made of three of them, which cancel except for their relative errors.
+    assert (prediction.grad * 3 * 20 * 30).abs().max() <= 3 * 2 / SSIM_C2 * FLAT
 
 
 def test_nearly_flat_images_lose_no_more_than_the_library():
@@ -54,8 +55,7 @@ def test_nearly_flat_images_lose_no_more_than_the_library():
     prediction = (truth + 1e-3 * torch.randn(60, 50, 3, generator=generator)).requires_grad_()
     loss = photometric_loss(prediction, truth, 1.0)
     expected, gradient = reference(prediction, truth, 1.0)
-    flat = 2 * MOMENT_ROUNDINGS * ULP / SSIM_C2
-    assert (loss - expected).abs() <= flat
+    assert (loss - expected).abs() <= FLAT
     ours = (torch.autograd.grad(loss, prediction)[0] - gradient).abs().max()
     library = prediction.detach().requires_grad_()
     images = (image.permute(2, 0, 1)[None] for image in (library, truth))
@@ -83,10 +83,9 @@ def test_small_images_are_the_librarys(size):
     with pytest.warns(UserWarning, match="Skipping Gaussian Smoothing"):
         loss = photometric_loss(prediction, truth, 0.2)
         expected, gradient = reference(prediction, truth, 0.2)
-    # An axis that is not blurred leaves windows of hardly any variance.
-    flat = 2 * MOMENT_ROUNDINGS * ULP / SSIM_C2
-    assert (loss - expected).abs() <= flat
-    assert (torch.autograd.grad(loss, prediction)[0] - gradient).abs().max() <= flat * gradient.abs().max()
+    # An axis that is not blurred leaves windows of next to no variance.
+    assert (loss - expected).abs() <= FLAT
+    assert (torch.autograd.grad(loss, prediction)[0] - gradient).abs().max() <= FLAT * gradient.abs().max()
 
 
 def test_not_a_number_is_seen():
