@@ -20,14 +20,12 @@ from typing import Any
 import torch
 from torch import nn
 
+from nrfgs_lab.bench.measure import measure
 from nrfgs_lab.bench.spec import Job
 from nrfgs_lab.lock import only_one
 from nrfgs_lab.training_run import TrainRecord, evaluate, machine, train
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
-
-PROGRESS_SECONDS = 1.0
-"""Time between two notes of a training's step."""
 
 
 def run(job: Job) -> None:
@@ -41,8 +39,6 @@ def run(job: Job) -> None:
         forget_other_arguments(work, job.identity)
         start = perf_counter()
         with host_without_downloads(job.args[0]):
-            from nrfgs_lab.bench.measure import measure
-
             record = train_or_continue(job, work)
             config = Path(record.config_path)
             results = {} if job.quick else {"eval": evaluate(config, work / "eval.json", work / "pictures")}
@@ -106,25 +102,15 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
     def saved(record: TrainRecord) -> None:
         write_whole(work / "train.json", json.dumps(asdict(record)))
 
-    noted = perf_counter()
-
-    def stepped(step: int) -> None:
-        nonlocal noted
-        if perf_counter() - noted >= PROGRESS_SECONDS:
-            with contextlib.suppress(OSError):  # a full disk must not end a training here
-                write_whole(work / "progress.json", json.dumps({"step": step}))
-            noted = perf_counter()
-
-    args, earlier = job.args, None
+    args = job.args
     checkpoint = last_checkpoint(work) if args[0].startswith("nrfgs") and job.steps else None
-    if checkpoint is not None:
-        earlier = record_until(work / "train.json", checkpoint)
+    earlier = checkpoint and record_until(work / "train.json", checkpoint)
     if earlier is not None:
         if earlier.steps >= job.steps:
             return earlier
         print(f"Going on from {checkpoint}")
         args = [args[0], "--load-dir", str(checkpoint.parent), *args[1:]]
-    return train(args, stepped, saved, earlier)
+    return train(args, on_save=saved, earlier=earlier)
 
 
 def last_checkpoint(work: Path) -> Path | None:

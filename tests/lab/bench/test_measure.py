@@ -3,14 +3,14 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
 from nrfgs_lab.bench import run as bench_run
-from nrfgs_lab.bench.measure import at_size, flip, over_views
+from nrfgs_lab.bench.measure import at_size, over_views
 from nrfgs_lab.bench.spec import Job, cells_of, command, identity, make_spec
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -33,14 +33,14 @@ def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monke
 
     train, evaluate = bench_run.train, bench_run.evaluate
 
-    def killed_at_5(args, on_step, on_save, earlier):
+    def killed_at_5(args, on_save, earlier):
         def step(number: int) -> None:
             if number == 5:
                 raise Killed
 
         return train(args, step, on_save, earlier)
 
-    def killed(*_):
+    def killed(*_, **__):
         raise Killed
 
     monkeypatch.setattr(bench_run, "train", killed_at_5)
@@ -83,40 +83,19 @@ def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monke
     assert len(list((tmp_path / "work" / "pictures").glob("eval_img_*.png"))) == 2
 
 
-class Grey:
-    """A model that renders grey."""
-
-    device = torch.device("cpu")
-
-    def get_outputs_for_camera(self, camera):
-        return {"rgb": torch.full((16, 16, 3), 0.5), "background": torch.zeros(3)}
-
-    def get_gt_img(self, image):
-        return image
-
-    def composite_with_background(self, image, background):
-        return image
-
-
-def test_flip_is_asked_for_inside_the_mask_and_left_out_of_the_mean_where_it_is_none():
-    asked = []
-
-    def flip(pred, truth, mask):
-        asked.append((pred.shape, float(truth.mean()), mask if mask is None else int(mask.sum())))
-        return None if mask is not None and not mask.any() else 0.25 * len(asked)
-
-    def view(name, value, mask=None):
-        batch = {"image": torch.full((16, 16, 3), value)} | ({} if mask is None else {"mask": mask})
-        return name, (None, batch)
-
-    part = torch.zeros(16, 16, 1)
-    part[:4] = 1.0
-    views = [view("a", 0.5), view("b", 0.0, part), view("c", 1.0, torch.zeros(16, 16, 1))]
-    measured = over_views(Grey(), views, flip)
-    assert asked == [((16, 16, 3), 0.5, None), ((16, 16, 3), 0.0, 64), ((16, 16, 3), 1.0, 0)]
-    assert [one["flip"] for one in measured["per_image"]] == [0.25, 0.5, None] and measured["flip"] == 0.375
-    without = over_views(Grey(), views)
-    assert without["flip"] is None and "flip" not in without["per_image"][0]
+def test_metrics_count_inside_the_mask():
+    grey, mask = torch.full((16, 16, 3), 0.5), torch.zeros(16, 16, 1)
+    mask[:4] = 1.0
+    model = SimpleNamespace(
+        device=torch.device("cpu"),
+        get_outputs_for_camera=lambda camera: {"rgb": grey, "background": torch.zeros(3)},
+        get_gt_img=lambda image: image,
+        composite_with_background=lambda image, background: image,
+    )
+    photograph = torch.where(mask > 0, 0.75, 0.0).expand(16, 16, 3)
+    views = [("a", (None, {"image": photograph, "mask": mask})), ("b", (None, {"image": photograph}))]
+    measured = over_views(model, views)
+    assert [image["l1"] for image in measured["per_image"]] == pytest.approx([0.25, (0.25 + 3 * 0.5) / 4])
 
 
 def test_at_size_keeps_the_pose_and_the_vertical_angle():
@@ -129,16 +108,3 @@ def test_at_size_keeps_the_pose_and_the_vertical_angle():
         rays = [one.generate_rays(0, coords=torch.tensor(at).float()) for one, at in ((camera, before), (wide, after))]
         torch.testing.assert_close(rays[0].directions, rays[1].directions)
         torch.testing.assert_close(rays[0].origins, rays[1].origins)
-
-
-def test_equal_is_zero_different_is_more_and_outside_a_mask_nothing_counts():
-    pytest.importorskip("flip_evaluator")
-    truth = np.random.default_rng(0).random((40, 50, 3))
-    worse = np.clip(truth + 0.2, 0, 1)
-    assert flip(truth, truth) == 0.0
-    assert 0 < flip(np.clip(truth + 0.05, 0, 1), truth) < flip(worse, truth) <= 1
-    left = np.zeros((40, 50), dtype=bool)
-    left[:, :25] = True
-    half = np.where(left[..., None], truth, worse)
-    assert flip(half, truth, left) == 0.0 < flip(half, truth, ~left)
-    assert flip(half, truth, np.zeros_like(left)) is None
