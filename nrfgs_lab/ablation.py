@@ -8,13 +8,13 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from time import perf_counter, process_time
 from typing import Any
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 from torch import Tensor
+from torch.utils.benchmark import Timer
 
 from nrfgs_lab.training_run import machine
 from nrfgs_ns.appearance.field import DIFFUSE, Field
@@ -55,10 +55,6 @@ class Inspect(NamesTraining):
     """dB that the parts may cost together that are left out at once"""
 
     def main(self) -> None:
-        if self.views < 1:
-            raise InputError(f"--views is {self.views}; it must be at least 1.")
-        if not self.budget >= 0:
-            raise InputError(f"--budget is {self.budget}; it must be zero or positive.")
         config = self.config()
         output = self.output or config.parent / "inspect.json"
         check_writable(output, "--output")
@@ -67,9 +63,9 @@ class Inspect(NamesTraining):
         if not isinstance(model.head, NeuralResidualField):
             raise InputError(f"{config}: the {model.head.name!r} head has no parts. Name a training of nrfgs.")
         images = pipeline.datamanager.fixed_indices_eval_dataloader
+        if not len(images) or self.views < 1:
+            raise InputError(f"{config}: {self.views} of {len(images)} test views. At least one is needed.")
         images = [images[i] for i in evenly_spaced(len(images), self.views)]
-        if not images:
-            raise InputError(f"{config}: its data set has no test views to measure on.")
         with progress(f"Looking at the splats from {len(cameras)} training views"):
             seen, distance = look_over(model, cameras), mean_log_distance(model, cameras)
         field, views = model.field.detached(), FieldViews(model, images)
@@ -81,8 +77,6 @@ class Inspect(NamesTraining):
                 rows.append(row(name, group, change(field), views, rows[0].psnr, **extra))
                 advance(name)
         all_together, left_out = together(field, rows, candidates, seen, views, self.budget)
-        for entry in rows:
-            entry.threshold = None if entry.threshold == float("inf") else entry.threshold  # JSON has no infinity
         result = {
             "machine": machine(),
             "splats": model.num_points,
@@ -118,7 +112,7 @@ class Row:
     rank: int | None = None
     """numbers in a latent, in group rank"""
     threshold: float | None = None
-    """residuals below it were dropped, 8-bit steps"""
+    """residuals below it were dropped, 8-bit steps; None in group residual: all"""
 
 
 Candidate = tuple[str, str, dict[str, Any], Callable[[Field], Field]]
@@ -135,12 +129,14 @@ def changes(field: Field, seen: Residuals, basis: LatentBasis, distance: float) 
         yield "opacity residual", "part", {}, without_opacity_residual
     if config.use_distance:
         yield "distance", "part", {}, lambda field: with_constant_distance(field, distance)
-    for rank in range(1, config.latent_dim + 1):
+    ranks = range(1, config.latent_dim + 1)
+    for rank in (rank for rank in ranks if rank <= 8 or rank % 8 == 0):
         yield f"latent rank {rank}", "rank", {"rank": rank}, lambda field, rank=rank: with_rank(field, basis, rank)
     for threshold in THRESHOLDS:
-        name = "all residuals" if threshold == float("inf") else f"residuals below {threshold:g} steps"
+        every = threshold == float("inf")
+        name = "all residuals" if every else f"residuals below {threshold:g} steps"
         change = lambda field, threshold=threshold: dropped(field, seen, threshold)  # noqa: E731
-        yield name, "residual", {"threshold": threshold}, change
+        yield name, "residual", {"threshold": None if every else threshold}, change  # JSON has no infinity
 
 
 def row(part: str, group: str, field: Field, views: FieldViews, full: float | None, **extra: Any) -> Row:
@@ -188,27 +184,14 @@ def head_seconds(views: FieldViews, field: Field) -> float:
     seconds = []
     for view, _, _ in views.views:
         rows = diffuse_last(field.splats, view.visible)
-        seconds.append(fastest(lambda rows=rows, center=view.center: field.head(field.splats, rows, center)))
+        timer = Timer("head(splats, rows, center)", globals={**field._asdict(), "rows": rows, "center": view.center})
+        seconds.append(min(timer.timeit(1).mean for _ in range(TIMED)))
     return sum(seconds) / len(seconds)
 
 
 def diffuse_last(splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:
     """Visible rows, those of diffuse splats last."""
     return visible[splats[DIFFUSE][visible].to(torch.uint8).argsort(stable=True)] if DIFFUSE in splats else visible
-
-
-def fastest(work: Callable[[], object]) -> float:
-    """Seconds of the fastest run: wall-clock on a GPU, processor time on a CPU."""
-    gpu = torch.cuda.is_available()
-    clock, wait = (perf_counter, torch.cuda.synchronize) if gpu else (process_time, lambda: None)
-    times = []
-    for _ in range(TIMED):
-        wait()
-        start = clock()
-        work()
-        wait()
-        times.append(clock() - start)
-    return min(times)
 
 
 @torch.no_grad()
@@ -225,18 +208,15 @@ def mean_log_distance(model, cameras) -> float:
 
 
 def table(rows: list[Row]) -> Table:
-    """Table of the rows; of ranks beyond eight every eighth."""
-    full, printed = rows[0], Table()
+    """Table of the rows, a section for each group."""
+    printed = Table()
     for column in ("left out", "PSNR (dB)", "loss (dB)", "MB", "head (ms)", "diffuse"):
         printed.add_column(column, justify="left" if column == "left out" else "right")
-    for previous, entry in zip([full, *rows], rows, strict=False):
-        if entry.group == "rank" and entry.rank > 8 and entry.rank % 8:
-            continue
-        if entry.group != previous.group:
-            printed.add_section()
+    for entry, following in zip(rows, [*rows[1:], None], strict=True):
         diffuse = f"{100 * entry.diffuse:.0f} %" if entry.diffuse else ""
         numbers = f"{entry.psnr:.2f}", f"{entry.loss_db:.3f}", f"{entry.bytes / 1e6:.2f}"
-        printed.add_row(entry.part, *numbers, f"{1e3 * entry.head_seconds:.1f}", diffuse)
+        last = following is not None and following.group != entry.group
+        printed.add_row(entry.part, *numbers, f"{1e3 * entry.head_seconds:.1f}", diffuse, end_section=last)
     return printed
 
 

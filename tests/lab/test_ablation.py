@@ -48,13 +48,8 @@ def test_the_command(tiny_scene, tmp_path, capsys):
     assert rows["latent rank 1"]["bytes"] < rows["latent rank 2"]["bytes"] < rows["nothing"]["bytes"]
     assert result["together"]["loss_db"] <= 0.05 + 1e-6 and result["together"]["bytes"] <= rows["nothing"]["bytes"]
     assert "can be left out together" in capsys.readouterr().out
-    for words, says in (
-        (["--views", "0"], "at least 1"),
-        (["--budget", "-1"], "zero or positive"),
-        (["--budget", "nan"], "zero or positive"),
-    ):
-        with pytest.raises(InputError, match=says):
-            tyro.cli(Inspect, args=["--load-config", str(config), *words]).main()
+    with pytest.raises(InputError, match="0 of 2 test views"):
+        tyro.cli(Inspect, args=["--load-config", str(config), "--views", "0"]).main()
 
 
 def test_the_head_is_timed_with_diffuse_splats_last():
