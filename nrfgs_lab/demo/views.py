@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, render, split_names
+from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, render
+from nrfgs_lab.scenes.dataset import split_names
 
 SHINES = 0.1
 """Change of white by gloss, in its strongest channel, from which a pixel of the truth counts as one that shines."""

@@ -7,6 +7,7 @@
 <out>/scene.json            version and config
 """
 
+import contextlib
 import json
 import tempfile
 from collections.abc import Callable
@@ -49,8 +50,13 @@ def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None
     out = Path(out)
     record = {"version": SCENE_VERSION, "config": asdict(config)}
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        _require_same_scene(out, record)
-        return out
+        with contextlib.suppress(OSError, ValueError):
+            if json.loads((out / "scene.json").read_text(encoding="utf-8")) == record:
+                return out
+        raise FileExistsError(
+            f"{out} exists and is not this procedural scene. Choose another folder, or delete this one to have it "
+            "written again."
+        )
 
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as workshop:
@@ -138,16 +144,3 @@ def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
         ],
     }
     (folder / "transforms.json").write_text(json.dumps(transforms, indent=1) + "\n", encoding="utf-8")
-
-
-def _require_same_scene(out: Path, record: dict) -> None:
-    """Pass when `out` is a data set of the scene that `record` describes; raise FileExistsError otherwise."""
-    fix = "Choose another folder, or delete this one to have it written again."
-    try:
-        there = json.loads((out / "scene.json").read_text(encoding="utf-8"))
-        differing = [key for key, value in record["config"].items() if there["config"].get(key) != value]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise FileExistsError(f"{out} exists and is not a procedural scene (no readable scene.json). {fix}") from error
-    if there != record:
-        what = f"another {', '.join(differing)}" if differing else "another version of the scene"
-        raise FileExistsError(f"{out} holds a procedural scene with {what}. {fix}")
