@@ -218,6 +218,9 @@ def build_scene(config: SceneConfig) -> Scene:
     rng = np.random.default_rng(config.seed)
     noises = [Waves.random(rng, (2.5, 5.0, 9.0)), Waves.random(rng, (3.0, 7.0, 15.0))]  # sky, ground
     noises += [Waves.random(rng, (2.0, 4.0, 8.0)) for _ in objects]  # per object, in its local units
+    # The sky glows behind each lamp, in its colour, with a peak radiance of 6 in its strongest channel.
+    directions = [np.divide(lamp.position, np.linalg.norm(lamp.position)) for lamp in lamps]
+    glows = [np.multiply(6.0, lamp.intensity) / max(lamp.intensity) for lamp in lamps]
     return Scene(
         config=config,
         world=World(sky_radius=10.0, solids=tuple(item.solid for item in objects)),
@@ -229,18 +232,7 @@ def build_scene(config: SceneConfig) -> Scene:
         sky=Sky(
             horizon=(0.56, 0.37, 0.27),
             zenith=(0.10, 0.10, 0.27),
-            patches=tuple((_unit(lamp.position), _patch_radiance(lamp)) for lamp in lamps),
+            patches=tuple(zip(directions, glows, strict=True)),
         ),
         noises=tuple(noises),
     )
-
-
-def _unit(position: tuple[float, float, float]) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in np.asarray(position) / np.linalg.norm(position))
-    return x, y, z
-
-
-def _patch_radiance(lamp: Lamp) -> tuple[float, float, float]:
-    """The soft patch behind a lamp, in the lamp's colour, with a peak radiance of 6 in its strongest channel."""
-    r, g, b = (6.0 * value / max(lamp.intensity) for value in lamp.intensity)
-    return r, g, b
