@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import IO, Annotated
 
 import tyro
+from filelock import FileLock
 
 from nrfgs_lab.bench.data import parser_options
 from nrfgs_lab.bench.report import FAILURE, report
@@ -41,7 +42,6 @@ from nrfgs_lab.bench.spec import (
     scene_path,
     steps_of,
 )
-from nrfgs_lab.lock import only_one
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, write_whole
 
@@ -119,7 +119,7 @@ class Bench:
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
             self.run_all(pending, plan)
         # Another command may end at this moment: whoever reports last must have read the records of both.
-        with only_one(self.out / ".lock", "Another command reports here; waiting for it to end."):
+        with FileLock(self.out / ".lock"):
             cells = self.shown(plan, chosen)
             report(plan, cells, self.out, self.work, self.stale(plan, cells, parsers))
         failed = [cell.name for cell in chosen if self.has_failed(cell.name)]

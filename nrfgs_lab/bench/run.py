@@ -18,11 +18,11 @@ from time import perf_counter
 from typing import Any
 
 import torch
+from filelock import FileLock
 from torch import nn
 
 from nrfgs_lab.bench.measure import measure
 from nrfgs_lab.bench.spec import Job
-from nrfgs_lab.lock import only_one
 from nrfgs_lab.training_run import TrainRecord, evaluate, machine, train
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
@@ -33,7 +33,7 @@ def run(job: Job) -> None:
     work, record_path = Path(job.work), Path(job.record)
     work.mkdir(parents=True, exist_ok=True)
     # A killed benchmark may leave children behind, which train into this folder.
-    with only_one(work / "lock", "Another process works on this run; waiting for it to end."):
+    with FileLock(work / "lock"):
         if record_path.exists():
             return
         forget_other_arguments(work, job.identity)
