@@ -7,8 +7,8 @@ Nothing is retrained: the loss is at least that of a model trained without the p
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -73,8 +73,8 @@ class Inspect(NamesTraining):
         candidates = list(changes(field, seen, basis, distance))
         rows = [row("nothing", "full", field, views, None)]
         with progress("Leaving out", len(candidates)) as advance:
-            for name, group, extra, change in candidates:
-                rows.append(row(name, group, change(field), views, rows[0].psnr, **extra))
+            for name, group, change in candidates:
+                rows.append(row(name, group, change(field), views, rows[0].psnr))
                 advance(name)
         all_together, left_out = together(field, rows, candidates, seen, views, self.budget)
         result = {
@@ -109,42 +109,40 @@ class Row:
     """mean over the views"""
     diffuse: float = 0.0
     """share of the splats without residual"""
-    rank: int | None = None
-    """numbers in a latent, in group rank"""
-    threshold: float | None = None
-    """residuals below it were dropped, 8-bit steps; None in group residual: all"""
 
 
-Candidate = tuple[str, str, dict[str, Any], Callable[[Field], Field]]
-"""Name, group, the row's extra columns, and the change."""
+Candidate = tuple[str, str, Callable[[Field], Field]]
+"""Name, group, and the change."""
 
 
 def changes(field: Field, seen: Residuals, basis: LatentBasis, distance: float) -> Iterator[Candidate]:
     """Parts that can be left out of a field."""
     config = field.head.config
     if field.head.high is not None:
-        yield "high branch", "part", {}, without_high_branch
-    yield "low branch", "part", {}, without_low_branch
+        yield "high branch", "part", without_high_branch
+    yield "low branch", "part", without_low_branch
     if config.opacity_residual:
-        yield "opacity residual", "part", {}, without_opacity_residual
+        yield "opacity residual", "part", without_opacity_residual
     if config.use_distance:
-        yield "distance", "part", {}, lambda field: with_constant_distance(field, distance)
+        yield "distance", "part", partial(with_constant_distance, log_distance=distance)
     ranks = range(1, config.latent_dim + 1)
     for rank in (rank for rank in ranks if rank <= 8 or rank % 8 == 0):
-        yield f"latent rank {rank}", "rank", {"rank": rank}, lambda field, rank=rank: with_rank(field, basis, rank)
+        yield f"latent rank {rank}", "rank", partial(with_rank, basis=basis, rank=rank)
     for threshold in THRESHOLDS:
-        every = threshold == float("inf")
-        name = "all residuals" if every else f"residuals below {threshold:g} steps"
-        change = lambda field, threshold=threshold: dropped(field, seen, threshold)  # noqa: E731
-        yield name, "residual", {"threshold": None if every else threshold}, change  # JSON has no infinity
+        yield residuals_below(threshold), "residual", partial(dropped, seen=seen, threshold=threshold)
 
 
-def row(part: str, group: str, field: Field, views: FieldViews, full: float | None, **extra: Any) -> Row:
+def residuals_below(threshold: float) -> str:
+    """Name of residuals below a threshold in 8-bit steps."""
+    return "all residuals" if threshold == float("inf") else f"residuals below {threshold:g} steps"
+
+
+def row(part: str, group: str, field: Field, views: FieldViews, full: float | None) -> Row:
     """Measure one field; `full` is the full field's PSNR, None for the full field."""
     score = views.psnr(field)
     loss = 0.0 if full is None else full - score
     share = diffuse_splats(field) / max(len(field.splats["means"]), 1)
-    return Row(part, group, score, loss, field.bytes, head_seconds(views, field), share, **extra)
+    return Row(part, group, score, loss, field.bytes, head_seconds(views, field), share)
 
 
 def diffuse_splats(field: Field) -> int:
@@ -160,8 +158,8 @@ def together(
     Parts may take half of the budget; residuals and the latents' rank the rest (`slim`). The low branch stays: it has
     the opacity, and without its colours nothing is saved.
     """
-    full, whole = rows[0].psnr, field
-    change_of = {name: change for name, _, _, change in candidates}
+    full = rows[0].psnr
+    change_of = {name: change for name, _, change in candidates}
     left_out: list[str] = []
     for part in sorted((r for r in rows if r.group == "part"), key=lambda r: r.loss_db):
         if part.part != "low branch" and part.loss_db <= budget:
@@ -170,12 +168,11 @@ def together(
                 field = smaller
                 left_out.append(part.part)
     slimmed = slim(field, seen, views, full - budget, lambda _: None)
-    every = slimmed.threshold == float("inf")
     if diffuse_splats(slimmed.field) > diffuse_splats(field):
-        left_out.append("all residuals" if every else f"residuals below {slimmed.threshold:g} steps")
-    if slimmed.rank < whole.head.config.latent_dim and not every:
+        left_out.append(residuals_below(slimmed.threshold))
+    if slimmed.rank < field.head.config.latent_dim and slimmed.threshold < float("inf"):
         left_out.append(f"latents beyond rank {slimmed.rank}")
-    return row("together", "together", slimmed.field, views, full, rank=slimmed.rank), left_out
+    return row("together", "together", slimmed.field, views, full), left_out
 
 
 @torch.no_grad()

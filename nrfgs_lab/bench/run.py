@@ -11,15 +11,15 @@ import contextlib
 import json
 import shutil
 import sys
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+from unittest import mock
 
 import torch
 from filelock import FileLock
-from torch import nn
 
 from nrfgs_lab.bench.measure import measure
 from nrfgs_lab.bench.spec import Job
@@ -62,9 +62,8 @@ def run(job: Job) -> None:
             shutil.rmtree(work, ignore_errors=True)
 
 
-@contextlib.contextmanager
-def host_without_downloads(method: str) -> Iterator[None]:
-    """Let nerfstudio's own methods run offline, for comparisons.
+def host_without_downloads(method: str) -> AbstractContextManager:
+    """Let nerfstudio's own methods run offline within a block, for comparisons.
 
     They build LPIPS with the model and download its weights: it is replaced by one that returns NaN, unless the weights
     are on disk. torch must be allowed to read their checkpoints.
@@ -74,22 +73,9 @@ def host_without_downloads(method: str) -> Iterator[None]:
     allow_nerfstudio_checkpoints()
     weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.DEFAULT.url).name
     if method.startswith("nrfgs") or weights.is_file():
-        yield
-        return
-    import torchmetrics.image.lpip as lpip
-
-    class NoLpips(nn.Module):
-        def __init__(self, **_: Any):
-            super().__init__()
-
-        def forward(self, *_: Any) -> torch.Tensor:
-            return torch.tensor(float("nan"))
-
-    original, lpip.LearnedPerceptualImagePatchSimilarity = lpip.LearnedPerceptualImagePatchSimilarity, NoLpips
-    try:
-        yield
-    finally:
-        lpip.LearnedPerceptualImagePatchSimilarity = original
+        return contextlib.nullcontext()
+    lpips = "torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity"
+    return mock.patch(lpips, lambda **_: lambda *_: torch.tensor(float("nan")))
 
 
 def train_or_continue(job: Job, work: Path) -> TrainRecord:

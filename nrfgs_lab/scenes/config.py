@@ -4,13 +4,14 @@
 import math
 from dataclasses import dataclass
 
+from nrfgs_ns.errors import InputError
+
 
 @dataclass(frozen=True)
 class SceneConfig:
     """One procedural scene and the data set made from it. Equal configs give byte-identical data sets.
 
-    Raises:
-        ValueError: gloss or seed, which a command takes, is outside its range.
+    InputError if gloss or seed, which `nrfgs demo` takes, is outside its range.
     """
 
     gloss: float = 1.0
@@ -38,9 +39,9 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.gloss <= 1.0:
-            raise ValueError(f"gloss must lie in [0, 1], got {self.gloss}")
+            raise InputError(f"--gloss is {self.gloss}; it must lie in [0, 1].")
         if self.seed < 0:
-            raise ValueError(f"seed must be at least 0, got {self.seed}")
+            raise InputError(f"--seed is {self.seed}; it must be at least 0.")
 
     @property
     def focal_length(self) -> float:

@@ -70,7 +70,7 @@ def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None
 
 
 def sparse_points(scene: Scene, cameras: Array) -> tuple[Array, Array]:
-    """Points on visible surfaces, as structure from motion would find them, and their colours.
+    """Points [P, 3] on visible surfaces, as structure from motion would find them, and their colours [P, 3] in [0, 1).
 
     Positions are the ends of rays through uniformly random image positions of random views, so that every visible
     surface, floor and sky included, is covered in proportion to the pixels that it fills. Colours are display values,
@@ -78,9 +78,6 @@ def sparse_points(scene: Scene, cameras: Array) -> tuple[Array, Array]:
 
     Args:
         cameras: [V, 4, 4] camera-to-world matrices of the training views.
-
-    Returns:
-        points [P, 3] and colours [P, 3] in [0, 1), both float32.
     """
     config = scene.config
     rng = np.random.default_rng([config.seed, 2])

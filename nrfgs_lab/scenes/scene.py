@@ -47,14 +47,11 @@ class Scene:
     shadow_softness: float = 0.35
 
     def first_hit(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """What rays see first.
+        """Points [N, 3] that rays see first, and their surfaces [N]: SKY, GROUND, FIRST_SOLID + k for object k.
 
         Args:
             origins, directions: [N, 3], float32 or float64, world units; origins inside the dome, above the ground and
                 outside the objects. Directions of any length > 0.
-
-        Returns:
-            points [N, 3] and surface numbers [N] (SKY, GROUND, FIRST_SOLID + k for object k).
         """
         o, d = origins.T, normalize(directions.T)
         distance, surface = self.world.first_hit(o, d, np.full(o.shape[1], CAMERA))
