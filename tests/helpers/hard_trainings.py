@@ -8,7 +8,6 @@ already is not repeated.
 """
 
 import json
-import math
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,9 +22,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from plyfile import PlyData
 from rich.progress import track
+from short_trainings import command_line, trained
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
-from nrfgs_lab.training_run import evaluate, machine, train
+from nrfgs_lab.training_run import evaluate, machine
 from nrfgs_ns.method_config import nrfgs
 
 SCENE = SceneConfig(views=16, width=48, height=36, points=600, samples=2)
@@ -122,28 +122,20 @@ def run(training: HardTraining, seed: int, steps: int, work: Path) -> dict[str, 
     shutil.rmtree(work, ignore_errors=True)
     data = write_scene(SCENE, work / "scene")
     training.edit(data)
-    chosen = {
-        "--data": data,
-        "--output-dir": work / "outputs",
-        "--max-num-iterations": steps,
+    small = {
         "--machine.seed": seed,
-        "--vis": "tensorboard",
-        "--steps-per-eval-image": 10**6,
         "--steps-per-eval-all-images": 10**6,
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
+        "--steps-per-eval-image": 10**6,
         "--pipeline.model.num-downscales": 0,
         "--pipeline.model.densification": "splatfacto,warmup_length=100",
-        **training.options,
     }
-    args = [training.method, *(str(word) for option in chosen.items() for word in option)]
-    args += ["nrfgs-data", "--auto-scale-poses", str(training.auto_scale)]
-    record = train(args)
-    results = evaluate(Path(record.config_path), work / "eval.json")
-    _, pipeline, _, _ = eval_setup(Path(record.config_path))
+    args = command_line(training.method, data, work / "outputs", steps, small, training.options)
+    config = trained([*args, "nrfgs-data", "--auto-scale-poses", str(training.auto_scale)])
+    results = evaluate(config, work / "eval.json")
+    _, pipeline, _, _ = eval_setup(config)
     tensors = all(bool(torch.isfinite(value).all()) for value in pipeline.model.parameters())
     numbers = [results[name] for name in ("psnr", "ssim", "l1")]
-    finite = tensors and all(number is not None and not math.isnan(number) for number in numbers)
+    finite = tensors and all(number is not None for number in numbers)  # evaluate() returns None for NaN
     return {"psnr": results["psnr"], "l1": results["l1"], "splats": results["splats"], "finite": finite}
 
 

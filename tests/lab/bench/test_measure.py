@@ -2,7 +2,6 @@
 """One real run of a benchmark, in this process: interrupted while training and before its evaluation, then measured."""
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -22,65 +21,46 @@ class Killed(BaseException):
 
 def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monkeypatch):
     content = {"runs": {"NRF": "nrfgs"}, "scenes": ["tiny"], "strategies": ["mcmc@310,warmup_length=1"], "steps": 8}
-    options = "--pipeline.model.few-views off"
-    content |= {"checkpoint_every": 2, "train_views": 3, "options": options}
+    content |= {"checkpoint_every": 2, "train_views": 3, "options": "--pipeline.model.few-views off"}
     spec = make_spec(content, "test")
     (cell,) = cells_of(spec)
-    parser = ["nrfgs-data", "--data", str(tiny_scene)]
-    args = command(spec, cell, parser, tmp_path / "work")
-    work = str(tmp_path / "work")
-    job = Job(args, {"run": "NRF"}, identity(spec, cell, parser), 8, str(tmp_path / "record.json"), work, 3, 1)
-
-    train, evaluate = bench_run.train, bench_run.evaluate
-
-    def killed_at_5(args, on_save, earlier):
-        def step(number: int) -> None:
-            if number == 5:
-                raise Killed
-
-        return train(args, step, on_save, earlier)
+    parser, work = ["nrfgs-data", "--data", str(tiny_scene)], tmp_path / "work"
+    args, record = command(spec, cell, parser, work), tmp_path / "record.json"
+    job = Job(args, {"run": "NRF"}, identity(spec, cell, parser), 8, str(record), str(work), 3, 1)
+    train = bench_run.train
 
     def killed(*_, **__):
         raise Killed
 
-    monkeypatch.setattr(bench_run, "train", killed_at_5)
-    with pytest.raises(Killed):
-        bench_run.run(job)
-    assert bench_run.last_checkpoint(tmp_path / "work").name == "step-000000004.ckpt"
-    monkeypatch.setattr(bench_run, "train", train)
-    monkeypatch.setattr(bench_run, "evaluate", killed)
-    with pytest.raises(Killed):
-        bench_run.run(job)
-    assert not Path(job.record).exists()
+    def killed_at_5(args, on_save, earlier):
+        return train(args, lambda step: killed() if step == 5 else None, on_save, earlier)
+
+    for name, deadly in (("train", killed_at_5), ("evaluate", killed)):
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(bench_run, name, deadly)
+            bench_run.run(job)
+        assert not record.exists()
+        assert bench_run.last_checkpoint(work).stem == {"train": "step-000000004", "evaluate": "step-000000007"}[name]
     monkeypatch.setattr(bench_run, "train", killed)  # what is trained is not trained again
-    monkeypatch.setattr(bench_run, "evaluate", evaluate)
     bench_run.run(job)
 
-    record = json.loads(Path(job.record).read_text())
+    record = json.loads(record.read_text())
     measured, trained = record["measured"], record["train"]
-    assert (
-        record["identity"] == job.identity
-        and record["cell"] == {"run": "NRF"}
-        and str(tmp_path) not in json.dumps(record)
-    )
+    assert record["identity"] == job.identity and record["cell"] == {"run": "NRF"}
+    assert str(tmp_path) not in json.dumps(record)
     assert trained["parts"] == 2 and trained["steps"] == 8 and trained["seconds"] > 0
     assert [step for step, _ in trained["splats"]] == [0, 7]
     assert [step for step, _ in trained["saved"]] == [2, 4, 6, 7]
-    # One and the same code took both; the renderings are the same to rounding.
+    # The same code took both; the renderings are the same to rounding.
     for metric in ("psnr", "ssim", "l1"):
         assert measured["test"][metric] == pytest.approx(record["eval"][metric], rel=1e-5)
-    assert measured["test"]["lpips"] is None
-    assert [image["image"] for image in measured["train"]["per_image"]] == [
-        "view_001.png",
-        "view_003.png",
-        "view_006.png",
-    ]
-    mean = sum(image["psnr"] for image in measured["train"]["per_image"]) / 3
-    assert measured["train"]["psnr"] == pytest.approx(mean)
+    images = measured["train"]["per_image"]
+    assert [image["image"] for image in images] == [f"view_00{view}.png" for view in (1, 3, 6)]
+    assert measured["train"]["psnr"] == pytest.approx(sum(image["psnr"] for image in images) / 3)
     assert measured["parameter_bytes"] == record["eval"]["parameter_bytes"] == 4 * (measured["splats"] * 46 + 6664)
-    assert measured["diffuse"] == 0
+    assert measured["test"]["lpips"] is None and measured["diffuse"] == 0
     assert measured["fps"] > 0 and measured["checkpoint_bytes"] > measured["parameter_bytes"]
-    assert len(list((tmp_path / "work" / "pictures").glob("eval_img_*.png"))) == 2
+    assert len(list((work / "pictures").glob("eval_img_*.png"))) == 2
 
 
 def test_metrics_count_inside_the_mask():

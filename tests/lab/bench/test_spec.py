@@ -186,23 +186,17 @@ def test_ablations_have_the_weights_that_the_guide_says(tiny_scene):
 
 def test_fingerprints_ignore_paths_and_see_the_rest():
     plan = spec(options="--a 1")
-    cell = cells_of(plan)[0]
-    one = identity(plan, cell, ["nrfgs-data", "--data", "/here/bonsai", "--x", "1"])
-    assert "/here" not in json.dumps(one)
-    assert one == identity(plan, cell, ["nrfgs-data", "--data", "/there", "--x", "1"])
-    assert one["options"] == identity(spec(options="--a 1", checkpoint_every=3), cell, None)["options"]
+    cell, parser = cells_of(plan)[0], ["nrfgs-data", "--data", "/here/bonsai", "--x", "1"]
+    one = identity(plan, cell, parser)
+    assert "/here" not in json.dumps(one) and one == identity(plan, cell, [*parser[:2], "/there", *parser[3:]])
+    assert one == identity(spec(options="--a 1", checkpoint_every=3), cell, parser)
     assert not differences(one, identity(plan, cell, None)), "without the data their options are not compared"
-    for other in (
-        identity(spec(options="--a 2"), cell, None),
-        identity(spec(options="--a 1", steps=3), cell, None),
-        identity(spec(options="--a 1", train_views=3), cell, None),
-        identity(plan, cell, ["nrfgs-data", "--data", "/here/bonsai", "--x", "2"]),
-    ):
-        assert differences(one, other)
-    assert differences(one, identity(spec(options="--a 2"), cell, None)) == "options: --a 1"
-    # A value that another option has, too, and one that the seed had before.
-    assert differences(one, identity(spec(options="--a 42"), cell, None)) == "options: --a 1"
-    assert differences(one, identity(spec(options="--a 1 --b 1"), cell, None)) == "options: fewer words"
+    for change in ({"steps": 3}, {"train_views": 3}):
+        assert differences(one, identity(spec(options="--a 1", **change), cell, None))
+    assert differences(one, identity(plan, cell, [*parser[:4], "2"])) == "parser: --x 1"
+    # The last two: a value that another option has, too, and one option more.
+    for options, words in (("--a 2", "--a 1"), ("--a 42", "--a 1"), ("--a 1 --b 1", "fewer words")):
+        assert differences(one, identity(spec(options=options), cell, None)) == f"options: {words}"
 
 
 # Data sets.

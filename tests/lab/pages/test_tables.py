@@ -10,7 +10,7 @@ from nrfgs_lab.pages import tables
 from nrfgs_lab.pages.few_views import runs_of
 from nrfgs_lab.pages.methods import gain, half
 from nrfgs_lab.pages.runs import VIEWS
-from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, files, pages, rendered, written
+from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, rendered, written
 
 PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
 LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -125,17 +125,6 @@ def test_a_declared_block_is_worked_out_from_records(monkeypatch):
     assert rendered(table).splitlines()[2] == "| A | 2 | 4 |"
     with pytest.raises(LookupError):
         rendered("{s|runs|name=c|psnr:.1f}")
-
-
-def test_between_two_files_the_trade_is_a_straight_line(monkeypatch):
-    found = {
-        "bonsai-model": {"train": {}},
-        "bonsai-version-2": {"bytes": 9_000_000, "loss_db": 0.0},
-        "bonsai-rate-0.0001": {"bytes": 5_000_000, "loss_db": 0.1},
-        "bonsai-rate-0.001": {"bytes": 2_000_000, "loss_db": 0.7},
-    }
-    monkeypatch.setattr(files, "records", lambda study: found)
-    assert files.at("bonsai", "loss", "4") == "0.30" and files.at("bonsai", "MB", "0.4") == "3.5"
 
 
 def test_every_record_is_named_in_the_index():
