@@ -95,18 +95,6 @@ def test_every_option_is_explained():
     assert not any("sh-degree" in flag or "num-downscales" in flag for flag in flags)  # suppressed; splatfacto's
 
 
-@pytest.mark.parametrize("words", [["nrfgs"], ["nrfgs", "nrfgs-data"]])
-def test_the_command_line_has_them(words):
-    screen = io.StringIO()
-    with contextlib.redirect_stdout(screen), pytest.raises(SystemExit):
-        parse([*words, "--help"])
-    known = set(re.findall(r"--([\w.-]+)", screen.getvalue()))
-    for option in own_options(methods()[0].config):
-        inner = option.flag.split(".dataparser.")
-        if len(inner) == len(words):  # the data set's options come after its word
-            assert inner[-1].lower() in {flag.lower() for flag in known}, option.flag
-
-
 ROOT = Path(__file__).resolve().parents[3]
 DOCS = ROOT / "docs"
 
