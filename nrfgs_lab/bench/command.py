@@ -47,7 +47,6 @@ from nrfgs_ns.files import check_writable, write_whole
 
 CHILD = (sys.executable, "-m", "nrfgs_lab.bench.run")
 """Command of a child; the file that describes its job is appended."""
-POLL_SECONDS = 0.2
 
 
 @dataclass
@@ -97,7 +96,10 @@ class Bench:
     def main(self) -> None:
         plan, chosen = self.chosen()
         check_writable(self.out / "table.md", "--out")
-        parsers = None if self.report_only else self.parsers(chosen)
+        parsers = None  # Scene -> the data parser and its options. A data set that cannot be read fails now.
+        if not self.report_only:
+            scenes = dict.fromkeys(cell.scene for cell in chosen)
+            parsers = {scene: parser_options(self.scenes, scene, self.work / "scenes") for scene in scenes}
         stale = self.stale(plan, chosen, parsers)
         if stale and not self.report_only:
             if not self.redo_stale:
@@ -168,11 +170,6 @@ class Bench:
         """Whether a run's last attempt failed."""
         return self.record(name).with_suffix(FAILURE).exists() and not self.record(name).exists()
 
-    def parsers(self, cells: list[Cell]) -> dict[Scene, list[str]]:
-        """Scene -> the data parser and its options. A data set that cannot be read fails now."""
-        scenes = dict.fromkeys(cell.scene for cell in cells)
-        return {scene: parser_options(self.scenes, scene, self.work / "scenes") for scene in scenes}
-
     def jobs_of(self, plan: Spec, cells: list[Cell], parsers: dict[Scene, list[str]]) -> dict[str, Job]:
         """Name -> job of every training."""
         return {
@@ -222,7 +219,7 @@ class Bench:
                     if slot not in running and waiting:
                         running[slot] = self.start(*waiting.pop(0), gpu, threads)
                         say(f"{running[slot].name}: started")
-                time.sleep(POLL_SECONDS)
+                time.sleep(0.2)
         finally:
             for child in running.values():
                 child.process.terminate()

@@ -308,12 +308,10 @@ def differences(made_with: dict[str, Any], wanted: dict[str, Any]) -> str:
     """Words of a record's identity that the wanted one lacks; "" if they are equal."""
     words = []
     for key, value in wanted.items():
-        had = made_with.get(key)
-        if had == value:
-            continue
-        both = isinstance(had, list) and isinstance(value, list)
-        odd = [pair for pair in settings(had) if pair not in settings(value)] if both else [str(had)]
-        words.append(f"{key}: {' '.join(odd) or 'fewer words'}")
+        if (had := made_with.get(key)) != value:
+            both = isinstance(had, list) and isinstance(value, list)
+            odd = [pair for pair in settings(had) if pair not in settings(value)] if both else [str(had)]
+            words.append(f"{key}: {' '.join(odd) or 'fewer words'}")
     return "; ".join(words)
 
 

@@ -22,6 +22,7 @@ from nrfgs_ns.files import check_writable
 
 NRF, SH = "nrfgs", "nrfgs-sh"
 METHODS = {NRF: "NRF", SH: "SH"}
+"""Method -> its label."""
 RATES = {
     NRF: {"--optimizers.latents.optimizer.lr": 0.01},
     SH: {
@@ -76,7 +77,7 @@ class Demo:
             from nrfgs_lab.training_run import evaluate, machine, train
 
             views, highlights = {}, {}
-            for method, label in self.methods.items():
+            for method, label in METHODS.items() if self.compare else [(NRF, METHODS[NRF])]:
                 args = self.train_args(method, data, steps)
                 progress.console.print(f"[dim]$ ns-train {shlex.join(args)}", highlight=False, soft_wrap=True)
                 with (self.out / f"{method}.log").open("w") as log, contextlib.redirect_stdout(log):
@@ -105,11 +106,6 @@ class Demo:
         if activate := _activation():
             screen.print(f"  {activate}", highlight=False, soft_wrap=True)
         screen.print(f"  nrfgs view {results[NRF]['train']['config_path']}", highlight=False, soft_wrap=True)
-
-    @property
-    def methods(self) -> dict[str, str]:
-        """What is trained, and its label."""
-        return METHODS if self.compare else {NRF: METHODS[NRF]}
 
     @property
     def scene_folder(self) -> str:

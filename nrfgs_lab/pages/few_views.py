@@ -28,8 +28,7 @@ BY_ERROR = {
     "faster growth": "error: fast all",
 }
 """Label -> trial in results/error-guided.json."""
-COPIES = {"added": "added", "on the logit": "logit", "the same, stored": "logit, base"}
-COPIES |= {"none": "no opacity residual"}
+COPIES = {"added": "added", "on the logit": "logit", "the same, stored": "logit, base", "none": "no opacity residual"}
 """Where the opacity residual is added -> the trial under MCMC."""
 
 

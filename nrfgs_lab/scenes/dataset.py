@@ -28,9 +28,6 @@ SCENE_VERSION = 2
 SEEN_TOLERANCE = 1e-3
 """A view sees a surface point when its ray ends within this distance of it, world units."""
 
-Progress = Callable[[int, int], None]
-"""Called after each picture with (pictures done, pictures in all)."""
-
 
 def split_names(config: SceneConfig) -> tuple[list[str], list[str]]:
     """Paths of the training and the test images, relative to the data set; every `test_every`-th is a test image."""
@@ -39,10 +36,11 @@ def split_names(config: SceneConfig) -> tuple[list[str], list[str]]:
     return [name for name in names if name not in set(test)], test
 
 
-def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None) -> Path:
+def write_scene(config: SceneConfig, out: Path, progress: Callable[[int, int], None] | None = None) -> Path:
     """Render a scene and write it as a nerfstudio data set; reuse `out` when it already holds exactly that.
 
     The data set is written beside `out` and moved there when it is complete: an interrupted run leaves no half of one.
+    `progress` is called after each picture with (pictures done, pictures in all).
 
     Raises:
         FileExistsError: when `out` holds anything else: another scene, other files.
@@ -105,7 +103,7 @@ def _sees(scene: Scene, camera: Array, points: Array) -> Array:
     return inside & (np.linalg.norm(hits - points, axis=1) < SEEN_TOLERANCE)
 
 
-def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
+def _write_files(scene: Scene, folder: Path, progress: Callable[[int, int], None] | None) -> None:
     from nrfgs_ns.data.points import write_ply  # imports nerfstudio: seconds, for work alone
 
     config = scene.config

@@ -29,8 +29,7 @@ class Object:
 class Scene:
     """Objects on a floor under lamps and a luminous sky dome; `shading.py` states the reflectance model.
 
-    The sky emits, and looks the same from everywhere at every gloss; so does a diffuse floor. Scene is immutable and
-    holds no image; queries are pure functions of their arguments, in the precision of the rays.
+    The sky and a diffuse floor look the same from everywhere at every gloss. Queries have the precision of the rays.
     """
 
     config: SceneConfig
