@@ -427,7 +427,8 @@ def _require_free(options: tuple[str, ...], given: dict[str, str], where: str) -
 
 
 def _known(value: dict[str, Any], kind: type, where: str) -> None:
-    known = [key.name for key in fields(kind) if key.name not in ("name", "held_out") or kind is Spec]
+    set_here = {Method: "name", Scene: "held_out"}.get(kind)
+    known = [key.name for key in fields(kind) if key.name != set_here]
     unknown = sorted(map(str, set(value) - set(known)))
     _require(not unknown, f"{where}: unknown key {', '.join(unknown)}. Known are {', '.join(known)}.")
 

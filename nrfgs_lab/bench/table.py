@@ -214,8 +214,7 @@ def markdown(rows: list[Row]) -> str:
 
 def grid(head: Sequence[str], rows: Iterable[Sequence[str]], left: int | None = None) -> str:
     """A table in Markdown, without the last line's end; columns after the first `left` are aligned to the right."""
-    left = len(head) if left is None else left
-    lines = [head, ["---"] * left + ["---:"] * (len(head) - left), *rows]
+    lines = [head, ["---" if left is None or i < left else "---:" for i in range(len(head))], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 

@@ -59,9 +59,8 @@ def rescale(folder: Path, factor: float) -> None:
     path = folder / "transforms.json"
     meta = json.loads(path.read_text())
     for frame in meta["frames"]:
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 3] *= factor
-        frame["transform_matrix"] = pose.tolist()
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= factor
     path.write_text(json.dumps(meta))
     points = PlyData.read(str(folder / meta["ply_file_path"]), mmap=False)
     for axis in "xyz":
@@ -81,14 +80,11 @@ def keep(folder: Path, count: int, identical: bool = False) -> None:
     meta = json.loads(path.read_text())
     by_name = {frame["file_path"]: frame for frame in meta["frames"]}
     names = meta["train_filenames"][:count]
-    for split in ("train", "val", "test"):
-        meta[f"{split}_filenames"] = names if split == "train" else []
-    if identical:
-        for name in names[1:]:
-            shutil.copy(folder / names[0], folder / name)
-            by_name[name]["transform_matrix"] = by_name[names[0]]["transform_matrix"]
-    meta["frames"] = [by_name[name] for name in names]
-    path.write_text(json.dumps(meta))
+    for name in names[1:] if identical else ():
+        shutil.copy(folder / names[0], folder / name)
+        by_name[name]["transform_matrix"] = by_name[names[0]]["transform_matrix"]
+    meta |= {"train_filenames": names, "val_filenames": [], "test_filenames": []}
+    path.write_text(json.dumps({**meta, "frames": [by_name[name] for name in names]}))
 
 
 def hard_trainings() -> list[HardTraining]:
