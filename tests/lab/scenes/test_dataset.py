@@ -14,6 +14,7 @@ from nrfgs_lab.scenes import (
     build_scene,
     camera_rays,
     dome_cameras,
+    project,
     render,
     write_scene,
 )
@@ -119,6 +120,16 @@ def test_test_views_surround_the_scene():
     azimuths = np.sort(np.arctan2(positions[:, 1], positions[:, 0]))
     gaps = np.diff(np.append(azimuths, azimuths[0] + 2 * np.pi))
     assert gaps.max() < np.radians(150)  # six views evenly spread leave gaps of 60 degrees
+
+
+def test_project_undoes_camera_rays():
+    config, camera = SceneConfig(), dome_cameras(SceneConfig())[7]
+    pixels = np.random.default_rng(0).uniform((0, 0), (config.width, config.height), size=(100, 2))
+    origins, directions = (a.astype(np.float64) for a in camera_rays(config, camera, pixels))
+    again, depth = project(config, camera, origins + 2.5 * directions)
+    # Rays are float32: 5 x 6e-8 of position, at depth 2.5 and focal length 214: 3e-5 pixels, and as much of direction.
+    np.testing.assert_allclose(again, pixels, atol=2e-4)
+    np.testing.assert_allclose(depth, 2.5, atol=1e-5)
 
 
 def test_a_pixel_is_the_mean_of_its_samples():

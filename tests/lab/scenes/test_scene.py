@@ -312,6 +312,13 @@ def test_no_surface_reflects_more_than_arrives(studio):
         assert diffuse.min() >= 0.0 and diffuse.max() + specular <= 1.0
 
 
+def test_seed_changes_the_textures_and_nothing_else():
+    a, b = (build_scene(SceneConfig(seed=seed, **SMALL)) for seed in (0, 1))
+    origins, directions = _image_rays(a.config)
+    assert (a.objects, a.lamps) == (b.objects, b.lamps)
+    assert np.abs(a.radiance(origins, directions) - b.radiance(origins, directions)).mean() > 1e-3
+
+
 def _image_rays(config):
     xs, ys = np.meshgrid(np.arange(config.width) + 0.5, np.arange(config.height) + 0.5)
     return camera_rays(config, dome_cameras(config)[5], np.stack([xs, ys], axis=-1).reshape(-1, 2))
