@@ -259,8 +259,8 @@ def test_without_gloss_every_point_has_one_colour(seed):
 def view_variance(gloss):
     """Mean over points and channels of the variance over views of the radiance."""
     scene = build_scene(SceneConfig(gloss=gloss, **SMALL))
-    points, surfaces = surface_points(scene, 800)
-    radiance = [scene.outgoing_radiance(points, surfaces, v) for v in views_above(scene, points, surfaces, 12)]
+    points, surfaces = surface_points(scene, 300)
+    radiance = [scene.outgoing_radiance(points, surfaces, v) for v in views_above(scene, points, surfaces, 8)]
     return np.var(radiance, axis=0).mean()
 
 
