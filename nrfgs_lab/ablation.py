@@ -7,14 +7,14 @@ Nothing is retrained: the loss is at least that of a model trained without the p
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from time import perf_counter, process_time
-from typing import Any
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 from torch import Tensor
+from torch.utils.benchmark import Timer
 
 from nrfgs_lab.residuals import THRESHOLDS, FieldViews, Residuals, dropped, look_over, slim
 from nrfgs_lab.training_run import machine
@@ -45,10 +45,6 @@ class Inspect(NamesTraining):
     """dB that the parts may cost together that are left out at once"""
 
     def main(self) -> None:
-        if self.views < 1:
-            raise InputError(f"--views is {self.views}; it must be at least 1.")
-        if not self.budget >= 0:
-            raise InputError(f"--budget is {self.budget}; it must be zero or positive.")
         config = self.config()
         output = self.output or config.parent / "inspect.json"
         check_writable(output, "--output")
@@ -57,9 +53,9 @@ class Inspect(NamesTraining):
         if not isinstance(model.head, NeuralResidualField):
             raise InputError(f"{config}: the {model.head.name!r} head has no parts. Name a training of nrfgs.")
         images = pipeline.datamanager.fixed_indices_eval_dataloader
+        if not len(images) or self.views < 1:
+            raise InputError(f"{config}: {self.views} of {len(images)} test views. At least one is needed.")
         images = [images[i] for i in evenly_spaced(len(images), self.views)]
-        if not images:
-            raise InputError(f"{config}: its data set has no test views to measure on.")
         with progress(f"Looking at the splats from {len(cameras)} training views"):
             seen, distance = look_over(model, cameras), mean_log_distance(model, cameras)
         field, views = model.field.detached(), FieldViews(model, images)
@@ -67,12 +63,10 @@ class Inspect(NamesTraining):
         candidates = list(changes(field, seen, basis, distance))
         rows = [row("nothing", "full", field, views, None)]
         with progress("Leaving out", len(candidates)) as advance:
-            for name, group, extra, change in candidates:
-                rows.append(row(name, group, change(field), views, rows[0].psnr, **extra))
+            for name, group, change in candidates:
+                rows.append(row(name, group, change(field), views, rows[0].psnr))
                 advance(name)
         all_together, left_out = together(field, rows, candidates, seen, views, self.budget)
-        for entry in rows:
-            entry.threshold = None if entry.threshold == float("inf") else entry.threshold  # JSON has no infinity
         result = {
             "machine": machine(),
             "splats": model.num_points,
@@ -105,40 +99,40 @@ class Row:
     """mean over the views"""
     diffuse: float = 0.0
     """share of the splats without residual"""
-    rank: int | None = None
-    """numbers in a latent, in group rank"""
-    threshold: float | None = None
-    """residuals below it were dropped, 8-bit steps"""
 
 
-Candidate = tuple[str, str, dict[str, Any], Callable[[Field], Field]]
-"""Name, group, the row's extra columns, and the change."""
+Candidate = tuple[str, str, Callable[[Field], Field]]
+"""Name, group, and the change."""
 
 
 def changes(field: Field, seen: Residuals, basis: LatentBasis, distance: float) -> Iterator[Candidate]:
     """Parts that can be left out of a field."""
     config = field.head.config
     if field.head.high is not None:
-        yield "high branch", "part", {}, without_high_branch
-    yield "low branch", "part", {}, without_low_branch
+        yield "high branch", "part", without_high_branch
+    yield "low branch", "part", without_low_branch
     if config.opacity_residual:
-        yield "opacity residual", "part", {}, without_opacity_residual
+        yield "opacity residual", "part", without_opacity_residual
     if config.use_distance:
-        yield "distance", "part", {}, lambda field: with_constant_distance(field, distance)
-    for rank in range(1, config.latent_dim + 1):
-        yield f"latent rank {rank}", "rank", {"rank": rank}, lambda field, rank=rank: with_rank(field, basis, rank)
+        yield "distance", "part", partial(with_constant_distance, log_distance=distance)
+    ranks = range(1, config.latent_dim + 1)
+    for rank in (rank for rank in ranks if rank <= 8 or rank % 8 == 0):
+        yield f"latent rank {rank}", "rank", partial(with_rank, basis=basis, rank=rank)
     for threshold in THRESHOLDS:
-        name = "all residuals" if threshold == float("inf") else f"residuals below {threshold:g} steps"
-        change = lambda field, threshold=threshold: dropped(field, seen, threshold)  # noqa: E731
-        yield name, "residual", {"threshold": threshold}, change
+        yield residuals_below(threshold), "residual", partial(dropped, seen=seen, threshold=threshold)
 
 
-def row(part: str, group: str, field: Field, views: FieldViews, full: float | None, **extra: Any) -> Row:
+def residuals_below(threshold: float) -> str:
+    """Name of residuals below a threshold in 8-bit steps."""
+    return "all residuals" if threshold == float("inf") else f"residuals below {threshold:g} steps"
+
+
+def row(part: str, group: str, field: Field, views: FieldViews, full: float | None) -> Row:
     """Measure one field; `full` is the full field's PSNR, None for the full field."""
     score = views.psnr(field)
     loss = 0.0 if full is None else full - score
     share = diffuse_splats(field) / max(len(field.splats["means"]), 1)
-    return Row(part, group, score, loss, field.bytes, head_seconds(views, field), share, **extra)
+    return Row(part, group, score, loss, field.bytes, head_seconds(views, field), share)
 
 
 def diffuse_splats(field: Field) -> int:
@@ -154,8 +148,8 @@ def together(
     Parts may take half of the budget; residuals and the latents' rank the rest (`slim`). The low branch stays: it has
     the opacity, and without its colours nothing is saved.
     """
-    full, whole = rows[0].psnr, field
-    change_of = {name: change for name, _, _, change in candidates}
+    full = rows[0].psnr
+    change_of = {name: change for name, _, change in candidates}
     left_out: list[str] = []
     for part in sorted((r for r in rows if r.group == "part"), key=lambda r: r.loss_db):
         if part.part != "low branch" and part.loss_db <= budget:
@@ -164,12 +158,11 @@ def together(
                 field = smaller
                 left_out.append(part.part)
     slimmed = slim(field, seen, views, full - budget)
-    every = slimmed.threshold == float("inf")
     if diffuse_splats(slimmed.field) > diffuse_splats(field):
-        left_out.append("all residuals" if every else f"residuals below {slimmed.threshold:g} steps")
-    if slimmed.rank < whole.head.config.latent_dim and not every:
+        left_out.append(residuals_below(slimmed.threshold))
+    if slimmed.rank < field.head.config.latent_dim and slimmed.threshold < float("inf"):
         left_out.append(f"latents beyond rank {slimmed.rank}")
-    return row("together", "together", slimmed.field, views, full, rank=slimmed.rank), left_out
+    return row("together", "together", slimmed.field, views, full), left_out
 
 
 @torch.no_grad()
@@ -178,27 +171,14 @@ def head_seconds(views: FieldViews, field: Field) -> float:
     seconds = []
     for view, _, _ in views.views:
         rows = diffuse_last(field.splats, view.visible)
-        seconds.append(fastest(lambda rows=rows, center=view.center: field.head(field.splats, rows, center)))
+        timer = Timer("head(splats, rows, center)", globals={**field._asdict(), "rows": rows, "center": view.center})
+        seconds.append(min(timer.timeit(1).mean for _ in range(TIMED)))
     return sum(seconds) / len(seconds)
 
 
 def diffuse_last(splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:
     """Visible rows, those of diffuse splats last."""
     return visible[splats[DIFFUSE][visible].to(torch.uint8).argsort(stable=True)] if DIFFUSE in splats else visible
-
-
-def fastest(work: Callable[[], object]) -> float:
-    """Seconds of the fastest run: wall-clock on a GPU, processor time on a CPU."""
-    gpu = torch.cuda.is_available()
-    clock, wait = (perf_counter, torch.cuda.synchronize) if gpu else (process_time, lambda: None)
-    times = []
-    for _ in range(TIMED):
-        wait()
-        start = clock()
-        work()
-        wait()
-        times.append(clock() - start)
-    return min(times)
 
 
 @torch.no_grad()
@@ -215,18 +195,15 @@ def mean_log_distance(model, cameras) -> float:
 
 
 def table(rows: list[Row]) -> Table:
-    """Table of the rows; of ranks beyond eight every eighth."""
-    full, printed = rows[0], Table()
+    """Table of the rows, a section for each group."""
+    printed = Table()
     for column in ("left out", "PSNR (dB)", "loss (dB)", "MB", "head (ms)", "diffuse"):
         printed.add_column(column, justify="left" if column == "left out" else "right")
-    for previous, entry in zip([full, *rows], rows, strict=False):
-        if entry.group == "rank" and entry.rank > 8 and entry.rank % 8:
-            continue
-        if entry.group != previous.group:
-            printed.add_section()
+    for entry, following in zip(rows, [*rows[1:], None], strict=True):
         diffuse = f"{100 * entry.diffuse:.0f} %" if entry.diffuse else ""
         numbers = f"{entry.psnr:.2f}", f"{entry.loss_db:.3f}", f"{entry.bytes / 1e6:.2f}"
-        printed.add_row(entry.part, *numbers, f"{1e3 * entry.head_seconds:.1f}", diffuse)
+        last = following is not None and following.group != entry.group
+        printed.add_row(entry.part, *numbers, f"{1e3 * entry.head_seconds:.1f}", diffuse, end_section=last)
     return printed
 
 

@@ -3,13 +3,12 @@
 
     python -m nrfgs_lab.compact SCENES/bonsai OUT         # the same for goldcape and fox; a GPU
     python -m nrfgs_lab.compact SCENES/fox OUT --rates --others ply                            # a PLY file alone
-    python -m nrfgs_lab.compact HELD/fox OUT --others --settings WORTH=0.5                     # a setting of fine-tunes
     python -m nrfgs_lab.results pack OUT results/compact.json
     python -m nrfgs_lab.pages.tables.files                # the figure
 
 It trains the capture, and exports compact files fine-tuned at each of --rates, and --others, unless OUT has their
-records. PSNR is of files read back, on test views. Settings are chosen on held-out views: `held_out` of `nrfgs bench`
-makes HELD.
+records. PSNR is of files read back, on test views. Records named after a setting (WORTH=0.5) were made with another
+value of that constant of nrfgs_ns/compact/finetune.py or nrfgs_ns/model/harmonics_tune.py, on held-out views.
 """
 
 import json
@@ -21,11 +20,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from nrfgs_lab.training_run import machine, train
-from nrfgs_ns.compact import finetune
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.options import CompactOptions, PlyOptions
 from nrfgs_ns.files import write_whole
-from nrfgs_ns.model import harmonics_tune
 
 
 @dataclass
@@ -44,20 +40,11 @@ class Trade:
     """steps of each fine-tune"""
     others: tuple[Literal["ply", "plain"], ...] = ("ply", "plain")
     """files without a fine-tune: a PLY, a compact file"""
-    settings: tuple[str, ...] = ()
-    """NAME=VALUE, in JSON: other values of constants in nrfgs_ns/compact/finetune.py and
-    nrfgs_ns/model/harmonics_tune.py"""
 
     def main(self) -> None:
         from nrfgs_ns.export.compact import export_compact
         from nrfgs_ns.export.ply import export_ply
 
-        for setting in self.settings:
-            key, value = setting.split("=")
-            module = next((module for module in (finetune, harmonics_tune) if hasattr(module, key)), None)
-            if module is None:
-                raise InputError(f"--settings {setting}: the fine-tunes have no {key}.")
-            setattr(module, key, json.loads(value))
         files = self.work / "files"
         files.mkdir(parents=True, exist_ok=True)
         config = Path(self.record("model", self.trained)["train"]["config_path"])
@@ -66,13 +53,10 @@ class Trade:
             return lambda report: export_compact(config, files / f"{report.stem}.nrf", options, True, report)
 
         for rate in self.rates:
-            self.record(
-                "-".join([f"rate-{rate:g}", *self.settings]), compact(CompactOptions(finetune=self.steps, rate=rate))
-            )
+            self.record(f"rate-{rate:g}", compact(CompactOptions(finetune=self.steps, rate=rate)))
         if "ply" in self.others:
-            name = "-".join(["ply", *self.settings])
-            ply = files / f"{self.data.name}-{name}.ply"
-            self.record(name, lambda report: export_ply(config, ply, PlyOptions(), True, report))
+            ply = files / f"{self.data.name}.ply"
+            self.record("ply", lambda report: export_ply(config, ply, PlyOptions(), True, report))
         if "plain" in self.others:
             self.record("version-2", compact(CompactOptions()))
 

@@ -20,15 +20,6 @@ TEXTS = ".md", ".yaml"
 """Endings of text files."""
 
 
-def rounded(content: Any) -> Any:
-    """Content with numbers of seven significant digits."""
-    if isinstance(content, dict):
-        return {name: rounded(value) for name, value in content.items()}
-    if isinstance(content, list):
-        return [rounded(value) for value in content]
-    return float(f"{content:.7g}") if isinstance(content, float) else content
-
-
 def slim(record: Any) -> Any:
     """A run's record without duplicate values of each image, and with fewer numbers of splats."""
     if not (isinstance(record, dict) and isinstance(record.get("train"), dict)):
@@ -58,7 +49,8 @@ def write(file: Path, records: dict[str, Any], texts: dict[str, list[str]] | Non
     """Write a study's file, named after the study."""
 
     def line(name: str) -> str:
-        return f"  {json.dumps(name)}: {json.dumps(rounded(records[name]), separators=(',', ':'))}"
+        rounded = json.loads(json.dumps(records[name]), parse_float=lambda digits: float(f"{float(digits):.7g}"))
+        return f"  {json.dumps(name)}: {json.dumps(rounded, separators=(',', ':'))}"
 
     parts = [f'"study": {json.dumps(file.stem)}', '"records": {\n' + ",\n".join(map(line, records)) + "\n }"]
     parts += [f'"texts": {json.dumps(texts, indent=1, ensure_ascii=False)}'] if texts else []

@@ -71,7 +71,7 @@ def train(
     def before(step: int) -> None:
         nonlocal started
         if started is None:
-            _synchronize()
+            synchronize()
             started = perf_counter()
 
     def after(step: int) -> None:
@@ -81,7 +81,7 @@ def train(
         if is_last or step % 100 == 0:
             record.splats.append([step, int(model.num_points)])
         if is_last or step_check(step, config.steps_per_save):  # a checkpoint follows, off the clock
-            _synchronize()
+            synchronize()
             record.seconds += perf_counter() - started
             started = None
             record.saved.append([step, record.seconds])
@@ -134,6 +134,7 @@ def digest_of(package: Path) -> str:
     return digest.hexdigest()[:12]
 
 
-def _synchronize() -> None:
+def synchronize() -> None:
+    """Wait for the GPU, if there is one."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()

@@ -32,10 +32,9 @@ def crop_sheet(pictures: dict[str, Path], path: Path) -> bool:
         path: where the PNG goes.
 
     Returns:
-        Whether there is a view that all runs have. Runs without pictures, or with pictures of another size than the
-        first run's, are left out.
+        Whether there is a view that all runs have. ValueError if their pictures differ in size.
     """
-    files = of_one_size({label: files for label, folder in pictures.items() if (files := numbered(folder))})
+    files = {label: files for label, folder in pictures.items() if (files := numbered(folder))}
     places = []
     for view in sorted(set.intersection(*map(set, files.values()))) if files else ():
         truth, renders = read(files, view)
@@ -60,21 +59,6 @@ def crop_sheet(pictures: dict[str, Path], path: Path) -> bool:
 def numbered(folder: Path) -> dict[int, Path]:
     """Number of the test view -> its picture."""
     return {int(file.name[9:13]): file for file in sorted(folder.glob("eval_img_[0-9][0-9][0-9][0-9]*.png"))}
-
-
-def of_one_size(files: dict[str, dict[int, Path]]) -> dict[str, dict[int, Path]]:
-    """Runs with pictures of the first run's size: others may have had scaled photographs."""
-
-    def size(file: Path) -> tuple[int, int]:
-        with Image.open(file) as picture:
-            return picture.size
-
-    first = {view: size(file) for view, file in next(iter(files.values()), {}).items()}
-    return {
-        label: views
-        for label, views in files.items()
-        if all(size(file) == first[view] for view, file in views.items() if view in first)
-    }
 
 
 def read(files: dict[str, dict[int, Path]], view: int) -> tuple[Images, dict[str, Images]]:

@@ -12,10 +12,10 @@ import json
 import shutil
 from pathlib import Path
 
+from filelock import FileLock
 from PIL import Image
 
 from nrfgs_lab.bench.spec import Scene
-from nrfgs_lab.lock import only_one
 from nrfgs_ns.data.checks import find_colmap
 from nrfgs_ns.data.colmap import read_model
 from nrfgs_ns.data.views import evenly_spaced
@@ -35,7 +35,7 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     """
     folder, mirror = root / scene.path, mirrors / scene.name
     if scene.held_out is not None:
-        with only_one(mirror.with_name(f"{mirror.name}.lock"), f"Another process makes {mirror}; waiting for it."):
+        with FileLock(mirror.with_name(f"{mirror.name}.lock")):
             if not (mirror / "transforms.json").exists():
                 make_held_out(folder, mirror, scene.held_out, scene.views)
         return ["nrfgs-data", "--data", str(mirror), *scene.options]

@@ -5,17 +5,16 @@
 when it times frames.
 """
 
-from collections.abc import Callable, Iterable
-from importlib.util import find_spec
+from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
 
+from nrfgs_lab.training_run import synchronize
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.image.metrics import METRIC_NAMES, image_metrics
 
@@ -38,18 +37,16 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
 
     Returns:
         "test" and "train" (null without views), each with "per_image" and means of psnr, ssim, ms_ssim, l1, lpips (null
-        without weights), colour-corrected cc_psnr, ..., and for "test" flip (null without `flip-evaluator`); "fps" at
-        the photographs' size and "fps_1080p" (null on a CPU), null if not timed; "splats", of which "diffuse" have no
-        residual; "parameter_bytes" of a renderer; "checkpoint_bytes" with the optimisers' moments.
+        without weights), colour-corrected cc_psnr, ...; "fps" at the photographs' size and "fps_1080p" (null on a CPU),
+        null if not timed; "splats", of which "diffuse" have no residual; "parameter_bytes" of a renderer;
+        "checkpoint_bytes" with the optimisers' moments.
     """
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
     model, data = pipeline.model, pipeline.datamanager
     model.eval()
     test = data.fixed_indices_eval_dataloader
     names = [Path(name).name for name in data.eval_dataset.image_filenames]
-    has_flip = find_spec("flip_evaluator") is not None
-    views = zip(names, test, strict=True)
-    result: dict[str, Any] = {"test": over_views(model, views, flip if has_flip else None), "train": None}
+    result: dict[str, Any] = {"test": over_views(model, zip(names, test, strict=True)), "train": None}
     if train_views > 0:
         images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
         cameras = data.train_dataset.cameras
@@ -58,12 +55,11 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
         names = [Path(data.train_dataset.image_filenames[i]).name for i in chosen]
         result["train"] = over_views(model, zip(names, views, strict=True))
     cameras = [camera for camera, _ in test]
+    large = [at_size(camera, *FULL_HD) for camera in cameras]
     return {
         **result,
         "fps": frames_per_second(model, cameras) if timed else None,
-        "fps_1080p": frames_per_second(model, [at_size(camera, *FULL_HD) for camera in cameras])
-        if timed and model.device.type == "cuda"
-        else None,
+        "fps_1080p": frames_per_second(model, large) if timed and model.device.type == "cuda" else None,
         "splats": int(model.num_points),
         "diffuse": getattr(model, "num_diffuse", 0),
         "parameter_bytes": getattr(model, "parameter_bytes", None)  # nerfstudio's own have splats and no more
@@ -72,47 +68,19 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
     }
 
 
-def over_views(model, views: Iterable, flip: Callable | None = None) -> dict[str, Any]:
-    """Means and each image's values over (name, (camera, batch)).
-
-    Args:
-        flip: prediction, truth and mask as arrays -> FLIP; a second for each view.
-    """
+def over_views(model, views: Iterable) -> dict[str, Any]:
+    """Means and each image's values over (name, (camera, batch))."""
     per_image = []
     for name, (camera, batch) in views:
         outputs = model.get_outputs_for_camera(camera)
         truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
         mask = batch["mask"].to(model.device).float() >= 0.5 if "mask" in batch else None
         per_image.append({"image": name, **image_metrics(outputs["rgb"], truth, mask)})
-        if flip is not None:
-            inside = None if mask is None else mask[..., 0].numpy(force=True)
-            per_image[-1]["flip"] = flip(outputs["rgb"].numpy(force=True), truth.numpy(force=True), inside)
     means = {}
-    for metric in (*METRIC_NAMES, "flip"):
+    for metric in METRIC_NAMES:
         values = [image[metric] for image in per_image if image.get(metric) is not None]
         means[metric] = sum(values) / len(values) if values else None
     return {**means, "per_image": per_image}
-
-
-def flip(pred: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float | None:
-    """Mean FLIP (Andersson et al., PACMCGIT 3(2), 2020) in [0, 1], lower is better; needs the package `flip-evaluator`.
-
-    Args:
-        pred, truth: sRGB images [H, W, 3] in [0, 1].
-        mask: bool [H, W], True inside; outside the prediction is replaced by the truth, and left out of the mean.
-
-    Returns:
-        None if the mask is empty. 67 pixels a degree are assumed.
-    """
-    import flip_evaluator
-
-    if mask is not None:
-        if not mask.any():
-            return None
-        pred = np.where(mask[..., None], pred, truth)
-    images = (np.ascontiguousarray(image, dtype=np.float32) for image in (truth, pred))
-    errors = np.squeeze(flip_evaluator.evaluate(*images, "LDR", applyMagma=False)[0], axis=-1)
-    return float(errors.mean() if mask is None else errors[mask].mean())
 
 
 def at_size(camera: Cameras, width: int, height: int) -> Cameras:
@@ -127,22 +95,16 @@ def at_size(camera: Cameras, width: int, height: int) -> Cameras:
 def frames_per_second(model, cameras: list) -> float:
     """Renderings per second of wall-clock, after an untimed one of each."""
     chosen = [cameras[i].to(model.device) for i in evenly_spaced(len(cameras), TIMED_CAMERAS)]
-    rendered, seconds = 0, 0.0
-    for timed in (False, True):
-        _synchronize()
+
+    def seconds_of_all() -> float:
         start = perf_counter()
-        while True:
-            for camera in chosen:
-                model.get_outputs_for_camera(camera)
-            _synchronize()
-            if not timed:
-                break
-            rendered, seconds = rendered + len(chosen), perf_counter() - start
-            if seconds >= TIMED_SECONDS:
-                break
-    return rendered / seconds
+        for camera in chosen:
+            model.get_outputs_for_camera(camera)
+        synchronize()
+        return perf_counter() - start
 
-
-def _synchronize() -> None:
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
+    seconds_of_all()
+    rounds = [seconds_of_all()]
+    while sum(rounds) < TIMED_SECONDS:
+        rounds.append(seconds_of_all())
+    return len(rounds) * len(chosen) / sum(rounds)

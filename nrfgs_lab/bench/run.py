@@ -11,23 +11,21 @@ import contextlib
 import json
 import shutil
 import sys
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+from unittest import mock
 
 import torch
-from torch import nn
+from filelock import FileLock
 
+from nrfgs_lab.bench.measure import measure
 from nrfgs_lab.bench.spec import Job
-from nrfgs_lab.lock import only_one
 from nrfgs_lab.training_run import TrainRecord, evaluate, machine, train
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
-
-PROGRESS_SECONDS = 1.0
-"""Time between two notes of a training's step."""
 
 
 def run(job: Job) -> None:
@@ -35,14 +33,12 @@ def run(job: Job) -> None:
     work, record_path = Path(job.work), Path(job.record)
     work.mkdir(parents=True, exist_ok=True)
     # A killed benchmark may leave children behind, which train into this folder.
-    with only_one(work / "lock", "Another process works on this run; waiting for it to end."):
+    with FileLock(work / "lock"):
         if record_path.exists():
             return
         forget_other_arguments(work, job.identity)
         start = perf_counter()
         with host_without_downloads(job.args[0]):
-            from nrfgs_lab.bench.measure import measure
-
             record = train_or_continue(job, work)
             config = Path(record.config_path)
             results = {} if job.quick else {"eval": evaluate(config, work / "eval.json", work / "pictures")}
@@ -66,9 +62,8 @@ def run(job: Job) -> None:
             shutil.rmtree(work, ignore_errors=True)
 
 
-@contextlib.contextmanager
-def host_without_downloads(method: str) -> Iterator[None]:
-    """Let nerfstudio's own methods run offline, for comparisons.
+def host_without_downloads(method: str) -> AbstractContextManager:
+    """Let nerfstudio's own methods run offline within a block, for comparisons.
 
     They build LPIPS with the model and download its weights: it is replaced by one that returns NaN, unless the weights
     are on disk. torch must be allowed to read their checkpoints.
@@ -78,22 +73,9 @@ def host_without_downloads(method: str) -> Iterator[None]:
     allow_nerfstudio_checkpoints()
     weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.DEFAULT.url).name
     if method.startswith("nrfgs") or weights.is_file():
-        yield
-        return
-    import torchmetrics.image.lpip as lpip
-
-    class NoLpips(nn.Module):
-        def __init__(self, **_: Any):
-            super().__init__()
-
-        def forward(self, *_: Any) -> torch.Tensor:
-            return torch.tensor(float("nan"))
-
-    original, lpip.LearnedPerceptualImagePatchSimilarity = lpip.LearnedPerceptualImagePatchSimilarity, NoLpips
-    try:
-        yield
-    finally:
-        lpip.LearnedPerceptualImagePatchSimilarity = original
+        return contextlib.nullcontext()
+    lpips = "torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity"
+    return mock.patch(lpips, lambda **_: lambda *_: torch.tensor(float("nan")))
 
 
 def train_or_continue(job: Job, work: Path) -> TrainRecord:
@@ -106,25 +88,15 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
     def saved(record: TrainRecord) -> None:
         write_whole(work / "train.json", json.dumps(asdict(record)))
 
-    noted = perf_counter()
-
-    def stepped(step: int) -> None:
-        nonlocal noted
-        if perf_counter() - noted >= PROGRESS_SECONDS:
-            with contextlib.suppress(OSError):  # a full disk must not end a training here
-                write_whole(work / "progress.json", json.dumps({"step": step}))
-            noted = perf_counter()
-
-    args, earlier = job.args, None
+    args = job.args
     checkpoint = last_checkpoint(work) if args[0].startswith("nrfgs") and job.steps else None
-    if checkpoint is not None:
-        earlier = record_until(work / "train.json", checkpoint)
+    earlier = checkpoint and record_until(work / "train.json", checkpoint)
     if earlier is not None:
         if earlier.steps >= job.steps:
             return earlier
         print(f"Going on from {checkpoint}")
         args = [args[0], "--load-dir", str(checkpoint.parent), *args[1:]]
-    return train(args, stepped, saved, earlier)
+    return train(args, on_save=saved, earlier=earlier)
 
 
 def last_checkpoint(work: Path) -> Path | None:

@@ -1,19 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plan of a benchmark: runs x strategies x scenes x seeds from a YAML file, and the command of each training.
 
-    runs:                                   # name -> method of ns-train, or method and options
-      SH: nrfgs-sh
-      NRF-16: {method: nrfgs, options: --pipeline.model.appearance.latent-dim 16}
-      splatfacto: {method: splatfacto, strategies: [own]}
-    strategies: [original, mcmc@200000]      # densification, options of its own after commas; `own`: the method's
-    scenes: [bonsai, {path: garden, downscale: 4}]
-    seeds: [42, 43]
-    steps: 30000
-
-The keys are fields of `Spec`, `Method` (a run) and `Scene`.
-
-A plan may have a default and knobs instead of runs. Each knob is varied alone, and the report compares every setting
-with the default (`trade.py`):
+docs/bench.md describes the file; its keys are the fields of `Spec`, `Method` (a run) and `Scene`. A plan may have a
+default and knobs instead of runs. Each knob is varied alone, and the report compares every setting with the default
+(`trade.py`):
 
     default: nrfgs
     knobs:
@@ -23,9 +13,6 @@ with the default (`trade.py`):
       head: {settings: {SH: nrfgs-sh, one branch: {options: --pipeline.model.appearance.split-bands False}}}
 
 A setting has the default's method and options, and its own after them; if it names a method, only its own.
-
-With `held_out: [4]` each scene is replaced by its training views at half the size; every eighth of them, from the
-fourth on, is a test view (`data.py`). Such a scene is called 4/bonsai.
 """
 
 import json
@@ -70,11 +57,11 @@ class Method:
     """method of ns-train"""
     options: tuple[str, ...] = ()
     """its options"""
-    strategies: tuple[str, ...] | None = None
+    strategies: tuple[str, ...] = ()
     """instead of the benchmark's; another project's methods have only `own` by default"""
     steps: int | str | None = None
     """instead of the preset's, the scene's or the benchmark's; own: what the method chooses"""
-    scenes: tuple[str, ...] | None = None
+    scenes: tuple[str, ...] = ()
     """only these scenes"""
     knob: str = ""
     """the knob that is varied"""
@@ -152,7 +139,7 @@ class Cell:
 
 @dataclass
 class Job:
-    """A training, and where its results go."""
+    """A training, and where its results go. The last three are those of `Spec`."""
 
     args: list[str]
     """command line of ns-train"""
@@ -167,11 +154,8 @@ class Job:
     work: str
     """folder for everything else"""
     train_views: int
-    """training images to evaluate"""
     jobs: int
-    """runs at once on the GPU; times are valid only with 1"""
     quick: bool = False
-    """no ns-eval, pictures or frame rates; the work folder is removed"""
 
 
 class _Loader(yaml.SafeLoader):
@@ -191,13 +175,12 @@ def load_spec(path: Path, plan: str = "") -> dict[str, Any]:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path} cannot be read as YAML ({error}). See docs/bench.md for an example.") from error
-    plans = content.get("plans", {"": content}) if isinstance(content, dict) else {"": content}
-    _require(isinstance(plans, dict), f"{path}: plans must be a mapping, of names to plans. See docs/bench.md.")
-    if plan not in plans and "" in plans:
-        raise InputError(f"{path} has no plans. Leave out --plan.")
+    plans = content.get("plans", {"": content}) if isinstance(content, dict) else {}
+    good = isinstance(plans, dict) and plans and all(isinstance(one, dict) for one in plans.values())
+    _require(good, f"{path} must be a mapping (runs: ..., scenes: ...), or have plans. See docs/bench.md.")
     if plan not in plans:
-        raise InputError(f"{path} has {', '.join(plans)}. Give --plan one of them.")
-    _require(isinstance(plans[plan], dict), f"{path} must be a mapping (runs: ..., scenes: ...). See docs/bench.md.")
+        choice = "no plans. Leave out --plan" if "" in plans else f"{', '.join(plans)}. Give --plan one of them"
+        raise InputError(f"{path} has {choice}.")
     return plans[plan]
 
 
@@ -205,27 +188,22 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     """Check and complete a file's content; an InputError begins with `where`, and names the key and the fix."""
     if "knobs" in content:
         content = _with_runs_of_knobs(content, where)
-    known = [key.name for key in fields(Spec)]
-    for key in content:
-        _require(key in known, f"{where}: unknown key {key!r}. Known are {', '.join(known)}.")
+    _known(content, Spec, where)
     for key in ("runs", "scenes"):
         _require(bool(content.get(key)), f"{where}: {key} is missing or empty. Name at least one.")
     _require(isinstance(content["runs"], dict), f"{where}: runs must map names to methods.")
+    lists = {"strategies": [OWN], "seeds": [42], "held_out": []}
     spec = Spec(
         **{
             **content,
-            "runs": [_method(name, value, where) for name, value in content["runs"].items()],
-            "scenes": [_scene(value, where) for value in as_list(content["scenes"])],
-            "strategies": [str(value) for value in as_list(content.get("strategies", [OWN]))],
-            "seeds": as_list(content.get("seeds", [42])),
-            "held_out": as_list(content.get("held_out", [])),
+            **{key: as_list(content.get(key, default)) for key, default in lists.items()},
+            "runs": [_method(name, value, f"{where}: runs: {name}") for name, value in content["runs"].items()],
+            "scenes": [_scene(value, f"{where}: scenes") for value in as_list(content["scenes"])],
             "options": words_of(content.get("options", ()), f"{where}: options"),
         }
     )
     for key, least in (("steps", 1), ("jobs", 1), ("gpus", 1), ("train_views", 0), ("checkpoint_every", 1)):
         _whole(getattr(spec, key), least, f"{where}: {key}")
-    for key in ("strategies", "seeds"):
-        _require(bool(getattr(spec, key)), f"{where}: {key} is empty. Name at least one, or leave it out.")
     for key in ("seeds", "held_out"):
         for value in getattr(spec, key):
             _whole(value, 0, f"{where}: {key}")
@@ -235,6 +213,7 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     for run in spec.runs:
         _check_run(run, spec, f"{where}: runs: {run.name}")
     names = [cell.name for cell in cells_of(spec)]
+    _require(bool(names), f"{where}: strategies or seeds is empty. Name at least one, or leave it out.")
     twice = sorted({name for name in names if names.count(name) > 1})
     _require(
         not twice,
@@ -266,12 +245,12 @@ def cells_of(spec: Spec) -> list[Cell]:
         for scene in spec.scenes
         for strategy in order
         for run in spec.runs
-        if strategy in strategies_of(run, spec) and (run.scenes is None or {scene.name, scene.path} & set(run.scenes))
+        if strategy in strategies_of(run, spec) and (not run.scenes or {scene.name, scene.path} & set(run.scenes))
     ]
 
 
 def strategies_of(run: Method, spec: Spec) -> tuple[str, ...]:
-    """Strategies of a run."""
+    """Strategies of a run; another project's methods have their own."""
     return run.strategies or (tuple(spec.strategies) if run.method.startswith("nrfgs") else (OWN,))
 
 
@@ -329,12 +308,10 @@ def differences(made_with: dict[str, Any], wanted: dict[str, Any]) -> str:
     """Words of a record's identity that the wanted one lacks; "" if they are equal."""
     words = []
     for key, value in wanted.items():
-        had = made_with.get(key)
-        if had == value:
-            continue
-        both = isinstance(had, list) and isinstance(value, list)
-        odd = [pair for pair in settings(had) if pair not in settings(value)] if both else [str(had)]
-        words.append(f"{key}: {' '.join(odd) or 'fewer words'}")
+        if (had := made_with.get(key)) != value:
+            both = isinstance(had, list) and isinstance(value, list)
+            odd = [pair for pair in settings(had) if pair not in settings(value)] if both else [str(had)]
+            words.append(f"{key}: {' '.join(odd) or 'fewer words'}")
     return "; ".join(words)
 
 
@@ -346,12 +323,11 @@ def settings(words: list[str]) -> list[str]:
 
 def read_record(path: Path) -> dict[str, Any]:
     """Record of a finished run; InputError if the file is not a record."""
-    kinds = {"identity": dict, "machine": dict, "jobs": int, "train": dict, "measured": dict}
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        if all(isinstance(record[key], kind) for key, kind in kinds.items()):
+        if {"identity", "machine", "jobs", "train", "measured"} <= set(record):
             return record
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError):
         pass
     raise InputError(f"{path} is no record of a run. Remove it to run it again.")
 
@@ -362,35 +338,33 @@ def scene_path(value: Any) -> str:
 
 
 def _method(name: Any, value: Any, where: str) -> Method:
-    value = {"method": value} if isinstance(value, str) else value
-    where = f"{where}: runs: {name}"
-    _require(isinstance(value, dict) and isinstance(value.get("method"), str), f"{where} names no method.")
-    single = len(value["method"].split()) == 1
-    _require(single, f"{where}: {value['method']!r} is no single word; use {{method: METHOD, options: OPTIONS}}.")
-    _known(value, Method, where)
-    value = {**value, "options": words_of(value.get("options", ()), f"{where}: options")}
+    value = _description(value, Method, "method", where)
     if value.get("steps") not in (None, OWN):
         _whole(value["steps"], 1, f"{where}: steps")
     for key in {"strategies", "scenes"} & set(value):
         value[key] = tuple(str(word) for word in as_list(value[key]))
-        _require(value[key] != (), f"{where}: {key} is empty. Name at least one, or leave it out.")
     return Method(**{**value, "name": str(name)})
 
 
 def _scene(value: Any, where: str) -> Scene:
-    value = {"path": value} if isinstance(value, (str, Path)) else value
-    _require(isinstance(value, dict) and "path" in value, f"{where}: scenes: {value!r} is neither a path nor has one.")
-    _known(value, Scene, f"{where}: scenes")
+    value = _description(value, Scene, "path", where)
     for key in ("downscale", "steps", "views"):
         if value.get(key) is not None:
-            _whole(value[key], 1, f"{where}: scenes: {key}")
+            _whole(value[key], 1, f"{where}: {key}")
     path = scene_path(value)
     _require(
         not Path(path).is_absolute() and path != "." and ".." not in Path(path).parts,
-        f"{where}: scenes: {path!r} is no folder below --scenes. Give --scenes the folder that it lies in.",
+        f"{where}: {path!r} is no folder below --scenes. Give --scenes the folder that it lies in.",
     )
-    _require(path != AVERAGE, f"{where}: scenes: {path!r} is what the table calls the average over scenes; rename it.")
-    return Scene(**{**value, "path": path, "options": words_of(value.get("options", ()), f"{where}: scenes: options")})
+    return Scene(**{**value, "path": path})
+
+
+def _description(value: Any, kind: type, first: str, where: str) -> dict[str, Any]:
+    """Keys of a run or a scene; a text is the value of the `first`."""
+    value = dict(value) if isinstance(value, dict) else {first: value}
+    _known(value, kind, where)
+    _require(isinstance(value.get(first), str), f"{where} names no {first}.")
+    return {**value, "options": words_of(value.get("options", ()), f"{where}: options")}
 
 
 def _with_runs_of_knobs(content: dict[str, Any], where: str) -> dict[str, Any]:
@@ -398,39 +372,36 @@ def _with_runs_of_knobs(content: dict[str, Any], where: str) -> dict[str, Any]:
     _require("runs" not in content, f"{where}: runs are made from {DEFAULT} and knobs. Leave runs out.")
     several = len(as_list(content.get("strategies", []))) > 1
     _require(not several, f"{where}: strategies names several. Make the others values of a knob.")
-    default = content.get(DEFAULT, "nrfgs")
-    default = {"method": default} if isinstance(default, str) else default
-    _require(isinstance(default, dict) and "method" in default, f"{where}: {DEFAULT} names no method.")
-    knobs = content["knobs"]
-    _require(isinstance(knobs, dict) and bool(knobs), f"{where}: knobs is empty. Name at least one.")
+    _require(isinstance(content["knobs"], dict), f"{where}: knobs must map names to what is varied.")
+    default = _description(content.get(DEFAULT, "nrfgs"), Method, "method", f"{where}: {DEFAULT}")
     runs = {DEFAULT: {**default, "knob": DEFAULT}}
-    for knob, description in knobs.items():
+    for knob, description in content["knobs"].items():
         for value, changes in _values(description, f"{where}: knobs: {knob}").items():
             name = f"{knob} {value}"
             _require(name not in runs, f"{where}: {name!r} is there twice. Give knobs distinct names.")
             changes = {"method": changes} if isinstance(changes, str) else changes
             _require(isinstance(changes, dict), f"{where}: {name} must be a method, or map keys of a run to values.")
-            base = {} if "method" in changes else default
-            options = [words_of(run.get("options", ()), f"{where}: {name}: options") for run in (base, changes)]
-            runs[name] = {**base, **changes, "options": options[0] + options[1], "knob": str(knob)}
+            base = {"options": ()} if "method" in changes else default
+            options = base["options"] + words_of(changes.get("options", ()), f"{where}: {name}: options")
+            runs[name] = {**base, **changes, "options": options, "knob": str(knob)}
     return {**{key: value for key, value in content.items() if key not in (DEFAULT, "knobs")}, "runs": runs}
 
 
 def _values(description: Any, where: str) -> dict[str, Any]:
     """Value of a knob -> changed keys of a run."""
-    kinds = {"option": {"option", "values"}, "steps": {"steps"}, "strategies": {"strategies"}, "settings": {"settings"}}
-    kind = next(
-        (kind for kind, keys in kinds.items() if isinstance(description, dict) and set(description) == keys), ""
+    match description:
+        case {"option": option, "values": list(values), **rest} if not rest:
+            return {str(value): {"options": [option, str(value)]} for value in values}
+        case {"steps": list(values), **rest} if not rest:
+            return {str(value): {"steps": value} for value in values}
+        case {"strategies": list(values), **rest} if not rest:
+            return {str(value): {"strategies": [value]} for value in values}
+        case {"settings": dict(settings), **rest} if not rest:
+            return {str(name): changes for name, changes in settings.items()}
+    raise InputError(
+        f"{where} needs option and a list of values, or a list of steps or strategies, or settings: names of runs "
+        "with their keys."
     )
-    _require(bool(kind), f"{where} needs option and values, or one of steps, strategies, settings.")
-    values = description["values" if kind == "option" else kind]
-    if kind == "settings":
-        _require(isinstance(values, dict) and bool(values), f"{where}: settings must map names to runs.")
-        return {str(name): changes for name, changes in values.items()}
-    _require(isinstance(values, list) and bool(values), f"{where}: the values must be a list.")
-    if kind == "option":
-        return {str(value): {"options": [description["option"], str(value)]} for value in values}
-    return {str(value): {kind: value if kind == "steps" else [value]} for value in values}
 
 
 def as_list(value: Any) -> list[Any]:
@@ -456,9 +427,10 @@ def _require_free(options: tuple[str, ...], given: dict[str, str], where: str) -
 
 
 def _known(value: dict[str, Any], kind: type, where: str) -> None:
-    known = [key.name for key in fields(kind) if key.name not in ("name", "held_out")]
-    unknown = sorted(set(value) - set(known))
-    _require(not unknown, f"{where}: unknown key {unknown}. Known are {', '.join(known)}.")
+    set_here = {Method: "name", Scene: "held_out"}.get(kind)
+    known = [key.name for key in fields(kind) if key.name != set_here]
+    unknown = sorted(map(str, set(value) - set(known)))
+    _require(not unknown, f"{where}: unknown key {', '.join(unknown)}. Known are {', '.join(known)}.")
 
 
 def _whole(value: Any, least: int, where: str) -> None:

@@ -4,7 +4,7 @@
 import math
 import re
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -48,20 +48,15 @@ def _gap(record: Record) -> float | None:
     return None if train is None or test is None else train - test
 
 
-METRICS = {"PSNR": ("{:.2f}", 1), "SSIM": ("{:.4f}", 1), "MS-SSIM": ("{:.4f}", 1), "LPIPS": ("{:.4f}", -1)}
-METRICS |= {"FLIP": ("{:.4f}", -1), "L1": ("{:.4f}", -1)}
-"""Metric -> format, and 1 where more is better."""
-
-
-def _metric(name: str) -> Column:
-    key = name.lower().replace("-", "_").replace(" ", "_")
-    return Column(name, _at("measured", "test", key), *METRICS[name.removeprefix("cc ")])
+def _metric(name: str, form: str = "{:.4f}", better: int = 1) -> Column:
+    return Column(name, _at("measured", "test", re.sub("[- ]", "_", name.lower())), form, better)
 
 
 COLUMNS = (
     Column("splats", _at("measured", "splats"), "{:,.0f}", -1),
     Column("time s", _at("train", "seconds"), "{:.1f}", -1, is_time=True),
-    *map(_metric, ("SSIM", "MS-SSIM", "LPIPS", "FLIP", "L1", "PSNR", "cc PSNR", "cc SSIM")),
+    *(_metric("SSIM"), _metric("MS-SSIM"), _metric("LPIPS", better=-1), _metric("L1", better=-1)),
+    *(_metric("PSNR", "{:.2f}"), _metric("cc PSNR", "{:.2f}"), _metric("cc SSIM")),
     Column("FPS", _at("measured", "fps"), "{:.1f}", 1, is_time=True),
     Column("FPS 1080p", _at("measured", "fps_1080p"), "{:.1f}", 1, is_time=True),
     Column("MB", _at("measured", "parameter_bytes"), "{:.2f}", -1, 1e6),
@@ -172,11 +167,6 @@ def ranks(rows: list[Row], column: Column) -> dict[int, int]:
     return {number: distinct.index(text) + 1 for number, text in shown.items() if text in distinct[:2]}
 
 
-def has_run(row: Row) -> bool:
-    """Whether a row has a record, a failure or a stale record."""
-    return bool(row.records) or any(why != MISSING for why in row.absent.values())
-
-
 HEAD = ["scene", "run", "strategy", "seeds"]
 
 
@@ -209,37 +199,25 @@ def notes(rows: list[Row]) -> list[str]:
     return result
 
 
-def not_run(rows: list[Row]) -> list[str]:
-    """A sentence with the rows that were not run, or nothing."""
-    places: dict[tuple[str, str], list[str]] = {}
-    for row in rows:
-        if row.scene != AVERAGE and not has_run(row):
-            places.setdefault((row.scene, row.strategy), []).append(row.run)
-    listed = "; ".join(f"{scene}, {strategy}: {', '.join(runs)}" for (scene, strategy), runs in places.items())
-    return [f"Not run yet, and in no row: {listed}."] if listed else []
-
-
 def markdown(rows: list[Row]) -> str:
-    """Markdown table of the rows that were run: best of each scene and strategy bold, second in italics."""
-    body = []
-    present = [row for row in rows if has_run(row)]
-    for place in dict.fromkeys((row.scene, row.strategy) for row in present):
-        group = [row for row in present if (row.scene, row.strategy) == place]
+    """Markdown table: best of each scene and strategy bold, second in italics."""
+    body, mark = [], {1: "**{}**", 2: "_{}_"}
+    for place in dict.fromkeys((row.scene, row.strategy) for row in rows):
+        group = [row for row in rows if (row.scene, row.strategy) == place]
         ranked = {column.name: ranks(group, column) for column in COLUMNS}
         for number, row in enumerate(group):
-            mark = {1: "**{}**", 2: "_{}_"}
             cells = [mark.get(ranked[one.name].get(number), "{}").format(row.text(one)) for one in COLUMNS]
             body.append([*map(plain_markdown, [row.scene, row.run, row.strategy, row.seeds]), *cells])
-    lines = [HEAD + [column.name for column in COLUMNS], ["---"] * len(HEAD) + ["---:"] * len(COLUMNS), *body]
-    text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
-    return text + "".join(f"\n{note}\n" for note in [*map(plain_markdown, not_run(rows)), *notes(rows)])
+    table = grid(HEAD + [column.name for column in COLUMNS], body, len(HEAD))
+    return "\n\n".join([table, *notes(rows)]) + "\n"
+
+
+def grid(head: Sequence[str], rows: Iterable[Sequence[str]], left: int | None = None) -> str:
+    """A table in Markdown, without the last line's end; columns after the first `left` are aligned to the right."""
+    lines = [head, ["---" if left is None or i < left else "---:" for i in range(len(head))], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def plain_markdown(text: str) -> str:
     """Text escaped for a cell of a Markdown table; an underscore between letters needs no escape."""
     return re.sub(r"[\\`*|<\[]|(?<!\w)_|_(?!\w)", r"\\\g<0>", " ".join(text.split()))
-
-
-def plain_label(text: str) -> str:
-    """Text escaped for matplotlib: `$` begins no formula, and a leading underscore hides no legend entry."""
-    return ("\N{ZERO WIDTH SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")

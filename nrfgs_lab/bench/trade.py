@@ -17,12 +17,9 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from rich.console import Console
 
 from nrfgs_lab.bench.spec import DEFAULT
-from nrfgs_lab.bench.table import BY_NAME, Column, Row, notes, plain_label, plain_markdown
+from nrfgs_lab.bench.table import BY_NAME, Column, Row, grid, notes, plain_markdown
 from nrfgs_ns.files import whole, write_whole
 
 LEVEL = 0.975
@@ -32,14 +29,6 @@ COSTS = {"training time": ("time s", 1), "time for a frame": ("FPS", -1), "bytes
 RATIOS = ("time s", "FPS", "MB", "peak MB", "splats")
 SHOWN = ("PSNR", "SSIM", "LPIPS", *RATIOS)
 HEAD = ["", "seeds", "PSNR", "SSIM", "LPIPS", "training time", "FPS", "MB", "peak memory", "splats"]
-WORDS = {
-    "same": "unclear",
-    "noise": "PSNR unclear",
-    "gain": "gain, cost unclear",
-    "loss": "loss, cost unclear",
-    "better": "better and cheaper",
-    "worse": "worse and more expensive",
-}
 LEGEND = (
     "Changes are against the default; times, frames, bytes, memory and splats as factors. (Round brackets): within the "
     "noise, estimated from the spread over seeds, pooled over all settings of the scene, at 95 %; one comparison in "
@@ -105,25 +94,24 @@ def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> d
     return result
 
 
-def price(gain: Change, cost: Change, power: int = 1) -> tuple[str, float | None]:
-    """Verdict on a setting.
+def price(gain: Change | None, cost: Change | None, power: int = 1) -> str:
+    """What a setting buys: dB for each doubling of a cost, or in words what else it is.
 
     Args:
         gain: change of PSNR, dB.
         cost: change of the cost's column, a ratio.
         power: the cost is the column to this power.
-
-    Returns:
-        A key of `WORDS`, or "trade" with dB for each doubling of the cost.
     """
+    if gain is None or cost is None:
+        return "-"
     if gain.is_noise:
-        return ("same" if cost.is_noise else "noise"), None
+        return "unclear" if cost.is_noise else "PSNR unclear"
     if cost.is_noise:
-        return ("gain" if gain.value > 0 else "loss"), None
+        return f"{'gain' if gain.value > 0 else 'loss'}, cost unclear"
     doublings = power * math.log2(cost.value)
     if (gain.value > 0) == (doublings > 0):
-        return "trade", gain.value / doublings
-    return ("better" if gain.value > 0 else "worse"), None
+        return f"{gain.value / doublings:.2f}"
+    return "better and cheaper" if gain.value > 0 else "worse and more expensive"
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -161,7 +149,7 @@ def report(rows: list[Row], knobs: dict[str, str], out: Path) -> None:
     write_whole(out / "tradeoff.md", text)
     if any(row.records for row in rows):
         draw(rows, knobs, out / "tradeoff.png")
-    Console(soft_wrap=True, markup=False, highlight=False).print(text)
+    print(text)
     print(f"Trade: {out / 'tradeoff.md'}, {out / 'tradeoff.png'}")
 
 
@@ -169,20 +157,19 @@ def table(rows: list[Row], default: Row) -> str:
     """Markdown table of one scene: the default in absolute numbers, the settings as changes."""
     changed = {name: changes(rows, default, BY_NAME[name], name in RATIOS) for name in SHOWN}
     fronts = {cost: front_of(rows, cost) for cost in COSTS}
-    head = [*HEAD, *(f"dB per doubling of {cost}" for cost in COSTS)]
-    lines = [head, ["---"] * 2 + ["---:"] * (len(head) - 2)]
+    lines = []
     for row in rows:
         if row is default:
             cells, prices = [row.text(BY_NAME[name]) for name in SHOWN], [""] * len(COSTS)
         else:
             cells = [change_text(changed[name].get(row.run), name) for name in SHOWN]
             gain = changed["PSNR"].get(row.run)
-            prices = [price_text(gain, changed[column].get(row.run), power) for column, power in COSTS.values()]
+            prices = [price(gain, changed[column].get(row.run), power) for column, power in COSTS.values()]
         stars = [" ★" if row.run in front else "" for front in fronts.values()]
         prices = [(text + star).strip() for text, star in zip(prices, stars, strict=True)]
         name = plain_markdown(row.run)
         lines.append([f"**{name}**" if row is default else name, row.seeds, *cells, *prices])
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    return grid([*HEAD, *(f"dB per doubling of {cost}" for cost in COSTS)], lines, 2) + "\n"
 
 
 def change_text(change: Change | None, name: str) -> str:
@@ -196,62 +183,41 @@ def change_text(change: Change | None, name: str) -> str:
     return f"[{text}]" if change.noise == math.inf else f"({text})"
 
 
-def price_text(gain: Change | None, cost: Change | None, power: int) -> str:
-    """A price in a cell of the table."""
-    if gain is None or cost is None:
-        return "-"
-    kind, number = price(gain, cost, power)
-    return f"{number:.2f}" if number is not None else WORDS[kind]
-
-
 def draw(rows: list[Row], knobs: dict[str, str], path: Path) -> None:
     """PSNR against each cost, a line of panels for each scene; the front as a staircase, with names."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
-    from matplotlib.ticker import LogLocator, NullFormatter
 
     scenes, names = (list(dict.fromkeys(values)) for values in ((row.scene for row in rows), knobs.values()))
-    with pyplot.rc_context({"font.size": 8}):
+    # A `$` in a name begins no formula.
+    with pyplot.rc_context({"font.size": 8, "text.parse_math": False}):
         size = 4.2 * len(COSTS), 3.2 * len(scenes) + 0.5
         figure, panels = pyplot.subplots(
             len(scenes), len(COSTS), figsize=size, dpi=110, squeeze=False, layout="constrained"
         )
-        handles: dict[str, Any] = {}
+        handles = {}
         for line, scene in zip(panels, scenes, strict=True):
             for panel, (cost, (column, _)) in zip(line, COSTS.items(), strict=True):
                 of_scene = [row for row in rows if row.scene == scene]
                 points = {row.run: (row.mean(BY_NAME[column]), row.mean(PSNR)) for row in of_scene}
-                points = {run: point for run, point in points.items() if None not in point}
                 for row in of_scene:
-                    if row.run in points:
-                        is_default, number = row.run == DEFAULT, names.index(knobs[row.run])
-                        errors = (row.deviation(one) or 0.0 for one in (BY_NAME[column], PSNR))
+                    if None not in points[row.run]:
+                        number = names.index(knobs[row.run])
+                        x_error, y_error = (row.deviation(one) or 0.0 for one in (BY_NAME[column], PSNR))
+                        style = {"color": f"C{number % 10}", "marker": "*osD^v<>phX"[number % 11], "elinewidth": 0.6}
                         handles[knobs[row.run]] = panel.errorbar(
-                            *points[row.run],
-                            **dict(zip(("xerr", "yerr"), errors, strict=True)),
-                            color="black" if is_default else f"C{number % 10}",
-                            marker="*osD^v<>phX"[number % 11],
-                            markersize=10 if is_default else 4,
-                            elinewidth=0.6,
-                            linestyle="none",
+                            *points[row.run], y_error, x_error, linestyle="none", **style
                         )
                 front = front_of(of_scene, cost)
                 xs, ys = ([points[run][axis] for run in front] for axis in (0, 1))
-                panel.step(xs, ys, where="post", color="grey", linewidth=0.8)
-                for number, run in enumerate(front):
-                    offset = 3, (4, -9)[number % 2]
-                    panel.annotate(plain_label(run), points[run], offset, textcoords="offset points", fontsize=6)
-                panel.set(title=plain_label(scene), xlabel=column, ylabel="PSNR", xscale="log")
-                panel.margins(0.12)
-                panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-                panel.xaxis.set_major_formatter("{x:g}")
-                panel.xaxis.set_minor_formatter(NullFormatter())
+                panel.step(xs, ys, where="post", color="grey")
+                for run in front:
+                    panel.annotate(run, points[run], (3, 4), textcoords="offset points", fontsize=6)
+                panel.set(title=scene, xlabel=column, ylabel="PSNR", xscale="log")
                 panel.grid(alpha=0.3, which="both", linewidth=0.4)
-        labels = [knob for knob in names if knob in handles]
-        legend = [handles[knob] for knob in labels], list(map(plain_label, labels))
-        figure.legend(*legend, loc="outside lower center", ncols=8, fontsize=7)
+        figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=8, fontsize=7)
         with whole(path) as aside:
             figure.savefig(aside, format="png", metadata={"Software": None})
         pyplot.close(figure)

@@ -22,6 +22,7 @@ from nrfgs_ns.files import check_writable
 
 NRF, SH = "nrfgs", "nrfgs-sh"
 METHODS = {NRF: "NRF", SH: "SH"}
+"""Method -> its label."""
 RATES = {
     NRF: {"--optimizers.latents.optimizer.lr": 0.01},
     SH: {
@@ -62,10 +63,7 @@ class Demo:
     def _run(self, screen: Console) -> None:
         if self.steps < 1:  # ns-train nrfgs would take 0 for as many as it finds right
             raise InputError(f"--steps is {self.steps}; it must be at least 1.")
-        try:
-            scene = self.scene()
-        except ValueError as error:
-            raise InputError(f"{error}. Change --gloss or --seed.") from error
+        scene = self.scene()
         check_writable(self.out / "results.json", "--out")
         steps = min(self.steps, 150) if self.quick else self.steps
         results: dict[str, dict[str, Any]] = {}
@@ -79,7 +77,7 @@ class Demo:
             from nrfgs_lab.training_run import evaluate, machine, train
 
             views, highlights = {}, {}
-            for method, label in self.methods.items():
+            for method, label in METHODS.items() if self.compare else [(NRF, METHODS[NRF])]:
                 args = self.train_args(method, data, steps)
                 progress.console.print(f"[dim]$ ns-train {shlex.join(args)}", highlight=False, soft_wrap=True)
                 with (self.out / f"{method}.log").open("w") as log, contextlib.redirect_stdout(log):
@@ -110,21 +108,15 @@ class Demo:
         screen.print(f"  nrfgs view {results[NRF]['train']['config_path']}", highlight=False, soft_wrap=True)
 
     @property
-    def methods(self) -> dict[str, str]:
-        """What is trained, and its label."""
-        return METHODS if self.compare else {NRF: METHODS[NRF]}
-
-    @property
     def scene_folder(self) -> str:
         """Folder of the data set inside `out`; its name tells one demo's scene from another's."""
         return f"scene-gloss{self.gloss:g}-seed{self.seed}" + ("-quick" if self.quick else "")
 
     def scene(self) -> SceneConfig:
         """The scene's configuration: many views, close together, as small highlights need."""
-        sizes = dict(views=60, width=64, height=48, points=1000) if self.quick else dict(views=200, width=96, height=72)
-        return SceneConfig(
-            **{**dict(gloss=self.gloss, studio=True, arc=120.0, points=2000, test_every=20, seed=self.seed), **sizes}
-        )
+        normal = dict(views=200, width=96, height=72, points=2000)
+        sizes = dict(views=60, width=64, height=48, points=1000) if self.quick else normal
+        return SceneConfig(gloss=self.gloss, studio=True, arc=120.0, test_every=20, seed=self.seed, **sizes)
 
     def train_args(self, method: str, data: Path, steps: int) -> list[str]:
         """The options of `ns-train`.

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, render, split_names
+from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, render
+from nrfgs_lab.scenes.dataset import split_names
 
 SHINES = 0.1
 """Change of white by gloss, in its strongest channel, from which a pixel of the truth counts as one that shines."""
@@ -55,19 +56,17 @@ class Look:
 
         self.pipeline = load_model(config, "test")
         self.scene, self.glossy, self.dull = scene, build_scene(scene), build_scene(replace(scene, gloss=0.0))
+        self.views = list(self.pipeline.datamanager.fixed_indices_eval_dataloader)
+        """nerfstudio's camera and batch of each test view"""
         poses = dict(zip(sorted(sum(split_names(scene), [])), dome_cameras(scene), strict=True))
         names = self.pipeline.datamanager.eval_dataset.image_filenames
         self.poses = [poses[f"images/{Path(name).name}"] for name in names]
         """camera-to-world matrices [4, 4] of the test views, in the scene's world"""
 
-    def cameras_and_batches(self) -> list[tuple[Any, dict[str, Any]]]:
-        """Nerfstudio's camera and batch of each test view."""
-        return list(self.pipeline.datamanager.fixed_indices_eval_dataloader)
-
     def test_views(self) -> list[SeenView]:
         """All test views."""
         model, views = self.pipeline.model, []
-        for pose, (camera, batch) in zip(self.poses, self.cameras_and_batches(), strict=True):
+        for pose, (camera, batch) in zip(self.poses, self.views, strict=True):
             truth = model.get_gt_img(batch["image"])[..., :3].cpu()
             rendered, base = model.get_outputs_for_camera(camera)["rgb"], model.get_base_color(camera)
             views.append(SeenView(truth, torch.from_numpy(render(self.dull, pose)), rendered.cpu(), base.cpu()))
@@ -82,7 +81,7 @@ class Look:
         window = brightest_window(shine)
         middle = np.array([[window[1] + 0.5 * window[3], window[0] + 0.5 * window[2]]])
         points, _ = self.glossy.first_hit(*camera_rays(self.scene, self.poses[view], middle))
-        camera, _ = self.cameras_and_batches()[view]
+        camera, _ = self.views[view]
         outputs = self.pipeline.datamanager.train_dataparser_outputs
         to_model = outputs.dataparser_transform.double().numpy()
         truths, rendered = [], []

@@ -114,10 +114,14 @@ class Page:
         self.control("Show").click()
         self.page.get_by_role("option", name=mode, exact=True).click()
 
+    def enter(self, label: str, number: float) -> None:
+        """Enter a number in the row of a label."""
+        self.control(label).fill(f"{number:g}")
+        self.control(label).press("Enter")
+
     def set_gain(self, gain: float) -> None:
         """Set the residual gain."""
-        self.control("Residual gain").fill(f"{gain:g}")
-        self.control("Residual gain").press("Enter")
+        self.enter("Residual gain", gain)
 
     def hide_cameras(self) -> None:
         """Hide the training cameras."""
@@ -130,8 +134,7 @@ class Page:
 
     def set_resolution(self, pixels: int) -> None:
         """Set the longer side of the picture."""
-        self.control("Max res").fill(str(pixels))
-        self.control("Max res").press("Enter")
+        self.enter("Max res", pixels)
 
     def step(self) -> int:
         """Training step on the page."""

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blocks of README.md, docs/captures.md and docs/opacity.md: captures' test views, and trials on held-out views."""
 
-from collections.abc import Iterable, Mapping
+from collections import ChainMap, defaultdict
+from collections.abc import Mapping, Sequence
 from statistics import fmean, median
 
 from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
@@ -10,12 +11,12 @@ FIELD, HOST = "nrfgs", "splatfacto"
 SHRUNK = "harmonics, same steps and shrinkage"
 BUDGET = "nrfgs, 150,000 splats", "harmonics, 150,000 splats"
 FEW = list(VIEWS)[1:]
-INSTEAD = (
-    ("`original`", "10,000 steps: 3DGS", "10,000 steps: field"),
-    ("`peak`", "field: peak", "field"),
-    ("`mcmc`", "mcmc: logit", "field"),
-)
-"""Label, trial, and the trial of the default that it is compared with."""
+INSTEAD = {
+    "`original`": ("10,000 steps: 3DGS", "10,000 steps: field"),
+    "`peak`": ("field: peak", "field"),
+    "`mcmc`": ("mcmc: logit", "field"),
+}
+"""Label -> trial in results/held-out.json, and the trial of the default that it is compared with."""
 BY_ERROR = {
     "`original`": "3DGS",
     "by error": "error",
@@ -27,8 +28,7 @@ BY_ERROR = {
     "faster growth": "error: fast all",
 }
 """Label -> trial in results/error-guided.json."""
-COPIES = {"added": "added", "on the logit": "logit", "the same, stored": "logit, base"}
-COPIES |= {"none": "no opacity residual"}
+COPIES = {"added": "added", "on the logit": "logit", "the same, stored": "logit, base", "none": "no opacity residual"}
 """Where the opacity residual is added -> the trial under MCMC."""
 
 
@@ -53,9 +53,9 @@ def captures() -> str:
     body = []
     for scene, views in VIEWS.items():
         field, harmonics, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, HOST))
-        cells = [f"{mean(runs, 'psnr'):.2f}/{mean(runs, 'ssim'):.3f}" for runs in (field, host, harmonics)]
         share = f"{mean(field, 'splats') / mean(harmonics, 'splats'):.2f}"
-        body.append([f"{scene}, {views}", *cells, _ahead(view_gains(field, harmonics)), share])
+        cells = [*map(_cell, (field, host, harmonics)), _ahead(view_gains(field, harmonics)), share]
+        body.append([f"{scene}, {views}", *cells])
     head = ["capture, training views", "`nrfgs`", "splatfacto", "harmonics"]
     return grid([*head, "gain (ahead)", "splats"], body)
 
@@ -90,19 +90,14 @@ def demo(what: str) -> str:
     return f"{min(seconds):.0f} to {max(seconds):.0f}"
 
 
-def _value(runs: Trainings, metric: str) -> float | None:
-    values = [one[metric] for one in runs if one.get(metric)]
-    return fmean(values) if values else None
-
-
 def _cell(runs: Trainings) -> str:
-    values = [(_value(runs, metric), form) for metric, form in (("psnr", ".2f"), ("ssim", ".3f"))]
-    return "/".join(format(value, form) for value, form in values if value is not None) or "-"
+    return f"{mean(runs, 'psnr'):.2f}/{mean(runs, 'ssim'):.3f}" if runs else "-"
 
 
 def _gap(runs: Trainings) -> str:
-    train = _value(runs, "train_psnr")
-    return "-" if train is None else f"{train - _value(runs, 'psnr'):.1f}"
+    if not runs or any(one.get("train_psnr") is None for one in runs):
+        return "-"
+    return f"{mean(runs, 'train_psnr') - mean(runs, 'psnr'):.1f}"
 
 
 def test_views() -> str:
@@ -123,14 +118,15 @@ def test_views() -> str:
 Views = dict[tuple[str, str, str], tuple[float, float]]
 
 
-def _views(*trials: str) -> Views:
-    return {
-        (one["scene"].partition("/")[2], one["scene"].partition("/")[0], view[0]): (view[1], view[2])
-        for trial in trials
-        for one in records("held-out").values()
-        if one["name"] == trial
-        for view in one["per_image"]
-    }
+def _views(study: str, trial: str) -> Views:
+    """Means over seeds on the views of a trial."""
+    values = defaultdict(list)
+    for one in records(study).values():
+        if one["name"] == trial:
+            held_out, _, capture = one["scene"].partition("/")
+            for image, psnr, ssim, *_ in one["per_image"]:
+                values[capture, held_out, image].append((psnr, ssim))
+    return {view: tuple(map(fmean, zip(*pairs, strict=True))) for view, pairs in values.items()}
 
 
 def _held_out_gain(ours: Mapping, theirs: Mapping, views: list) -> str:
@@ -141,43 +137,28 @@ def _held_out_gain(ours: Mapping, theirs: Mapping, views: list) -> str:
     return f"{signed(median(psnr), 2)}/{signed(1000 * fmean(ssim), 0)}"
 
 
-def gains_over(harmonics: str, rows: Mapping[str, Iterable[str]]) -> str:
-    """Gains of trials (names by the row's label) over `harmonics` on the held-out views that all have."""
-    base = _views(harmonics)
-    tried = {label: _views(*names) for label, names in rows.items()}
+def gains_over(harmonics: str, rows: Mapping[str, Sequence[str]]) -> str:
+    """Gains of trials over `harmonics` on the held-out views that all have; of a row's trials the last counts."""
+    base = _views("held-out", harmonics)
+    tried = {label: ChainMap(*(_views("held-out", name) for name in reversed(names))) for label, names in rows.items()}
     common = [view for view in base if all(view in views for views in tried.values())]
     places = {scene: [view for view in common if view[0] == scene] for scene in FEW}
     body = [[label, *(_held_out_gain(views, base, places[scene]) for scene in FEW)] for label, views in tried.items()]
     return grid(["views", *(f"{scene}, {len(views)}" for scene, views in places.items())], body)
 
 
-def instead() -> str:
-    """Gains of other strategies over the default's on held-out views, and their splats."""
-    runs, body = list(records("held-out").values()), []
-    for label, trial, default in INSTEAD:
-        ours, theirs = _views(trial), _views(default)
-        cells = [_held_out_gain(ours, theirs, [v for v in theirs if v in ours and v[0] == one]) for one in FEW]
-        splats = [{one["scene"]: one["splats"] for one in runs if one["name"] == name} for name in (trial, default)]
-        share = median(splats[0][scene] / splats[1][scene] for scene in splats[0].keys() & splats[1].keys())
-        body.append([label, *cells, f"{share:.1f}"])
-    return grid(["", *FEW, "splats"], body)
-
-
-def by_error() -> str:
-    """Gain of growth by error over the default on held-out views, in the mean over seeds, and its splats."""
-    runs = records("error-guided").values()
-
-    def means(trial: str, scene: str) -> tuple[dict[str, tuple[float, float]], float]:
-        seeds = [run for run in runs if run["name"] == trial and run["scene"].endswith(f"/{scene}")]
-        views = zip(*(run["per_image"] for run in seeds), strict=True)
-        values = {view[0][0]: (fmean(one[1] for one in view), fmean(one[2] for one in view)) for view in views}
-        return values, fmean(run["splats"] for run in seeds) if seeds else 0.0
-
+def gains_of(study: str, rows: Mapping[str, tuple[str, str]]) -> str:
+    """Gains of trials over others on the held-out views that both have, and their share of the others' splats."""
     body = []
-    for label, trial in BY_ERROR.items():
-        pairs = [(means(trial, scene), means("default", scene)) for scene in FEW]
-        shares = [ours[1] / theirs[1] for ours, theirs in pairs if ours[1]]
-        cells = [_held_out_gain(ours[0], theirs[0], sorted(ours[0])) for ours, theirs in pairs]
+    for label, trials in rows.items():
+        ours, theirs = (_views(study, trial) for trial in trials)
+        cells = [_held_out_gain(ours, theirs, [v for v in theirs if v in ours and v[0] == scene]) for scene in FEW]
+        splats = [defaultdict(list), defaultdict(list)]
+        for one in records(study).values():
+            for number, trial in enumerate(trials):
+                if one["name"] == trial:
+                    splats[number][one["scene"]].append(one["splats"])
+        shares = [fmean(splats[0][scene]) / fmean(splats[1][scene]) for scene in splats[0].keys() & splats[1].keys()]
         body.append([label, *cells, f"{median(shares):.1f}"])
     return grid(["", *FEW, "splats"], body)
 
@@ -221,8 +202,10 @@ BLOCKS = {
         "harmonics: shrinkage",
         {"**u = V / (V + 20)**": ("field", "field: trust"), "u = 1": ("field: u = 1", "field: whole")},
     ),
-    "captures.instead": instead,
-    "captures.by_error": by_error,
+    "captures.instead": lambda: gains_of("held-out", INSTEAD),
+    "captures.by_error": lambda: gains_of(
+        "error-guided", {label: (trial, "default") for label, trial in BY_ERROR.items()}
+    ),
     "captures.without": without,
     "captures.test_views": test_views,
     "opacity.copies": lambda: gains_over("mcmc: harmonics", {name: [f"mcmc: {one}"] for name, one in COPIES.items()}),

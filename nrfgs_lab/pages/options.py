@@ -4,16 +4,14 @@
 python -m nrfgs_lab.pages.options            # writes docs/options.md
 """
 
-import ast
 import dataclasses
-import inspect
 import re
-import textwrap
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import docstring_parser
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -74,20 +72,15 @@ def explanation(config: type, name: str) -> str | None:
     """Docstring of a field in the nearest of this project's classes, or None."""
     for base in config.__mro__:
         if base.__module__.split(".")[0] in PACKAGES and name in vars(base).get("__annotations__", {}):
-            return _explanations(base)[name]
+            return _explanations(base).get(name, "")
     return None
 
 
 @cache
 def _explanations(config: type) -> dict[str, str]:
     """Field -> its docstring, on one line."""
-    (body,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
-    texts = {}
-    for node, following in zip(body.body, [*body.body[1:], None], strict=True):
-        if isinstance(node, ast.AnnAssign):
-            is_text = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
-            texts[node.target.id] = " ".join(following.value.value.split()) if is_text else ""
-    return texts
+    found = docstring_parser.parse_from_object(config).params
+    return {field.arg_name: " ".join((field.description or "").split()) for field in found}
 
 
 def table(options: list[Option], prefix: str = "") -> str:

@@ -15,13 +15,9 @@ FEW = {
 """Trial -> label."""
 
 
-def _trial(method: str, trial: str, scene: str) -> dict[str, Any] | None:
-    return records("growth").get(f"{method}/{trial}/{scene}-4")
-
-
 def growth_on_captures() -> str:
     """Gains of trials over splatfacto's rules on captures of few views: median dB, mean SSIM x 1000, splats."""
-    scenes = "castle", "kitchen", "fern", "fox", "goldcape", "caliterra"
+    scenes, trials = ("castle", "kitchen", "fern", "fox", "goldcape", "caliterra"), records("growth")
 
     def gain(new: dict[str, Any] | None, old: dict[str, Any] | None) -> str:
         if new is None or old is None:
@@ -33,7 +29,8 @@ def growth_on_captures() -> str:
     body = []
     for method, head in {"nrfgs": "field", "nrfgs-sh": "harmonics"}.items():
         for trial, label in FEW.items():
-            cells = [gain(_trial(method, trial, scene), _trial(method, "splatfacto", scene)) for scene in scenes]
+            pairs = [[trials.get(f"{method}/{name}/{scene}-4") for name in (trial, "splatfacto")] for scene in scenes]
+            cells = [gain(*pair) for pair in pairs]
             if any(cells):
                 body.append([f"{head}: {label}", *cells])
     return grid(["", *(f"`{scene}`" for scene in scenes)], body)

@@ -8,13 +8,13 @@ each test view its name, PSNR, SSIM and MS-SSIM.
 import json
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from nrfgs_lab.bench.table import BY_NAME, Row
+from nrfgs_lab.bench.table import BY_NAME, Row, grid
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = re.compile(r"runs/(?P<run>.+)-(?P<strategy>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)")
@@ -84,12 +84,6 @@ def view_gains(ours: Trainings, theirs: Trainings, all_seeds: bool = False) -> l
             for name, psnr, *_ in one["per_image"] if all_seeds or one["seed"] in seeds else ():
                 views[name][number].append(psnr)
     return [fmean(one) - fmean(other) for one, other in views.values() if one and other]
-
-
-def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def table(head: str, rows: dict[str, Any], *cells: Callable[[Any], str]) -> str:

@@ -6,21 +6,21 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-from nrfgs_lab.bench.table import BY_NAME, Row
+from nrfgs_lab.bench.table import Row
 from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, signed, span, table
 
 SITTING = timedelta(minutes=10)
 """Trainings that began within it were made on one machine, one after the other."""
 
 
-def row_of(run: str, scene: str = "bonsai") -> Row:
-    """Whole trainings, by their names in the plan `speed`."""
-    return bench_rows("speed")[scene, "own", run]
+def row_of(run: str) -> Row:
+    """Whole trainings of bonsai, by their names in the plan `speed`."""
+    return bench_rows("speed")["bonsai", "own", run]
 
 
-def values(column: str, run: str, scene: str = "bonsai") -> list[float]:
-    """A quantity of whole trainings, by seed."""
-    return list(row_of(run, scene).values[column].values())
+def values(column: str, run: str) -> list[float]:
+    """A quantity of whole trainings of bonsai, by seed."""
+    return list(row_of(run).values[column].values())
 
 
 def _ratios(column: str, run: str, base: str) -> list[float]:
@@ -65,11 +65,6 @@ def trainings() -> str:
 def spread(*runs: str) -> str:
     """By how much the slowest training of a run is above its fastest, at most."""
     return f"{100 * max(max(times) / min(times) - 1 for times in (values('time s', run) for run in runs)):.0f} %"
-
-
-def of_training(column: str, run: str) -> str:
-    """A quantity of trainings of bonsai, the median."""
-    return BY_NAME[column].form.format(median(values(column, run)))
 
 
 def _steps(run: str, begin: int, end: int) -> float:
@@ -175,7 +170,7 @@ BLOCKS = {
             "nrfgs-sh": "the same model with spherical harmonics (3DGS)",
             "splatfacto": "nerfstudio's own, for comparison",
         }.get,
-        lambda run: f"{float(of_training('peak MB', run)) / 1000:.1f} GB",
-        lambda run: f"{of_training('time s', run)} s",
+        lambda run: f"{median(values('peak MB', run)) / 1000:.1f} GB",
+        lambda run: f"{median(values('time s', run)):.1f} s",
     ),
 }

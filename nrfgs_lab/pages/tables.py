@@ -13,7 +13,7 @@ that a number of decibels in the prose of such a page stands in one of its block
 import operator
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from statistics import fmean, median
 from typing import Any
@@ -60,16 +60,6 @@ def _block(match: re.Match) -> str:
         new = BLOCKS[name](*(words[1:-1].split(", ") if words else []))
     new = f"\n\n{new.strip()}\n\n" if old.startswith("\n") else new
     return f"{OPENING}{name}{words} -->{new}<!-- end -->"
-
-
-def loose_decibels(text: str) -> Iterator[str]:
-    """Numbers of decibels in a page's prose that stand in none of its blocks."""
-    inside = " ".join(content for *_, content in BLOCK.findall(text))
-    known = set(re.findall(r"\d+(?:\.\d+)?", inside))
-    prose = re.sub(r"```.*?```|`[^`\n]*`", "", BLOCK.sub("", text), flags=re.DOTALL)
-    for number in re.findall(r"(?<![\d.])(\d+(?:\.\d+)?) dB", prose):
-        if number not in known:
-            yield number
 
 
 # Blocks that numbers.yaml declares.

@@ -49,20 +49,14 @@ document.body.append(frame);
 
 
 def measured(page: Path, browser: list[str], size: tuple[int, int], count: int, patience: float) -> dict:
-    """Measure a page in a browser.
+    """`nrfgs.measure`'s answer, "seconds_to_load", and "pictures": PNG bytes from some photographs' cameras.
 
     Args:
         page: the .html file, or the folder of a page with a separate scene.
         browser: command and options; a profile's folder and the address are added.
         size: of the frame, in CSS pixels.
         count: pictures over which seconds are averaged.
-        patience: seconds to wait.
-
-    Returns:
-        `nrfgs.measure`'s answer, "seconds_to_load", and "pictures": PNG bytes from some photographs' cameras.
-
-    Raises:
-        RuntimeError: the page failed, or did not answer.
+        patience: seconds to wait; RuntimeError if there is no answer, or the page failed.
     """
     folder, name = (page, "index.html") if page.is_dir() else (page.parent, page.name)
     outer = OUTER.replace("WIDTH", str(size[0])).replace("HEIGHT", str(size[1])).replace("COUNT", str(count))

@@ -16,16 +16,10 @@ written as a nerfstudio data set, or asked for its colour along any ray:
 
 from .cameras import camera_rays, dome_cameras, project, render
 from .config import SceneConfig
-from .dataset import split_names, write_scene
-from .geometry import FIRST_SOLID, GROUND, SKY
-from .scene import Scene, build_scene
-from .shading import tone_curve
+from .dataset import write_scene
+from .scene import build_scene
 
 __all__ = [
-    "FIRST_SOLID",
-    "GROUND",
-    "SKY",
-    "Scene",
     "SceneConfig",
     "build_scene",
     "camera_rays",
@@ -33,6 +27,5 @@ __all__ = [
     "project",
     "render",
     "split_names",
-    "tone_curve",
     "write_scene",
 ]

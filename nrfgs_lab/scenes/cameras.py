@@ -53,14 +53,11 @@ def look_at(position: Array, target: Array) -> Array:
 
 
 def camera_rays(config: SceneConfig, camera_to_world: Array, pixels: Array) -> tuple[Array, Array]:
-    """Rays through image positions.
+    """Origins [N, 3] and directions [N, 3] (not unit) of rays through image positions, float32.
 
     Args:
         camera_to_world: [4, 4] or [N, 4, 4], OpenGL axes.
         pixels: [N, 2], (x, y) from the left and top edge of the image; the centre of the first pixel is (0.5, 0.5).
-
-    Returns:
-        origins [N, 3] and directions [N, 3] (not unit), float32.
     """
     x = (pixels[:, 0] - 0.5 * config.width) / config.focal_length
     y = (0.5 * config.height - pixels[:, 1]) / config.focal_length

@@ -7,6 +7,7 @@
 <out>/scene.json            version and config
 """
 
+import contextlib
 import json
 import tempfile
 from collections.abc import Callable
@@ -27,9 +28,6 @@ SCENE_VERSION = 2
 SEEN_TOLERANCE = 1e-3
 """A view sees a surface point when its ray ends within this distance of it, world units."""
 
-Progress = Callable[[int, int], None]
-"""Called after each picture with (pictures done, pictures in all)."""
-
 
 def split_names(config: SceneConfig) -> tuple[list[str], list[str]]:
     """Paths of the training and the test images, relative to the data set; every `test_every`-th is a test image."""
@@ -38,10 +36,11 @@ def split_names(config: SceneConfig) -> tuple[list[str], list[str]]:
     return [name for name in names if name not in set(test)], test
 
 
-def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None) -> Path:
+def write_scene(config: SceneConfig, out: Path, progress: Callable[[int, int], None] | None = None) -> Path:
     """Render a scene and write it as a nerfstudio data set; reuse `out` when it already holds exactly that.
 
     The data set is written beside `out` and moved there when it is complete: an interrupted run leaves no half of one.
+    `progress` is called after each picture with (pictures done, pictures in all).
 
     Raises:
         FileExistsError: when `out` holds anything else: another scene, other files.
@@ -49,8 +48,13 @@ def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None
     out = Path(out)
     record = {"version": SCENE_VERSION, "config": asdict(config)}
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        _require_same_scene(out, record)
-        return out
+        with contextlib.suppress(OSError, ValueError):
+            if json.loads((out / "scene.json").read_text(encoding="utf-8")) == record:
+                return out
+        raise FileExistsError(
+            f"{out} exists and is not this procedural scene. Choose another folder, or delete this one to have it "
+            "written again."
+        )
 
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as workshop:
@@ -64,7 +68,7 @@ def write_scene(config: SceneConfig, out: Path, progress: Progress | None = None
 
 
 def sparse_points(scene: Scene, cameras: Array) -> tuple[Array, Array]:
-    """Points on visible surfaces, as structure from motion would find them, and their colours.
+    """Points [P, 3] on visible surfaces, as structure from motion would find them, and their colours [P, 3] in [0, 1).
 
     Positions are the ends of rays through uniformly random image positions of random views, so that every visible
     surface, floor and sky included, is covered in proportion to the pixels that it fills. Colours are display values,
@@ -72,9 +76,6 @@ def sparse_points(scene: Scene, cameras: Array) -> tuple[Array, Array]:
 
     Args:
         cameras: [V, 4, 4] camera-to-world matrices of the training views.
-
-    Returns:
-        points [P, 3] and colours [P, 3] in [0, 1), both float32.
     """
     config = scene.config
     rng = np.random.default_rng([config.seed, 2])
@@ -102,7 +103,7 @@ def _sees(scene: Scene, camera: Array, points: Array) -> Array:
     return inside & (np.linalg.norm(hits - points, axis=1) < SEEN_TOLERANCE)
 
 
-def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
+def _write_files(scene: Scene, folder: Path, progress: Callable[[int, int], None] | None) -> None:
     from nrfgs_ns.data.points import write_ply  # imports nerfstudio: seconds, for work alone
 
     config = scene.config
@@ -138,16 +139,3 @@ def _write_files(scene: Scene, folder: Path, progress: Progress | None) -> None:
         ],
     }
     (folder / "transforms.json").write_text(json.dumps(transforms, indent=1) + "\n", encoding="utf-8")
-
-
-def _require_same_scene(out: Path, record: dict) -> None:
-    """Pass when `out` is a data set of the scene that `record` describes; raise FileExistsError otherwise."""
-    fix = "Choose another folder, or delete this one to have it written again."
-    try:
-        there = json.loads((out / "scene.json").read_text(encoding="utf-8"))
-        differing = [key for key, value in record["config"].items() if there["config"].get(key) != value]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise FileExistsError(f"{out} exists and is not a procedural scene (no readable scene.json). {fix}") from error
-    if there != record:
-        what = f"another {', '.join(differing)}" if differing else "another version of the scene"
-        raise FileExistsError(f"{out} holds a procedural scene with {what}. {fix}")

@@ -116,15 +116,12 @@ class World:
     solids: tuple[Solid, ...]
 
     def first_hit(self, origins: Array, directions: Array, leaving: Array) -> tuple[Array, Array]:
-        """Nearest surface along rays that start inside the dome.
+        """Distances [N] to the nearest surfaces along rays, and the surfaces' numbers [N].
 
         Args:
             origins: [3, N], above the ground, inside the dome, outside the solids (or on their surfaces).
             directions: [3, N], unit.
             leaving: [N] integers, the surface that the ray leaves (CAMERA when none).
-
-        Returns:
-            distances [N] and surface numbers [N].
         """
         _, distance = Sphere((0.0, 0.0, 0.0), self.sky_radius).interval(origins, directions)
         surface = np.full(distance.shape, SKY, dtype=np.int8)

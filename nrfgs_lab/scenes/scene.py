@@ -29,8 +29,7 @@ class Object:
 class Scene:
     """Objects on a floor under lamps and a luminous sky dome; `shading.py` states the reflectance model.
 
-    The sky emits, and looks the same from everywhere at every gloss; so does a diffuse floor. Scene is immutable and
-    holds no image; queries are pure functions of their arguments, in the precision of the rays.
+    The sky and a diffuse floor look the same from everywhere at every gloss. Queries have the precision of the rays.
     """
 
     config: SceneConfig
@@ -47,14 +46,11 @@ class Scene:
     shadow_softness: float = 0.35
 
     def first_hit(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """What rays see first.
+        """Points [N, 3] that rays see first, and their surfaces [N]: SKY, GROUND, FIRST_SOLID + k for object k.
 
         Args:
             origins, directions: [N, 3], float32 or float64, world units; origins inside the dome, above the ground and
                 outside the objects. Directions of any length > 0.
-
-        Returns:
-            points [N, 3] and surface numbers [N] (SKY, GROUND, FIRST_SOLID + k for object k).
         """
         o, d = origins.T, normalize(directions.T)
         distance, surface = self.world.first_hit(o, d, np.full(o.shape[1], CAMERA))
@@ -218,6 +214,9 @@ def build_scene(config: SceneConfig) -> Scene:
     rng = np.random.default_rng(config.seed)
     noises = [Waves.random(rng, (2.5, 5.0, 9.0)), Waves.random(rng, (3.0, 7.0, 15.0))]  # sky, ground
     noises += [Waves.random(rng, (2.0, 4.0, 8.0)) for _ in objects]  # per object, in its local units
+    # The sky glows behind each lamp, in its colour, with a peak radiance of 6 in its strongest channel.
+    directions = [np.divide(lamp.position, np.linalg.norm(lamp.position)) for lamp in lamps]
+    glows = [np.multiply(6.0, lamp.intensity) / max(lamp.intensity) for lamp in lamps]
     return Scene(
         config=config,
         world=World(sky_radius=10.0, solids=tuple(item.solid for item in objects)),
@@ -229,18 +228,7 @@ def build_scene(config: SceneConfig) -> Scene:
         sky=Sky(
             horizon=(0.56, 0.37, 0.27),
             zenith=(0.10, 0.10, 0.27),
-            patches=tuple((_unit(lamp.position), _patch_radiance(lamp)) for lamp in lamps),
+            patches=tuple(zip(directions, glows, strict=True)),
         ),
         noises=tuple(noises),
     )
-
-
-def _unit(position: tuple[float, float, float]) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in np.asarray(position) / np.linalg.norm(position))
-    return x, y, z
-
-
-def _patch_radiance(lamp: Lamp) -> tuple[float, float, float]:
-    """The soft patch behind a lamp, in the lamp's colour, with a peak radiance of 6 in its strongest channel."""
-    r, g, b = (6.0 * value / max(lamp.intensity) for value in lamp.intensity)
-    return r, g, b

@@ -122,8 +122,8 @@ class Sky:
 
     horizon: Colour
     zenith: Colour
-    patches: tuple[tuple[Colour, Colour], ...]
-    """(towards, radiance) of the lamp patches; `towards` has unit length."""
+    patches: tuple[tuple[Array, Array], ...]
+    """(towards, radiance) of the lamp patches, [3] each; `towards` has unit length."""
     sharpness: float = 60.0
     cloud: float = 0.3
 

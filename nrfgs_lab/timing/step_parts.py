@@ -13,7 +13,6 @@ import gc
 import json
 import sys
 import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -100,7 +99,8 @@ class StepParts:
                 nonlocal began
                 strategy = model.densification.strategy
                 if step == self.grow:
-                    keep_only(self.splats, model, trainer.optimizers.optimizers)
+                    kept = torch.randperm(model.num_points, device=model.device)[: self.splats].sort().values
+                    take_rows(model, trainer.optimizers.optimizers, kept)
                     strategy.refine_every = strategy.reset_every = NEVER
                 which, at = divmod(step - begin, length)
                 if not 0 <= which < len(VARIANTS):
@@ -125,14 +125,6 @@ class StepParts:
         trainer.graphs = None
         gc.collect()
         return rows, (model, {"own": own, "1080p": [at_size(camera, *FULL_HD) for camera in own]})
-
-
-def keep_only(count: int, model: Any, by_group: Mapping[str, torch.optim.Optimizer]) -> None:
-    """Remove random splats of a training until there are `count` or fewer."""
-    if model.num_points > count:
-        surplus = torch.zeros(model.num_points, dtype=torch.bool, device=model.device)
-        surplus[torch.randperm(len(surplus), device=model.device)[: len(surplus) - count]] = True
-        take_rows(model, by_group, (~surplus).nonzero()[:, 0])
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ already is not repeated.
 """
 
 import json
-import math
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,9 +22,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from plyfile import PlyData
 from rich.progress import track
+from short_trainings import command_line, trained
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
-from nrfgs_lab.training_run import evaluate, machine, train
+from nrfgs_lab.training_run import evaluate, machine
 from nrfgs_ns.method_config import nrfgs
 
 SCENE = SceneConfig(views=16, width=48, height=36, points=600, samples=2)
@@ -59,9 +59,8 @@ def rescale(folder: Path, factor: float) -> None:
     path = folder / "transforms.json"
     meta = json.loads(path.read_text())
     for frame in meta["frames"]:
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 3] *= factor
-        frame["transform_matrix"] = pose.tolist()
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= factor
     path.write_text(json.dumps(meta))
     points = PlyData.read(str(folder / meta["ply_file_path"]), mmap=False)
     for axis in "xyz":
@@ -81,14 +80,11 @@ def keep(folder: Path, count: int, identical: bool = False) -> None:
     meta = json.loads(path.read_text())
     by_name = {frame["file_path"]: frame for frame in meta["frames"]}
     names = meta["train_filenames"][:count]
-    for split in ("train", "val", "test"):
-        meta[f"{split}_filenames"] = names if split == "train" else []
-    if identical:
-        for name in names[1:]:
-            shutil.copy(folder / names[0], folder / name)
-            by_name[name]["transform_matrix"] = by_name[names[0]]["transform_matrix"]
-    meta["frames"] = [by_name[name] for name in names]
-    path.write_text(json.dumps(meta))
+    for name in names[1:] if identical else ():
+        shutil.copy(folder / names[0], folder / name)
+        by_name[name]["transform_matrix"] = by_name[names[0]]["transform_matrix"]
+    meta |= {"train_filenames": names, "val_filenames": [], "test_filenames": []}
+    path.write_text(json.dumps({**meta, "frames": [by_name[name] for name in names]}))
 
 
 def hard_trainings() -> list[HardTraining]:
@@ -122,28 +118,20 @@ def run(training: HardTraining, seed: int, steps: int, work: Path) -> dict[str, 
     shutil.rmtree(work, ignore_errors=True)
     data = write_scene(SCENE, work / "scene")
     training.edit(data)
-    chosen = {
-        "--data": data,
-        "--output-dir": work / "outputs",
-        "--max-num-iterations": steps,
+    small = {
         "--machine.seed": seed,
-        "--vis": "tensorboard",
-        "--steps-per-eval-image": 10**6,
         "--steps-per-eval-all-images": 10**6,
-        "--logging.local-writer.enable": False,
-        "--logging.profiler": "none",
+        "--steps-per-eval-image": 10**6,
         "--pipeline.model.num-downscales": 0,
         "--pipeline.model.densification": "splatfacto,warmup_length=100",
-        **training.options,
     }
-    args = [training.method, *(str(word) for option in chosen.items() for word in option)]
-    args += ["nrfgs-data", "--auto-scale-poses", str(training.auto_scale)]
-    record = train(args)
-    results = evaluate(Path(record.config_path), work / "eval.json")
-    _, pipeline, _, _ = eval_setup(Path(record.config_path))
+    args = command_line(training.method, data, work / "outputs", steps, small, training.options)
+    config = trained([*args, "nrfgs-data", "--auto-scale-poses", str(training.auto_scale)])
+    results = evaluate(config, work / "eval.json")
+    _, pipeline, _, _ = eval_setup(config)
     tensors = all(bool(torch.isfinite(value).all()) for value in pipeline.model.parameters())
     numbers = [results[name] for name in ("psnr", "ssim", "l1")]
-    finite = tensors and all(number is not None and not math.isnan(number) for number in numbers)
+    finite = tensors and all(number is not None for number in numbers)  # evaluate() returns None for NaN
     return {"psnr": results["psnr"], "l1": results["l1"], "splats": results["splats"], "finite": finite}
 
 

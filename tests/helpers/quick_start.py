@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makes the start of each training in a process of tests quick."""
+"""A quick start of each training in a process of tests."""
 
 import gc
 
@@ -7,10 +7,10 @@ FREEZE, UNFREEZE = gc.freeze, gc.unfreeze
 
 
 def keep_what_is_imported() -> None:
-    """Keep the garbage collector off what there is, hundreds of thousands of objects, until `let_go`.
+    """Keep the garbage collector off all that is imported, until `let_go`.
 
-    Each training would walk through them, freeze them and thaw them again, which takes as long as ten of its steps.
-    That it does is what `test_lifecycle.py` looks at.
+    Each training would walk through hundreds of thousands of objects, freeze them and thaw them again, which takes as
+    long as ten of its steps. `test_lifecycle.py` checks that it does.
     """
     gc.collect()
     FREEZE()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trainings of a few steps: the command line that they have in common, what they leave, and whether two are one."""
+"""Trainings of a few steps: their command line, what they leave, and whether two are the same."""
 
 from pathlib import Path
 from typing import Any
@@ -24,15 +24,15 @@ QUIET = {
 
 
 def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict[str, Any]) -> list[str]:
-    """What follows `ns-train` for a quiet training.
+    """Words after `ns-train` of a quiet training.
 
     Args:
         method: name of a registered method.
         scene: folder of the data set.
         out: folder for what the training writes.
-        steps: of the whole training, those before the checkpoint that it goes on from included.
-        options: values by option, dashes included. Of several values the last counts, and None takes the option away
-            ("None" is a value).
+        steps: of the whole training, including those before the checkpoint that it goes on from.
+        options: values by option, dashes included; of several the last counts, and None takes the option away ("None"
+            is a value).
     """
     chosen = {"--data": scene, "--output-dir": out, "--max-num-iterations": steps, **QUIET}
     for more in options:
@@ -66,13 +66,12 @@ def checkpoint_of(config: Path) -> dict:
 
 
 def assert_same_training(one: dict, other: dict, rtol: float = 1e-5, atol: float = 1e-7) -> None:
-    """Two checkpoints were written after the same step and hold the same tensors: parameters, what densification has
-    counted, the optimisers' moments.
+    """Assert that two checkpoints have the same step and tensors: parameters, densification's counts, Adam's moments.
 
     A training that goes on from its checkpoint is the unbroken one: on the same machine both add the same numbers in
     the same order, so that only a lost state can differ.
     """
-    assert one["step"] == other["step"], f"after step {one['step']}, and after step {other['step']}"
+    assert one["step"] == other["step"]
     for part in ("pipeline", "optimizers"):
         assert_close(_tensors(one[part]), _tensors(other[part]), rtol=rtol, atol=atol)
 

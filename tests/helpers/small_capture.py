@@ -31,15 +31,8 @@ class Capture:
             pixels = self.rng.integers(0, 256, (self.height, self.width, 3), dtype=np.uint8)
             Image.fromarray(pixels).save(folder / name)
             frames.append({"file_path": name, "transform_matrix": self.pose(2 * np.pi * i / images).tolist()})
-        self.meta = {
-            "fl_x": 10.0,
-            "fl_y": 11.0,
-            "cx": 6.0,
-            "cy": 4.5,
-            "w": self.width,
-            "h": self.height,
-            "frames": frames,
-        }
+        intrinsics = {"fl_x": 10.0, "fl_y": 11.0, "cx": 6.0, "cy": 4.5}
+        self.meta = {**intrinsics, "w": self.width, "h": self.height, "frames": frames}
 
     @staticmethod
     def pose(angle: float) -> np.ndarray:

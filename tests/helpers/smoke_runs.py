@@ -8,6 +8,7 @@ writes results/smoke.json: for each case the PSNR of trainings with several seed
 
 import json
 import sys
+from functools import cache
 from pathlib import Path
 from statistics import stdev
 from typing import Any
@@ -32,25 +33,24 @@ def cases() -> dict[str, tuple[str, str, dict[str, Any], tuple[int, ...]]]:
     return found
 
 
+@cache
+def recorded() -> dict[str, dict[str, Any]]:
+    """Case -> "psnr" of its trainings by seed, and "after_one_step", which learns nothing."""
+    return json.loads(FILE.read_text(encoding="utf-8"))["records"]
+
+
 def bound(case: str) -> float:
     """PSNR that a training of the case must exceed: four deviations below the least of those recorded.
 
     The deviation is over seeds, the largest of the cases on the same data set.
     """
-    records = json.loads(FILE.read_text(encoding="utf-8"))["records"]
-    group = [one for name, one in records.items() if name.split("/")[0] == case.split("/")[0]]
-    return min(records[case]["psnr"]) - 4 * max(stdev(one["psnr"]) for one in group)
-
-
-def after_one_step(case: str) -> float:
-    """PSNR of the case's training after one step, which learns nothing."""
-    return json.loads(FILE.read_text(encoding="utf-8"))["records"][case]["after_one_step"]
+    group = [one for name, one in recorded().items() if name.split("/")[0] == case.split("/")[0]]
+    return min(recorded()[case]["psnr"]) - 4 * max(stdev(one["psnr"]) for one in group)
 
 
 def gain_bound(scene: str) -> float:
     """Decibels by which the field must be above harmonics on a capture: four deviations below the least recorded."""
-    records = json.loads(FILE.read_text(encoding="utf-8"))["records"]
-    field, harmonics = (records[f"{scene}/{method}"]["psnr"] for method in ("nrfgs", "nrfgs-sh"))
+    field, harmonics = (recorded()[f"{scene}/{method}"]["psnr"] for method in ("nrfgs", "nrfgs-sh"))
     gains = [ours - theirs for ours, theirs in zip(field, harmonics, strict=True)]
     return min(gains) - 4 * stdev(gains)
 

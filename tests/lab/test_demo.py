@@ -42,7 +42,7 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
 
 @pytest.mark.parametrize(
     "options, says",
-    [({"steps": 0}, "--steps is 0"), ({"gloss": 1.5}, "gloss must lie in"), ({"seed": -1}, "seed must be")],
+    [({"steps": 0}, "--steps is 0"), ({"gloss": 1.5}, "--gloss is 1.5"), ({"seed": -1}, "--seed is -1")],
 )
 def test_impossible_options_are_refused_in_a_sentence(options, says, tmp_path):
     with pytest.raises(InputError, match=says):

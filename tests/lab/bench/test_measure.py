@@ -2,15 +2,14 @@
 """One real run of a benchmark, in this process: interrupted while training and before its evaluation, then measured."""
 
 import json
-from pathlib import Path
+from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
 from nrfgs_lab.bench import run as bench_run
-from nrfgs_lab.bench.measure import at_size, flip, over_views
+from nrfgs_lab.bench.measure import at_size, over_views
 from nrfgs_lab.bench.spec import Job, cells_of, command, identity, make_spec
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -22,101 +21,61 @@ class Killed(BaseException):
 
 def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monkeypatch):
     content = {"runs": {"NRF": "nrfgs"}, "scenes": ["tiny"], "strategies": ["mcmc@310,warmup_length=1"], "steps": 8}
-    options = "--pipeline.model.few-views off"
-    content |= {"checkpoint_every": 2, "train_views": 3, "options": options}
+    content |= {"checkpoint_every": 2, "train_views": 3, "options": "--pipeline.model.few-views off"}
     spec = make_spec(content, "test")
     (cell,) = cells_of(spec)
-    parser = ["nrfgs-data", "--data", str(tiny_scene)]
-    args = command(spec, cell, parser, tmp_path / "work")
-    work = str(tmp_path / "work")
-    job = Job(args, {"run": "NRF"}, identity(spec, cell, parser), 8, str(tmp_path / "record.json"), work, 3, 1)
+    parser, work = ["nrfgs-data", "--data", str(tiny_scene)], tmp_path / "work"
+    args, record = command(spec, cell, parser, work), tmp_path / "record.json"
+    job = Job(args, {"run": "NRF"}, identity(spec, cell, parser), 8, str(record), str(work), 3, 1)
+    train = bench_run.train
 
-    train, evaluate = bench_run.train, bench_run.evaluate
-
-    def killed_at_5(args, on_step, on_save, earlier):
-        def step(number: int) -> None:
-            if number == 5:
-                raise Killed
-
-        return train(args, step, on_save, earlier)
-
-    def killed(*_):
+    def killed(*_, **__):
         raise Killed
 
-    monkeypatch.setattr(bench_run, "train", killed_at_5)
-    with pytest.raises(Killed):
-        bench_run.run(job)
-    assert bench_run.last_checkpoint(tmp_path / "work").name == "step-000000004.ckpt"
-    monkeypatch.setattr(bench_run, "train", train)
-    monkeypatch.setattr(bench_run, "evaluate", killed)
-    with pytest.raises(Killed):
-        bench_run.run(job)
-    assert not Path(job.record).exists()
+    def killed_at_5(args, on_save, earlier):
+        return train(args, lambda step: killed() if step == 5 else None, on_save, earlier)
+
+    for name, deadly in (("train", killed_at_5), ("evaluate", killed)):
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(bench_run, name, deadly)
+            bench_run.run(job)
+        assert not record.exists()
+        assert bench_run.last_checkpoint(work).stem == {"train": "step-000000004", "evaluate": "step-000000007"}[name]
     monkeypatch.setattr(bench_run, "train", killed)  # what is trained is not trained again
-    monkeypatch.setattr(bench_run, "evaluate", evaluate)
     bench_run.run(job)
 
-    record = json.loads(Path(job.record).read_text())
+    record = json.loads(record.read_text())
     measured, trained = record["measured"], record["train"]
-    assert (
-        record["identity"] == job.identity
-        and record["cell"] == {"run": "NRF"}
-        and str(tmp_path) not in json.dumps(record)
-    )
+    assert record["identity"] == job.identity and record["cell"] == {"run": "NRF"}
+    assert str(tmp_path) not in json.dumps(record)
     assert trained["parts"] == 2 and trained["steps"] == 8 and trained["seconds"] > 0
     assert [step for step, _ in trained["splats"]] == [0, 7]
     assert [step for step, _ in trained["saved"]] == [2, 4, 6, 7]
-    # One and the same code took both; the renderings are the same to rounding.
+    # The same code took both; the renderings are the same to rounding.
     for metric in ("psnr", "ssim", "l1"):
         assert measured["test"][metric] == pytest.approx(record["eval"][metric], rel=1e-5)
-    assert measured["test"]["lpips"] is None
-    assert [image["image"] for image in measured["train"]["per_image"]] == [
-        "view_001.png",
-        "view_003.png",
-        "view_006.png",
-    ]
-    mean = sum(image["psnr"] for image in measured["train"]["per_image"]) / 3
-    assert measured["train"]["psnr"] == pytest.approx(mean)
+    images = measured["train"]["per_image"]
+    assert [image["image"] for image in images] == [f"view_00{view}.png" for view in (1, 3, 6)]
+    assert measured["train"]["psnr"] == pytest.approx(sum(image["psnr"] for image in images) / 3)
     assert measured["parameter_bytes"] == record["eval"]["parameter_bytes"] == 4 * (measured["splats"] * 46 + 6664)
-    assert measured["diffuse"] == 0
+    assert measured["test"]["lpips"] is None and measured["diffuse"] == 0
     assert measured["fps"] > 0 and measured["checkpoint_bytes"] > measured["parameter_bytes"]
-    assert len(list((tmp_path / "work" / "pictures").glob("eval_img_*.png"))) == 2
+    assert len(list((work / "pictures").glob("eval_img_*.png"))) == 2
 
 
-class Grey:
-    """A model that renders grey."""
-
-    device = torch.device("cpu")
-
-    def get_outputs_for_camera(self, camera):
-        return {"rgb": torch.full((16, 16, 3), 0.5), "background": torch.zeros(3)}
-
-    def get_gt_img(self, image):
-        return image
-
-    def composite_with_background(self, image, background):
-        return image
-
-
-def test_flip_is_asked_for_inside_the_mask_and_left_out_of_the_mean_where_it_is_none():
-    asked = []
-
-    def flip(pred, truth, mask):
-        asked.append((pred.shape, float(truth.mean()), mask if mask is None else int(mask.sum())))
-        return None if mask is not None and not mask.any() else 0.25 * len(asked)
-
-    def view(name, value, mask=None):
-        batch = {"image": torch.full((16, 16, 3), value)} | ({} if mask is None else {"mask": mask})
-        return name, (None, batch)
-
-    part = torch.zeros(16, 16, 1)
-    part[:4] = 1.0
-    views = [view("a", 0.5), view("b", 0.0, part), view("c", 1.0, torch.zeros(16, 16, 1))]
-    measured = over_views(Grey(), views, flip)
-    assert asked == [((16, 16, 3), 0.5, None), ((16, 16, 3), 0.0, 64), ((16, 16, 3), 1.0, 0)]
-    assert [one["flip"] for one in measured["per_image"]] == [0.25, 0.5, None] and measured["flip"] == 0.375
-    without = over_views(Grey(), views)
-    assert without["flip"] is None and "flip" not in without["per_image"][0]
+def test_metrics_count_inside_the_mask():
+    grey, mask = torch.full((16, 16, 3), 0.5), torch.zeros(16, 16, 1)
+    mask[:4] = 1.0
+    model = SimpleNamespace(
+        device=torch.device("cpu"),
+        get_outputs_for_camera=lambda camera: {"rgb": grey, "background": torch.zeros(3)},
+        get_gt_img=lambda image: image,
+        composite_with_background=lambda image, background: image,
+    )
+    photograph = torch.where(mask > 0, 0.75, 0.0).expand(16, 16, 3)
+    views = [("a", (None, {"image": photograph, "mask": mask})), ("b", (None, {"image": photograph}))]
+    measured = over_views(model, views)
+    assert [image["l1"] for image in measured["per_image"]] == pytest.approx([0.25, (0.25 + 3 * 0.5) / 4])
 
 
 def test_at_size_keeps_the_pose_and_the_vertical_angle():
@@ -129,16 +88,3 @@ def test_at_size_keeps_the_pose_and_the_vertical_angle():
         rays = [one.generate_rays(0, coords=torch.tensor(at).float()) for one, at in ((camera, before), (wide, after))]
         torch.testing.assert_close(rays[0].directions, rays[1].directions)
         torch.testing.assert_close(rays[0].origins, rays[1].origins)
-
-
-def test_equal_is_zero_different_is_more_and_outside_a_mask_nothing_counts():
-    pytest.importorskip("flip_evaluator")
-    truth = np.random.default_rng(0).random((40, 50, 3))
-    worse = np.clip(truth + 0.2, 0, 1)
-    assert flip(truth, truth) == 0.0
-    assert 0 < flip(np.clip(truth + 0.05, 0, 1), truth) < flip(worse, truth) <= 1
-    left = np.zeros((40, 50), dtype=bool)
-    left[:, :25] = True
-    half = np.where(left[..., None], truth, worse)
-    assert flip(half, truth, left) == 0.0 < flip(half, truth, ~left)
-    assert flip(half, truth, np.zeros_like(left)) is None

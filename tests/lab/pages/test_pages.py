@@ -17,7 +17,7 @@ import tyro
 from nerfstudio.configs import method_configs
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
-from smoke_runs import after_one_step
+from smoke_runs import recorded
 
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
 from nrfgs_lab.pages.tables import pages
@@ -73,7 +73,7 @@ def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tm
     state = torch.load(next(tmp_path.rglob("*.ckpt")), weights_only=True)["pipeline"]
     assert state["_model.gauss_params.slopes"].abs().max() > 0
     reached = evaluate(record.config_path, tmp_path / "eval.json")["psnr"]
-    assert reached > after_one_step("tiny/nrfgs-sh")
+    assert reached > recorded()["tiny/nrfgs-sh"]["after_one_step"]
 
 
 def test_the_page_is_current():
@@ -93,18 +93,6 @@ def test_every_option_is_explained():
     assert {f"pipeline.model.appearance.{name}" for name in fields} <= flags
     assert "time-budget" in flags and "pipeline.model.densification" in flags
     assert not any("sh-degree" in flag or "num-downscales" in flag for flag in flags)  # suppressed; splatfacto's
-
-
-@pytest.mark.parametrize("words", [["nrfgs"], ["nrfgs", "nrfgs-data"]])
-def test_the_command_line_has_them(words):
-    screen = io.StringIO()
-    with contextlib.redirect_stdout(screen), pytest.raises(SystemExit):
-        parse([*words, "--help"])
-    known = set(re.findall(r"--([\w.-]+)", screen.getvalue()))
-    for option in own_options(methods()[0].config):
-        inner = option.flag.split(".dataparser.")
-        if len(inner) == len(words):  # the data set's options come after its word
-            assert inner[-1].lower() in {flag.lower() for flag in known}, option.flag
 
 
 ROOT = Path(__file__).resolve().parents[3]

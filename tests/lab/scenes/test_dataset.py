@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The written data set: conventions, split, points, determinism, reuse, and that nerfstudio reads it."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -15,11 +16,10 @@ from nrfgs_lab.scenes import (
     dome_cameras,
     project,
     render,
-    split_names,
-    tone_curve,
     write_scene,
 )
-from nrfgs_lab.scenes.dataset import sparse_points
+from nrfgs_lab.scenes.dataset import sparse_points, split_names
+from nrfgs_lab.scenes.shading import tone_curve
 
 MATT = SceneConfig(gloss=0.0, views=10, width=96, height=72, points=1500)
 GLOSSY = SceneConfig(gloss=1.0, views=9, width=24, height=18, points=50)
@@ -95,25 +95,6 @@ def test_points_project_onto_their_colours(matt):
     # Half a pixel raises the mean error by about a third and more.
     for shift in [(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]:
         assert colour_errors(matt, MATT, shift)[0].mean() > 1.2 * errors.mean()
-
-
-def test_transforms_hold_the_cameras(matt):
-    transforms, images, _, _ = load(matt)
-    np.testing.assert_array_equal([f["transform_matrix"] for f in transforms["frames"]], dome_cameras(MATT))
-    names = [f["file_path"] for f in transforms["frames"]]
-    assert names == sorted(names) and len(names) == MATT.views
-    assert {image.shape for image in images.values()} == {(72, 96, 3)}
-    assert transforms["camera_model"] == "OPENCV"
-    assert [transforms[key] for key in ("w", "h", "cx", "cy", "k1", "k2", "p1", "p2")] == [96, 72, 48, 36, 0, 0, 0, 0]
-
-
-def test_every_eighth_image_is_for_test_and_validation(matt):
-    transforms, _, _, _ = load(matt)
-    names = [f["file_path"] for f in transforms["frames"]]
-    assert transforms["test_filenames"] == transforms["val_filenames"] == [names[0], names[8]]
-    assert transforms["train_filenames"] == names[1:8] + names[9:]
-    train, test = split_names(SceneConfig(views=48, test_every=5))
-    assert len(test) == 10 and len(train) == 38 and not set(train) & set(test)
 
 
 def test_cameras_are_rigid_upright_and_look_at_the_scene():
@@ -200,25 +181,16 @@ def test_same_scene_is_reused_even_beside_other_files(glossy):
     (glossy / "outputs").rmdir()
 
 
-def test_another_scene_is_refused_by_name(glossy):
-    other = SceneConfig(**{**GLOSSY.__dict__, "gloss": 0.5})
-    with pytest.raises(FileExistsError, match=r"glossy holds a procedural scene with another gloss\. Choose another"):
-        write_scene(other, glossy)
-
-
-def test_other_content_is_refused(tmp_path):
+def test_other_content_is_refused(glossy, tmp_path):
     tiny = SceneConfig(views=2, width=4, height=3, samples=1, points=5)
+    with pytest.raises(FileExistsError, match=r"glossy exists and is not this procedural scene\. Choose another"):
+        write_scene(dataclasses.replace(GLOSSY, gloss=0.5), glossy)
     photos = tmp_path / "photos"
     photos.mkdir()
     (photos / "holiday.jpg").touch()
-    with pytest.raises(FileExistsError, match="photos exists and is not a procedural scene.*delete this one"):
-        write_scene(tiny, photos)
-    with pytest.raises(FileExistsError, match="holiday.jpg exists"):
-        write_scene(tiny, photos / "holiday.jpg")
-    (photos / "scene.json").write_text("[1, 2]")
-    with pytest.raises(FileExistsError, match="not a procedural scene"):
-        write_scene(tiny, photos)
-
+    for place in (photos, photos / "holiday.jpg"):
+        with pytest.raises(FileExistsError, match=f"{place.name} exists and is not this .*delete this one"):
+            write_scene(tiny, place)
     (tmp_path / "empty").mkdir()
     assert (write_scene(tiny, tmp_path / "empty") / "scene.json").is_file()
 

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Procedural scenes: options, geometry, shading, and all together."""
-
-import math
+"""Procedural scenes: geometry, shading, and all together."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_lab.scenes import FIRST_SOLID, GROUND, SKY, SceneConfig, build_scene, camera_rays, dome_cameras
-from nrfgs_lab.scenes.geometry import CAMERA, Box, Sphere, World
+from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras
+from nrfgs_lab.scenes.geometry import CAMERA, FIRST_SOLID, GROUND, SKY, Box, Sphere, World
 from nrfgs_lab.scenes.shading import (
     Ambient,
     Finish,
@@ -19,34 +17,6 @@ from nrfgs_lab.scenes.shading import (
     mean_fresnel,
     tone_curve,
 )
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("gloss", -0.1),
-        ("gloss", 1.01),
-        ("gloss", math.nan),
-        ("gloss", "shiny"),
-        ("arc", 0.0),
-        ("arc", 361.0),
-        ("views", 1),
-        ("views", 4.0),
-        ("width", 0),
-        ("height", -3),
-        ("samples", 0),
-        ("points", 0),
-        ("test_every", 1),
-        ("seed", -1),
-        ("seed", True),
-        ("field_of_view", 0.0),
-        ("field_of_view", 121.0),
-    ],
-)
-def test_bad_values_name_the_field_and_the_value(field, value):
-    with pytest.raises(ValueError, match=f"SceneConfig.{field} must .*got {value!r}"):
-        SceneConfig(**{field: value})
-
 
 SPHERE = Sphere((0.3, -0.2, 0.7), 0.7)
 BOX = Box((-0.9, 0.8, 0.5), (0.3, 0.4, 0.5), yaw=0.6)
@@ -148,21 +118,17 @@ def test_shadow_is_full_through_the_middle_none_in_the_open_and_soft_between():
     points = np.array([[0.3, -0.2, 0.0], [4.0, 4.0, 0.0]] + [[0.3 + x, -0.2, 0.0] for x in np.linspace(0.0, 1.2, 50)])
     towards = lamp - points
     distance = np.linalg.norm(towards, axis=1)
-    leaving = np.full(len(points), GROUND)
-    share = WORLD.shadow(points.T, (towards / distance[:, None]).T, distance, leaving, softness=0.35)
-    assert share[0] == 0.0 and share[1] == 1.0
-    rim = share[2:]
-    assert (np.diff(rim) >= 0.0).all() and rim[0] == 0.0 and rim[-1] == 1.0
-    assert ((rim > 0.05) & (rim < 0.95)).any()
 
+    def share(distances, surface=GROUND):
+        rays = points.T, (towards / distance[:, None]).T
+        return WORLD.shadow(*rays, distances, np.full(len(points), surface), softness=0.35)
 
-def test_shadow_ignores_solids_behind_the_lamp_and_the_lit_solid_itself():
-    point, up = np.array([[0.3, -0.2, 0.0]]).T, np.array([[0.0, 0.0, 1.0]]).T
-    below_the_sphere = np.array([1e-3])
-    ground, sphere = np.array([GROUND]), np.array([FIRST_SOLID])
-    # The sphere touches the ground here, so at most 1e-3 of it lies before the lamp: smoothstep(1e-3 / 0.35) < 3e-5.
-    assert WORLD.shadow(point, up, below_the_sphere, ground, softness=0.35)[0] > 1.0 - 3e-5
-    assert WORLD.shadow(point, up, np.array([5.0]), sphere, softness=0.35)[0] == 1.0
+    blocked, open_, *rim = share(distance)
+    assert blocked == rim[0] == 0.0 and open_ == rim[-1] == 1.0
+    assert (np.diff(rim) >= 0.0).all() and ((np.array(rim) > 0.05) & (np.array(rim) < 0.95)).any()
+    # The sphere does not shade itself, nor does what lies behind the lamp: it touches the ground at the first point.
+    assert share(distance, surface=FIRST_SOLID)[0] == 1.0
+    assert share(np.full(len(points), 1e-3))[0] > 1.0 - 3e-5
 
 
 def test_openness_is_the_unblocked_share_of_cosine_weighted_directions():
@@ -279,12 +245,6 @@ def views_above(scene, points, surfaces, count, seed=1):
     return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
-def test_every_surface_is_seen():
-    scene = build_scene(SceneConfig(**SMALL))
-    _, surfaces = surface_points(scene, 4000)
-    assert set(surfaces) == {SKY, GROUND, *range(FIRST_SOLID, FIRST_SOLID + len(scene.objects))}
-
-
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_without_gloss_every_point_has_one_colour(seed):
@@ -296,34 +256,11 @@ def test_without_gloss_every_point_has_one_colour(seed):
         np.testing.assert_array_equal(other, first)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_without_gloss_rays_from_everywhere_bring_that_colour(dtype):
-    scene = build_scene(SceneConfig(gloss=0.0, **SMALL))
-    points, surfaces = surface_points(scene)
-    expected = scene.outgoing_radiance(points, surfaces, views_above(scene, points, surfaces, 1)[0])
-    compared = 0
-    for view in views_above(scene, points, surfaces, 5, seed=2):
-        origins = (points + 0.05 * view).astype(dtype)
-        hits, again = scene.first_hit(origins, -view.astype(dtype))
-        # Rays that meet another object within 0.05, start in one, or just miss the edge, see something else; grazing
-        # ones (n.v < 0.1) magnify rounding.
-        facing = (scene.world.normals(points.T, surfaces).T * view).sum(-1)
-        same = (again == surfaces) & (np.linalg.norm(hits - points, axis=1) < 1e-3) & (facing > 0.1)
-        assert same.mean() > 0.75
-        compared += same.sum()
-        arriving = scene.radiance(origins, -view.astype(dtype))
-        assert arriving.dtype == dtype
-        # Rounding moves the hit by a few eps x 10 (the dome's radius) / 0.1 (grazing), and colours change by at most
-        # some 20 per unit length (the steepest texture edge: tanh slope 3 x pi x 4 fields / radius 0.3 / 2, times 0.3).
-        np.testing.assert_allclose(arriving[same], expected[same], atol=4 * np.finfo(dtype).eps * 10 / 0.1 * 20)
-    assert compared > 2000
-
-
 def view_variance(gloss):
     """Mean over points and channels of the variance over views of the radiance."""
     scene = build_scene(SceneConfig(gloss=gloss, **SMALL))
-    points, surfaces = surface_points(scene, 800)
-    radiance = [scene.outgoing_radiance(points, surfaces, v) for v in views_above(scene, points, surfaces, 12)]
+    points, surfaces = surface_points(scene, 300)
+    radiance = [scene.outgoing_radiance(points, surfaces, v) for v in views_above(scene, points, surfaces, 8)]
     return np.var(radiance, axis=0).mean()
 
 
