@@ -6,10 +6,12 @@ when it times frames.
 """
 
 from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
@@ -37,9 +39,9 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
 
     Returns:
         "test" and "train" (null without views), each with "per_image" and means of psnr, ssim, ms_ssim, l1, lpips (null
-        without weights), colour-corrected cc_psnr, ...; "fps" at the photographs' size and "fps_1080p" (null on a CPU),
-        null if not timed; "splats", of which "diffuse" have no residual; "parameter_bytes" of a renderer;
-        "checkpoint_bytes" with the optimisers' moments.
+        without weights), flip (null without `flip-evaluator`), colour-corrected cc_psnr, ...; "fps" at the photographs'
+        size and "fps_1080p" (null on a CPU), null if not timed; "splats", of which "diffuse" have no residual;
+        "parameter_bytes" of a renderer; "checkpoint_bytes" with the optimisers' moments.
     """
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
     model, data = pipeline.model, pipeline.datamanager
@@ -76,11 +78,32 @@ def over_views(model, views: Iterable) -> dict[str, Any]:
         truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
         mask = batch["mask"].to(model.device).float() >= 0.5 if "mask" in batch else None
         per_image.append({"image": name, **image_metrics(outputs["rgb"], truth, mask)})
+        if find_spec("flip_evaluator") is not None:
+            arrays = [None if image is None else image.numpy(force=True) for image in (outputs["rgb"], truth, mask)]
+            per_image[-1]["flip"] = flip(*arrays)
     means = {}
-    for metric in METRIC_NAMES:
+    for metric in (*METRIC_NAMES, "flip"):
         values = [image[metric] for image in per_image if image.get(metric) is not None]
         means[metric] = sum(values) / len(values) if values else None
     return {**means, "per_image": per_image}
+
+
+def flip(pred: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float | None:
+    """Mean FLIP (Andersson et al., PACMCGIT 3(2), 2020) in [0, 1] at 67 pixels a degree; lower is better.
+
+    Args:
+        pred, truth: sRGB images [H, W, 3] in [0, 1].
+        mask: bool [H, W, 1]; outside, the images count as equal and no pixel enters the mean.
+
+    Returns:
+        None if the mask is empty.
+    """
+    import flip_evaluator
+
+    inside = np.ones_like(truth[..., :1], dtype=bool) if mask is None else mask
+    images = (np.ascontiguousarray(image, dtype=np.float32) for image in (truth, np.where(inside, pred, truth)))
+    errors = flip_evaluator.evaluate(*images, "LDR", applyMagma=False)[0]
+    return float(errors.reshape(inside.shape)[inside].mean()) if inside.any() else None
 
 
 def at_size(camera: Cameras, width: int, height: int) -> Cameras:

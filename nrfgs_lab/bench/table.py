@@ -55,7 +55,8 @@ def _metric(name: str, form: str = "{:.4f}", better: int = 1) -> Column:
 COLUMNS = (
     Column("splats", _at("measured", "splats"), "{:,.0f}", -1),
     Column("time s", _at("train", "seconds"), "{:.1f}", -1, is_time=True),
-    *(_metric("SSIM"), _metric("MS-SSIM"), _metric("LPIPS", better=-1), _metric("L1", better=-1)),
+    *(_metric("SSIM"), _metric("MS-SSIM"), _metric("LPIPS", better=-1), _metric("FLIP", better=-1)),
+    _metric("L1", better=-1),
     *(_metric("PSNR", "{:.2f}"), _metric("cc PSNR", "{:.2f}"), _metric("cc SSIM")),
     Column("FPS", _at("measured", "fps"), "{:.1f}", 1, is_time=True),
     Column("FPS 1080p", _at("measured", "fps_1080p"), "{:.1f}", 1, is_time=True),

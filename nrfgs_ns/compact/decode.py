@@ -38,6 +38,11 @@ class Decoded(NamedTuple):
     """the table, float32, and "diffuse", bool [N]; latents of diffuse splats are 0"""
     header: dict[str, Any]
 
+    @property
+    def near(self) -> float:
+        """Depth from which splats are drawn, in world units; 0: splatfacto's."""
+        return self.header.get("render", {}).get("near_plane", 0.0)
+
 
 def decode(path: Path) -> Decoded:
     """Read a compact file; InputError if it cannot be read, is damaged, or describes no field."""
@@ -55,7 +60,10 @@ def decode(path: Path) -> Decoded:
             raise ValueError("the head's weights are not finite")
         grids = _grids(header["grids"], config.latent_dim)
         _check_size(header["splats"], config.latent_dim, sum(stream.nbytes for stream in streams.values()))
-        return Decoded(config, weights, _splats(header["splats"], grids, streams), header)
+        decoded = Decoded(config, weights, _splats(header["splats"], grids, streams), header)
+        if type(decoded.near) not in (int, float) or not 0 <= decoded.near < math.inf:
+            raise ValueError(f"the near plane is {ascii(decoded.near)}")
+        return decoded
     except BROKEN as error:
         reason = " ".join(str(error).split())[:LONGEST_REASON]
         raise InputError(
@@ -139,5 +147,6 @@ def model_state(model, decoded: Decoded) -> dict[str, Any]:
             "head": decoded.header["head"]["name"],
             "densification": model.densification.name,
             "strategy": {DIFFUSE: diffuse} if diffuse.any() else {},
+            "near": decoded.near,
         },
     }

@@ -6,7 +6,7 @@ Keys of the header, beside "streams":
     format   "nrfgs-compact"
     splats   {"view": V, "diffuse": W}: how many of each kind; N = V + W
     head     "name" ("nrf"), "config" (the field's options, "latent_dim" the rank R), "scene_unit"
-    render   "rasterize_mode", "background" (RGB)
+    render   "rasterize_mode", "background" (RGB), "near_plane" in world units
     grids    for "means", "turns", "scales", "opacities", "colors", "latents": "low" and "step", [columns]
 
 An integer k in a column of a table stands for low + step k; low is 0 except in means. The streams:

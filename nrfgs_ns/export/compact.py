@@ -77,6 +77,7 @@ def write_file(
         field = with_rank(field, basis, field.head.config.latent_dim)
     times.append(perf_counter())
     render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
+    render["near_plane"] = model.projection_options.near_plane
     size = write_container(output, *encode(field, render, steps))
     times.append(perf_counter())
     decoded = decode(output)

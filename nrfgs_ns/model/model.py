@@ -43,7 +43,7 @@ from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.rasterizer import ProjectionOptions
 
 NEAR_SHARE = 0.5
-"""Near plane of `near_plane` auto, in nearest depths."""
+"""Near plane of `near_plane` auto, in the depth of the nearest points (`data.views.nearest_depth`)."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """Background in evaluation after training with random ones: viser's default grey, as in splatfacto."""
 
@@ -73,8 +73,8 @@ class NrfgsModel(SplatfactoModel):
         """World units in a scene unit; lengths in the configuration are in scene units."""
         self.num_views: int = metadata.get("different_views", self.num_train_data)
         """Different training views (`data.views.different_views`); a checkpoint keeps its training's number."""
-        self.nearest_depth: float = metadata.get("nearest_depth", 0.0)
-        """Depth of the nearest points (`data.views.nearest_depth`); a checkpoint keeps its training's."""
+        self.near: float = NEAR_SHARE * metadata.get("nearest_depth", 0.0)
+        """Depth from which `near_plane` auto draws splats, in world units; a checkpoint keeps its training's."""
         config.appearance.validate()
         self.head = config.suited_appearance(self.num_views).setup(self.scene_unit)
         config.sh_degree = self.head.sh_degree
@@ -166,7 +166,7 @@ class NrfgsModel(SplatfactoModel):
 
     @property
     def projection_options(self) -> ProjectionOptions:
-        near = NEAR_SHARE * self.nearest_depth if self.config.near_plane == "auto" else 0.0
+        near = self.near if self.config.near_plane == "auto" else 0.0
         # In training the guard finds numbers that are not finite.
         return projection_options(self.config.rasterize_mode, self.scene_unit, near, assume_finite=self.training)
 
@@ -454,11 +454,10 @@ class NrfgsModel(SplatfactoModel):
             "densification": self.densification.name,
             "strategy": dict(self.densification.state),
             "views": self.num_views,
+            "near": self.near,
         }
         if reduced := self.reduced_head:
             state["capacity"] = {"head": reduced}
-        if self.nearest_depth > 0:
-            state["nearest_depth"] = self.nearest_depth
         return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -469,7 +468,7 @@ class NrfgsModel(SplatfactoModel):
             )
         self.densification.load_state(state["strategy"], self.device)
         self.num_views = state.get("views", self.num_train_data)
-        self.nearest_depth = state.get("nearest_depth", 0.0)
+        self.near = state.get("near", 0.0)
         if "schedule_step" in state:
             self.schedule_at(state["schedule_step"])
             self.head.set_step(self.schedule_step)

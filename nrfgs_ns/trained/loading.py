@@ -102,7 +102,7 @@ def load_file(path: Path) -> "NrfgsModel":
         case _:
             raise InputError(f"{path} does not say how it is rendered. Export it again with nrfgs export compact.")
     name = {(0, 0, 0): "black", (1, 1, 1): "white"}.get(tuple(background), "random")
-    config = NrfgsModelConfig(appearance=decoded.config, rasterize_mode=mode, background_color=name)
+    config = NrfgsModelConfig(appearance=decoded.config, rasterize_mode=mode, background_color=name, near_plane="auto")
     model = config.setup(
         scene_box=SceneBox(torch.stack([means.amin(0), means.amax(0)])),
         num_train_data=1,

@@ -177,6 +177,9 @@ def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
     expected = build(one.head.config, model.head.state_dict(), 32.0)(model.field.splats, rows, center)
     assert_close(model.field.head(model.field.splats, rows, center), expected)
     assert model.projection_options.near_plane == 0.32, "the near plane is in scene units"
+    header["render"]["near_plane"] = 2.5
+    write_container(tmp_path / "f.nrf", header, streams)
+    assert load_file(tmp_path / "f.nrf").projection_options.near_plane == 2.5, "of the training, in world units"
     write_container(tmp_path / "f.nrf", {**header, "render": {"rasterize_mode": "classic"}}, streams)
     with pytest.raises(InputError, match="does not say how it is rendered"):
         load_file(tmp_path / "f.nrf")

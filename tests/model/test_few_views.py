@@ -76,8 +76,7 @@ def test_nothing_is_drawn_before_half_the_nearest_depth(tiny_scene, tmp_path, no
     config = trained(command_line("nrfgs", tiny_scene, tmp_path / "new", 2, QUICK))
     state = checkpoint_of(config)["pipeline"]["_model._extra_state"]
     model = ready(tiny_scene, tmp_path / "on", 4, {"--load-dir": models_of(config)}).pipeline.model
-    depth = model.nearest_depth
-    assert model.projection_options.near_plane == 0.5 * depth == 0.5 * state["nearest_depth"] > 0.01 * model.scene_unit
+    assert model.projection_options.near_plane == model.near == state["near"] > 0.01 * model.scene_unit
     off = ready(tiny_scene, tmp_path / "off", 1, {"--pipeline.model.near-plane": "off"}).pipeline.model
     assert off.projection_options.near_plane == 0.01 * off.scene_unit
 

@@ -113,7 +113,7 @@ class Painter {
     this.count = scene.count;
     this.viewDependent = scene.viewDependent;
     this.background = scene.header.render.background;
-    this.near = 0.01 * scene.header.head.scene_unit;
+    this.near = scene.header.render.near_plane ?? 0.01 * scene.header.head.scene_unit;
     this.largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.plan = plan(scene.header.head.config, scene.weights);
     if (this.largest < WIDTH || this._height(scene.count, TABLE_TEXELS) > this.largest) {
