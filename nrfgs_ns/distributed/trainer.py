@@ -22,7 +22,6 @@ from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.model import ShardedModel
 from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import cut_optimizer_state, gather_model_state, gather_optimizer_state
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched, WatchedOptimizers
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
@@ -183,12 +182,12 @@ class ShardedGuard(Guard):
 class ShardedOptimizers(WatchedOptimizers):
     """The optimisers of one device: gradients of what all devices have are summed before the step."""
 
-    def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:
-        self.guard.before_optimizers(self, gradients_are_scaled=False)
-        shared = [name for name in param_groups if name not in self.guard.model.gauss_params]
+    def step(self) -> None:
+        self.guard.before_optimizers(self)
+        shared = [name for name in self.optimizers if name not in self.guard.model.gauss_params]
         gradients = [parameter.grad for name in shared for parameter in parameters_of(self.optimizers[name])]
         comm.sum_over_devices([gradient for gradient in gradients if gradient is not None])
-        LeanOptimizers.optimizer_scaler_step_some(self, grad_scaler, param_groups)
+        LeanOptimizers.step(self)
 
     def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
         """Load this device's rows of a whole checkpoint; the model has been loaded."""
@@ -202,16 +201,9 @@ class ShardedOptimizers(WatchedOptimizers):
 
 
 class ShardedTrainer(NrfgsTrainer):
-    """The trainer of one device.
-
-    Raises:
-        InputError: an option cannot be had on several devices.
-    """
+    """The trainer of one device."""
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        for name in ("mixed_precision", "use_grad_scaler"):
-            if getattr(config, name):
-                raise InputError(f"{name} is on, which training on several devices does not do. Leave it out.")
         if config.machine.device_type == "cuda":
             torch.cuda.set_device(local_rank)
         CONSOLE.quiet = comm.rank() > 0

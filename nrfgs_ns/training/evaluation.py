@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks at test views: an evaluation's table, and what tensorboard (or Weights & Biases, or Comet) shows of the
-appearance head while it trains.
+"""An evaluation's table, and the appearance head's components in tensorboard, wandb or comet during training.
 
-Between two training steps `track` looks at the first test view. Numbers and pictures go through nerfstudio's writer to
-whatever listens, histograms to tensorboard, the one writer that has them. No random number is drawn: a training is the
-same with and without.
+Between two training steps `track` renders the first test view. Numbers and pictures go through nerfstudio's writer,
+histograms to tensorboard alone. No random number is drawn: a training is the same with and without.
 """
 
 from collections.abc import Mapping, Sequence
@@ -65,9 +63,9 @@ def far_below(images: Sequence[Mapping[str, Any]]) -> list[tuple[str, float, flo
 
 @torch.no_grad()
 def track(pipeline: Pipeline, step: int, pictures: bool) -> None:
-    """Log the head's components over the splats that the first test camera sees: the mean of weights, and the root mean
-    square of changes, in units of white or of opacity; with pictures, its base colours and each component, too.
-    """
+    """Log the head's components over the splats that the first test camera sees: the mean of weights and the root mean
+    square of changes, in units of white or of opacity; with pictures, also images of the base colours and of each
+    component."""
     pipeline.eval()
     model = pipeline.model
     camera = pipeline.datamanager.eval_dataset.cameras[:1].to(model.device)

@@ -306,9 +306,6 @@ class _StepGraph:
 
     def prepare(self, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
         """Take a step's camera, its photograph, which is training photograph `index`, and its noise."""
-        for name, parameter in self.parameters.items():
-            if parameter.grad is not None and parameter.grad is self.gradients[name]:  # kept to be added to
-                parameter.grad = parameter.grad.clone()
         mine, now = self.seen_from, seen_from
         torch._foreach_copy_([mine.viewmat, mine.K, mine.center], [now.viewmat, now.K, now.center])
         for name, values in self.batch.items():
@@ -329,7 +326,5 @@ class _StepGraph:
         self._counted.copy_(self.room.counted, non_blocking=True)
         self._arrived.record()
         for name, parameter in self.parameters.items():
-            gradient = self.gradients[name]
-            if gradient is not None:
-                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+            parameter.grad = self.gradients[name]
         return self.losses

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nerfstudio's trainer with whole checkpoints, a guard against numbers that are not finite, a time budget, a mean over
-the last steps, and an orderly end whatever causes it."""
+the last steps, and an orderly end whatever its cause."""
 
 import gc
 import math
@@ -21,7 +21,6 @@ from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_eval_enabled
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import ForTheUser, InputError
@@ -49,7 +48,7 @@ class NrfgsTrainer(Trainer):
         total_steps: steps of the whole training, including those before a checkpoint.
         line: the progress line; None: nothing is shown, or nerfstudio's table.
         pace: position on the schedules; None: the step.
-        steps_are_chosen: whether the number of training views decides the number of steps.
+        steps_are_chosen: whether the number of training views decides how many steps there are.
         mean: the parameters' mean over the last steps; None without `average_steps`.
     """
 
@@ -92,7 +91,7 @@ class NrfgsTrainer(Trainer):
             self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last completed step"""
-        if self.world_size == 1 and not self.use_grad_scaler:
+        if self.world_size == 1:
             self.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
         if comms.is_main_process():
             report_choices(self.config, self.pipeline, self.steps_are_chosen)
@@ -100,7 +99,7 @@ class NrfgsTrainer(Trainer):
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
     def setup_optimizers(self) -> Optimizers:
-        """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
+        """The optimisers, behind a guard."""
         self.steps_are_chosen = self.config.max_num_iterations == 0 and self.config.time_budget is None
         self.config = self.config.for_views(self.pipeline.model.num_views)
         self.total_steps = self.config.max_num_iterations
@@ -116,7 +115,7 @@ class NrfgsTrainer(Trainer):
     # Resuming.
 
     def _load_checkpoint(self) -> None:
-        """Resume from the checkpoint that the configuration names, if any; InputError where that cannot be."""
+        """Resume from the checkpoint that the configuration names, if any; InputError if that is impossible."""
         config = self.config
         path = config.load_checkpoint
         if config.load_dir is not None:
@@ -141,7 +140,6 @@ class NrfgsTrainer(Trainer):
         self.optimizers.load_optimizers(content["optimizers"])
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
-        self.grad_scaler.load_state_dict(content["scalers"])
         self._follow(training.get("pace"))
         if self.mean is not None and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.pipeline.model, self.optimizers.optimizers)
@@ -154,7 +152,7 @@ class NrfgsTrainer(Trainer):
         return scene_of([Path(name).name for name in data.image_filenames], data.cameras)
 
     def _follow(self, written: dict[str, Any] | None) -> None:
-        """Go on from the position of the checkpoint's pace; the remaining steps walk through the rest."""
+        """Go on from the checkpoint's position on the schedules; the remaining steps walk through the rest."""
         pace = self.pace
         if pace is None and written is not None:
             same = "a --time-budget" if "seconds" in written else f"--schedule-steps {written['length']}"
@@ -234,13 +232,19 @@ class NrfgsTrainer(Trainer):
 
     def train_iteration(self, step: int):
         """One step; TrainingStopped where it, or on a GPU the one before, met a number that is not finite."""
-        model, pace = self.pipeline.model, self.pace
+        model, pace, optimizers = self.pipeline.model, self.pace, self.optimizers
         if pace is not None:
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         with self._last_good_state_on_disk():
-            self.guard.begin(step, self.optimizers, settled_later=self.graphs is not None)
-            loss, losses, metrics = self._descend(step)
+            self.guard.begin(step, optimizers, settled_later=self.graphs is not None)
+            optimizers.zero_grad_all()
+            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs)
+            loss = reduce(torch.add, losses.values())
+            if loss.requires_grad:  # a recorded step has made its gradients already
+                loss.backward()
+            optimizers.step()
+            optimizers.scheduler_step_all(step)
         self._made = step
         if pace is not None:
             model.schedule_at(int(pace.position))
@@ -248,28 +252,6 @@ class NrfgsTrainer(Trainer):
             self.stop_training = self._stop or pace.is_spent
             writer.GLOBAL_BUFFER["max_iter"] = step + 1 + pace.steps_left  # the progress line's total
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
-
-    def _descend(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """Nerfstudio's `Trainer.train_iteration`, for steps whose gradients may be there with their losses."""
-        optimizers, every = self.optimizers, self.gradient_accumulation_steps
-        optimizers.zero_grad_some([group for group in optimizers.parameters if step % every[group] == 0])
-        with torch.autocast(device_type=torch.device(self.device).type, enabled=self.mixed_precision):
-            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs)
-            loss = reduce(torch.add, losses.values())
-        if loss.requires_grad:  # not that of a recorded step
-            self.grad_scaler.scale(loss).backward()
-        due = [group for group in optimizers.parameters if step % every[group] == every[group] - 1]
-        optimizers.optimizer_scaler_step_some(self.grad_scaler, due)
-        if self.config.log_gradients:
-            named = self.pipeline.model.named_parameters()
-            norms = {name: value.grad.norm() for name, value in named if value.grad is not None}
-            metrics |= {f"Gradients/{name}": norm for name, norm in norms.items()}
-            metrics["Gradients/Total"] = sum(norms.values())
-        scale = self.grad_scaler.get_scale()
-        self.grad_scaler.update()
-        if scale <= self.grad_scaler.get_scale():  # a smaller one: the optimisers have made no step
-            optimizers.scheduler_step_all(step)
-        return loss, losses, metrics
 
     @property
     def last_step(self) -> int:
@@ -297,7 +279,7 @@ class NrfgsTrainer(Trainer):
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
         if self._signal and not timed_out and self._made < self.last_step:
             self._stop_as_asked()
-        if self.mean is not None and self._stop and not timed_out:
+        if self._stop and not timed_out:
             self._report_no_mean("the training was stopped before its last step")
         else:
             self.take_the_mean()
@@ -361,7 +343,7 @@ class NrfgsTrainer(Trainer):
         kept = f"The last checkpoint is {last}." if last else "This training has written no checkpoint."
         if self._made < self._start_step:
             return f"No step had been made. {kept}"
-        self.optimizers.zero_grad_some(list(self.optimizers.optimizers))
+        self.optimizers.zero_grad_all()
         gc.collect()
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
@@ -386,15 +368,13 @@ class NrfgsTrainer(Trainer):
         if mean.count == 0:
             self._report_no_mean("the time was up sooner than foreseen")
             return
-        size = window(self.config.average_steps, self._made + 1)
-        why = f", not {size}: until then splats were added, removed or reset" if mean.restarted else ""
-        steps = f"the last {mean.count} steps{why}"
-        CONSOLE.print(f"The trained model is the mean of its parameters over {steps}.", soft_wrap=True)
+        CONSOLE.print(f"The trained model is the mean of its parameters over the last {mean.count} steps.")
         with self.train_lock:
             mean.install()
 
     def _report_no_mean(self, why: str) -> None:
-        warn(f"Nothing was averaged, despite average_steps: {why}. The model is the last step's.")
+        if self.mean is not None:
+            warn(f"Nothing was averaged, despite average_steps: {why}. The model is the last step's.")
 
     # Checkpoints.
 

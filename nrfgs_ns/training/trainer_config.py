@@ -2,9 +2,9 @@
 """The trainer's options: checks before anything is read or written, automatic values, a training's folder."""
 
 import math
-import shlex
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 
@@ -70,8 +70,11 @@ class NrfgsTrainerConfig(TrainerConfig):
     def check(self, devices: int) -> None:
         """Raise InputError where an option is out of range, is not for several devices, or names no checkpoint."""
         for path in (self.get_base_dir(), self.data):
-            if path is not None and any("\udc80" <= letter <= "\udcff" for letter in str(path)):
+            if any("\udc80" <= letter <= "\udcff" for letter in str(path)):
                 raise InputError(f"{str(path)!r} has letters beyond this system's encoding. Set PYTHONUTF8=1.")
+        for name in ("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps", "log_gradients"):
+            if value := getattr(self, name):
+                raise InputError(f"{name} is {value}; these methods train without it. Leave it out.")
         data, positive = self.pipeline.datamanager, math.ulp(0.0)
         limits = [
             ("time_budget", self.time_budget, positive),
@@ -85,13 +88,13 @@ class NrfgsTrainerConfig(TrainerConfig):
             ("machine.num_devices", self.machine.num_devices, 1),
             ("machine.num_machines", self.machine.num_machines, 1),
         ]
-        for name, group in self.optimizers.items():
-            least, schedule = 0, group.get("scheduler")
-            if isinstance(schedule, ExponentialDecaySchedulerConfig):
-                least = positive  # zero cannot fall exponentially
-                limits.append((f"optimizers.{name}.scheduler.lr_final", schedule.lr_final, least))
-                limits.append((f"optimizers.{name}.scheduler.max_steps", schedule.max_steps, schedule.warmup_steps + 1))
-            limits.append((f"optimizers.{name}.optimizer.lr", group["optimizer"].lr, least))
+        for group, parts in self.optimizers.items():
+            name, schedule = f"optimizers.{group}", parts["scheduler"]
+            falls = isinstance(schedule, ExponentialDecaySchedulerConfig)  # which zero cannot
+            limits.append((f"{name}.optimizer.lr", parts["optimizer"].lr, positive if falls else 0))
+            if falls:
+                limits.append((f"{name}.scheduler.lr_final", schedule.lr_final, positive))
+                limits.append((f"{name}.scheduler.max_steps", schedule.max_steps, schedule.warmup_steps + 1))
         for name, value, low in limits:
             if value is not None and not low <= value < MOST:
                 least = "positive" if low == positive else f"at least {low}"
@@ -160,23 +163,18 @@ class NrfgsTrainerConfig(TrainerConfig):
             whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
             TrainerConfig.save_config(whole)
         except OSError as error:
-            message = f"--output-dir {self.output_dir}: {self.get_base_dir()} cannot be written ({error.strerror})."
-            raise InputError(f"{message} Name another folder.") from error
+            raise InputError(f"{self.get_base_dir()} cannot be written: {error}. Name another --output-dir.") from error
 
     def _take_a_folder(self) -> None:
-        """Make a folder that is this training's alone: a name that another one took gets a number. A training that goes
-        on from checkpoints in its own folder keeps that."""
+        """Make a folder for this training alone, numbering a name that is taken; a training that goes on from
+        checkpoints in its own folder keeps that."""
         if self.load_dir is not None and self.load_dir.resolve() == self.get_checkpoint_dir().resolve():
             return
         name = self.timestamp
-        for suffix in chain([""], (f"_{number}" for number in count(2))):
-            self.timestamp = f"{name}{suffix}"
-            try:
-                self.get_base_dir().mkdir(parents=True)
-                return
-            except FileExistsError:
-                if not self.get_base_dir().is_dir():
-                    raise
+        for number in count(2):
+            with suppress(FileExistsError):
+                return self.get_base_dir().mkdir(parents=True)
+            self.timestamp = f"{name}_{number}"
 
 
 def parse(args: list[str]) -> TrainerConfig:
@@ -213,20 +211,17 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
             f"noise on the camera centre in training: about {offset:.2g} scene units, {model.noise_factor:.2g} times "
             "the distance between neighbouring cameras"
         )
-    noun = "training view" if given == 1 else "training views"
-    count = f"{given} {noun}" if views == given else f"{views} different training views of {given}"
+    count = f"{given} training view{'s' * (given != 1)}"
+    if views != given:
+        count = f"{views} different training views of {given}"
     if parts:
         CONSOLE.print(f"{count}: {', '.join(parts)} (docs/captures.md).", soft_wrap=True)
-    data = config.pipeline.datamanager
     is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS
-    is_ours = isinstance(data.dataparser, NrfgsDataParserConfig)
-    if config.machine.device_type == "cpu" and is_long and is_ours and data.camera_res_scale_factor == 1:
+    if config.machine.device_type == "cpu" and is_long and config.pipeline.datamanager.camera_res_scale_factor == 1:
         cameras = pipeline.datamanager.train_dataset.cameras
         scale = min(1.0, LONGEST_SIDE / int(max(cameras.width.max(), cameras.height.max())))
-        words = ["--data", str(_absolute(data.dataparser.data)), "--time-budget", "10"]
-        words += ["--pipeline.datamanager.camera-res-scale-factor", f"{scale:.2g}"]
-        command = shlex.join(["ns-train", "nrfgs-fast", *words])
-        CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {command}", **PLAIN)
+        words = f"nrfgs-fast, --time-budget 10 and --pipeline.datamanager.camera-res-scale-factor {scale:.2g}"
+        CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {words}", **PLAIN)
     folder = config.get_base_dir()
     if notes and folder.is_dir():
         (folder / NOTES).write_text("\n".join([count, *notes]) + "\n", encoding="utf-8")

@@ -123,7 +123,7 @@ def test_what_gives_rows_another_meaning_begins_anew(change, anew, trainer):
         mean.add(trainer.optimizers.optimizers)
     change(model, trainer.pipeline.datamanager, trainer.optimizers)
     mean.add(trainer.optimizers.optimizers)
-    assert (mean.count, mean.restarted) == ((1, True) if anew else (3, False))
+    assert mean.count == (1 if anew else 3)
     if anew:  # nothing of the earlier rows is left in it
         now = {name: value.detach().clone() for name, value in model.gauss_params.items()}
         mean.install()
@@ -226,7 +226,7 @@ def test_splats_that_change_cut_the_window_short(averaged):
     saved = checkpoint_of(training.config)["pipeline"]
     expected = mean_after(training.after, range(8, 12))
     assert_close({name: saved[name].double() for name in expected}, expected, rtol=0, atol=4e-6)
-    assert "over the last 4 steps, not 6" in training.said
+    assert "over the last 4 steps." in training.said
 
 
 @pytest.mark.parametrize("name, more", [("calm", {}), ("reset", RESET)])

@@ -14,7 +14,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.trained.loading import load_model
-from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, verdict
+from nrfgs_ns.training.photographs import Evidence, exif_of, exposure
 from nrfgs_ns.training.trainer_config import parse
 
 NAN = math.nan
@@ -33,24 +33,23 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
-    ("choice", "pairs", "known", "wanted", "words"),
+    ("pairs", "known", "wanted", "words"),
     [
-        ("auto", SAME, [NAN] * 11, False, "varies by 0.01 stops, colour by 0.01"),
-        ("auto", DIFFERENT, [NAN] * 11, True, "exposure varies by 0.38 stops"),
-        ("auto", pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them"),
-        ("auto", pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
-        ("auto", SAME, [0.3] + [NAN] * 10, False, "EXIF: exposure varies by 0.00 stops"),
-        ("auto", SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: exposure varies by 0.10 stops"),
+        (SAME, [NAN] * 11, False, "varies by 0.01 stops, colour by 0.01"),
+        (DIFFERENT, [NAN] * 11, True, "exposure varies by 0.38 stops"),
+        (pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them"),
+        (pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
+        (SAME, [0.3] + [NAN] * 10, False, "EXIF: exposure varies by 0.00 stops"),
+        (SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: exposure varies by 0.10 stops"),
         # The light changed, and the camera followed it.
-        ("auto", SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of the difference"),
-        ("auto", DIFFERENT, [0.0, 0.7] * 5 + [0.0], True, "exposure varies by 0.35 stops, which explains"),
-        ("on", SAME, [NAN] * 11, True, "EXIF: no exposures"),
+        (SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of the difference"),
+        (DIFFERENT, [0.0, 0.7] * 5 + [0.0], True, "exposure varies by 0.35 stops, which explains"),
     ],
 )
-def test_the_evidence_decides(choice, pairs, known, wanted, words):
+def test_the_evidence_decides(pairs, known, wanted, words):
     seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
-    decision, numbers = verdict(choice, Evidence(pairs, CENTERS, torch.tensor(known), seen))
-    assert decision == wanted and words in numbers
+    evidence = Evidence(pairs, CENTERS, torch.tensor(known), seen)
+    assert evidence.calls_for_learning == wanted and words in evidence.numbers
 
 
 def test_exposure_in_stops():
