@@ -111,9 +111,10 @@ class Sized(SimpleNamespace):
         return len(self.width)
 
 
-def test_progress_is_told_in_a_log():
+def test_progress_is_told_in_a_log(monkeypatch):
     log, now = io.StringIO(), [0.0]
-    with progress("Counting", 100, Console(file=log), lambda: now[0]) as advance:
+    monkeypatch.setattr("nrfgs_ns.progress.monotonic", lambda: now[0])
+    with progress("Counting", 100, Console(file=log)) as advance:
         for _ in range(100):
             now[0] += SECONDS_BETWEEN_LINES / 40
             advance()

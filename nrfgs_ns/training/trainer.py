@@ -171,10 +171,8 @@ class NrfgsTrainer(Trainer):
             if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # an unchanged rate stays the same to the last bit
                 pace.rate = max(rate, 1e-9)
         elif pace.is_spent:
-            raise InputError(
-                f"The training has used its time budget of {self.config.time_budget:g} minutes: there is nothing "
-                "left to do. A larger --time-budget goes on."
-            )
+            budget = f"its time budget of {self.config.time_budget:g} minutes"
+            raise InputError(f"The training has used {budget}. A larger --time-budget goes on.")
         self.pipeline.model.schedule_at(int(pace.position))
 
     def optimizer_configs(self) -> dict[str, Any]:
@@ -186,12 +184,8 @@ class NrfgsTrainer(Trainer):
     # Training.
 
     def train(self) -> None:
-        """Train.
-
-        Raises:
-            TrainingStopped: a number is not finite, or the memory has run out; what is good has been written.
-            SystemExit: a signal has ended it, with that signal's status; the state has been written.
-        """
+        """Train. Raises TrainingStopped where a number is not finite or memory has run out, and SystemExit with the
+        status of a signal; the last good state has been written."""
         with self._last_good_state_on_disk():
             self.guard.step = self._start_step
             self.guard.check_parameters(self.optimizers)
@@ -212,8 +206,8 @@ class NrfgsTrainer(Trainer):
                 self.line.close()
 
     def _update_viewer_state(self, step: int) -> None:
-        """Nerfstudio's with fewer events: logging each step's duration takes the host longer than some kernels take.
-        Averages are logged every `logging.steps_per_log` steps; the progress line is updated more often."""
+        """Nerfstudio's with fewer events, since logging each step's duration takes the host longer than some kernels
+        take: those of every `logging.steps_per_log`-th step. The progress line is updated more often."""
         super()._update_viewer_state(step)
         if step % self.config.logging.steps_per_log != 0:
             writer.EVENT_STORAGE.clear()
@@ -278,26 +272,19 @@ class NrfgsTrainer(Trainer):
         self.step, self._is_ending = self._made, True
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
         if self._signal and not timed_out and self._made < self.last_step:
-            self._stop_as_asked()
-        if self._stop and not timed_out:
-            self._report_no_mean("the training was stopped before its last step")
-        else:
-            self.take_the_mean()
+            outcome = NOTHING_TO_SAVE
+            if self._made >= self._start_step:
+                outcome = f"Stopped at step {self._made}, saved. {self._save_once()}"
+            self._end(outcome, 128 + self._signal)
+        self.take_the_mean(stopped=self._stop and not timed_out)
         if self.line is not None:
             self.line.finish(self._made)
         super()._after_train()
 
-    def _stop_as_asked(self) -> None:
-        """Save, say so, and end the process with the status of the signal."""
-        outcome = NOTHING_TO_SAVE
-        if self._made >= self._start_step:
-            if self._saved_step != self._made:
-                self.save_checkpoint(self._made)
-            outcome = f"Stopped at step {self._made}, saved. {self._how_to_go_on}"
-        self._end(outcome, 128 + self._signal)
-
-    @property
-    def _how_to_go_on(self) -> str:
+    def _save_once(self) -> str:
+        """Save the last completed step unless it has been; returns how to go on."""
+        if self._saved_step != self._made:
+            self.save_checkpoint(self._made)
         return f"Go on with the same command and --load-dir {self.checkpoint_dir}"
 
     def _end(self, line: str, status: int) -> None:
@@ -314,8 +301,8 @@ class NrfgsTrainer(Trainer):
 
     @contextmanager
     def _state_on_disk_if_it_fails(self) -> Iterator[None]:
-        """Save the last complete step when something other than a signal or the guard ends the training. Raises
-        TrainingStopped where the memory has run out; other exceptions are raised again."""
+        """Save the last complete step when something other than a signal or the guard ends the training, and raise the
+        exception again; TrainingStopped where memory has run out."""
         try:
             yield
         except (InputError, TrainingStopped, DiskFull):
@@ -328,13 +315,9 @@ class NrfgsTrainer(Trainer):
                 raise
             error.__traceback__ = None  # its frames hold the step's tensors
             outcome, what = self._save_last_step(), str(error).partition("\n")[0]
-            raise TrainingStopped(
-                f"Out of memory in step {self.step}: {what}\n{outcome} Fewer splats or smaller images take less "
-                "(docs/troubleshooting.md).",
-                self.step,
-                "memory",
-                savable=self._saved_step == self._made,
-            ) from None
+            message = f"Out of memory in step {self.step}: {what}\n{outcome} Fewer splats or smaller images take less"
+            savable = self._saved_step == self._made
+            raise TrainingStopped(f"{message} (docs/troubleshooting.md).", self.step, "memory", savable) from None
 
     def _save_last_step(self) -> str:
         """Save the state after the last completed step, if it is consistent; returns a sentence about the outcome."""
@@ -351,30 +334,24 @@ class NrfgsTrainer(Trainer):
         if not rows_agree(model.gauss_params, self.optimizers.optimizers, model.densification.state.values()):
             return f"Splats were being added or removed, so that nothing could be saved. {kept}"
         try:
-            if self._saved_step != self._made:
-                self.save_checkpoint(self._made)
+            return f"Step {self._made} is saved. {self._save_once()}."
         except (Exception, ForTheUser) as error:  # the first failure is the one to raise
             return f"The state could not be saved ({error}). {kept}"
-        return f"Step {self._made} is saved. {self._how_to_go_on}."
 
-    def take_the_mean(self) -> None:
-        """Replace the parameters by their mean over the last steps, if there is one, and say so; TrainingStopped where
-        the last step met a number that is not finite."""
-        mean = self.mean
-        if mean is None:
+    def take_the_mean(self, stopped: bool = False) -> None:
+        """Replace the parameters by their mean over the last steps, unless the training was stopped before them, and
+        say so; TrainingStopped where the last step met a number that is not finite."""
+        if self.mean is None:
             return
         with self._last_good_state_on_disk():
             self.guard.settle()
-        if mean.count == 0:
-            self._report_no_mean("the time was up sooner than foreseen")
-            return
-        CONSOLE.print(f"The trained model is the mean of its parameters over the last {mean.count} steps.")
-        with self.train_lock:
-            mean.install()
-
-    def _report_no_mean(self, why: str) -> None:
-        if self.mean is not None:
+        if stopped or self.mean.count == 0:
+            why = "the training was stopped before its last step" if stopped else "the time was up sooner than foreseen"
             warn(f"Nothing was averaged, despite average_steps: {why}. The model is the last step's.")
+            return
+        CONSOLE.print(f"The trained model is the mean of its parameters over the last {self.mean.count} steps.")
+        with self.train_lock:
+            self.mean.install()
 
     # Checkpoints.
 

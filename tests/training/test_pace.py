@@ -212,7 +212,7 @@ def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
     record, folder, last, pace = run("a", 0.5)
     assert record.steps == 30 and last == 29 and record.saved == [[29, record.seconds]]
     assert pace["position"] > 39 and pace["seconds"] == 30
-    with pytest.raises(InputError, match="used its time budget of 0.5 minutes.*A larger --time-budget goes on"):
+    with pytest.raises(InputError, match="used its time budget of 0.5 minutes. A larger --time-budget goes on"):
         run("b", 0.5, {"--load-dir": folder})
     record, _, last, pace = run("c", 0.6, {"--load-dir": folder})
     assert record.steps == 6 and last == 35 and pace["seconds"] == 36
