@@ -133,7 +133,7 @@ SCHEDULES = {
 SH = {"--pipeline.model.appearance.degree-interval": 10}
 CALM = {"--pipeline.model.densification": "splatfacto,refine_every=1000"}
 """No densification, which every second step would double the splats until a step takes a second."""
-MCMC = {"--pipeline.model.densification": "mcmc,warmup_length=8,refine_every=2,budget=400,stop_at=20"}
+STRETCHED = {"--schedule-steps": 40, "--steps-per-save": 3}
 
 
 def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> list[str]:
@@ -141,41 +141,39 @@ def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> lis
     return command_line(method, scene, out, steps, SCHEDULES, *more)
 
 
-STRETCHED = {"--schedule-steps": 40, "--steps-per-save": 9}
-
-
 @pytest.fixture(scope="module")
-def stretched(tiny_scene, tmp_path_factory) -> tuple[Path, Path]:
-    """config.yml of 20 steps of the 40, and a folder with the checkpoint of step 9."""
-    out, original = tmp_path_factory.mktemp("stretched"), NrfgsTrainer._write_checkpoint
+def stretched(tiny_scene, tmp_path_factory):
+    """20 steps of the 40: config.yml, a folder with the checkpoint of step 9, and numbers of splats by step."""
+    out, original, counts = tmp_path_factory.mktemp("stretched"), NrfgsTrainer._write_checkpoint, {}
 
     def keep(trainer, step):
         original(trainer, step)
+        counts[step] = trainer.pipeline.model.num_points
         if step == 9:
             shutil.copytree(trainer.checkpoint_dir, out / "kept")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch.cuda, "is_available", lambda: False)  # as where it goes on
         patch.setattr(NrfgsTrainer, "_write_checkpoint", keep)
-        return trained(options(tiny_scene, out, "nrfgs-sh", 20, SH, STRETCHED)), out / "kept"
+        return trained(options(tiny_scene, out, "nrfgs-sh", 20, SH, STRETCHED)), out / "kept", counts
 
 
 @pytest.mark.usefixtures("no_cuda")
-def test_a_stretched_training(stretched, tiny_scene, tmp_path):
+def test_a_stretched_training(stretched):
     """Degree 3 is reached at step 15, and its harmonics are there when it is evaluated; splats come only before it."""
-    _, pipeline, _, step = eval_setup(stretched[0])
+    config, _, counts = stretched
+    _, pipeline, _, step = eval_setup(config)
     assert step == 19 and pipeline.model.head.active_degree == 3
     assert pipeline.model.schedule_step == 40
     # 8 training images hold densification back for 8 + 2 steps after the reset at 0: it acts at steps 10, 12 and 14.
-    short = train(options(tiny_scene, tmp_path / "short", "nrfgs-sh", 12, SH, {"--schedule-steps": 24}))
-    assert short.splats[-1][1] > short.splats[0][1] and short.splats[-1][1] < pipeline.model.num_points
-    state = checkpoint_of(stretched[0])
+    assert counts[3] == counts[9] < counts[12] < counts[15] == counts[18] == pipeline.model.num_points
+    state = checkpoint_of(config)
     assert state["training"]["pace"] == {"length": 40, "rate": 2.0, "position": 40.0}
 
 
 @pytest.mark.usefixtures("no_cuda")
 def test_a_stretched_training_continues_to_the_bit(stretched, tiny_scene, tmp_path):
-    whole, kept = stretched
+    whole, kept, _ = stretched
     rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 20, SH, STRETCHED, {"--load-dir": kept}))
     one, other = checkpoint_of(whole), checkpoint_of(rest)
     assert one["step"] == 19

@@ -105,10 +105,14 @@ QUICK = {
 }
 
 
+TWICE = {"--steps-per-save": 2}
+
+
 @pytest.fixture(scope="module")
 def finished(exposed_scene, tmp_path_factory):
-    """config.yml of a training of four steps, whose exposures come from the photographs themselves."""
-    return trained(command_line("nrfgs-sh", exposed_scene[0], tmp_path_factory.mktemp("whole"), 4, QUICK))
+    """config.yml of a training of four steps, whose exposures come from the photographs; with the checkpoint of
+    step 2."""
+    return trained(command_line("nrfgs-sh", exposed_scene[0], tmp_path_factory.mktemp("whole"), 4, QUICK, TWICE))
 
 
 def test_known_exposures_are_found(exposed_scene, finished):
@@ -122,14 +126,17 @@ def test_known_exposures_are_found(exposed_scene, finished):
     assert abs(learnt.mean()) < 1e-6
 
 
+def assert_it_goes_on(config, scene, out, *more: dict) -> None:
+    """From step 2 to the bit."""
+    load = {"--load-dir": models_of(config), "--load-step": 2}
+    rest = trained(command_line("nrfgs-sh", scene, out, 4, QUICK, load, *more))
+    assert_same_training(checkpoint_of(config), checkpoint_of(rest), rtol=0, atol=0)
+
+
 def test_resumed_is_the_unbroken_one(exposed_scene, finished, tmp_path, capsys):
-    scene, _ = exposed_scene
-    half = trained(command_line("nrfgs-sh", scene, tmp_path / "half", 2, QUICK))
-    assert "Photographs: exposure and white balance learnt, since the photographs differ" in " ".join(
-        capsys.readouterr().out.split()
-    )
-    rest = trained(command_line("nrfgs-sh", scene, tmp_path / "rest", 4, QUICK, {"--load-dir": models_of(half)}))
-    assert_same_training(checkpoint_of(finished), checkpoint_of(rest), rtol=0, atol=0)
+    assert_it_goes_on(finished, exposed_scene[0], tmp_path)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Photographs: exposure and white balance learnt, since the photographs differ" in said
 
 
 def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path, monkeypatch, capsys):
@@ -202,14 +209,7 @@ def test_what_is_behind_a_cut_out_photograph_is_exposed_with_it(tiny_scene, tmp_
 
 def test_robust_loss_trims_and_goes_on(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr("nrfgs_ns.image.robust.FIRST_STEP", 1)
-
-    def train(name, steps, *more):
-        out = tmp_path / name
-        return trained(
-            command_line("nrfgs-sh", tiny_scene, out, steps, QUICK, {"--pipeline.model.robust-loss": 0.1}, *more)
-        )
-
-    whole = checkpoint_of(train("whole", 4))
-    assert whole["pipeline"]["_model.trimming.histogram"].sum() > 0
-    rest = train("rest", 4, {"--load-dir": models_of(train("half", 2))})
-    assert_same_training(whole, checkpoint_of(rest), rtol=0, atol=0)
+    robust = {"--pipeline.model.robust-loss": 0.1}
+    whole = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "whole", 4, QUICK, TWICE, robust))
+    assert checkpoint_of(whole)["pipeline"]["_model.trimming.histogram"].sum() > 0
+    assert_it_goes_on(whole, tiny_scene, tmp_path / "rest", robust)

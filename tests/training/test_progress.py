@@ -62,12 +62,6 @@ def test_on_a_terminal_the_line_makes_room_for_an_evaluation(screen, tiny_scene,
     assert text.index("Evaluating") < text.index("step 5 of 6") < text.index("step 6 of 6 (100 %)")
 
 
-def views(*psnrs: float | None) -> list[dict]:
-    return [
-        {"image": f"{index}.png", **({} if value is None else {"psnr": value})} for index, value in enumerate(psnrs)
-    ]
-
-
 @pytest.mark.parametrize(
     ("psnrs", "names"),
     [
@@ -78,4 +72,5 @@ def views(*psnrs: float | None) -> list[dict]:
     ],
 )
 def test_views_far_below_the_rest_are_named_the_worst_first(psnrs, names):
-    assert [name for name, *_ in far_below(views(*psnrs))] == names
+    views = [{"image": f"{index}.png", "psnr": value} for index, value in enumerate(psnrs)]
+    assert [name for name, *_ in far_below(views)] == names
