@@ -22,6 +22,7 @@ from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.model import ShardedModel
 from nrfgs_ns.distributed.schedules import forget_faster, with_fewer_steps
 from nrfgs_ns.distributed.shards import cut_optimizer_state, gather_model_state, gather_optimizer_state
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched, WatchedOptimizers
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
@@ -201,9 +202,16 @@ class ShardedOptimizers(WatchedOptimizers):
 
 
 class ShardedTrainer(NrfgsTrainer):
-    """The trainer of one device."""
+    """The trainer of one device.
+
+    Raises:
+        InputError: an option cannot be had on several devices.
+    """
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        for name in ("mixed_precision", "use_grad_scaler"):
+            if getattr(config, name):
+                raise InputError(f"{name} is on, which training on several devices does not do. Leave it out.")
         if config.machine.device_type == "cuda":
             torch.cuda.set_device(local_rank)
         CONSOLE.quiet = comm.rank() > 0

@@ -7,7 +7,6 @@ torch's own.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -168,17 +167,6 @@ def try_kernel(device: torch.device) -> bool:
             AdamTable(device).step([(group, [number], [state])], None)
 
     return _GATE.opens(device, device, trial)
-
-
-def in_world_units(group: dict[str, Any], scene_unit: float) -> dict[str, Any]:
-    """A parameter group's configuration for lengths, its learning rates from scene units to world units."""
-    if scene_unit == 1.0:
-        return group
-    optimizer, scheduler = group["optimizer"], group["scheduler"]
-    if scheduler is not None:
-        names = [name for name in ("lr_final", "lr_pre_warmup") if getattr(scheduler, name, None) is not None]
-        scheduler = replace(scheduler, **{name: getattr(scheduler, name) * scene_unit for name in names})
-    return {**group, "optimizer": replace(optimizer, lr=optimizer.lr * scene_unit), "scheduler": scheduler}
 
 
 def parameters_of(optimizer: Optimizer) -> list[Tensor]:

@@ -65,18 +65,9 @@ class Evidence(NamedTuple):
         return text
 
 
-def evidence(datamanager: Any) -> Evidence:
-    """Compare a training's photographs, whose images have been read."""
-    dataset = datamanager.train_dataset
-    metadata = datamanager.train_dataparser_outputs.metadata
-    exif = torch.tensor([exposure(entry) for entry in exif_of(dataset.image_filenames, metadata.get("exif"))])
-    pairs = compare_photographs(metadata.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
-    centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
-    return Evidence(pairs, centers, exif, estimate(pairs, torch.full_like(exif, torch.nan), centers))
-
-
 def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | None, list[str]]:
-    """The photographs' exposure model, announced in one line.
+    """The photographs' exposure model, announced in one line; InputError where it is requested together with the
+    bilateral grid.
 
     Args:
         config: an NrfgsModelConfig.
@@ -84,9 +75,6 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
 
     Returns:
         The model, None where nothing is learnt; and the evidence in words and numbers.
-
-    Raises:
-        InputError: it is requested together with the bilateral grid.
     """
     choice = config.photographs
     if choice == "on" and config.use_bilateral_grid:
@@ -95,7 +83,11 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
         )
     if choice == "off" or config.use_bilateral_grid:
         return None, []
-    known = evidence(datamanager)
+    dataset, metadata = datamanager.train_dataset, datamanager.train_dataparser_outputs.metadata
+    exif = torch.tensor([exposure(entry) for entry in exif_of(dataset.image_filenames, metadata.get("exif"))])
+    pairs = compare_photographs(metadata.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
+    centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
+    known = Evidence(pairs, centers, exif, estimate(pairs, torch.full_like(exif, torch.nan), centers))
     wanted = choice == "on" or known.calls_for_learning
     outcome = f"exposure and white balance {'learnt' if wanted else 'not learnt'}"
     if choice == "on":
@@ -108,8 +100,8 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
     notes = [f"photographs: {outcome}: {known.numbers}"]
     if not wanted:
         return None, notes
-    looks = estimate(known.pairs, known.exif, known.centers) if torch.isfinite(known.exif).any() else known.seen
-    names = [path.name for path in datamanager.train_dataset.image_filenames]
+    looks = estimate(pairs, exif, centers) if torch.isfinite(exif).any() else known.seen
+    names = [path.name for path in dataset.image_filenames]
     return PhotographModel(names, looks.stops, looks.held), notes
 
 

@@ -40,7 +40,7 @@ SMALLEST_SIDE = 2
 
 @dataclass
 class ShardingConfig:
-    """How the splats are spread over several devices, and what a step counts."""
+    """How the splats are spread over the devices, and what a step counts. Nothing of it is read with one device."""
 
     rebalance_at: float = 1.1
     """splats move between devices when one has more than this many times the mean"""
@@ -197,7 +197,7 @@ class NrfgsPipeline(VanillaPipeline):
         }
 
     def check_schedules(self, state: dict[str, Any]) -> None:
-        """Raise InputError where a checkpoint's steps count for another number of images than this training's."""
+        """Raise InputError where a training goes on whose step numbers mean another number of images."""
         written = state.get("images_per_step", 1)
         if written != self.images_per_step:
             raise InputError(
@@ -207,7 +207,7 @@ class NrfgsPipeline(VanillaPipeline):
             )
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the state in a training; an evaluation ignores it."""
+        """Restore what `get_extra_state` gave, in a training; an evaluation ignores it."""
         if self.test_mode != "val":
             return
         self.check_schedules(state)

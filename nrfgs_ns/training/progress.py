@@ -2,6 +2,7 @@
 """The progress line: steps, the PSNR of a test view, the time left. It replaces nerfstudio's table on the terminal and
 changes no number of the training."""
 
+import math
 from dataclasses import dataclass, field
 from datetime import timedelta
 from threading import Lock
@@ -65,10 +66,10 @@ class ProgressLine(LocalWriter):
             CONSOLE.print(message, markup=False, soft_wrap=True)
         self._pipeline: Any = None
         self._live: Live | None = None
-        self._is_over = False
         self._last: tuple[int, float] | None = None
         """step and time of the last update"""
-        self._due = -1.0
+        self._due = 0.0
+        """time of the next update"""
         self._first = 0
 
     def watch(self, pipeline: Any, lock: Lock) -> None:
@@ -87,18 +88,17 @@ class ProgressLine(LocalWriter):
 
     def write_stats_log(self, step: int) -> None:
         """Update the line if it is due."""
-        if not self._is_over and perf_counter() >= self._due:
+        if perf_counter() >= self._due:
             self._update(max(step, self._first))
 
     def finish(self, step: int) -> None:
         """Show the result of the last step and leave the line there."""
-        if not self._is_over:
-            self._update(step, is_last=True)
-            self.close()
+        self._update(step, is_last=True)
+        self.close()
 
     def close(self) -> None:
         """Release the terminal for good."""
-        self._is_over = True
+        self._due = math.inf
         self.step_aside()
 
     def step_aside(self) -> None:

@@ -31,7 +31,6 @@ from nrfgs_ns.training.dense_start import start_with_dense_points
 from nrfgs_ns.training.evaluation import track
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
-from nrfgs_ns.training.optimizers import in_world_units
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
 from nrfgs_ns.training.step_graph import StepGraphs
@@ -176,10 +175,15 @@ class NrfgsTrainer(Trainer):
         self.pipeline.model.schedule_at(int(pace.position))
 
     def optimizer_configs(self) -> dict[str, Any]:
-        """The configured optimisers; the means' learning rate, a length, in world units."""
-        groups = self.config.optimizers.copy()
-        groups["means"] = in_world_units(groups["means"], self.pipeline.model.scene_unit)
-        return groups
+        """The configured optimisers; the means' learning rates, lengths in scene units, in world units."""
+        unit, means = self.pipeline.model.scene_unit, self.config.optimizers["means"]
+        optimizer, scheduler = means["optimizer"], means["scheduler"]
+        if scheduler is not None:
+            rates = {name: getattr(scheduler, name, None) for name in ("lr_final", "lr_pre_warmup")}
+            rates = {name: unit * rate for name, rate in rates.items() if rate is not None}
+            scheduler = replace(scheduler, **rates)
+        means = {"optimizer": replace(optimizer, lr=unit * optimizer.lr), "scheduler": scheduler}
+        return {**self.config.optimizers, "means": means}
 
     # Training.
 
