@@ -55,6 +55,13 @@ def at_step(trainer: NrfgsTrainer, step: int, then) -> None:
     trainer.pipeline.get_train_loss_dict = spoilt
 
 
+def failing(error: BaseException):
+    def fail(*_):
+        raise error
+
+    return fail
+
+
 @pytest.fixture(scope="module")
 def finished(tiny_scene, tmp_path_factory) -> Path:
     """config.yml of the unbroken training."""
@@ -93,22 +100,19 @@ def test_a_signal_before_the_first_step_saves_nothing_and_a_paused_training_hear
 def test_ctrl_c_while_images_are_read_is_one_line(tiny_scene, tmp_path, capsys, monkeypatch):
     trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS)).setup(local_rank=0, world_size=1)
 
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("nrfgs_ns.data.datamanager.NrfgsDatamanager.load_all_images", interrupted)
+    reading = "nrfgs_ns.data.datamanager.NrfgsDatamanager.load_all_images"
+    monkeypatch.setattr(reading, failing(KeyboardInterrupt()))
     with pytest.raises(SystemExit) as ended:
         trainer.setup()
     assert ended.value.code == 130 and "Stopped before the first step" in capsys.readouterr().out
 
 
-def out_of_memory():
-    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.")
+OUT_OF_MEMORY = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.")
 
 
 def test_memory_that_runs_out_costs_no_step(tiny_scene, tmp_path):
-    trainer = ready(tiny_scene, tmp_path / "a")
-    at_step(trainer, 6, out_of_memory)
+    trainer = ready(tiny_scene, tmp_path)
+    at_step(trainer, 6, failing(OUT_OF_MEMORY))
     with pytest.raises(TrainingStopped) as stopped:
         trainer.train()
     assert (stopped.value.step, stopped.value.origin, stopped.value.savable) == (6, "memory", True)
@@ -116,9 +120,6 @@ def test_memory_that_runs_out_costs_no_step(tiny_scene, tmp_path):
     assert first == "Out of memory in step 6: CUDA out of memory. Tried to allocate 2 GiB."
     assert second.startswith("Step 5 is saved.")
     assert list(find(trainer.checkpoint_dir)) == [5]
-    again = ready(tiny_scene, tmp_path / "b", {"--load-dir": trainer.checkpoint_dir})
-    again.train()
-    assert max(find(again.checkpoint_dir)) == STEPS - 1
 
 
 def test_memory_that_runs_out_while_splats_are_added_saves_nothing_half_done(tiny_scene, tmp_path):
@@ -126,9 +127,8 @@ def test_memory_that_runs_out_while_splats_are_added_saves_nothing_half_done(tin
     model = trainer.pipeline.model
 
     def half_done(*_):
-        means = torch.nn.Parameter(torch.cat([model.gauss_params["means"].detach()] * 2))
-        model.gauss_params["means"] = means
-        out_of_memory()
+        model.gauss_params["means"] = torch.nn.Parameter(torch.cat([model.gauss_params["means"].detach()] * 2))
+        raise OUT_OF_MEMORY
 
     at_step(trainer, 5, lambda: setattr(model.densification, "post_backward", half_done))
     with pytest.raises(TrainingStopped, match="added or removed.*The last checkpoint is .*step-000000003.ckpt"):
@@ -139,20 +139,13 @@ def test_memory_that_runs_out_while_splats_are_added_saves_nothing_half_done(tin
 @pytest.mark.parametrize("disk_is_full", [False, True])
 def test_another_failure_saves_too_and_is_raised(disk_is_full, tiny_scene, tmp_path, monkeypatch, capsys):
     trainer = ready(tiny_scene, tmp_path)
-
-    def broken():
-        raise BrokenPipeError("the log is gone")
-
-    def full(folder, *_):
-        raise DiskFull(f"The disk of {folder} is full.")
-
     if disk_is_full:
-        monkeypatch.setattr(checkpoint_files, "write", full)
-    at_step(trainer, 4, broken)
+        monkeypatch.setattr(checkpoint_files, "write", failing(DiskFull("The disk is full.")))
+    at_step(trainer, 4, failing(BrokenPipeError("the log is gone")))
     with pytest.raises(BrokenPipeError):
         trainer.train()
     assert list(find(trainer.checkpoint_dir)) == ([] if disk_is_full else [3])
-    outcome = "The state could not be saved (The disk of" if disk_is_full else "Step 3 is saved."
+    outcome = "The state could not be saved (The disk is full" if disk_is_full else "Step 3 is saved."
     assert f"failed in step 4. {outcome}" in capsys.readouterr().out
 
 
@@ -240,12 +233,11 @@ def test_a_folder_beyond_the_systems_encoding_is_refused(tiny_scene, tmp_path):
         config.print_to_terminal()
 
 
-@pytest.mark.parametrize(
-    "more", [{"--pipeline.model.num-downscales": 5}, {"--pipeline.datamanager.camera-res-scale-factor": 0.01}]
-)
-def test_images_too_small_to_begin_with_are_refused(more, tiny_scene, tmp_path):
-    with pytest.raises(InputError, match="1 x 1 pixels.*--pipeline.model.num-downscales|0.01 leaves nothing"):
-        ready(tiny_scene, tmp_path, more)
+def test_images_too_small_to_begin_with_are_refused(tiny_scene, tmp_path):
+    with pytest.raises(InputError, match="1 x 1 pixels.*--pipeline.model.num-downscales"):
+        ready(tiny_scene, tmp_path, {"--pipeline.model.num-downscales": 5})
+    with pytest.raises(InputError, match="0.01 leaves nothing"):
+        ready(tiny_scene, tmp_path, {"--pipeline.datamanager.camera-res-scale-factor": 0.01})
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tiny_scene):
@@ -264,20 +256,17 @@ def test_another_scene_and_other_options_are_refused(finished, tiny_scene, tmp_p
         ready(tiny_scene, tmp_path / "c", resumed, {"--pipeline.model.appearance.color-scale": 0.3}, steps=STEPS + 2)
 
 
-def test_two_trainings_of_one_second_have_a_folder_each(tiny_scene, tmp_path):
-    """Likewise two that were given the same one; a training that goes on in its own folder stays there."""
-    names = ["2026-01-02_030405", "2026-01-02_030405", "2026-01-02_030405", "mine", "mine"]
-    configs = [parse(command_line("nrfgs", tiny_scene, tmp_path, 1)) for _ in names]
-    for config, name in zip(configs, names, strict=True):
-        config.timestamp = name
-        config.save_config()
-    names = [config.get_base_dir().name for config in configs]
-    assert names == ["2026-01-02_030405", "2026-01-02_030405_2", "2026-01-02_030405_3", "mine", "mine_2"]
-    on = parse(command_line("nrfgs", tiny_scene, tmp_path, 2, {"--timestamp": "mine"}))
-    on.load_dir = on.get_checkpoint_dir()
+def test_trainings_of_one_name_have_a_folder_each(tiny_scene, tmp_path):
+    """Those of one second, too; a training that goes on in its own folder stays there."""
+    config = parse(command_line("nrfgs", tiny_scene, tmp_path, 1))
+    configs = [replace(config, timestamp="mine") for _ in range(3)]
+    for each in configs:
+        each.save_config()
+        assert (each.get_base_dir() / "config.yml").is_file()
+    assert [each.get_base_dir().name for each in configs] == ["mine", "mine_2", "mine_3"]
+    on = replace(config, timestamp="mine", load_dir=configs[0].get_checkpoint_dir())
     on.save_config()
     assert on.timestamp == "mine"
-    assert all((config.get_base_dir() / "config.yml").is_file() for config in configs)
 
 
 def test_a_configuration_leads_to_its_data_from_any_folder(tiny_scene, tmp_path, monkeypatch):

@@ -142,17 +142,13 @@ def test_large_gradients_that_adam_can_square_pass(start):
 
 
 @pytest.mark.parametrize(
-    ("name", "scale", "cause"),
-    [
-        ("loss", None, r"the image or mask is broken: .*view_\d+.png"),
-        ("scales", 25.0, "Lower --optimizers.scales.optimizer.lr"),
-    ],
+    ("name", "cause"),
+    [("loss", r"the image or mask is broken: .*view_\d+.png"), ("scales", "Lower --optimizers.scales.optimizer.lr")],
 )
-def test_the_cause_broken_image(name, scale, cause, start):
-    """Or a learning rate."""
+def test_the_likely_cause(name, cause, start):
     trainer = start()
-    if scale is not None:
-        trainer.pipeline.model.scales.data[3] = scale
+    if name == "scales":
+        trainer.pipeline.model.scales.data[3] = 25.0
     poison(trainer, at=2, name=name, value=NAN, row=3)
     with pytest.raises(TrainingStopped, match=cause):
         trainer.train()
