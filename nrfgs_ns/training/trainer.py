@@ -132,10 +132,8 @@ class NrfgsTrainer(Trainer):
         check_options(training["options"], options_of(config))
         if config.time_budget is None and self._start_step >= self.total_steps:
             schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
-            raise InputError(
-                f"{path} is the end of a training of {self.total_steps:,} steps: there is nothing left to do. "
-                f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more."
-            )
+            longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
+            raise InputError(f"{path} is the end of a training of {self.total_steps:,} steps: {longer}.")
         self.optimizers.load_optimizers(content["optimizers"])
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
@@ -332,8 +330,7 @@ class NrfgsTrainer(Trainer):
             return f"No step had been made. {kept}"
         self.optimizers.zero_grad_all()
         gc.collect()
-        if torch.cuda.is_available():
-            torch.cuda.empty_cache()
+        torch.cuda.empty_cache()  # nothing without CUDA
         model = self.pipeline.model
         if not rows_agree(model.gauss_params, self.optimizers.optimizers, model.densification.state.values()):
             return f"Splats were being added or removed, so that nothing could be saved. {kept}"

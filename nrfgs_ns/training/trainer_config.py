@@ -19,9 +19,8 @@ from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, STEPS_PER_VIEW, Pace, TimedPace, resolution_phases, steps_for
 
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
-"""The trainer of these options, which imports this module."""
 SEVERAL_DEVICES = "nrfgs_ns.distributed"
-"""The package that trains on several devices; it imports this one."""
+"""These import this module."""
 AVERAGED = 200
 """Steps to average in the presets and where the steps are chosen by the views."""
 MOST = 2**32
@@ -29,7 +28,7 @@ MOST = 2**32
 LONGEST_SIDE = 240
 """Pixels of photographs that two CPU cores train on in minutes."""
 FEW = 0.9
-"""Trust in view dependence below which its reduction is worth a word on the terminal: 180 training views."""
+"""Trust in view dependence below which its reduction is reported on the terminal: 180 training views."""
 PLAIN = {"markup": False, "highlight": False, "soft_wrap": True}
 """Text for the console that may hold brackets and paths."""
 NOTES = "choices.txt"
@@ -55,11 +54,7 @@ class NrfgsTrainerConfig(TrainerConfig):
     max_num_iterations is 0, otherwise 0"""
 
     def setup(self, **kwargs) -> Trainer:
-        """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
-
-        Raises:
-            InputError: as `check`.
-        """
+        """The trainer, for several devices the one that spreads the splats over them; InputError as `check`."""
         devices, steps = kwargs.get("world_size", 1), self.max_num_iterations or STEPS
         self.check(devices)
         if devices == 1:
@@ -99,9 +94,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             if value is not None and not low <= value < MOST:
                 least = "positive" if low == positive else f"at least {low}"
                 raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
-        for name in ("time_budget", "schedule_steps"):
-            if getattr(self, name) is not None and devices > 1:
-                raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
+        if devices > 1 and (self.time_budget or self.schedule_steps) is not None:
+            raise InputError("time_budget and schedule_steps are for one device. Leave them out.")
         self.pipeline.model.check()
         length = self.schedule_steps or self.max_num_iterations or STEPS
         self.pipeline.model.densification.check_training(devices, length)
@@ -111,7 +105,7 @@ class NrfgsTrainerConfig(TrainerConfig):
             checkpoint_files.checkpoints_in(self.load_dir)
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
-        """The configuration with automatic values filled in: steps, schedules and mean of a training on one device."""
+        """The configuration of a training on one device, with automatic steps, schedules and mean filled in."""
         if self.max_num_iterations > 0:
             return replace(self, average_steps=self.average_steps or 0)
         return replace(
@@ -131,19 +125,14 @@ class NrfgsTrainerConfig(TrainerConfig):
         return None if self.schedule_steps is None else Pace(length, length / self.max_num_iterations)
 
     def print_to_terminal(self) -> None:
-        """Check the options before anything is written, and print ns-train's first line. The whole configuration is in
-        config.yml, and shown with NRFGS_DEBUG=1.
-
-        Raises:
-            InputError: as `check`, or there is no data.
-        """
+        """Check the options before anything is written, and print ns-train's first line, or with NRFGS_DEBUG=1 the
+        whole configuration. InputError as `check`, or where there is no data."""
         if DEBUG:
             super().print_to_terminal()
         devices = self.machine.num_devices * self.machine.num_machines
         self.check(devices)
         datamanager = self.pipeline.datamanager
-        data = self.data or datamanager.data
-        parser = datamanager.dataparser
+        data, parser = self.data or datamanager.data, datamanager.dataparser
         is_here = not isinstance(parser, NrfgsDataParserConfig) or Path("transforms.json").exists()
         if data is None and parser.data == Path() and not is_here:
             fix = "Name the folder of the data set; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
@@ -153,8 +142,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
 
     def save_config(self) -> None:
-        """Make the training's folder and save config.yml there, with paths that do not depend on the working folder;
-        InputError where nothing can be written there."""
+        """Make the training's folder and save config.yml there, with absolute paths; InputError where it cannot be
+        written."""
         data = self.pipeline.datamanager
         dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
         pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
