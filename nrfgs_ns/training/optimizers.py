@@ -116,9 +116,9 @@ class LeanOptimizers(Optimizers):
             scheduler = self.schedulers[name]
             scheduler.load_state_dict({**state, "base_lrs": scheduler.base_lrs})
             rates = scheduler.get_last_lr()
-            if isinstance(scheduler, LambdaLR):
-                pairs = zip(scheduler.base_lrs, scheduler.lr_lambdas, strict=True)
-                rates = [base * share(scheduler.last_epoch) for base, share in pairs]
+            if isinstance(scheduler, LambdaLR):  # of this training's rates, not the checkpoint's
+                shares = (share(scheduler.last_epoch) for share in scheduler.lr_lambdas)
+                rates = [base * share for base, share in zip(scheduler.base_lrs, shares, strict=True)]
             for group, rate in zip(self.optimizers[name].param_groups, rates, strict=True):
                 group["lr"] = rate
 

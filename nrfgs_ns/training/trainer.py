@@ -114,7 +114,7 @@ class NrfgsTrainer(Trainer):
     # Resuming.
 
     def _load_checkpoint(self) -> None:
-        """Resume from the checkpoint that the configuration names, if any; InputError if that is impossible."""
+        """Resume from the checkpoint that the configuration names, if any; InputError if it does not fit."""
         config = self.config
         path = config.load_checkpoint
         if config.load_dir is not None:
@@ -270,7 +270,7 @@ class NrfgsTrainer(Trainer):
     # The end.
 
     def _after_train(self) -> None:
-        """Nerfstudio's, whose step number is one too high after an early stop; from here on the model is the mean."""
+        """Nerfstudio's, whose step number is one too high after an early stop. The mean becomes the model."""
         self.step, self._is_ending = self._made, True
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
         if self._signal and not timed_out and self._made < self.last_step:

@@ -118,28 +118,34 @@ def test_a_limit_on_file_sizes_is_named_with_what_was_kept(tmp_path):
 
 
 def write_until_killed(folder: Path, count: int) -> None:
-    """Write checkpoints, and be killed before a file operation."""
+    """Write checkpoints, and be killed before a file operation, or halfway through writing the content."""
+    save = torch.save
+
+    def tick() -> None:
+        nonlocal count
+        count -= 1
+        if count == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
 
     def dying(call):
-        def counted(*args):
-            nonlocal count
-            count -= 1
-            if count == 0:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return call(*args)
+        return lambda *args: (tick(), call(*args))[1]
 
-        return counted
+    def dying_save(content, path) -> None:
+        save(content, path)
+        os.truncate(path, os.path.getsize(path) // 2)
+        tick()
+        save(content, path)
 
     for name in ("open", "fsync", "close", "replace", "unlink"):
         setattr(os, name, dying(getattr(os, name)))
-    torch.save = dying(torch.save)
+    torch.save = dying_save
     for step in range(1, 100):
         write(folder, step, content(step))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
 def test_a_writer_that_is_killed_at_any_operation_leaves_whole_files(tmp_path):
-    """SIGKILL before each of the first file operations of `write`, which then goes on in the same folder."""
+    """SIGKILL at each of the first file operations of `write`, which then goes on in the same folder."""
     for count in range(1, 30):
         folder = tmp_path / str(count) / "models"
         child = os.fork()
