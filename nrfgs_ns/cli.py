@@ -25,7 +25,7 @@ def commands() -> dict[str, EntryPoint]:
 
 
 def summary(command: EntryPoint) -> str:
-    """The first sentence of a command's docstring, read without importing its module; "" if there is no source."""
+    """The first sentence of a command's docstring, read from its source; "" if there is none."""
     spec = find_spec(command.module)
     if spec is None or spec.origin is None:
         return ""
@@ -45,7 +45,7 @@ def listing() -> str:
 
 
 def chosen(arguments: list[str]):
-    """The command that the arguments name, with its options; InputError if there is none."""
+    """The named command with its options; InputError for an unknown name."""
     name, *options = arguments or ["--help"]
     if name in ("--help", "-h"):
         print(listing())
@@ -60,7 +60,7 @@ def chosen(arguments: list[str]):
 
 def entrypoint() -> None:
     """The console script `nrfgs COMMAND`."""
-    # Deprecations inside nerfstudio, and a loss that it logs undetached: not the reader's business.
+    # Deprecations in nerfstudio, and a loss that it logs undetached, do not concern the user.
     warnings.simplefilter("ignore", FutureWarning)
     warnings.filterwarnings("ignore", "Converting a tensor with requires_grad=True to a scalar")
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exceptions that are meant for the user rather than for the programmer."""
+"""Exceptions meant for the user rather than for the programmer."""
 
 import os
 
@@ -10,14 +10,14 @@ DEBUG = os.environ.get("NRFGS_DEBUG", "0") not in ("", "0")
 class ForTheUser(Exception if DEBUG else SystemExit):
     """Ends a command with its message as the last line and status 1, without a traceback.
 
-    It is a SystemExit because most commands are nerfstudio's: what nobody catches there ends the program, and Python
-    prints the message.
+    It is a SystemExit because most commands are nerfstudio's: uncaught, it ends the program, and Python prints the
+    message.
     """
 
 
 class InputError(ForTheUser, ValueError):
-    """Something the user handed over (a data set, a file, a checkpoint, an option) cannot be used.
+    """A data set, file, checkpoint or option of the user cannot be used.
 
-    The message has three parts: the file or field it is about, what was found there, and the fix, that is what
-    the user can do next. It is raised before time is spent on training.
+    The message has three parts: the file or field, what was found there, and what the user can do next. It is raised
+    before time is spent on training.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are whole or not there."""
+"""Files that are complete or absent."""
 
 import contextlib
 import os
@@ -12,12 +12,8 @@ from nrfgs_ns.errors import InputError
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Make the folders that a file will lie in, and raise InputError where it cannot be written: a command asks before
-    its work, not after it.
-
-    Args:
-        option: that named the file, for the message.
-    """
+    """Make a file's folders, and raise InputError where it cannot be written: before a command's work, not after it.
+    `option` named the file."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
@@ -29,17 +25,14 @@ def check_writable(path: Path, option: str) -> None:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file aside and move it into place: a reader finds all of it or none."""
+    """Write a file aside and move it into place: readers find all of it or none."""
     with whole(path) as aside:
         aside.write_text(text, encoding="utf-8")
 
 
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A file to write in place of `path`, which becomes it when the block ends, and vanishes if the block fails.
-
-    Each writer has a file of its own: of several processes that write the same one at once, the last one's stays.
-    """
+    """A file of its own for each writer, moved to `path` when the block ends, and removed if it fails."""
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f"{path.name}.{secrets.token_hex(4)}.writing")
     try:

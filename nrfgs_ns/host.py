@@ -1,35 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What this package leans on in nerfstudio and gsplat beyond their documented interfaces, and in which versions.
+"""The private names of nerfstudio and gsplat that this package relies on, and their versions.
 
-`tests/test_host.py` looks every name up in the installed versions: a newer host that has lost one fails there, by name.
-What behaves differently between gsplat's versions is told apart by `gsplat_version` in `rasterizer/gsplat_cuda.py`
-alone: 1.4.0 is what nerfstudio 1.1.5 pins, 1.5.3 works beneath it (docs/troubleshooting.md).
-
-Nothing here imports nerfstudio or gsplat.
+`tests/test_host.py` looks up every name in the installed versions. Only `rasterizer/gsplat_cuda.py` distinguishes
+gsplat's versions, by `gsplat_version`: nerfstudio 1.1.5 pins 1.4.0, and 1.5.3 works beneath it
+(docs/troubleshooting.md). Nothing here imports nerfstudio or gsplat.
 """
 
 from functools import cache
 from importlib.metadata import version
 
 NERFSTUDIO = "1.1.5"
-"""The version of nerfstudio that the names below were read in."""
+"""The version of nerfstudio in which the names below were read."""
 GSPLAT = ("1.4.0", "1.5.3")
-"""Those of gsplat."""
+"""The same for gsplat."""
 
 PRIVATE = {
-    # The trainer is extended between its own steps, and writes and reads checkpoints in its own way.
+    # Extended between its own steps; checkpoints are written and read differently.
     "nerfstudio.engine.trainer:Trainer": (
         "_after_train",
         "_load_checkpoint",
         "_train_complete_viewer",
         "_update_viewer_state",
     ),
-    # Who called it is asked slowly, and the compiler imported early (start.py).
+    # Replaced by faster ones (start.py).
     "nerfstudio.configs.external_methods": ("inspect",),
     "nerfstudio.utils.misc": ("torch_compile",),
-    # Seeds as ns-train seeds.
+    # Seeds like ns-train.
     "nerfstudio.scripts.train": ("_set_random_seed",),
-    # Images are kept where there is room for them; a dataset knows its files; what undistorts a photograph.
+    # Images are cached where there is room for them, and undistorted one by one.
     "nerfstudio.data.datamanagers.full_images_datamanager": ("_undistort_image",),
     "nerfstudio.data.datamanagers.full_images_datamanager:FullImageDatamanager": ("_load_images",),
     # Splatfacto's own, which the model calls or replaces.
@@ -39,7 +37,7 @@ PRIVATE = {
         "_get_background_color",
         "_get_downscale_factor",
     ),
-    # A control of the viewer is set up by, and wakes, the viewer.
+    # A control is set up by the viewer and triggers a new picture.
     "nerfstudio.viewer.viewer_elements:ViewerControl": ("_setup",),
     "nerfstudio.viewer.viewer:Viewer": ("_trigger_rerender",),
     # Growth by gradients: which splats are split, duplicated or pruned. Statistics and resets are this package's own:

@@ -14,9 +14,7 @@ SECONDS_BETWEEN_LINES = 30.0
 
 
 @contextlib.contextmanager
-def progress(
-    description: str, total: int | None = None, console: Console = CONSOLE, clock: Callable[[], float] = monotonic
-) -> Iterator[Callable[..., None]]:
+def progress(description: str, total: int | None = None, console: Console = CONSOLE) -> Iterator[Callable[..., None]]:
     """Show the progress of `total` pieces of work; yields advance(description=None), to be called after each."""
     if console.is_terminal:
         columns = TextColumn("{task.description:<40}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
@@ -24,14 +22,14 @@ def progress(
             task = bar.add_task(description, total=total)
             yield lambda description=None: bar.update(task, advance=1, description=description)
         return
-    done, printed = 0, clock()
+    done, printed = 0, monotonic()
     console.print(f"{description} ...", markup=False, highlight=False, soft_wrap=True)
 
     def advance(detail: str | None = None) -> None:
         nonlocal done, printed
         done += 1
-        if clock() - printed >= SECONDS_BETWEEN_LINES:
-            printed = clock()
+        if monotonic() - printed >= SECONDS_BETWEEN_LINES:
+            printed = monotonic()
             count = f"{done:,}" if total is None else f"{done:,} of {total:,}"
             console.print(f"{detail or description}: {count}", markup=False, highlight=False, soft_wrap=True)
 

@@ -22,7 +22,7 @@ from nrfgs_ns.errors import DEBUG
 
 
 def with_data_parsers() -> None:
-    """Speed up nerfstudio's next imports, and silence their deprecation warnings unless NRFGS_DEBUG=1."""
+    """Speed up nerfstudio's next imports; silence their deprecation warnings unless NRFGS_DEBUG=1."""
     gc.freeze()  # imported objects stay: the collector need not visit them
     atexit.register(gc.unfreeze)  # frozen objects are not destroyed in order, and Triton's bindings complain
     if not DEBUG:
@@ -41,8 +41,8 @@ def with_methods() -> None:
 
 
 def _compile_when_called(torch_compile: Callable) -> Callable:
-    """Nerfstudio's `torch_compile` as a decorator that waits for the function's first call: torch's compiler, imported
-    for one function of splatfacto's, is a tenth of a command's start."""
+    """Nerfstudio's `torch_compile`; as a decorator it compiles at the function's first call: importing torch's
+    compiler, for one function of splatfacto's, is a tenth of a command's start."""
 
     @functools.wraps(torch_compile)
     def decorator_or_compiled(*args: Any, **options: Any) -> Any:
@@ -59,8 +59,8 @@ def _compile_when_called(torch_compile: Callable) -> Callable:
 
 
 def _names_of_callers() -> list[SimpleNamespace]:
-    """Names of the running functions, the caller's first. Nerfstudio asks 26 times through inspect.stack(), which reads
-    the source of every frame: two fifths of a command's start."""
+    """Names of the running functions, the caller's first. Nerfstudio calls inspect.stack() 26 times, which reads the
+    source of every frame: two fifths of a command's start."""
     frame, frames = sys._getframe(1), []
     while frame is not None:
         frames.append(SimpleNamespace(function=frame.f_code.co_name))

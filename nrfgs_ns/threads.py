@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One CPU thread for small work: OpenMP's threads busily wait for each other after each operation, and beside another
-process several are slower than one."""
+"""One CPU thread for small work: OpenMP's threads wait for each other busily after each operation, so that beside
+another process several are slower than one."""
 
 import contextlib
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 
 SMALL = 100_000
-"""Splats plus pixels of a picture, below which one thread is enough."""
+"""Splats plus pixels of a picture below which one thread is enough."""
 
 
 class Threads:
@@ -18,7 +18,7 @@ class Threads:
         self.most = most
 
     def suit(self, splats: int, pixels: int = 0) -> None:
-        """Take all threads for pictures of this size, if it is not small."""
+        """Use all threads for pictures of this size, unless it is small."""
         if splats + pixels >= SMALL:
             torch.set_num_threads(self.most)
 

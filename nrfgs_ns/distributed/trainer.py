@@ -170,12 +170,12 @@ class ShardedGuard(Guard):
 class ShardedOptimizers(WatchedOptimizers):
     """The optimisers of one device: gradients of what all devices have are summed before the step."""
 
-    def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:
-        self.guard.before_optimizers(self, gradients_are_scaled=False)
-        shared = [name for name in param_groups if name not in self.guard.model.gauss_params]
+    def step(self) -> None:
+        self.guard.before_optimizers(self)
+        shared = [name for name in self.optimizers if name not in self.guard.model.gauss_params]
         gradients = [parameter.grad for name in shared for parameter in parameters_of(self.optimizers[name])]
         comm.sum_over_devices([gradient for gradient in gradients if gradient is not None])
-        LeanOptimizers.optimizer_scaler_step_some(self, grad_scaler, param_groups)
+        LeanOptimizers.step(self)
 
     def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
         """Load this device's rows of a whole checkpoint; the model has been loaded."""

@@ -3,7 +3,7 @@
 
 PyTorch launches once for each learning rate, with 65,536 numbers to each block of threads: small tables take as long as
 large ones. Here a program takes `BLOCK` numbers of any tensor. Each tensor has a column in a table, which is copied to
-the device in each step, because gradients lie elsewhere in each.
+the device in each step, because the gradients' addresses change.
 
 The equations are torch's (Kingma and Ba 2015), in float32; the bias corrections in float64.
 """
@@ -19,13 +19,13 @@ from torch import Tensor
 from nrfgs_ns.kernels.launch import ALIGNMENT, Launcher
 
 BLOCK = 512
-"""Numbers that a program takes; a power of two."""
+"""Numbers per program; a power of two."""
 WARPS = 4
-"""Warps of a program."""
+"""Warps per program."""
 COLUMNS = 64
-"""Most tensors of a step; a power of two."""
+"""Most tensors in a step; a power of two."""
 END, SIZE, PARAMETER, MEAN, SQUARE, STEP, GRADIENT, RATE, BETA1, BETA2, EPSILON, DECAY = map(tl.constexpr, range(12))
-"""Rows of the table: the last program's number + 1, how many numbers there are, where they lie, and the constants."""
+"""Rows of the table: the last program's number + 1, the tensor's size, addresses, and constants."""
 ROWS = 12
 FIXED = slice(PARAMETER.value, STEP.value + 1)
 CONSTANTS = slice(RATE.value, DECAY.value + 1)
@@ -48,13 +48,13 @@ def _number(table, row, column, COLUMNS: tl.constexpr):
 
 @triton.jit
 def _place(base, table, row, column, COLUMNS: tl.constexpr):
-    """Where a tensor begins. Its distance from `base` is whole fours of numbers, so that four are read at once."""
+    """Where a tensor begins. Its distance from `base` is a multiple of four numbers, so that four are read at once."""
     return base + tl.multiple_of(_entry(table, row, column, COLUMNS), 4)
 
 
 @triton.jit
 def adam_kernel(base, table, skip, BLOCK: tl.constexpr, COLUMNS: tl.constexpr):
-    """One step of all tensors of `table`, which their counters have counted; if `skip` is not 0, they uncount it."""
+    """One step of all tensors of `table`, which their counters have counted; if `skip` is not 0, only uncount it."""
     program = tl.program_id(0)
     ends = tl.load(table + END * COLUMNS + tl.arange(0, COLUMNS))
     column = tl.sum((ends <= program).to(tl.int32), axis=0)
@@ -120,11 +120,11 @@ class AdamTable:
 
         Args:
             work: all groups.
-            skip: a number on the device, not 0 to leave everything as it was before; None: do not skip.
+            skip: a number on the device, not 0 to skip the step and uncount it; None: do not skip.
 
         Returns:
-            Whether the kernel could make it: of at most `COLUMNS` tensors, all float32, dense, aligned and on the
-            table's device. If not, nothing has been done.
+            Whether the kernel made the step: it takes at most `COLUMNS` tensors, all float32, dense, aligned and on the
+            table's device. If not, nothing has changed.
         """
         fixed: list[int] = []
         gradients: list[int] = []
@@ -153,13 +153,13 @@ class AdamTable:
             self.copied.record()
         skip = self.never if skip is None else skip
         launch((self.programs, 1, 1), base, self.device, skip, BLOCK=BLOCK, COLUMNS=COLUMNS, num_warps=WARPS)
-        for _, parameters, _ in work:  # of which PyTorch cannot know that they have been written to
+        for _, parameters, _ in work:  # PyTorch cannot know that they have been written to
             for parameter in parameters:
                 torch.autograd.graph.increment_version(parameter)
         return True
 
     def _write_fixed(self, work: list[Group], fixed: list[int]) -> bool:
-        """Write where the tensors lie, as far as that stays from step to step, if the kernel can step them."""
+        """Write the addresses and sizes that stay from step to step; whether the kernel takes these tensors."""
         self.fixed = []
         parts = [
             tensor

@@ -5,9 +5,9 @@ Optimization 30, 1992).
 Most learning rates never fall, and each step sees one view: parameters fluctuate around what they have learnt. Their
 mean lies closer to the centre than the last step does.
 
-Averaging is meaningless once a row denotes another splat. The mean therefore restarts wherever splats were added,
-removed, moved onto others or had their opacity reset: all of these replace the `Parameter` objects, even where shapes
-stay. MCMC's noise, which changes the means in place, is averaged away.
+Averaging is meaningless once a row denotes another splat. The mean therefore restarts where splats were added, removed,
+moved onto others or had their opacity reset: all of these replace the `Parameter` objects, even if shapes stay. MCMC's
+noise, which changes the means in place, is averaged away.
 """
 
 from collections.abc import Mapping
@@ -25,24 +25,19 @@ improves, so that the mean is worse than the last step."""
 
 
 def window(average_steps: int, total: int) -> int:
-    """How many of the last steps to average in a training of `total` steps: at least 1."""
+    """Number of last steps to average in a training of `total` steps, at least 1."""
     return max(min(average_steps, int(LARGEST_SHARE * total)), 1)
 
 
 class ParameterMean:
-    """A running mean, m += (p - m) / n, of all parameters that a training's optimisers hold.
-
-    Attributes:
-        count: n, the number of averaged steps; 0 without a mean.
-        restarted: whether an earlier mean was dropped because rows came to denote other splats.
-    """
+    """A running mean, m += (p - m) / n, of all parameters that a training's optimisers hold; `count` is n, or 0."""
 
     def __init__(self):
         self.forget()
 
     def forget(self) -> None:
         """Drop the mean."""
-        self.count, self.restarted = 0, False
+        self.count = 0
         self._means: dict[str, Tensor] = {}
         self._parameters: dict[str, Tensor] = {}
 
@@ -51,7 +46,6 @@ class ParameterMean:
         """Add the present parameters to the mean."""
         if not self.is_current(optimizers):
             parameters = _parameters(optimizers)
-            self.restarted = self.restarted or self.count > 0
             self._means = {name: torch.zeros_like(parameter) for name, parameter in parameters.items()}
             self._parameters, self.count = parameters, 0
         self.count += 1
@@ -66,15 +60,15 @@ class ParameterMean:
 
     def state(self) -> dict[str, Any]:
         """The checkpoint's entry: numbers and tensors."""
-        return {"count": self.count, "restarted": self.restarted, "means": dict(self._means)}
+        return {"count": self.count, "means": dict(self._means)}
 
     def load_state(self, state: Mapping[str, Any], model, optimizers: Mapping[str, Optimizer]) -> None:
-        """Go on from a checkpoint's `state`, whose parameters have been loaded; one of other shapes is ignored."""
+        """Go on from the `state` of a checkpoint whose parameters have been loaded; other shapes are ignored."""
         parameters = _parameters(optimizers)
         shapes = {name: parameter.shape for name, parameter in parameters.items()}
         if {name: mean.shape for name, mean in state["means"].items()} != shapes:
             return  # the guard has removed splats since
-        self.count, self.restarted = state["count"], state["restarted"]
+        self.count = state["count"]
         self._means = {name: mean.to(parameters[name]) for name, mean in state["means"].items()}
         self._parameters = parameters
 

@@ -7,11 +7,8 @@ model. `read` checks every byte, in 0.3 s for 500 MB.
 
 import os
 import re
-import secrets
 import shutil
-import time
 import zipfile
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +19,9 @@ from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import ForTheUser, InputError
 
 NAME = re.compile(r"step-(\d{9,})\.ckpt")
-"""Names of checkpoints; other files in their folder are ignored."""
+"""Names of checkpoints; other files in the folder are ignored."""
 KEPT = 2
-"""Checkpoints to keep: should the last one be damaged, the one before is there."""
-ABANDONED = 3600.0
-"""Seconds after which an unfinished file is taken for a killed process's."""
+"""Checkpoints to keep: if the last one is damaged, the one before is read."""
 
 
 class DiskFull(ForTheUser, RuntimeError):
@@ -38,8 +33,8 @@ class Damaged(ValueError):
 
 
 def allow_nerfstudio_checkpoints() -> None:
-    """Let `torch.load(weights_only=True)` read nerfstudio's checkpoints: the numpy scalars in the state of their
-    learning-rate schedulers. These types are plain data."""
+    """Let `torch.load(weights_only=True)` read the numpy scalars in the state of nerfstudio's learning-rate schedulers.
+    These types are plain data."""
     scalar = np._core.multiarray.scalar if hasattr(np, "_core") else np.core.multiarray.scalar
     torch.serialization.add_safe_globals(
         [scalar, (scalar, "numpy.core.multiarray.scalar"), np.dtype, np.dtypes.Float64DType]
@@ -47,23 +42,20 @@ def allow_nerfstudio_checkpoints() -> None:
 
 
 def find(folder: Path) -> dict[int, Path]:
-    """Checkpoints in a folder by step, the newest first; none if there is no such folder."""
+    """Checkpoints in a folder by step, the newest first; empty if there is no folder."""
     files = folder.iterdir() if folder.is_dir() else ()
     by_step = {int(match[1]): file for file in files if (match := NAME.fullmatch(file.name))}
     return dict(sorted(by_step.items(), reverse=True))
 
 
 def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = True) -> Path:
-    """Write a checkpoint beside its folder, sync it to disk, move it into the folder, and remove older ones; DiskFull
-    where it cannot be written."""
+    """Write a checkpoint beside its folder, sync it to disk, move it in, and remove older ones; DiskFull where it
+    cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)
     final = folder / f"step-{step:09d}.ckpt"
-    for abandoned in folder.parent.glob(f"{folder.name}.*.writing"):  # by killed processes
-        with suppress(OSError):  # another process was faster, or it is not ours
-            if time.time() - abandoned.stat().st_mtime > ABANDONED:
-                abandoned.unlink()
-    # Beside the folder: nerfstudio's commands take every file within for a checkpoint.
-    unfinished = folder.with_name(f"{folder.name}.{secrets.token_hex(8)}.writing")
+    # Beside the folder: nerfstudio's commands take every file within for a checkpoint. By a name that the next write
+    # uses again, if this process is killed.
+    unfinished = folder.with_name(f"{folder.name}.writing")
     try:
         torch.save(content, unfinished)
         _sync(unfinished)
@@ -87,7 +79,7 @@ def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = 
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a checkpoint, tensors in host memory; Damaged where a byte is not as it was written."""
+    """Read a checkpoint into host memory; Damaged where a byte is not as it was written."""
     allow_nerfstudio_checkpoints()
     try:
         with zipfile.ZipFile(path) as archive:
@@ -115,8 +107,8 @@ def read_or_refuse(path: Path) -> dict[str, Any]:
 
 
 def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, Any]]:
-    """Read a folder's last checkpoint, or that of a step; where the last is damaged the one before, with a warning.
-    InputError where none can be read."""
+    """Read a folder's last checkpoint, or a step's; if the last is damaged the one before, with a warning. InputError
+    if none can be read."""
     checkpoints = checkpoints_in(folder)
     if step is not None:
         if step not in checkpoints:
@@ -146,7 +138,7 @@ def checkpoints_in(folder: Path) -> dict[int, Path]:
 
 
 def _sync(path: Path) -> None:
-    """Have the system write a file, or a folder's list of files, to the disk now."""
+    """Flush a file, or a folder's list of files, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

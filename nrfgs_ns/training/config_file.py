@@ -29,27 +29,20 @@ from nrfgs_ns.errors import InputError
 
 OURS = "nrfgs_ns."
 PACKAGES = ("nerfstudio.", OURS, "torch.optim.")
-PATHS = {
-    f"{module}.{name}" for module in ("pathlib", "pathlib._local") for name in ("Path", "PosixPath", "WindowsPath")
-}
-FIX = "Name the config.yml that the training saved"
 
 
 def read_config(path: Path) -> TrainerConfig:
     """The configuration of a training; InputError where the file is no whole one, names anything else than the module's
     docstring lists, or has a value of another type than its option."""
+    fix = "Name the config.yml that the training saved"
     if not path.is_file():
-        raise InputError(f"{path}: no such file. {FIX}.")
+        raise InputError(f"{path}: no such file. {fix}.")
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:
-        raise InputError(f"{path} is not a configuration: {' '.join(str(error).split())}. {FIX}.") from error
+        raise InputError(f"{path} is not a configuration: {' '.join(str(error).split())}. {fix}.") from error
     if not isinstance(config, TrainerConfig):
-        raise InputError(f"{path} is not the configuration of a training. {FIX}.")
-    missing = {field.name for field in fields(ExperimentConfig)} - vars(config).keys()
-    if missing:
-        raise InputError(f"{path} is not whole: it lacks {', '.join(sorted(missing)[:3])}. {FIX}.")
-    _fill_in(config)
+        raise InputError(f"{path} is not the configuration of a training. {fix}.")
     check_types(config, str(path))
     return config
 
@@ -74,7 +67,7 @@ def check_types(config: Any, source: str, prefix: str = "") -> None:
 
 
 def _is_a(value: Any, hint: Any) -> bool:
-    """Whether a value has the type that a field's annotation names; items of containers are not looked at."""
+    """Whether a value has the type that a field's annotation names; items of containers are not checked."""
     kind = get_origin(hint) or hint
     if kind in (Union, types.UnionType):
         return any(_is_a(value, option) for option in get_args(hint))
@@ -88,19 +81,7 @@ def _is_a(value: Any, hint: Any) -> bool:
 
 
 def _default(field: Field) -> Any:
-    if field.default is not MISSING:
-        return field.default
-    return field.default_factory() if field.default_factory is not MISSING else MISSING
-
-
-def _fill_in(config: Any) -> None:
-    """Give options that the file does not have their defaults."""
-    for field in fields(config):
-        if field.name not in vars(config) and (default := _default(field)) is not MISSING:
-            setattr(config, field.name, default)
-        value = getattr(config, field.name, None)
-        if is_dataclass(value) and not isinstance(value, type):
-            _fill_in(value)
+    return field.default if field.default_factory is MISSING else field.default_factory()
 
 
 class _Loader(yaml.SafeLoader):
@@ -115,60 +96,58 @@ def _refuse(node: yaml.Node, name: str) -> yaml.YAMLError:
     )
 
 
-def _class(node: yaml.Node, name: str) -> type:
-    """The class of this full name, if it is one of the packages' own."""
+def _class(loader: _Loader, name: str, node: yaml.Node) -> type:
+    """`!!python/name:`, a class of one of the packages. `_object` decides what it may be used for."""
     module, _, attribute = name.rpartition(".")
-    if not name.startswith(PACKAGES):
-        raise _refuse(node, name)
     try:
-        kind = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise _refuse(node, name) from error
+        kind = getattr(importlib.import_module(module), attribute) if name.startswith(PACKAGES) else None
+    except (ImportError, AttributeError):
+        kind = None
     if not isinstance(kind, type) or not kind.__module__.startswith(PACKAGES):
         raise _refuse(node, name)
     return kind
 
 
-def _object(loader: _Loader, suffix: str, node: yaml.Node):
-    """`!!python/object:`, a configuration."""
-    kind = _class(node, suffix)
+def _object(loader: _Loader, name: str, node: yaml.Node):
+    """`!!python/object:`, a configuration; options that the file lacks have their defaults."""
+    kind = _class(loader, name, node)
     if not is_dataclass(kind) or not (issubclass(kind, PrintableConfig) or kind.__module__.startswith(OURS)):
-        raise _refuse(node, suffix)
+        raise _refuse(node, name)
     config = kind.__new__(kind)
     yield config
     values = loader.construct_mapping(node, deep=True)
-    for name, value in values.items():
-        if isinstance(value, type) and not (name == "_target" and _fits(kind, value)):
+    defaults = {field.name: _default(field) for field in fields(kind)}
+    for key, value in values.items():
+        if isinstance(value, type) and not (
+            key == "_target" and (issubclass(value, torch.optim.Optimizer) or issubclass(value, defaults[key]))
+        ):
             raise _refuse(node, f"{value.__module__}.{value.__qualname__}")
-    vars(config).update(values)
+    needed = {key for key, value in defaults.items() if value is MISSING}
+    if issubclass(kind, ExperimentConfig):  # a file that is cut off lacks some
+        needed |= {field.name for field in fields(ExperimentConfig)}
+    if missing := sorted(needed - values.keys()):
+        raise yaml.YAMLError(f"it lacks {', '.join(missing[:3])}")
+    vars(config).update(defaults | values)
 
 
-def _fits(config: type, target: type) -> bool:
-    """Whether a configuration of this class may set up objects of that class."""
-    if issubclass(target, torch.optim.Optimizer):
-        return True
-    default = next((_default(field) for field in fields(config) if field.name == "_target"), None)
-    return isinstance(default, type) and issubclass(target, default)
-
-
-def _apply(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
+def _apply(loader: _Loader, name: str, node: yaml.Node) -> Any:
     """`!!python/object/apply:`, a path or an enum's value."""
     arguments = loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else [None]
-    if suffix in PATHS and all(isinstance(part, str) for part in arguments):
+    if name.startswith("pathlib.") and all(isinstance(part, str) for part in arguments):
         return Path(*arguments)
-    if suffix == "builtins.getattr":  # how Python 3.11.0 to 3.11.3 write an enum: its class and the member's name
-        kind, name = arguments if len(arguments) == 2 else (None, None)
-        if isinstance(kind, type) and issubclass(kind, Enum) and isinstance(name, str) and name in kind.__members__:
-            return kind[name]
-        raise _refuse(node, suffix)
-    kind = _class(node, suffix)
+    if name == "builtins.getattr":  # how Python 3.11.0 to 3.11.3 write an enum: its class and the member's name
+        kind, member = arguments
+        if isinstance(kind, type) and issubclass(kind, Enum) and member in kind.__members__:
+            return kind[member]
+        raise _refuse(node, name)
+    kind = _class(loader, name, node)
     if not issubclass(kind, Enum) or len(arguments) != 1:
-        raise _refuse(node, suffix)
+        raise _refuse(node, name)
     return kind(arguments[0])
 
 
 TAG = "tag:yaml.org,2002:python/"
-_Loader.add_multi_constructor(f"{TAG}name:", lambda loader, name, node: _class(node, name))  # `_object` checks whose
+_Loader.add_multi_constructor(f"{TAG}name:", _class)
 _Loader.add_multi_constructor(f"{TAG}object:", _object)
 _Loader.add_multi_constructor(f"{TAG}object/apply:", _apply)
 _Loader.add_constructor(f"{TAG}tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))

@@ -2,7 +2,7 @@
 """The guard: the first number of a training that is not finite stops it, with the last good state on disk.
 
 Between the backward pass and the optimisers, the guard takes the largest absolute value of the rendered image, of each
-loss and of each gradient, all in one fused call. NaN, infinity, or a gradient beyond `MAX_GRADIENT` condemns the step.
+loss and of each gradient, in one fused call. NaN, infinity, or a gradient beyond `MAX_GRADIENT` condemns the step.
 
 - On a CPU the training stops before the optimisers step.
 - On a GPU, reading the numbers would make the host wait in every step. Instead the verdict stays on the device, where
@@ -18,7 +18,7 @@ rasterizer does not draw them, so no gradient shows them) are removed before the
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,11 +34,11 @@ PARAMETERS_EVERY = 100
 """Steps between two checks of the parameters."""
 PATIENCE = 100
 """Steps in a row without a visible splat after which the training stops."""
-HUGE_BY_GROUP = {"scales": 20.0, "means": 1e6, "quats": math.inf}
+HUGE = {"scales": 20.0, "means": 1e6, "quats": math.inf}
 """Values (log-scales, scene units) that no training reaches with suitable learning rates. Quaternions are normalised,
-so theirs may have any length."""
-HUGE = 1e3
-"""The same for all other tensors: logits, a head's per-splat tensors, shared weights."""
+so theirs may have any length. All other tensors (logits, a head's per-splat tensors, shared weights): `HUGE_OTHERWISE`.
+"""
+HUGE_OTHERWISE = 1e3
 
 Origin = Literal["rendering", "gradient", "parameter", "elsewhere", "nothing visible", "memory"]
 """Cause of a stop; "rendering": a number in the image or a loss, "elsewhere": on another device."""
@@ -47,11 +47,8 @@ Findings = list[tuple[str, float, Tensor]]
 
 
 class TrainingStopped(ForTheUser, RuntimeError):
-    """A training cannot go on: it met a number that is not finite, sees nothing, or its memory has run out.
-
-    Args:
-        savable: whether the remaining state is good.
-    """
+    """A training cannot go on: a number is not finite, nothing is visible, or memory has run out. A state that is
+    `savable` is good."""
 
     def __init__(self, message: str, step: int, origin: Origin, savable: bool = True):
         super().__init__(message)
@@ -60,8 +57,7 @@ class TrainingStopped(ForTheUser, RuntimeError):
         self.savable = savable
 
 
-@dataclass
-class Watched:
+class Watched(NamedTuple):
     """A tensor that may condemn a step."""
 
     name: str
@@ -108,52 +104,48 @@ class Guard:
         if step % PARAMETERS_EVERY == 0:
             self.check_parameters(optimizers)
 
-    def before_optimizers(self, optimizers: LeanOptimizers, gradients_are_scaled: bool) -> None:
-        """Check image, losses and gradients, and condemn the step if one is not finite: on a CPU, TrainingStopped.
-
-        Args:
-            gradients_are_scaled: only image and losses are checked; a GradScaler skips steps with infinite gradients.
-        """
+    def before_optimizers(self, optimizers: LeanOptimizers) -> None:
+        """Check image, losses and gradients, and condemn the step if one is not finite: on a CPU, TrainingStopped."""
         watched = [Watched(name, "rendering", value) for name, value in self.model.watched.items()]
-        for name, optimizer in optimizers.optimizers.items() if not gradients_are_scaled else ():
+        for name, optimizer in optimizers.optimizers.items():
             for parameter in parameters_of(optimizer):
                 if parameter.grad is not None and parameter.numel() > 0:
                     watched.append(Watched(f"the gradient of {name}", "gradient", parameter.grad))
         sizes = torch.stack(torch._foreach_norm([each.tensor for each in watched], math.inf))
         self._verdict = self._share(Verdict(self.step, watched, sizes))
-        sizes = self._verdict.sizes
-        if gradients_are_scaled or not optimizers.all_fused:
+        if not optimizers.all_fused:
             self.settle()
             return
+        sizes = self._verdict.sizes
         condemned = (~(sizes <= MAX_GRADIENT)).any().float()  # NaN compares as false
         for optimizer in optimizers.optimizers.values():
             optimizer.found_inf = condemned
-        self._silence_densification()
+        means2d = getattr(self.model, "info", {}).get("means2d")
+        if means2d is not None and means2d.retains_grad:  # densification's statistics take what is finite
+            for gradient in (means2d.grad, getattr(means2d, "absgrad", None)):
+                if gradient is not None:
+                    gradient.nan_to_num_(0.0, 0.0, 0.0)
         if sizes.is_cuda:
             self._send_home(self._verdict)
 
     def _check_visibility(self) -> None:
         """Raise TrainingStopped where no splat is left, or none was visible in the last `PATIENCE` steps: no rows, or,
-        where all splats have one (`step_graph.py`), no pairs of splats and tiles."""
+        in recorded steps, where all splats have one, no pairs of splats and tiles."""
         if self.model.num_points == 0:
-            message = (
-                f"No splat is left in step {self.step}: all were pruned. Images or masks show nothing, or thresholds "
-                "of the densification are too high."
-            )
+            message = f"No splat is left in step {self.step}: all were pruned. Images or masks show nothing, or "
+            message += "thresholds of the densification are too high."
             raise TrainingStopped(message, self.step, "nothing visible", savable=False)
         info = getattr(self.model, "info", {})
         rows = info.get("gaussian_ids")
         blind = rows is not None and (len(rows) == 0 or info.get("pairs") == 0)
         self.blind_steps = self.blind_steps + 1 if blind else 0
         if self.blind_steps >= PATIENCE:
-            message = (
-                f"No splat has been visible in the last {PATIENCE} steps, so nothing is learnt. Poses and points are "
-                "not of one world, or a learning rate has thrown the splats out of sight (see the viewer)."
-            )
+            message = f"No splat has been visible in the last {PATIENCE} steps, so nothing is learnt. Poses and points "
+            message += "are not of one world, or a learning rate has thrown the splats out of sight (see the viewer)."
             raise TrainingStopped(message, self.step, "nothing visible")
 
     def _share(self, verdict: Verdict) -> Verdict:
-        """Add other devices' findings, where there are any (`distributed`)."""
+        """Add other devices' findings (`distributed`)."""
         return verdict
 
     def _send_home(self, verdict: Verdict) -> None:
@@ -173,26 +165,20 @@ class Guard:
         pairs = zip(verdict.watched, self._read(verdict), strict=True)
         bad = [(each, size) for each, size in pairs if not size <= MAX_GRADIENT]
         if bad:
-            findings = [(each.name, size, each.tensor) for each, size in bad]
-            message = report(self.pipeline, verdict.step, findings, MAX_GRADIENT)
-            message += (
-                f"\nThe update of step {verdict.step} was not made. The state before it is in that step's checkpoint; "
-                "with --load-dir, training goes on from there."
-            )
-            raise TrainingStopped(message, verdict.step, bad[0][0].origin)
+            step, findings = verdict.step, [(each.name, size, each.tensor) for each, size in bad]
+            message = report(self.pipeline, step, findings, MAX_GRADIENT)
+            message += f"\nThe update of step {step} was not made. The state before it is in that step's checkpoint; "
+            raise TrainingStopped(f"{message}with --load-dir, training goes on from there.", step, bad[0][0].origin)
 
     def _read(self, verdict: Verdict) -> list[float]:
-        """A verdict's sizes, for which the host waits."""
+        """Wait for a verdict's sizes."""
         if verdict.arrived is not None:
             verdict.arrived.synchronize()
         return verdict.sizes.tolist()
 
     def check_parameters(self, optimizers: LeanOptimizers) -> None:
-        """Check every parameter, and remove the splats that are not finite.
-
-        Raises:
-            TrainingStopped: one is not finite. It is savable unless it is a shared weight.
-        """
+        """Remove the splats that are not finite and raise TrainingStopped, savable unless a shared weight is not finite
+        either."""
         named = {name: value for name, value in self.pipeline.named_parameters() if value.numel() > 0}
         sizes = torch.stack([size.float() for size in torch._foreach_norm(list(named.values()), math.inf)]).tolist()
         findings = [
@@ -213,14 +199,6 @@ class Guard:
             message += "\nNothing has been written: the checkpoint before, if there is one, is the last good state."
         raise TrainingStopped(message, self.step, "parameter", savable=only_splats)
 
-    def _silence_densification(self) -> None:
-        """Set gradients on the image plane that are not finite to zero for densification's statistics."""
-        means2d = getattr(self.model, "info", {}).get("means2d")
-        if means2d is not None and means2d.retains_grad:  # densification needs them
-            for gradient in (means2d.grad, getattr(means2d, "absgrad", None)):
-                if gradient is not None:
-                    gradient.nan_to_num_(0.0, 0.0, 0.0)
-
 
 class WatchedOptimizers(LeanOptimizers):
     """The optimisers, behind the guard."""
@@ -229,36 +207,33 @@ class WatchedOptimizers(LeanOptimizers):
         super().__init__(*args)
         self.guard = guard
 
-    def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:
-        self.guard.before_optimizers(self, gradients_are_scaled=grad_scaler.is_enabled())
-        super().optimizer_scaler_step_some(grad_scaler, param_groups)
+    def step(self) -> None:
+        self.guard.before_optimizers(self)
+        super().step()
 
     def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
-        """Nerfstudio's; the checkpoint may have brought a smaller head than these were built on."""
-        weights = list(self.guard.model.head.parameters())
-        if weights:
+        """Load the moments; the checkpoint may have brought a smaller head than these were built on."""
+        if weights := list(self.guard.model.head.parameters()):
             self.hold("field", weights)
         super().load_optimizers(loaded_state)
 
 
 def report(pipeline, step: int, findings: Findings, limit: float) -> str:
-    """The message of a stop: tensors, splats, and the likely cause."""
-    (first, size, _), others = findings[0], ", ".join(name for name, _, _ in findings[1:4])
-    what = f"reaches {size:.2g}, which Adam cannot square"
-    if not math.isfinite(size):
-        what = "has NaN" if math.isnan(size) else "is infinite"
-    lines = [f"Training stopped at step {step}: {first} {what}." + (f" Also: {others}." if others else "")]
-    model, names = pipeline.model, [name for name, _, _ in findings]
+    """The message of a stop: the first tensor, its splats, and the likely cause."""
+    model, (first, size, _) = pipeline.model, findings[0]
+    what = "has NaN" if math.isnan(size) else "is infinite"
+    if math.isfinite(size):
+        what = f"reaches {size:.2g}, which Adam cannot square"
+    lines = [f"Training stopped at step {step}: {first} {what}."]
     for name, _, values in findings:
         if name.removeprefix("the gradient of ").removeprefix("gauss_params.") in model.gauss_params:
             rows = (~_within(values, limit)).nonzero().flatten().tolist()
             shown = ", ".join(map(str, rows[:3])) + (", ..." if len(rows) > 3 else "")
             lines.append(f"{name}: {len(rows)} of {len(values)} splats, first {shown}.")
             break
-    image = "of this step"
-    if (index := getattr(model, "watched_image", None)) is not None:
-        image = pipeline.datamanager.train_dataset.image_filenames[index]
-    return "\n".join([*lines, f"Likely cause: {_cause(model, names, image)}"])
+    index = getattr(model, "watched_image", None)
+    image = "of this step" if index is None else pipeline.datamanager.train_dataset.image_filenames[index]
+    return "\n".join([*lines, f"Likely cause: {_cause(model, [name for name, _, _ in findings], image)}"])
 
 
 def _within(tensor: Tensor, limit: float) -> Tensor:
@@ -270,9 +245,8 @@ def _cause(model, names: list[str], image: object) -> str:
     """The likeliest cause of non-finite tensors, and what to do about it."""
     if "loss main_loss" in names and "the rendered image" not in names:
         return f"the rendering is finite and its loss is not, so the image or mask is broken: {image}. Replace it."
-    values = [*model.gauss_params.items(), *(("field", weight) for weight in model.head.parameters())]
-    for group, value in values:
-        if value.numel() and not (reached := float(value.abs().max())) <= HUGE_BY_GROUP.get(group, HUGE):  # or NaN
+    for group, value in (*model.gauss_params.items(), *(("field", weight) for weight in model.head.parameters())):
+        if value.numel() and not (reached := float(value.abs().max())) <= HUGE.get(group, HUGE_OTHERWISE):  # or NaN
             return (
                 f"a learning rate that is too high: {group} have reached {reached:.2g}. Lower "
                 f"--optimizers.{group}.optimizer.lr and start from an older checkpoint."

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A checkpoint's data set, and the options that say what its numbers mean, so that no other training goes on from it.
-
-With another head or another origin of the world the same numbers are another model, and the checkpoint is refused.
-How learning goes on (learning rates, thresholds, steps) may change.
+"""A checkpoint's data set, and the options that define its numbers. A training with another head or another origin of
+the world is refused; learning rates, thresholds and steps may change.
 """
 
 from collections.abc import Iterator, Mapping
@@ -23,24 +21,28 @@ MEANING = (
     "pipeline.datamanager.dataparser",
     "pipeline.datamanager.camera_res_scale_factor",
 )
-"""Options, or groups of them, that say what the numbers mean."""
+"""Options, or groups of options, that define the numbers."""
 NEUTRAL = (
     "pipeline.model.appearance.implementation",
     "pipeline.datamanager.dataparser.data",
     "pipeline.datamanager.dataparser.colmap_path",
     "pipeline.datamanager.dataparser.images_path",
 )
-"""Those of the groups that change no number, or whose images and poses are compared instead."""
+"""Options in those groups that change no number, or whose images and poses are compared instead."""
 FAR = 0.01
-"""Distance between the same camera's centres, as a share of the cameras' extent, from which on it is another one."""
+"""Largest distance that a camera may have moved, as a share of the cameras' extent."""
 
 
 def options_of(config: Any) -> dict[str, str]:
-    """The options of a training that say what its numbers mean."""
+    """The options of a training that define its numbers."""
+
+    def is_among(name: str, groups: tuple[str, ...]) -> bool:
+        return any(name == group or name.startswith(f"{group}.") for group in groups)
+
     return {
         name: value.__name__ if isinstance(value, type) else value if isinstance(value, str) else repr(value)
         for name, value in leaves({"pipeline": config.pipeline})
-        if _is_among(name, MEANING) and not _is_among(name, NEUTRAL)
+        if is_among(name, MEANING) and not is_among(name, NEUTRAL)
     }
 
 
@@ -75,12 +77,8 @@ def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> None:
         )
 
 
-def _is_among(name: str, groups: tuple[str, ...]) -> bool:
-    return any(name == group or name.startswith(f"{group}.") for group in groups)
-
-
 def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names and values of a configuration's options, or of a dictionary of such."""
+    """Dotted names and values of the options of a configuration, or of a dictionary of configurations."""
     if isinstance(value, DensificationConfig):
         value = str(value)  # as it is typed
     if is_dataclass(value) and not isinstance(value, type):

@@ -2,19 +2,19 @@
 """How fast a training walks through its schedules.
 
 Learning rates, the rise of resolution and of harmonics, and the first and last step of densification are laid out for
-a training of L steps. A training of another number of steps can walk through the same schedules: after each step its
-*position* on them, 0 to L, moves on by the pace's *rate*. Without a pace the position is the step, and the rate is 1.
+a training of L steps. A training of another length can walk through the same schedules: each step advances its
+*position* on them, 0 to L, by the pace's *rate*. Without a pace the position is the step, and the rate is 1.
 
 - `Pace`: a constant rate, L / N for N steps.
-- `TimedPace`: the rate is chosen anew after each step such that position L and the end of a time budget meet,
+- `TimedPace`: after each step the rate is chosen so that the training reaches position L when the time budget ends,
 
       rate(p) = seconds per step / seconds left * integral_p^L c(u) / c(p) du
 
-  where c(u) is the relative cost of a step at position u. A wrong c makes for an uneven walk, not for another end:
+  where c(u) is the relative cost of a step at position u. A wrong c makes the walk uneven but does not move its end:
   training stops when the time is up.
 
-The distances between refinements and between resets of opacity, which must see every view, and the averages of Adam
-stay as they are, in steps.
+Adam's averages and the distances between refinements and between resets of opacity, which must see every view, stay
+in steps.
 """
 
 import math
@@ -25,50 +25,49 @@ from time import perf_counter
 from typing import Any
 
 STEPS = 30_000
-"""The training that the methods' schedules are laid out for."""
+"""Length of the training that the methods' schedules are laid out for."""
 STEPS_PER_VIEW = 120
-"""Steps for each training view, where their number is chosen; `bonsai`'s 255 views have as many in `STEPS`."""
+"""Steps for each training view, where their number is chosen: those of `bonsai`'s 255 views in `STEPS`."""
 FEWEST_STEPS = 10_000
-"""Steps of a training of few views, where their number is chosen."""
+"""Fewest steps, where their number is chosen."""
 STEPS_BEFORE_PLANNING = 10
 """Steps at rate 1 before a timed training plans: the first ones also compile and warm up."""
 ROUNDING = 1e-6
-"""In steps: positions are sums of rates."""
+"""Error of positions, which are sums of rates, in steps."""
 STEPS_IN_MEDIAN = 51
-"""The pace of the machine is the median of this many steps: evaluations and checkpoints in between do not count as
-steps."""
+"""Steps in the median that estimates a step's duration, so that evaluations and checkpoints in between do not count."""
 
 Phases = list[tuple[float, float]]
 Clock = Callable[[], float]
 
 
 def steps_for(views: int) -> int:
-    """Steps that suit a capture: with more, few views are learnt by heart."""
+    """Steps for a capture: with more, few views are learnt by heart."""
     return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), STEPS)
 
 
 class Pace:
-    """A constant rate: positions for each step, positive."""
+    """A constant, positive rate: positions per step."""
 
     def __init__(self, length: int, rate: float = 1.0):
         self.length = length
         self.rate = rate
         self.position = 0.0
-        """0 at the first step; stays at L once it is there"""
+        """0 at the first step, at most L"""
 
     def start(self) -> None:
-        """Note that training begins, or goes on, now."""
+        """Training begins, or goes on, now."""
 
     def begin_step(self) -> None:
-        """Note that a step begins now."""
+        """A step begins now."""
 
     def advance(self) -> None:
-        """Move on to the position of the next step, once in each step."""
+        """Move on to the next step's position."""
         self.position = min(self.position + self.rate, float(self.length))
 
     def step_at(self, position: float, now: int) -> int:
-        """The first step at or beyond a position, at the present rate; 0 if it lies behind. `now` is the step whose
-        position is `self.position`."""
+        """The first step at or beyond a position, at the present rate; 0 if the position is behind. `now` is the
+        present step."""
         ahead = (position - self.position) / self.rate
         return now + math.ceil(ahead - ROUNDING) if ahead > -ROUNDING else 0
 
@@ -85,10 +84,9 @@ class TimedPace(Pace):
     """A rate that lets the schedules end when the time does.
 
     Args:
-        seconds: the budget, positive, from the start of training to the end of its last step, warm-up, evaluations,
-            checkpoints and pauses included.
-        phases: pairs (position at which the phase ends, relative cost of a step in it), in order; the last one ends
-            at infinity.
+        seconds: the budget from the start of training to the end of its last step, including warm-up, evaluations,
+            checkpoints and pauses.
+        phases: pairs (position at which the phase ends, relative cost of a step in it), the last ending at infinity.
         clock: seconds, for tests.
     """
 
@@ -98,14 +96,14 @@ class TimedPace(Pace):
         self.phases = phases or [(math.inf, 1.0)]
         self.clock = clock
         self.earlier = 0.0
-        """seconds that the training took before it went on from a checkpoint"""
+        """seconds before the checkpoint that the training goes on from"""
         self._started: float | None = None
         self._begun: float | None = None
         self._durations: deque[float] = deque(maxlen=STEPS_IN_MEDIAN)
 
     @property
     def elapsed(self) -> float:
-        """Seconds since training began, interruptions left out."""
+        """Seconds of training, without interruptions."""
         return self.earlier + (0.0 if self._started is None else self.clock() - self._started)
 
     @property
@@ -115,7 +113,7 @@ class TimedPace(Pace):
 
     @property
     def is_spent(self) -> bool:
-        """Whether the end of the budget is nearer now than after another step."""
+        """Whether the budget ends nearer to now than to the end of another step."""
         return self.elapsed + 0.5 * self.step_seconds >= self.seconds
 
     @property
@@ -157,14 +155,11 @@ class TimedPace(Pace):
         self.earlier = state.get("seconds", 0.0)
 
 
-COST_OF_HALF_RESOLUTION = 0.5
-"""Guess: a step at half the resolution costs half as much: between a quarter, as its pixels, and 1, as its splats."""
-
-
 def resolution_phases(num_downscales: int, resolution_schedule: int) -> Phases:
-    """Phases for `TimedPace` while the resolution doubles `num_downscales` times."""
-    rising = [
-        (float((done + 1) * resolution_schedule), COST_OF_HALF_RESOLUTION ** (num_downscales - done))
-        for done in range(num_downscales)
-    ]
+    """Phases for `TimedPace` while the resolution doubles `num_downscales` times.
+
+    A step at half the resolution is taken to cost half as much: it has a quarter of the pixels and all splats.
+    """
+    halvings = range(num_downscales, 0, -1)
+    rising = [(float((num_downscales + 1 - n) * resolution_schedule), 0.5**n) for n in halvings]
     return [*rising, (math.inf, 1.0)]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a training learns each photograph's exposure and white balance, and from where it starts: it does if EXIF
-says that exposure varies, or if photographs disagree about the same points by more than their places explain
+"""Whether a training learns each photograph's exposure and white balance, and from which start: it does if EXIF says
+that exposure varies, or if photographs disagree about the same points by more than their places explain
 (`image/overlap.py`).
 """
 
@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -23,7 +23,6 @@ from nrfgs_ns.image.overlap import ENOUGH_STOPS, Looks, Pairs, estimate, slope, 
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.pinhole import world_to_camera
 
-Choice = Literal["auto", "on", "off"]
 Exif = dict[str, Any]
 
 
@@ -39,29 +38,36 @@ class Evidence(NamedTuple):
     """exposures from the pairs alone"""
 
     @property
-    def learnt_by_itself(self) -> bool:
+    def calls_for_learning(self) -> bool:
         """Whether exposure and white balance are learnt unless an option decides.
 
-        EXIF's exposure counts as far as the photographs' brightness follows it: one that the light or the camera's own
-        tone curve makes up for does not show.
+        EXIF's exposure counts as far as the photographs' brightness follows it: a change that the light or the camera's
+        own tone curve makes up for does not show.
         """
         vary = any(size >= enough for size, enough in zip(self.seen.random, ENOUGH_STOPS, strict=True))
         followed, _ = slope(self.pairs, self.exif)
         return vary or varies(self.exif) and followed * spread(self.exif) >= ENOUGH_STOPS[0]
 
-
-def evidence(datamanager: Any) -> Evidence:
-    """Compare a training's photographs, whose images have been read."""
-    dataset = datamanager.train_dataset
-    metadata = datamanager.train_dataparser_outputs.metadata
-    exif = torch.tensor([exposure(entry) for entry in exif_of(dataset.image_filenames, metadata.get("exif"))])
-    pairs = compare_photographs(metadata.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
-    centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
-    return Evidence(pairs, centers, exif, estimate(pairs, torch.full_like(exif, torch.nan), centers))
+    @property
+    def numbers(self) -> str:
+        """The evidence in words and numbers."""
+        exposures, *colors = self.seen.random
+        text = f"exposure varies by {exposures:.2f} stops, colour by {max(colors):.2f}"
+        if not any(self.seen.random):
+            text = "photographs have too few points in common to compare them"
+        text += f" (learnt from {ENOUGH_STOPS[0]:g}, or {ENOUGH_STOPS[1]:g} in colour); EXIF: "
+        if not torch.isfinite(self.exif).any():
+            return text + "no exposures"
+        text += f"exposure varies by {spread(self.exif):.2f} stops"
+        _, explained = slope(self.pairs, self.exif)
+        if varies(self.exif) and explained is not None:
+            text += f", which explains {explained:.0%} of the difference"
+        return text
 
 
 def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | None, list[str]]:
-    """The photographs' exposure model, announced in one line.
+    """The photographs' exposure model, announced in one line; InputError where it is requested together with the
+    bilateral grid.
 
     Args:
         config: an NrfgsModelConfig.
@@ -69,9 +75,6 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
 
     Returns:
         The model, None where nothing is learnt; and the evidence in words and numbers.
-
-    Raises:
-        InputError: it is requested together with the bilateral grid.
     """
     choice = config.photographs
     if choice == "on" and config.use_bilateral_grid:
@@ -80,8 +83,12 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
         )
     if choice == "off" or config.use_bilateral_grid:
         return None, []
-    known = evidence(datamanager)
-    wanted, numbers = verdict(choice, known)
+    dataset, metadata = datamanager.train_dataset, datamanager.train_dataparser_outputs.metadata
+    exif = torch.tensor([exposure(entry) for entry in exif_of(dataset.image_filenames, metadata.get("exif"))])
+    pairs = compare_photographs(metadata.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
+    centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
+    known = Evidence(pairs, centers, exif, estimate(pairs, torch.full_like(exif, torch.nan), centers))
+    wanted = choice == "on" or known.calls_for_learning
     outcome = f"exposure and white balance {'learnt' if wanted else 'not learnt'}"
     if choice == "on":
         reason = "as requested"
@@ -90,32 +97,16 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
     else:
         reason = f"since {'the photographs agree' if any(known.seen.random) else 'too few common points compare them'}"
     CONSOLE.print(f"Photographs: {outcome}, {reason}.", soft_wrap=True)
-    notes = [f"photographs: {outcome}: {numbers}"]
+    notes = [f"photographs: {outcome}: {known.numbers}"]
     if not wanted:
         return None, notes
-    looks = estimate(known.pairs, known.exif, known.centers) if torch.isfinite(known.exif).any() else known.seen
-    names = [path.name for path in datamanager.train_dataset.image_filenames]
+    looks = estimate(pairs, exif, centers) if torch.isfinite(exif).any() else known.seen
+    names = [path.name for path in dataset.image_filenames]
     return PhotographModel(names, looks.stops, looks.held), notes
 
 
-def verdict(choice: Choice, known: Evidence) -> tuple[bool, str]:
-    """Whether a training learns photographs' exposure, and the numbers behind that."""
-    exposures, *colors = known.seen.random
-    numbers = f"exposure varies by {exposures:.2f} stops, colour by {max(colors):.2f}"
-    if not any(known.seen.random):
-        numbers = "photographs have too few points in common to compare them"
-    numbers += f" (learnt from {ENOUGH_STOPS[0]:g}, or {ENOUGH_STOPS[1]:g} in colour); EXIF: "
-    if not torch.isfinite(known.exif).any():
-        return known.learnt_by_itself or choice == "on", numbers + "no exposures"
-    numbers += f"exposure varies by {spread(known.exif):.2f} stops"
-    _, explained = slope(known.pairs, known.exif)
-    if varies(known.exif) and explained is not None:
-        numbers += f", which explains {explained:.0%} of the difference"
-    return known.learnt_by_itself or choice == "on", numbers
-
-
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
-    """Raise InputError where a checkpoint, whose entry is `written`, learnt other photographs than the training."""
+    """Raise InputError where a checkpoint, with the entry `written`, learnt other photographs than this training."""
     if (own is None) != (written is None):
         theirs, ours = ("on", "off") if own is None else ("off", "on")
         raise InputError(
@@ -132,19 +123,17 @@ def exif_of(paths: Sequence[Path], stored: Sequence[Exif] | None) -> list[Exif]:
 
 
 def exposure(exif: Exif) -> float:
-    """A photograph's exposure in stops, up to a constant; NaN if it cannot be told."""
+    """A photograph's exposure in stops, up to a constant; NaN if unknown."""
     if "exposure_time" not in exif or "iso" not in exif:
         return math.nan
     return math.log2(exif["exposure_time"]) + math.log2(exif["iso"]) - 2 * math.log2(exif.get("f_number", 1.0))
 
 
 def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequence[Mapping[str, Any]]) -> Pairs:
-    """Compare photographs at the points that they share.
+    """Compare V photographs at the reconstruction's points [N, 3], if it has any.
 
     Args:
-        points: of the reconstruction, [N, 3]; None: there are none.
-        cameras: [V].
-        images: "image" [H, W, 3 or 4] and perhaps "mask" [H, W, 1] of each. [V]
+        images: "image" [H, W, 3 or 4] and perhaps "mask" [H, W, 1] of each photograph.
     """
     centers = cameras.camera_to_worlds[:, :3, 3].cpu()
     if points is None or len(points) == 0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pipeline: nerfstudio's, with early checks, evaluation that can say "no number", and exact resume."""
+"""Nerfstudio's pipeline with early checks, evaluation in which a metric may be missing, and exact resume."""
 
 import json
 import random
@@ -35,7 +35,7 @@ from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.panel import ViewerPanel
 
 SMALLEST_SIDE = 2
-"""Pixels that an image has along each side at the lowest resolution: SSIM takes a side of one for none."""
+"""Fewest pixels along each side of an image at the lowest resolution: SSIM takes a side of one for none."""
 
 
 @dataclass
@@ -64,7 +64,7 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
 
 class NrfgsPipeline(VanillaPipeline):
     """VanillaPipeline that reads every image before the first step, so that a broken one costs no training time,
-    evaluates with null for a metric that cannot be had, and whose checkpoints resume exactly."""
+    evaluates to null where a metric is undefined, and resumes exactly from its checkpoints."""
 
     config: NrfgsPipelineConfig
     notes: tuple[str, ...] | list[str] = ()
@@ -104,8 +104,7 @@ class NrfgsPipeline(VanillaPipeline):
             )
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load a checkpoint, or the compact file that the configuration names; InputError where it cannot be this
-        model's."""
+        """Load a checkpoint, or the compact file that the configuration names; InputError if it does not fit."""
         if self.config.compact is not None:
             state = model_state(self.model, decode(self.config.compact))
             loaded_state = {f"_model.{name}": value for name, value in state.items()}
@@ -114,7 +113,7 @@ class NrfgsPipeline(VanillaPipeline):
         super().load_pipeline(loaded_state, step)
 
     def train(self, mode: bool = True):
-        # Nerfstudio asks before every step; to walk through all modules for nothing costs the host time.
+        # Called before every step: walking through all modules for nothing costs the host time.
         return self if self.training == self.model.training == mode else super().train(mode)
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
@@ -124,12 +123,8 @@ class NrfgsPipeline(VanillaPipeline):
         return super().get_training_callbacks(attributes)
 
     def get_train_loss_dict(self, step: int, graphs: StepGraphs | None = None):
-        """Outputs, losses and metrics of a step; metrics only when they are logged.
-
-        Args:
-            graphs: of the training, if steps are recorded. The losses of a recorded step need no gradient: the
-                parameters have theirs.
-        """
+        """Outputs, losses and metrics of a step; metrics only when they are logged. The losses of a step recorded in
+        `graphs` need no gradient: the parameters have theirs."""
         camera, batch = self.datamanager.next_train(step)
         done = None if graphs is None else graphs.losses(camera, batch, step)
         outputs = self._model(camera) if done is None else done[0]
@@ -140,7 +135,7 @@ class NrfgsPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Evaluate all test images.
+        """Evaluate all test images; with pictures of each if there is an `output_path`.
 
         Args:
             step: unused; nerfstudio passes it.
@@ -148,8 +143,8 @@ class NrfgsPipeline(VanillaPipeline):
                 numbers, which a tensorboard can show.
 
         Returns:
-            Mean over images of psnr, ssim, ms_ssim, l1, lpips, and of the same colour-corrected (cc_psnr, ...);
-            seconds_per_image (rendering alone, the first image left out) and its inverse fps; splats; parameter_bytes.
+            Means over images of `METRIC_NAMES`; seconds_per_image (rendering alone, without the first image) and its
+            inverse fps; splats; parameter_bytes.
         """
         self.eval()
         if output_path is not None:
@@ -187,7 +182,7 @@ class NrfgsPipeline(VanillaPipeline):
         return result
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Random generators and the order of the cameras, as numbers, strings and tensors: torch reads these without
+        """Random generators and the order of the cameras, as numbers, strings and tensors, which torch reads without
         trusting the file."""
         return {
             "torch_rng": torch.get_rng_state(),

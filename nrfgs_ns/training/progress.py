@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The progress line: steps, the PSNR of a test view, the time that is left.
+"""The progress line: steps, the PSNR of a test view, the time left. It replaces nerfstudio's table on the terminal and
+changes no number of the training."""
 
-It replaces nerfstudio's table on the terminal. The test view is only rendered: a training gives the same numbers with
-and without the line.
-"""
-
-from collections.abc import Callable
+import math
 from dataclasses import dataclass, field
 from datetime import timedelta
 from threading import Lock
@@ -57,37 +54,26 @@ def end_earlier_logs() -> None:
 class ProgressLine(LocalWriter):
     """One line that is updated on a terminal, and repeated now and then in a file.
 
-    The trainer calls `write_stats_log` after each step, nerfstudio's loop in those that are logged.
+    The trainer calls `write_stats_log` after each step, nerfstudio's loop after those that are logged.
 
     Args:
         banner_messages: lines printed once above it: the viewer's address.
-        clock: seconds, for tests.
     """
 
-    def __init__(
-        self,
-        config: ProgressLineConfig,
-        banner_messages: list[str] | None = None,
-        clock: Callable[[], float] = perf_counter,
-    ):
+    def __init__(self, config: ProgressLineConfig, banner_messages: list[str] | None = None):
         super().__init__(config, banner_messages)
         for message in banner_messages or []:
             CONSOLE.print(message, markup=False, soft_wrap=True)
-        self.clock = clock
         self._pipeline: Any = None
         self._live: Live | None = None
-        self._is_over = False
         self._last: tuple[int, float] | None = None
         """step and time of the last update"""
-        self._due = -1.0
+        self._due = 0.0
+        """time of the next update"""
         self._first = 0
 
     def watch(self, pipeline: Any, lock: Lock) -> None:
-        """Report the PSNR of this pipeline's middle test view, if it has any.
-
-        Args:
-            lock: held while rendering: the viewer uses the same model.
-        """
+        """Report the PSNR of the middle test view, if there is any, rendered under the viewer's lock."""
         data = pipeline.datamanager
         views = data.eval_dataset.image_filenames
         if views:
@@ -102,18 +88,17 @@ class ProgressLine(LocalWriter):
 
     def write_stats_log(self, step: int) -> None:
         """Update the line if it is due."""
-        if not self._is_over and self.clock() >= self._due:
+        if perf_counter() >= self._due:
             self._update(max(step, self._first))
 
     def finish(self, step: int) -> None:
         """Show the result of the last step and leave the line there."""
-        if not self._is_over:
-            self._update(step, is_last=True)
-            self.close()
+        self._update(step, is_last=True)
+        self.close()
 
     def close(self) -> None:
         """Release the terminal for good."""
-        self._is_over = True
+        self._due = math.inf
         self.step_aside()
 
     def step_aside(self) -> None:
@@ -123,7 +108,7 @@ class ProgressLine(LocalWriter):
             self._live = None
 
     def _update(self, step: int, is_last: bool = False) -> None:
-        start = self.clock()
+        start = perf_counter()
         total = max(writer.GLOBAL_BUFFER["max_iter"], step + 1)
         done = (step + 1) / total
         parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)"]
@@ -150,14 +135,13 @@ class ProgressLine(LocalWriter):
             self._live = Live(console=CONSOLE, auto_refresh=False)
             self._live.start()
         self._live.update(line, refresh=True)
-        now = self.clock()
-        self._due = max(now + SHORTEST, now + (now - start) / SHARE)
+        now = perf_counter()
+        self._due = now + max(SHORTEST, (now - start) / SHARE)
 
 
 @torch.no_grad()
 def psnr_of(pipeline: Any, index: int) -> float | None:
-    """PSNR of a test view in dB, as in an evaluation; None if its mask leaves nothing. Leaves the pipeline in training
-    mode."""
+    """PSNR of a test view in dB, as in an evaluation; None if its mask leaves nothing. Ends in training mode."""
     model, data = pipeline.model, pipeline.datamanager
     pipeline.eval()
     try:

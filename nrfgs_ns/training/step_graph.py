@@ -5,9 +5,9 @@ A step launches a hundred kernels, and the host takes longer to launch them than
 2 ms at 250,000 splats. Between two refinements each step does the same to the same tensors. So it is recorded once,
 and launched as a whole from then on, with another camera, photograph and noise.
 
-What makes steps differ in size must not be there: all splats have a row, visible or not, and the tiles' lists have room
-for half as many pairs again as any view had lately. Should a view need more, which the host learns a step later, the
-farthest splats were missing from that step, and there is more room from then on.
+Sizes must not differ between steps: all splats have a row, visible or not, and the tiles' lists have room for 1.5 times
+the pairs of recent views. If a view needs more, which the host learns a step later, its farthest splats are left out of
+that step, and there is more room from then on.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import composite_view, project_view
 
 MORE_ROOM = 1.5
-"""Room for pairs of splats and tiles, for each that the view with the most has."""
+"""Room for pairs of splats and tiles, relative to the view that has most."""
 VIEWS_ASKED = 20
-"""Views that are asked how many pairs they have."""
+"""Views in which pairs are counted."""
 MOST_SIZES = 4
-"""Sizes of photographs that are recorded; of others, steps are made one kernel after the other."""
+"""Most sizes of photographs that are recorded; steps of further sizes run kernel by kernel."""
 
 
 class StepGraphs:
@@ -41,7 +41,7 @@ class StepGraphs:
     Args:
         model: an NrfgsModel.
         datamanager: of its training.
-        guard: of its training, which is asked about the step before, once, before each step is computed.
+        guard: of its training; it settles the step before once, before each step is computed.
     """
 
     def __init__(self, model, datamanager, guard):
@@ -55,21 +55,20 @@ class StepGraphs:
         self._has_said_why = False
 
     def _takes(self, step: int, batch: Mapping[str, Any]) -> bool:
-        """Whether this step can be a graph's. What keeps steps from it is said once."""
+        """Whether this step can be recorded; what prevents it is reported once."""
         model = self.model
         if self._given_up or model.device.type != "cuda" or model.num_points == 0:
             return False
         if (obstacle := self._obstacle(batch)) is not None:
             if not self._has_said_why:
-                CONSOLE.print(
-                    f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}.", soft_wrap=True
-                )
+                why = f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}."
+                CONSOLE.print(why, soft_wrap=True)
                 self._has_said_why = True
             return False
         return not (model.config.use_scale_regularization and step % 10 == 0)
 
     def _obstacle(self, batch: Mapping[str, Any]) -> str | None:
-        """What of the training's options a graph does not know, or of this photograph."""
+        """An option of the training, or a property of this photograph, that graphs do not support."""
         model = self.model
         exposed = model.photograph is not None
         obstacles = (
@@ -90,12 +89,9 @@ class StepGraphs:
     def losses(
         self, camera: Cameras, batch: Mapping[str, Any], step: int
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]] | None:
-        """The model's outputs and losses, both without gradients of their own: those of the losses' sum are already in
-        the parameters. None: the step is the first of its kind, or cannot be recorded.
-
-        Raises:
-            TrainingStopped: the step before was condemned.
-        """
+        """The model's outputs and losses, detached: the parameters have the gradients of the losses' sum. None where
+        the step is the first of its kind, or cannot be recorded; TrainingStopped where the step before was
+        condemned."""
         if not self._takes(step, batch) or self._is_new():
             self.guard.settle()
             return None
@@ -117,8 +113,8 @@ class StepGraphs:
         return dict(graph.outputs), dict(losses)
 
     def _is_new(self) -> bool:
-        """Whether a step is another than the one before, and none that has been recorded: splats have come or gone,
-        pixels are others, or the head or the densification does something else."""
+        """Whether a step differs from the recorded ones: in its splats, in its resolution, or in what the head or the
+        densification does."""
         model = self.model
         splats = list(model.gauss_params.values())
         now = [*splats, model.head]  # whose weights live as long as it does
@@ -136,14 +132,14 @@ class StepGraphs:
             self._pairs_for_each = 0.0
         if self._graphs:
             self._graphs.clear()
-            torch.cuda.empty_cache()  # a graph's memory is no other's before
+            torch.cuda.empty_cache()  # which alone frees a graph's memory for others
         self._of, self._how = now, how
         return True
 
     def _record(
         self, kind: tuple, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int
     ) -> _StepGraph | None:
-        """A graph for this kind of photograph, ready for a step. None, and no graph from now on, where that fails."""
+        """A graph for this kind of photograph, prepared for a step. None, and no graph from now on, if that fails."""
         self._see_pairs()
         self._graphs.pop(kind, None)
         try:
@@ -162,17 +158,14 @@ class StepGraphs:
         return graph
 
     def _see_pairs(self) -> None:
-        """Learn from the graphs that there are how many pairs views have."""
+        """Learn from the present graphs how many pairs views have."""
         for graph in self._graphs.values():
             self._pairs_for_each = max(self._pairs_for_each, graph.most_pairs() / graph.count)
 
     @torch.no_grad()
     def _most_pairs(self) -> int:
-        """The most pairs of views that are evenly taken from all.
-
-        Raises:
-            RuntimeError: another than the kernels of `tile_lists.py` lists what tiles draw.
-        """
+        """The most pairs of any of `VIEWS_ASKED` views; RuntimeError where gsplat makes the lists, not
+        `tile_lists.py`."""
         from nrfgs_ns.rasterizer.tile_lists import FixedRoom
 
         model, count = self.model, len(self.datamanager.train_dataset)
@@ -189,7 +182,7 @@ class StepGraphs:
 
 
 def _kind(batch: Mapping[str, Any]) -> tuple:
-    """What of a photograph decides which graph it can be given to."""
+    """The properties of a photograph for which its graph is recorded."""
     return tuple(batch["image"].shape), "mask" in batch
 
 
@@ -199,7 +192,7 @@ class _StepGraph:
     Args:
         model: an NrfgsModel in training.
         seen_from, batch: some camera, and its photograph and mask as the datamanager gives them.
-        pairs: room for pairs.
+        pairs: how many the lists have room for.
     """
 
     def __init__(self, model, seen_from: Pinhole, batch: Mapping[str, Any], pairs: int):
@@ -218,9 +211,9 @@ class _StepGraph:
         self._arrived = torch.cuda.Event()
         self._arrived.record()
         self.last_pairs = 1
-        """of the step before, as far as the host has learnt"""
+        """of the step before, as far as the host knows"""
         self.shot = None if model.photograph is None else model.photograph.shots.detach()[:1].clone()
-        """the numbers of the step's photograph, [1, R], if they are learnt; a graph cannot choose a row by itself"""
+        """the step's row of a learnt exposure model, [1, R], which a graph cannot select by itself"""
         noise = model.view_noise
         self.noise = None if noise.sigma == 0.0 else noise.generator(device, 0)
 
@@ -233,16 +226,16 @@ class _StepGraph:
         aside.wait_stream(now)
         try:
             with torch.cuda.stream(aside):
-                self._compute()  # what is made or compiled at a first call is there from here on
+                self._compute()  # once outside the recording: first calls compile and allocate
                 for generator, state in zip(generators, states, strict=True):
                     generator.set_state(state)
-                self.graph.capture_begin(capture_error_mode="thread_local")  # a viewer's thread may do as it likes
+                self.graph.capture_begin(capture_error_mode="thread_local")  # a viewer has a thread of its own
                 try:
                     self._compute()
                 finally:
                     self.graph.capture_end()
         except Exception:
-            for generator, state in zip(generators, states, strict=True):  # they believe that they are recorded
+            for generator, state in zip(generators, states, strict=True):  # still marked as recorded
                 generator.graphsafe_set_state(torch.Generator(device).graphsafe_get_state())
                 generator.set_state(state)
             raise
@@ -251,8 +244,8 @@ class _StepGraph:
     def _compute(self) -> None:
         """One step's rendering, loss and gradients, from and to tensors that stay where they are.
 
-        Gradients go to leaves that share the parameters' numbers. The parameters themselves may be held by what an
-        earlier step has left, and would be another stream's.
+        Gradients go to leaves that share the parameters' memory: an earlier step's graph may still hold the parameters
+        themselves, and on another stream.
         """
         model = self.model
         leaves = {name: value.detach().requires_grad_() for name, value in self.parameters.items()}
@@ -277,7 +270,7 @@ class _StepGraph:
                 look=look,
             )
             outputs["background"] = background
-            stored = torch.sigmoid(splats["opacities"]).flatten()  # what nobody is shown otherwise
+            stored = torch.sigmoid(splats["opacities"]).flatten()  # for splats that are not visible
             shown = torch.where(info["radii"] > 0, appearance.opacities, stored)
             model.densification.pre_backward(model.step, info, shown, splats["opacities"])
             losses = loss_of(model, splats, outputs, self.batch)
@@ -290,7 +283,7 @@ class _StepGraph:
         self.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in info.items()}
         for name in ("grad", "absgrad") if info["means2d"].retains_grad else ():
             gradient = getattr(info["means2d"], name, None)
-            if gradient is not None:  # what is not finite counts as zero in densification's statistics
+            if gradient is not None:  # numbers that are not finite count as zero in densification's statistics
                 setattr(self.info["means2d"], name, gradient.nan_to_num_(0.0, 0.0, 0.0))
 
     def had_room(self) -> bool:
@@ -305,10 +298,7 @@ class _StepGraph:
         return int(self._counted[1])
 
     def prepare(self, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
-        """Take a step's camera, its photograph, which is training photograph `index`, and its noise."""
-        for name, parameter in self.parameters.items():
-            if parameter.grad is not None and parameter.grad is self.gradients[name]:  # kept to be added to
-                parameter.grad = parameter.grad.clone()
+        """Copy in a step's camera, noise and training photograph, number `index`."""
         mine, now = self.seen_from, seen_from
         torch._foreach_copy_([mine.viewmat, mine.K, mine.center], [now.viewmat, now.K, now.center])
         for name, values in self.batch.items():
@@ -320,7 +310,7 @@ class _StepGraph:
             self.shot.copy_(self.model.photograph.shots.detach()[index : index + 1])
 
     def run(self) -> dict[str, Tensor]:
-        """The losses; the parameters have the gradients of their sum. `outputs` and `info` are this step's."""
+        """Compute a step: returns its losses, sets the parameters' gradients, `outputs` and `info`."""
         self.graph.replay()
         if self.shot is not None:
             shots = self.parameters["photograph.shots"] = self.model.photograph.shots
@@ -329,7 +319,5 @@ class _StepGraph:
         self._counted.copy_(self.room.counted, non_blocking=True)
         self._arrived.record()
         for name, parameter in self.parameters.items():
-            gradient = self.gradients[name]
-            if gradient is not None:
-                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+            parameter.grad = self.gradients[name]
         return self.losses

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a training ends before its last step: signals, and memory that ran out.
+"""How a training ends before its last step: by a signal, or because memory has run out.
 
-A first Ctrl-C, SIGTERM or SIGHUP (a terminal that was closed) lets the step that is under way end, evaluation included,
-so that the state on disk is that of an unbroken training. A second Ctrl-C ends the process at once.
+A first Ctrl-C, SIGTERM or SIGHUP (a closed terminal) lets the current step end, evaluation included, so that the state
+on disk is that of an uninterrupted training. A second Ctrl-C ends the process at once.
 """
 
 import os
@@ -22,10 +22,10 @@ PATIENCE = 0.5
 
 
 class StopRequest:
-    """Signals' request to stop.
+    """A signal's request to stop.
 
     Attributes:
-        signal: the first that was heard; None: the training goes on.
+        signal: the first one received; None: the training goes on.
         is_over: whether the training has ended, so that signals end the process as usual.
     """
 
@@ -57,33 +57,30 @@ class StopRequest:
 
 @contextmanager
 def heard_signals(request: StopRequest) -> Iterator[None]:
-    """Let signals make a request instead of ending the process. Those that are ignored (`nohup`) stay so.
-
-    Only the main thread can do that; in another one nothing changes.
-    """
+    """Let signals make a request instead of ending the process, except those that are ignored (`nohup`). Outside the
+    main thread, which alone can do that, nothing changes."""
     is_main = threading.current_thread() is threading.main_thread()
     before = {number: signal.getsignal(number) for number in SIGNALS if is_main}
-    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
-    for number in before:
-        signal.signal(number, request.hear)
+    for number, handler in before.items():
+        if handler not in (signal.SIG_IGN, None):
+            signal.signal(number, request.hear)
     try:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if handler is not None:
+                signal.signal(number, handler)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether the memory of a GPU or of the host has run out."""
-    if isinstance(error, (torch.OutOfMemoryError, MemoryError)):
-        return True
-    # What torch's allocator of host memory raises is known by its words alone.
-    return isinstance(error, RuntimeError) and "DefaultCPUAllocator: " in str(error)
+    # torch's allocator of host memory raises a RuntimeError that only its message tells from others.
+    return isinstance(error, (torch.OutOfMemoryError, MemoryError)) or "DefaultCPUAllocator: " in str(error)
 
 
 def rows_agree(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], counted: Iterable[object]) -> bool:
-    """Whether a state that was interrupted anywhere is consistent: each splat has a row in every tensor, also in those
-    of the optimisers and of densification's statistics, `counted`."""
+    """Whether an interrupted state is consistent: each splat has a row in every tensor, including those of the
+    optimisers and of densification's statistics, `counted`."""
     tensors = [*splats.values(), *counted]
     for name, parameter in splats.items():
         if optimizers[name].param_groups[0]["params"][0] is not parameter:
@@ -93,13 +90,13 @@ def rows_agree(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]
 
 
 def _say(line: str) -> None:
-    """Write a line to the terminal from within a signal's handler, where print may not be called."""
+    """Write a line to the terminal from a signal handler, where print may not be called."""
     with suppress(OSError):
         os.write(2, f"\n{line}\n".encode())
 
 
 def _let_go_of_terminal() -> None:
-    """Let what is still printed go nowhere: writing to a terminal that is gone is an error."""
+    """Discard all further output: writing to a terminal that is gone is an error."""
     nowhere = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(nowhere, stream)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nerfstudio's trainer with whole checkpoints, a guard against numbers that are not finite, a time budget, a mean over
-the last steps, and an orderly end whatever causes it."""
+the last steps, and an orderly end whatever its cause."""
 
 import gc
 import math
@@ -21,7 +21,6 @@ from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_eval_enabled
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import ForTheUser, InputError
@@ -32,7 +31,6 @@ from nrfgs_ns.training.dense_start import start_with_dense_points
 from nrfgs_ns.training.evaluation import track
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
-from nrfgs_ns.training.optimizers import in_world_units
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
 from nrfgs_ns.training.step_graph import StepGraphs
@@ -49,7 +47,7 @@ class NrfgsTrainer(Trainer):
         total_steps: steps of the whole training, including those before a checkpoint.
         line: the progress line; None: nothing is shown, or nerfstudio's table.
         pace: position on the schedules; None: the step.
-        steps_are_chosen: whether the number of training views decides the number of steps.
+        steps_are_chosen: whether the number of training views decides how many steps there are.
         mean: the parameters' mean over the last steps; None without `average_steps`.
     """
 
@@ -92,7 +90,7 @@ class NrfgsTrainer(Trainer):
             self.line.watch(self.pipeline, self.train_lock)
         self._made = self._start_step - 1
         """the last completed step"""
-        if self.world_size == 1 and not self.use_grad_scaler:
+        if self.world_size == 1:
             self.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
         if comms.is_main_process():
             report_choices(self.config, self.pipeline, self.steps_are_chosen)
@@ -100,7 +98,7 @@ class NrfgsTrainer(Trainer):
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
     def setup_optimizers(self) -> Optimizers:
-        """The optimisers, behind a guard (see `nrfgs_ns.training.guard`)."""
+        """The optimisers, behind a guard."""
         self.steps_are_chosen = self.config.max_num_iterations == 0 and self.config.time_budget is None
         self.config = self.config.for_views(self.pipeline.model.num_views)
         self.total_steps = self.config.max_num_iterations
@@ -116,7 +114,7 @@ class NrfgsTrainer(Trainer):
     # Resuming.
 
     def _load_checkpoint(self) -> None:
-        """Resume from the checkpoint that the configuration names, if any; InputError where that cannot be."""
+        """Resume from the checkpoint that the configuration names, if any; InputError if it does not fit."""
         config = self.config
         path = config.load_checkpoint
         if config.load_dir is not None:
@@ -134,14 +132,11 @@ class NrfgsTrainer(Trainer):
         check_options(training["options"], options_of(config))
         if config.time_budget is None and self._start_step >= self.total_steps:
             schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
-            raise InputError(
-                f"{path} is the end of a training of {self.total_steps:,} steps: there is nothing left to do. "
-                f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more."
-            )
+            longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
+            raise InputError(f"{path} is the end of a training of {self.total_steps:,} steps: {longer}.")
         self.optimizers.load_optimizers(content["optimizers"])
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
-        self.grad_scaler.load_state_dict(content["scalers"])
         self._follow(training.get("pace"))
         if self.mean is not None and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.pipeline.model, self.optimizers.optimizers)
@@ -154,7 +149,7 @@ class NrfgsTrainer(Trainer):
         return scene_of([Path(name).name for name in data.image_filenames], data.cameras)
 
     def _follow(self, written: dict[str, Any] | None) -> None:
-        """Go on from the position of the checkpoint's pace; the remaining steps walk through the rest."""
+        """Go on from the checkpoint's position on the schedules; the remaining steps walk through the rest."""
         pace = self.pace
         if pace is None and written is not None:
             same = "a --time-budget" if "seconds" in written else f"--schedule-steps {written['length']}"
@@ -173,27 +168,26 @@ class NrfgsTrainer(Trainer):
             if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # an unchanged rate stays the same to the last bit
                 pace.rate = max(rate, 1e-9)
         elif pace.is_spent:
-            raise InputError(
-                f"The training has used its time budget of {self.config.time_budget:g} minutes: there is nothing "
-                "left to do. A larger --time-budget goes on."
-            )
+            budget = f"its time budget of {self.config.time_budget:g} minutes"
+            raise InputError(f"The training has used {budget}. A larger --time-budget goes on.")
         self.pipeline.model.schedule_at(int(pace.position))
 
     def optimizer_configs(self) -> dict[str, Any]:
-        """The configured optimisers; the means' learning rate, a length, in world units."""
-        groups = self.config.optimizers.copy()
-        groups["means"] = in_world_units(groups["means"], self.pipeline.model.scene_unit)
-        return groups
+        """The configured optimisers; the means' learning rates, lengths in scene units, in world units."""
+        unit, means = self.pipeline.model.scene_unit, self.config.optimizers["means"]
+        optimizer, scheduler = means["optimizer"], means["scheduler"]
+        if scheduler is not None:
+            rates = {name: getattr(scheduler, name, None) for name in ("lr_final", "lr_pre_warmup")}
+            rates = {name: unit * rate for name, rate in rates.items() if rate is not None}
+            scheduler = replace(scheduler, **rates)
+        means = {"optimizer": replace(optimizer, lr=unit * optimizer.lr), "scheduler": scheduler}
+        return {**self.config.optimizers, "means": means}
 
     # Training.
 
     def train(self) -> None:
-        """Train.
-
-        Raises:
-            TrainingStopped: a number is not finite, or the memory has run out; what is good has been written.
-            SystemExit: a signal has ended it, with that signal's status; the state has been written.
-        """
+        """Train. Raises TrainingStopped where a number is not finite or memory has run out, and SystemExit with the
+        status of a signal; the last good state has been written."""
         with self._last_good_state_on_disk():
             self.guard.step = self._start_step
             self.guard.check_parameters(self.optimizers)
@@ -214,8 +208,8 @@ class NrfgsTrainer(Trainer):
                 self.line.close()
 
     def _update_viewer_state(self, step: int) -> None:
-        """Nerfstudio's with fewer events: logging each step's duration takes the host longer than some kernels take.
-        Averages are logged every `logging.steps_per_log` steps; the progress line is updated more often."""
+        """Nerfstudio's with fewer events, since logging each step's duration takes the host longer than some kernels
+        take: those of every `logging.steps_per_log`-th step. The progress line is updated more often."""
         super()._update_viewer_state(step)
         if step % self.config.logging.steps_per_log != 0:
             writer.EVENT_STORAGE.clear()
@@ -234,13 +228,19 @@ class NrfgsTrainer(Trainer):
 
     def train_iteration(self, step: int):
         """One step; TrainingStopped where it, or on a GPU the one before, met a number that is not finite."""
-        model, pace = self.pipeline.model, self.pace
+        model, pace, optimizers = self.pipeline.model, self.pace, self.optimizers
         if pace is not None:
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         with self._last_good_state_on_disk():
-            self.guard.begin(step, self.optimizers, settled_later=self.graphs is not None)
-            loss, losses, metrics = self._descend(step)
+            self.guard.begin(step, optimizers, settled_later=self.graphs is not None)
+            optimizers.zero_grad_all()
+            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs)
+            loss = reduce(torch.add, losses.values())
+            if loss.requires_grad:  # a recorded step has made its gradients already
+                loss.backward()
+            optimizers.step()
+            optimizers.scheduler_step_all(step)
         self._made = step
         if pace is not None:
             model.schedule_at(int(pace.position))
@@ -248,28 +248,6 @@ class NrfgsTrainer(Trainer):
             self.stop_training = self._stop or pace.is_spent
             writer.GLOBAL_BUFFER["max_iter"] = step + 1 + pace.steps_left  # the progress line's total
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
-
-    def _descend(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """Nerfstudio's `Trainer.train_iteration`, for steps whose gradients may be there with their losses."""
-        optimizers, every = self.optimizers, self.gradient_accumulation_steps
-        optimizers.zero_grad_some([group for group in optimizers.parameters if step % every[group] == 0])
-        with torch.autocast(device_type=torch.device(self.device).type, enabled=self.mixed_precision):
-            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs)
-            loss = reduce(torch.add, losses.values())
-        if loss.requires_grad:  # not that of a recorded step
-            self.grad_scaler.scale(loss).backward()
-        due = [group for group in optimizers.parameters if step % every[group] == every[group] - 1]
-        optimizers.optimizer_scaler_step_some(self.grad_scaler, due)
-        if self.config.log_gradients:
-            named = self.pipeline.model.named_parameters()
-            norms = {name: value.grad.norm() for name, value in named if value.grad is not None}
-            metrics |= {f"Gradients/{name}": norm for name, norm in norms.items()}
-            metrics["Gradients/Total"] = sum(norms.values())
-        scale = self.grad_scaler.get_scale()
-        self.grad_scaler.update()
-        if scale <= self.grad_scaler.get_scale():  # a smaller one: the optimisers have made no step
-            optimizers.scheduler_step_all(step)
-        return loss, losses, metrics
 
     @property
     def last_step(self) -> int:
@@ -292,30 +270,23 @@ class NrfgsTrainer(Trainer):
     # The end.
 
     def _after_train(self) -> None:
-        """Nerfstudio's, whose step number is one too high after an early stop; from here on the model is the mean."""
+        """Nerfstudio's, whose step number is one too high after an early stop. The mean becomes the model."""
         self.step, self._is_ending = self._made, True
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
         if self._signal and not timed_out and self._made < self.last_step:
-            self._stop_as_asked()
-        if self.mean is not None and self._stop and not timed_out:
-            self._report_no_mean("the training was stopped before its last step")
-        else:
-            self.take_the_mean()
+            outcome = NOTHING_TO_SAVE
+            if self._made >= self._start_step:
+                outcome = f"Stopped at step {self._made}, saved. {self._save_once()}"
+            self._end(outcome, 128 + self._signal)
+        self.take_the_mean(stopped=self._stop and not timed_out)
         if self.line is not None:
             self.line.finish(self._made)
         super()._after_train()
 
-    def _stop_as_asked(self) -> None:
-        """Save, say so, and end the process with the status of the signal."""
-        outcome = NOTHING_TO_SAVE
-        if self._made >= self._start_step:
-            if self._saved_step != self._made:
-                self.save_checkpoint(self._made)
-            outcome = f"Stopped at step {self._made}, saved. {self._how_to_go_on}"
-        self._end(outcome, 128 + self._signal)
-
-    @property
-    def _how_to_go_on(self) -> str:
+    def _save_once(self) -> str:
+        """Save the last completed step unless it has been; returns how to go on."""
+        if self._saved_step != self._made:
+            self.save_checkpoint(self._made)
         return f"Go on with the same command and --load-dir {self.checkpoint_dir}"
 
     def _end(self, line: str, status: int) -> None:
@@ -332,8 +303,8 @@ class NrfgsTrainer(Trainer):
 
     @contextmanager
     def _state_on_disk_if_it_fails(self) -> Iterator[None]:
-        """Save the last complete step when something other than a signal or the guard ends the training. Raises
-        TrainingStopped where the memory has run out; other exceptions are raised again."""
+        """Save the last complete step when something other than a signal or the guard ends the training, and raise the
+        exception again; TrainingStopped where memory has run out."""
         try:
             yield
         except (InputError, TrainingStopped, DiskFull):
@@ -346,13 +317,9 @@ class NrfgsTrainer(Trainer):
                 raise
             error.__traceback__ = None  # its frames hold the step's tensors
             outcome, what = self._save_last_step(), str(error).partition("\n")[0]
-            raise TrainingStopped(
-                f"Out of memory in step {self.step}: {what}\n{outcome} Fewer splats or smaller images take less "
-                "(docs/troubleshooting.md).",
-                self.step,
-                "memory",
-                savable=self._saved_step == self._made,
-            ) from None
+            message = f"Out of memory in step {self.step}: {what}\n{outcome} Fewer splats or smaller images take less"
+            savable = self._saved_step == self._made
+            raise TrainingStopped(f"{message} (docs/troubleshooting.md).", self.step, "memory", savable) from None
 
     def _save_last_step(self) -> str:
         """Save the state after the last completed step, if it is consistent; returns a sentence about the outcome."""
@@ -361,40 +328,31 @@ class NrfgsTrainer(Trainer):
         kept = f"The last checkpoint is {last}." if last else "This training has written no checkpoint."
         if self._made < self._start_step:
             return f"No step had been made. {kept}"
-        self.optimizers.zero_grad_some(list(self.optimizers.optimizers))
+        self.optimizers.zero_grad_all()
         gc.collect()
-        if torch.cuda.is_available():
-            torch.cuda.empty_cache()
+        torch.cuda.empty_cache()  # nothing without CUDA
         model = self.pipeline.model
         if not rows_agree(model.gauss_params, self.optimizers.optimizers, model.densification.state.values()):
             return f"Splats were being added or removed, so that nothing could be saved. {kept}"
         try:
-            if self._saved_step != self._made:
-                self.save_checkpoint(self._made)
+            return f"Step {self._made} is saved. {self._save_once()}."
         except (Exception, ForTheUser) as error:  # the first failure is the one to raise
             return f"The state could not be saved ({error}). {kept}"
-        return f"Step {self._made} is saved. {self._how_to_go_on}."
 
-    def take_the_mean(self) -> None:
-        """Replace the parameters by their mean over the last steps, if there is one, and say so; TrainingStopped where
-        the last step met a number that is not finite."""
-        mean = self.mean
-        if mean is None:
+    def take_the_mean(self, stopped: bool = False) -> None:
+        """Replace the parameters by their mean over the last steps, unless the training was stopped before them, and
+        say so; TrainingStopped where the last step met a number that is not finite."""
+        if self.mean is None:
             return
         with self._last_good_state_on_disk():
             self.guard.settle()
-        if mean.count == 0:
-            self._report_no_mean("the time was up sooner than foreseen")
+        if stopped or self.mean.count == 0:
+            why = "the training was stopped before its last step" if stopped else "the time was up sooner than foreseen"
+            warn(f"Nothing was averaged, despite average_steps: {why}. The model is the last step's.")
             return
-        size = window(self.config.average_steps, self._made + 1)
-        why = f", not {size}: until then splats were added, removed or reset" if mean.restarted else ""
-        steps = f"the last {mean.count} steps{why}"
-        CONSOLE.print(f"The trained model is the mean of its parameters over {steps}.", soft_wrap=True)
+        CONSOLE.print(f"The trained model is the mean of its parameters over the last {self.mean.count} steps.")
         with self.train_lock:
-            mean.install()
-
-    def _report_no_mean(self, why: str) -> None:
-        warn(f"Nothing was averaged, despite average_steps: {why}. The model is the last step's.")
+            self.mean.install()
 
     # Checkpoints.
 

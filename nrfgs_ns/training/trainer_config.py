@@ -2,9 +2,9 @@
 """The trainer's options: checks before anything is read or written, automatic values, a training's folder."""
 
 import math
-import shlex
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 
@@ -20,9 +20,8 @@ from nrfgs_ns.training.config_file import check_types
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, STEPS_PER_VIEW, Pace, TimedPace, resolution_phases, steps_for
 
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
-"""The trainer of these options, which imports this module."""
 SEVERAL_DEVICES = "nrfgs_ns.distributed"
-"""The package that trains on several devices; it imports this one."""
+"""These import this module."""
 AVERAGED = 200
 """Steps to average in the presets and where the steps are chosen by the views."""
 MOST = 2**32
@@ -30,7 +29,7 @@ MOST = 2**32
 LONGEST_SIDE = 240
 """Pixels of photographs that two CPU cores train on in minutes."""
 FEW = 0.9
-"""Trust in view dependence below which its reduction is worth a word on the terminal: 180 training views."""
+"""Trust in view dependence below which its reduction is reported on the terminal: 180 training views."""
 PLAIN = {"markup": False, "highlight": False, "soft_wrap": True}
 """Text for the console that may hold brackets and paths."""
 NOTES = "choices.txt"
@@ -56,11 +55,7 @@ class NrfgsTrainerConfig(TrainerConfig):
     max_num_iterations is 0, otherwise 0"""
 
     def setup(self, **kwargs) -> Trainer:
-        """The trainer; for several devices, the one that spreads the splats over them (`distributed`).
-
-        Raises:
-            InputError: as `check`.
-        """
+        """The trainer, for several devices the one that spreads the splats over them; InputError as `check`."""
         devices, steps = kwargs.get("world_size", 1), self.max_num_iterations or STEPS
         self.check(devices)
         if devices == 1:
@@ -71,8 +66,11 @@ class NrfgsTrainerConfig(TrainerConfig):
     def check(self, devices: int) -> None:
         """Raise InputError where an option is out of range, is not for several devices, or names no checkpoint."""
         for path in (self.get_base_dir(), self.data):
-            if path is not None and any("\udc80" <= letter <= "\udcff" for letter in str(path)):
+            if any("\udc80" <= letter <= "\udcff" for letter in str(path)):
                 raise InputError(f"{str(path)!r} has letters beyond this system's encoding. Set PYTHONUTF8=1.")
+        for name in ("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps", "log_gradients"):
+            if value := getattr(self, name):
+                raise InputError(f"{name} is {value}; these methods train without it. Leave it out.")
         data, positive = self.pipeline.datamanager, math.ulp(0.0)
         limits = [
             ("time_budget", self.time_budget, positive),
@@ -86,20 +84,19 @@ class NrfgsTrainerConfig(TrainerConfig):
             ("machine.num_devices", self.machine.num_devices, 1),
             ("machine.num_machines", self.machine.num_machines, 1),
         ]
-        for name, group in self.optimizers.items():
-            least, schedule = 0, group.get("scheduler")
-            if isinstance(schedule, ExponentialDecaySchedulerConfig):
-                least = positive  # zero cannot fall exponentially
-                limits.append((f"optimizers.{name}.scheduler.lr_final", schedule.lr_final, least))
-                limits.append((f"optimizers.{name}.scheduler.max_steps", schedule.max_steps, schedule.warmup_steps + 1))
-            limits.append((f"optimizers.{name}.optimizer.lr", group["optimizer"].lr, least))
+        for group, parts in self.optimizers.items():
+            name, schedule = f"optimizers.{group}", parts["scheduler"]
+            falls = isinstance(schedule, ExponentialDecaySchedulerConfig)  # which zero cannot
+            limits.append((f"{name}.optimizer.lr", parts["optimizer"].lr, positive if falls else 0))
+            if falls:
+                limits.append((f"{name}.scheduler.lr_final", schedule.lr_final, positive))
+                limits.append((f"{name}.scheduler.max_steps", schedule.max_steps, schedule.warmup_steps + 1))
         for name, value, low in limits:
             if value is not None and not low <= value < MOST:
                 least = "positive" if low == positive else f"at least {low}"
                 raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
-        for name in ("time_budget", "schedule_steps"):
-            if getattr(self, name) is not None and devices > 1:
-                raise InputError(f"{name} is for one device. Set it to None, or use --machine.num-devices 1.")
+        if devices > 1 and (self.time_budget or self.schedule_steps) is not None:
+            raise InputError("time_budget and schedule_steps are for one device. Leave them out.")
         check_types(self.pipeline, "config.yml", "pipeline.")
         self.pipeline.model.check()
         length = self.schedule_steps or self.max_num_iterations or STEPS
@@ -110,7 +107,7 @@ class NrfgsTrainerConfig(TrainerConfig):
             checkpoint_files.checkpoints_in(self.load_dir)
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
-        """The configuration with automatic values filled in: steps, schedules and mean of a training on one device."""
+        """The configuration of a training on one device, with automatic steps, schedules and mean filled in."""
         if self.max_num_iterations > 0:
             return replace(self, average_steps=self.average_steps or 0)
         return replace(
@@ -130,19 +127,14 @@ class NrfgsTrainerConfig(TrainerConfig):
         return None if self.schedule_steps is None else Pace(length, length / self.max_num_iterations)
 
     def print_to_terminal(self) -> None:
-        """Check the options before anything is written, and print ns-train's first line. The whole configuration is in
-        config.yml, and shown with NRFGS_DEBUG=1.
-
-        Raises:
-            InputError: as `check`, or there is no data.
-        """
+        """Check the options before anything is written, and print ns-train's first line, or with NRFGS_DEBUG=1 the
+        whole configuration. InputError as `check`, or where there is no data."""
         if DEBUG:
             super().print_to_terminal()
         devices = self.machine.num_devices * self.machine.num_machines
         self.check(devices)
         datamanager = self.pipeline.datamanager
-        data = self.data or datamanager.data
-        parser = datamanager.dataparser
+        data, parser = self.data or datamanager.data, datamanager.dataparser
         is_here = not isinstance(parser, NrfgsDataParserConfig) or Path("transforms.json").exists()
         if data is None and parser.data == Path() and not is_here:
             fix = "Name the folder of the data set; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
@@ -152,8 +144,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
 
     def save_config(self) -> None:
-        """Make the training's folder and save config.yml there, with paths that do not depend on the working folder;
-        InputError where nothing can be written there."""
+        """Make the training's folder and save config.yml there, with absolute paths; InputError where it cannot be
+        written."""
         data = self.pipeline.datamanager
         dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
         pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
@@ -162,23 +154,18 @@ class NrfgsTrainerConfig(TrainerConfig):
             whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
             TrainerConfig.save_config(whole)
         except OSError as error:
-            message = f"--output-dir {self.output_dir}: {self.get_base_dir()} cannot be written ({error.strerror})."
-            raise InputError(f"{message} Name another folder.") from error
+            raise InputError(f"{self.get_base_dir()} cannot be written: {error}. Name another --output-dir.") from error
 
     def _take_a_folder(self) -> None:
-        """Make a folder that is this training's alone: a name that another one took gets a number. A training that goes
-        on from checkpoints in its own folder keeps that."""
+        """Make a folder for this training alone, numbering a name that is taken; a training that goes on from
+        checkpoints in its own folder keeps that."""
         if self.load_dir is not None and self.load_dir.resolve() == self.get_checkpoint_dir().resolve():
             return
         name = self.timestamp
-        for suffix in chain([""], (f"_{number}" for number in count(2))):
-            self.timestamp = f"{name}{suffix}"
-            try:
-                self.get_base_dir().mkdir(parents=True)
-                return
-            except FileExistsError:
-                if not self.get_base_dir().is_dir():
-                    raise
+        for number in count(2):
+            with suppress(FileExistsError):
+                return self.get_base_dir().mkdir(parents=True)
+            self.timestamp = f"{name}_{number}"
 
 
 def parse(args: list[str]) -> TrainerConfig:
@@ -215,20 +202,17 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
             f"noise on the camera centre in training: about {offset:.2g} scene units, {model.noise_factor:.2g} times "
             "the distance between neighbouring cameras"
         )
-    noun = "training view" if given == 1 else "training views"
-    count = f"{given} {noun}" if views == given else f"{views} different training views of {given}"
+    count = f"{given} training view{'s' * (given != 1)}"
+    if views != given:
+        count = f"{views} different training views of {given}"
     if parts:
         CONSOLE.print(f"{count}: {', '.join(parts)} (docs/captures.md).", soft_wrap=True)
-    data = config.pipeline.datamanager
     is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS
-    is_ours = isinstance(data.dataparser, NrfgsDataParserConfig)
-    if config.machine.device_type == "cpu" and is_long and is_ours and data.camera_res_scale_factor == 1:
+    if config.machine.device_type == "cpu" and is_long and config.pipeline.datamanager.camera_res_scale_factor == 1:
         cameras = pipeline.datamanager.train_dataset.cameras
         scale = min(1.0, LONGEST_SIDE / int(max(cameras.width.max(), cameras.height.max())))
-        words = ["--data", str(_absolute(data.dataparser.data)), "--time-budget", "10"]
-        words += ["--pipeline.datamanager.camera-res-scale-factor", f"{scale:.2g}"]
-        command = shlex.join(["ns-train", "nrfgs-fast", *words])
-        CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {command}", **PLAIN)
+        words = f"nrfgs-fast, --time-budget 10 and --pipeline.datamanager.camera-res-scale-factor {scale:.2g}"
+        CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {words}", **PLAIN)
     folder = config.get_base_dir()
     if notes and folder.is_dir():
         (folder / NOTES).write_text("\n".join([count, *notes]) + "\n", encoding="utf-8")

@@ -73,12 +73,12 @@ def assert_same_training(one: dict, other: dict, rtol: float = 1e-5, atol: float
     """
     assert one["step"] == other["step"]
     for part in ("pipeline", "optimizers"):
-        assert_close(_tensors(one[part]), _tensors(other[part]), rtol=rtol, atol=atol)
+        assert_close(tensors_of(one[part]), tensors_of(other[part]), rtol=rtol, atol=atol)
 
 
-def _tensors(tree: Any, prefix: str = "") -> dict[str, torch.Tensor]:
+def tensors_of(tree: Any, prefix: str = "") -> dict[str, torch.Tensor]:
     """The tensors of a checkpoint's part, by path."""
     if isinstance(tree, torch.Tensor):
         return {prefix: tree}
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, (list, tuple)) else ()
-    return {path: leaf for key, value in items for path, leaf in _tensors(value, f"{prefix}/{key}").items()}
+    return {path: leaf for key, value in items for path, leaf in tensors_of(value, f"{prefix}/{key}").items()}

@@ -24,7 +24,7 @@ def saved(tmp_path):
     return save
 
 
-@pytest.mark.parametrize("name", ["nrfgs", "nrfgs_best", "nrfgs_gsnb"])
+@pytest.mark.parametrize("name", ["nrfgs_best", "nrfgs_gsnb"])
 def test_what_is_saved_is_read_back(saved, name):
     config = replace(getattr(method_config, name).config, data=Path("/some where/scène"))
     assert read_config(saved(yaml.dump(config))) == config
@@ -43,41 +43,38 @@ def test_enums_as_early_versions_of_python_3_11_write_them(saved):
 
 
 WHOLE = yaml.dump(method_config.nrfgs.config)
+CALL = "!!python/object/apply:os.system ['touch {mark}']"
+NAME = "!!python/name:nerfstudio"
+
+
+def with_project(value: str) -> str:
+    return WHOLE.replace("project_name: nerfstudio-project", value)
+
+
 HOSTILE = {
-    "a call": "!!python/object/apply:os.system ['touch {mark}']",
+    "a call": CALL,
     "a call with keywords": "!!python/object/apply:os.system\nargs: ['touch {mark}']",
     "a new object": "!!python/object/new:os.system ['touch {mark}']",
-    "a call inside": WHOLE.replace(
-        "project_name: nerfstudio-project", "project_name: !!python/object/apply:os.system ['touch {mark}']"
-    ),
-    "a call in a path": WHOLE.replace(
-        "project_name: nerfstudio-project",
-        "project_name: !!python/object/apply:pathlib.Path [!!python/object/apply:os.system ['touch {mark}']]",
-    ),
+    "a call inside": with_project(f"project_name: {CALL}"),
+    "a call in a path": with_project(f"project_name: !!python/object/apply:pathlib.Path [{CALL}]"),
     "a call through a package": "!!python/object/apply:nerfstudio.utils.scripts.run_command ['touch {mark}']",
     "a module of a package": "!!python/object/apply:nerfstudio.scripts.train.os.system ['touch {mark}']",
     "a module": "!!python/module:os",
-    "a function as target": WHOLE.replace(
-        "!!python/name:nrfgs_ns.training.trainer.NrfgsTrainer ''", "!!python/name:os.system ''"
-    ),
+    "a function as target": WHOLE.replace("name:nrfgs_ns.training.trainer.NrfgsTrainer ''", "name:os.system ''"),
     "another class as target": WHOLE.replace(
-        "!!python/name:torch.optim.adam.Adam ''", "!!python/name:nerfstudio.utils.writer.TensorboardWriter ''", 1
+        "!!python/name:torch.optim.adam.Adam ''", f"{NAME}.utils.writer.TensorboardWriter ''", 1
     ),
-    "a method of a configuration": WHOLE.replace(
-        "project_name: nerfstudio-project", "setup: !!python/name:torch.optim.adam.Adam ''"
-    ),
-    "an object that is no configuration": "!!python/object:nerfstudio.engine.trainer.Trainer {{}}",
-    "an object of another package": "!!python/object:subprocess.Popen {{}}",
+    "a method of a configuration": with_project("setup: !!python/name:torch.optim.adam.Adam ''"),
+    "an object that is no configuration": "!!python/object:nerfstudio.engine.trainer.Trainer {}",
+    "an object of another package": "!!python/object:subprocess.Popen {}",
     "a list": "[1, 2]",
     "nothing": "",
-    "no YAML": "{{]",
+    "no YAML": "{]",
     "deep": "[" * 2_000,
-    "bytes": "!!binary aGk=",
     "an attribute": "!!python/object/apply:builtins.getattr [!!python/name:os.path '', sep]",
     "an attribute of a class": "!!python/object/apply:builtins.getattr "
-    "[!!python/name:nerfstudio.engine.trainer.TrainerConfig '', setup]",
-    "what the enum has beside values": "!!python/object/apply:builtins.getattr "
-    "[!!python/name:nerfstudio.utils.writer.EventName '', __class__]",
+    f"[{NAME}.engine.trainer.TrainerConfig '', setup]",
+    "an attribute of an enum": f"!!python/object/apply:builtins.getattr [{NAME}.utils.writer.EventName '', __class__]",
     "a value that the enum lacks": "!!python/object/apply:nerfstudio.utils.writer.EventName ['no such']",
 }
 
@@ -85,7 +82,7 @@ HOSTILE = {
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE.keys())
 def test_a_file_that_asks_for_more_is_refused(saved, tmp_path, text):
     mark = tmp_path / "mark"
-    text = text.replace("{mark}", str(mark)).replace("{{", "{").replace("}}", "}")
+    text = text.replace("{mark}", str(mark))
     assert text != WHOLE
     with pytest.raises(InputError, match="config.yml is not") as refused:
         read_config(saved(text))
@@ -121,16 +118,17 @@ def test_a_pipeline_refuses_it_too():
 def test_an_option_that_is_newer_than_the_file_has_its_default(saved):
     config = replace(method_config.nrfgs.config, average_steps=3)
     text = yaml.dump(config)
-    for line in ("average_steps: 3\n", "    view_noise: 0.5\n"):
-        assert line in text
-        text = text.replace(line, "")
+    for option in ("average_steps: 3\n", "    view_noise: 0.5\n", r"  sharding: .*\n(?:    .*\n)+"):
+        text, count = re.subn(option, "", text)
+        assert count == 1
     read = read_config(saved(text))
     assert read.average_steps is None and read.pipeline.model.view_noise == 0.0
+    assert read.pipeline.sharding == config.pipeline.sharding
 
 
 def test_a_file_that_is_not_there_or_no_configuration(tmp_path):
-    for length in (1, 1000, len(WHOLE) - 2):
-        (tmp_path / "cut").write_text(WHOLE[:length])
+    for cut in (WHOLE[:1], WHOLE[:1000], WHOLE[:-2], WHOLE[: WHOLE.index("viewer:")]):
+        (tmp_path / "cut").write_text(cut)
         with pytest.raises(InputError):
             read_config(tmp_path / "cut")
     with pytest.raises(InputError, match="no such file. Name the config.yml"):

@@ -5,11 +5,12 @@ import math
 
 import pytest
 import torch
-from short_trainings import command_line, set_up
+from short_trainings import command_line, set_up, tensors_of
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.training import guard
 from nrfgs_ns.training.checkpoint_files import write
-from nrfgs_ns.training.guard import MAX_GRADIENT, PATIENCE, TrainingStopped
+from nrfgs_ns.training.guard import MAX_GRADIENT, TrainingStopped
 
 
 @pytest.fixture(autouse=True)
@@ -76,35 +77,32 @@ def checkpoints(trainer) -> dict[int, dict]:
 
 def numbers(state) -> dict[str, torch.Tensor]:
     """Every floating point tensor of a checkpoint, by path."""
-    found = {}
+    parts = {name: state[name] for name in ("pipeline", "optimizers")}
+    return {path: value for path, value in tensors_of(parts).items() if value.is_floating_point()}
 
-    def walk(path, value):
-        if isinstance(value, torch.Tensor) and value.is_floating_point():
-            found[path] = value
-        elif isinstance(value, dict):
-            for key, inner in value.items():
-                walk(f"{path}/{key}", inner)
 
-    walk("", {name: state[name] for name in ("pipeline", "optimizers")})
-    return found
+def state_of(trainer) -> dict:
+    """What a checkpoint would hold now."""
+    optimizers = {name: optimizer.state_dict() for name, optimizer in trainer.optimizers.optimizers.items()}
+    return {"pipeline": trainer.pipeline.state_dict(), "optimizers": optimizers}
 
 
 @pytest.mark.parametrize(
     ("fused", "name", "value"),
-    [(False, "means", NAN), (False, "loss", NAN), (True, "latents", INF), (True, "scales", 1e19), (True, "loss", NAN)],
+    [(False, "loss", NAN), (True, "means", NAN), (True, "scales", 1e19)],
 )
 def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fused, name, value):
     trainer = start(fused=fused)
     poison(trainer, at=3, name=name, value=value)
     before = {}
-    original = trainer.optimizers.optimizer_scaler_step_some
+    original = trainer.optimizers.step
 
     def remember(*args):
         if trainer.step == 3:
             before.update({path: tensor.clone() for path, tensor in numbers(state_of(trainer)).items()})
         original(*args)
 
-    trainer.optimizers.optimizer_scaler_step_some = remember
+    trainer.optimizers.step = remember
     with pytest.raises(TrainingStopped, match="stopped at step 3") as stopped:
         trainer.train()
     assert stopped.value.step == 3
@@ -127,9 +125,8 @@ def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fuse
     assert again._start_step == 4 and max(checkpoints(again)) == 4
 
 
-@pytest.mark.parametrize("fused", [False, True], ids=["on the host", "on the device"])
-def test_a_condemned_last_step_is_reported_too(start, fused):
-    trainer = start(fused=fused, steps=3)
+def test_a_condemned_last_step_is_reported_too(start):
+    trainer = start(fused=True, steps=3)
     poison(trainer, at=2, name="quats", value=INF)
     with pytest.raises(TrainingStopped, match="step 2"):
         trainer.train()
@@ -145,28 +142,23 @@ def test_large_gradients_that_adam_can_square_pass(start):
 
 
 @pytest.mark.parametrize(
-    ("name", "scale", "cause"),
-    [
-        ("loss", None, r"the image or mask is broken: .*view_\d+.png"),
-        ("scales", 25.0, "Lower --optimizers.scales.optimizer.lr"),
-    ],
+    ("name", "cause"),
+    [("loss", r"the image or mask is broken: .*view_\d+.png"), ("scales", "Lower --optimizers.scales.optimizer.lr")],
 )
-def test_the_cause_broken_image(name, scale, cause, start):
-    """Or a learning rate."""
+def test_the_likely_cause(name, cause, start):
     trainer = start()
-    if scale is not None:
-        trainer.pipeline.model.scales.data[3] = scale
+    if name == "scales":
+        trainer.pipeline.model.scales.data[3] = 25.0
     poison(trainer, at=2, name=name, value=NAN, row=3)
     with pytest.raises(TrainingStopped, match=cause):
         trainer.train()
 
 
-@pytest.mark.parametrize("name", ["means", "latents"])
-def test_a_splat_that_is_not_finite_is_named_and_left_out(start, name):
+def test_a_splat_that_is_not_finite_is_named_and_left_out(start):
     trainer = start(steps=3)
     count = trainer.pipeline.model.num_points
-    trainer.pipeline.model.gauss_params[name].data[11] = NAN
-    with pytest.raises(TrainingStopped, match=f"gauss_params.{name} has NaN") as stopped:
+    trainer.pipeline.model.gauss_params["latents"].data[11] = NAN
+    with pytest.raises(TrainingStopped, match="gauss_params.latents has NaN") as stopped:
         trainer.train()
     assert f"1 of {count} splats, first 11." in str(stopped.value)
     ((_, state),) = checkpoints(trainer).items()
@@ -176,24 +168,17 @@ def test_a_splat_that_is_not_finite_is_named_and_left_out(start, name):
     start({"--load-dir": trainer.checkpoint_dir}).train()
 
 
-def test_shared_weights_that_are_not_finite_are_never_written(start):
-    trainer = start(steps=2)
-    trainer.train()
-    good = set(checkpoints(trainer))
-    trainer.pipeline.model.head.low[0].weight.data[0, 0] = NAN
-    with pytest.raises(TrainingStopped, match="head.low.0.weight has NaN"):
-        trainer.save_checkpoint(5)
-    assert set(checkpoints(trainer)) == good
-
-
-@pytest.mark.parametrize("name", ["gauss_params.means", "head.low.0.weight"])
-def test_a_checkpoint_that_is_not_finite_is_refused(start, name):
+def test_weights_that_are_not_finite_are_never_written_nor_read(start):
     trainer = start(steps=2)
     trainer.train()
     ((step, state),) = checkpoints(trainer).items()
-    state["pipeline"][f"_model.{name}"].view(-1)[4] = INF
+    trainer.pipeline.model.head.low[0].weight.data[0, 0] = NAN
+    with pytest.raises(TrainingStopped, match="head.low.0.weight has NaN"):
+        trainer.save_checkpoint(5)
+    assert set(checkpoints(trainer)) == {step}
+    state["pipeline"]["_model.gauss_params.means"].view(-1)[4] = INF
     write(trainer.checkpoint_dir, step, state)
-    with pytest.raises(InputError, match=f"'{name}'.*not finite"):
+    with pytest.raises(InputError, match="'gauss_params.means'.*not finite"):
         start({"--load-dir": trainer.checkpoint_dir})
 
 
@@ -232,19 +217,14 @@ def test_on_a_gpu(start, name, value):
     start({"--load-dir": trainer.checkpoint_dir}).train()
 
 
-def state_of(trainer) -> dict:
-    """What a checkpoint would hold now."""
-    optimizers = {name: optimizer.state_dict() for name, optimizer in trainer.optimizers.optimizers.items()}
-    return {"pipeline": trainer.pipeline.state_dict(), "optimizers": optimizers}
-
-
-def test_a_training_in_which_nothing_is_visible_stops(start):
-    trainer = start(steps=PATIENCE + 50)
+def test_a_training_in_which_nothing_is_visible_stops(start, monkeypatch):
+    monkeypatch.setattr(guard, "PATIENCE", 5)
+    trainer = start()
     with torch.no_grad():
         trainer.pipeline.model.gauss_params["means"] += 1e6
-    with pytest.raises(TrainingStopped, match=f"No splat has been visible in the last {PATIENCE} steps") as stopped:
+    with pytest.raises(TrainingStopped, match="No splat has been visible in the last 5 steps") as stopped:
         trainer.train()
-    assert stopped.value.step == PATIENCE and list(checkpoints(trainer)) == [PATIENCE]
+    assert stopped.value.step == 5 and list(checkpoints(trainer)) == [5]
 
 
 def test_a_training_without_splats_stops_and_saves_nothing(start):

@@ -14,7 +14,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.trained.loading import load_model
-from nrfgs_ns.training.photographs import Evidence, exif_of, exposure, verdict
+from nrfgs_ns.training.photographs import Evidence, exif_of, exposure
 from nrfgs_ns.training.trainer_config import parse
 
 NAN = math.nan
@@ -33,24 +33,23 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
-    ("choice", "pairs", "known", "wanted", "words"),
+    ("pairs", "known", "wanted", "words"),
     [
-        ("auto", SAME, [NAN] * 11, False, "varies by 0.01 stops, colour by 0.01"),
-        ("auto", DIFFERENT, [NAN] * 11, True, "exposure varies by 0.38 stops"),
-        ("auto", pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them"),
-        ("auto", pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
-        ("auto", SAME, [0.3] + [NAN] * 10, False, "EXIF: exposure varies by 0.00 stops"),
-        ("auto", SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: exposure varies by 0.10 stops"),
+        (SAME, [NAN] * 11, False, "varies by 0.01 stops, colour by 0.01"),
+        (DIFFERENT, [NAN] * 11, True, "exposure varies by 0.38 stops"),
+        (pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them"),
+        (pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
+        (SAME, [0.3] + [NAN] * 10, False, "EXIF: exposure varies by 0.00 stops"),
+        (SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: exposure varies by 0.10 stops"),
         # The light changed, and the camera followed it.
-        ("auto", SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of the difference"),
-        ("auto", DIFFERENT, [0.0, 0.7] * 5 + [0.0], True, "exposure varies by 0.35 stops, which explains"),
-        ("on", SAME, [NAN] * 11, True, "EXIF: no exposures"),
+        (SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of the difference"),
+        (DIFFERENT, [0.0, 0.7] * 5 + [0.0], True, "exposure varies by 0.35 stops, which explains"),
     ],
 )
-def test_the_evidence_decides(choice, pairs, known, wanted, words):
+def test_the_evidence_decides(pairs, known, wanted, words):
     seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
-    decision, numbers = verdict(choice, Evidence(pairs, CENTERS, torch.tensor(known), seen))
-    assert decision == wanted and words in numbers
+    evidence = Evidence(pairs, CENTERS, torch.tensor(known), seen)
+    assert evidence.calls_for_learning == wanted and words in evidence.numbers
 
 
 def test_exposure_in_stops():
@@ -106,10 +105,14 @@ QUICK = {
 }
 
 
+TWICE = {"--steps-per-save": 2}
+
+
 @pytest.fixture(scope="module")
 def finished(exposed_scene, tmp_path_factory):
-    """config.yml of a training of four steps, whose exposures come from the photographs themselves."""
-    return trained(command_line("nrfgs-sh", exposed_scene[0], tmp_path_factory.mktemp("whole"), 4, QUICK))
+    """config.yml of a training of four steps, whose exposures come from the photographs; with the checkpoint of
+    step 2."""
+    return trained(command_line("nrfgs-sh", exposed_scene[0], tmp_path_factory.mktemp("whole"), 4, QUICK, TWICE))
 
 
 def test_known_exposures_are_found(exposed_scene, finished):
@@ -123,14 +126,17 @@ def test_known_exposures_are_found(exposed_scene, finished):
     assert abs(learnt.mean()) < 1e-6
 
 
+def assert_it_goes_on(config, scene, out, *more: dict) -> None:
+    """From step 2 to the bit."""
+    load = {"--load-dir": models_of(config), "--load-step": 2}
+    rest = trained(command_line("nrfgs-sh", scene, out, 4, QUICK, load, *more))
+    assert_same_training(checkpoint_of(config), checkpoint_of(rest), rtol=0, atol=0)
+
+
 def test_resumed_is_the_unbroken_one(exposed_scene, finished, tmp_path, capsys):
-    scene, _ = exposed_scene
-    half = trained(command_line("nrfgs-sh", scene, tmp_path / "half", 2, QUICK))
-    assert "Photographs: exposure and white balance learnt, since the photographs differ" in " ".join(
-        capsys.readouterr().out.split()
-    )
-    rest = trained(command_line("nrfgs-sh", scene, tmp_path / "rest", 4, QUICK, {"--load-dir": models_of(half)}))
-    assert_same_training(checkpoint_of(finished), checkpoint_of(rest), rtol=0, atol=0)
+    assert_it_goes_on(finished, exposed_scene[0], tmp_path)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Photographs: exposure and white balance learnt, since the photographs differ" in said
 
 
 def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path, monkeypatch, capsys):
@@ -180,14 +186,7 @@ def test_what_is_behind_a_cut_out_photograph_is_exposed_with_it(tiny_scene, tmp_
 
 def test_robust_loss_trims_and_goes_on(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr("nrfgs_ns.image.robust.FIRST_STEP", 1)
-
-    def train(name, steps, *more):
-        out = tmp_path / name
-        return trained(
-            command_line("nrfgs-sh", tiny_scene, out, steps, QUICK, {"--pipeline.model.robust-loss": 0.1}, *more)
-        )
-
-    whole = checkpoint_of(train("whole", 4))
-    assert whole["pipeline"]["_model.trimming.histogram"].sum() > 0
-    rest = train("rest", 4, {"--load-dir": models_of(train("half", 2))})
-    assert_same_training(whole, checkpoint_of(rest), rtol=0, atol=0)
+    robust = {"--pipeline.model.robust-loss": 0.1}
+    whole = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "whole", 4, QUICK, TWICE, robust))
+    assert checkpoint_of(whole)["pipeline"]["_model.trimming.histogram"].sum() > 0
+    assert_it_goes_on(whole, tiny_scene, tmp_path / "rest", robust)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is shown: the progress line, which changes no number, and views far below the rest."""
+"""What is shown: the progress line, which changes no number, and an evaluation's table."""
 
 import io
 import re
@@ -9,7 +9,7 @@ from rich.console import Console
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_ns.training import pipeline, progress
-from nrfgs_ns.training.evaluation import far_below
+from nrfgs_ns.training.evaluation import print_evaluation
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -62,20 +62,8 @@ def test_on_a_terminal_the_line_makes_room_for_an_evaluation(screen, tiny_scene,
     assert text.index("Evaluating") < text.index("step 5 of 6") < text.index("step 6 of 6 (100 %)")
 
 
-def views(*psnrs: float | None) -> list[dict]:
-    return [
-        {"image": f"{index}.png", **({} if value is None else {"psnr": value})} for index, value in enumerate(psnrs)
-    ]
-
-
-@pytest.mark.parametrize(
-    ("psnrs", "names"),
-    [
-        ((25.0, 26.0, 12.0, 25.5, 26.5, 8.0, 25.2, 25.8, None), ["5.png", "2.png"]),
-        ((20.0, 22.0, 24.0, 26.0, 28.0, 30.0), []),  # spread widely
-        ((25.0, 25.1, 25.0, 25.1, 25.0, 23.0), []),  # spread little: 2 dB are not far
-        ((25.0, 25.0, 25.0, 5.0), []),  # too few
-    ],
-)
-def test_views_far_below_the_rest_are_named_the_worst_first(psnrs, names):
-    assert [name for name, *_ in far_below(views(*psnrs))] == names
+def test_an_evaluation_names_the_worst_view(capsys):
+    views = [{"image": f"{psnr:g}.png", "psnr": psnr} for psnr in (25.0, 12.0, 26.0)] + [{"image": "masked.png"}]
+    print_evaluation({"psnr": 21.0, "per_image": views})
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Means over 4 test views" in said and "Median view 25.0 dB. Worst 12.0 dB: 12.png" in said

@@ -8,17 +8,17 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
-from short_trainings import command_line, set_up
+from short_trainings import command_line, set_up, trained
 
-from nrfgs_lab.training_run import evaluate, parse, train
+from nrfgs_lab.training_run import evaluate, parse
 from nrfgs_ns.kernels.trial import Gate
 from nrfgs_ns.training.photographs import compare_photographs
 from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs
 
-gpu = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels"),
-]
+
+def gpu(test):
+    """Mark a test, or a class of tests, that needs a CUDA device and gsplat's kernels."""
+    return pytest.mark.gpu(pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")(test))
 
 
 @pytest.fixture
@@ -110,11 +110,10 @@ def test_what_is_not_recorded_is_said_once(build, option, capsys, monkeypatch):
     assert capsys.readouterr().out.count("not recorded") == 1
 
 
+@gpu
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-best"])
 @pytest.mark.parametrize("step", [10, 100, 20_000], ids=["head rests", "growing", "at rest"])
 class TestOnCuda:
-    pytestmark = gpu
-
     def test_a_step_is_the_same_recorded(self, build, method, step):
         pipeline, graphs = build("cuda", method)
         assert recorded(pipeline, graphs, step, 0) is None  # the first of its kind
@@ -139,8 +138,7 @@ class TestOnCuda:
         assert not graphs._given_up
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+@gpu
 def test_a_photographs_exposure_is_learnt_the_same(build):
     pipeline, graphs = build("cuda", "nrfgs", "--pipeline.model.photographs", "on")
     with torch.no_grad():
@@ -152,8 +150,7 @@ def test_a_photographs_exposure_is_learnt_the_same(build):
         assert_same(recorded(pipeline, graphs, 100 + view, view), expected)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+@gpu
 def test_each_photograph_has_its_mask(build):
     pipeline, graphs = build("cuda", "nrfgs")
     height, width = pipeline.datamanager.train_view(0)[1]["image"].shape[:2]
@@ -165,8 +162,7 @@ def test_each_photograph_has_its_mask(build):
     assert (expected[0] - eager(pipeline, 105, 5)[0]).abs() > 1e-3
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
+@gpu
 def test_a_training_learns_the_same(tiny_scene, tmp_path, monkeypatch):
     """With refinements, resets and three resolutions on the way."""
     psnr = []
@@ -174,11 +170,8 @@ def test_a_training_learns_the_same(tiny_scene, tmp_path, monkeypatch):
         with monkeypatch.context() as only:
             if not taken:
                 only.setattr(StepGraphs, "_takes", lambda *_: False)
-            args = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path / str(taken))]
-            args += ["--max-num-iterations", "600", "--schedule-steps", "30000", "--vis", "tensorboard"]
-            args += ["--steps-per-eval-image", "100000", "--steps-per-eval-all-images", "100000"]
-            record = train(args)
-            psnr.append(evaluate(record.config_path, tmp_path / "eval.json")["psnr"])
+            args = command_line("nrfgs", tiny_scene, tmp_path / str(taken), 600, {"--schedule-steps": 30000})
+            psnr.append(evaluate(trained(args), tmp_path / "eval.json")["psnr"])
     assert abs(psnr[0] - psnr[1]) < 0.7  # two trainings of one seed differ by a few tenths
 
 
@@ -189,8 +182,7 @@ def tried(model) -> dict[str, set]:
     return {gate.what: set(gate) for gate in (*gates, model.head.fused.ready) if gate}
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@gpu
 def test_no_kernel_is_left_to_the_first_steps(tiny_scene, tmp_path):
     trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, 3))
     before = tried(trainer.pipeline.model)
@@ -199,8 +191,7 @@ def test_no_kernel_is_left_to_the_first_steps(tiny_scene, tmp_path):
     assert tried(trainer.pipeline.model) == before
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@gpu
 def test_photographs_are_compared_without_memory_that_stays():
     """cuBLAS keeps 32 MiB of an H100 for each thread that multiplies matrices."""
     cameras = Cameras(torch.eye(4)[:3].repeat(8, 1, 1), 30.0, 30.0, 16.0, 16.0, 32, 32)
