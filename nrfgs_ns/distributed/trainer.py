@@ -219,6 +219,7 @@ class ShardedTrainer(NrfgsTrainer):
         super()._end(line, status)
 
     def setup_optimizers(self) -> Optimizers:
+        self.start_densely()
         self.guard = ShardedGuard(self.pipeline, self.request)
         self.mean = ShardedMean() if self.config.average_steps > 0 else None
         groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log

@@ -97,14 +97,18 @@ class NrfgsTrainer(Trainer):
         if self.config.average_steps > 0:  # after the callbacks that change parameters
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
+    def start_densely(self) -> None:
+        """Add points from the photographs to those that a new training starts from."""
+        if self.config.load_dir is None and self.config.load_checkpoint is None:
+            notes = start_with_dense_points(self.pipeline.model, self.pipeline.datamanager)
+            self.pipeline.notes = [*self.pipeline.notes, *notes]
+
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, behind a guard."""
         self.steps_are_chosen = self.config.max_num_iterations == 0 and self.config.time_budget is None
         self.config = self.config.for_views(self.pipeline.model.num_views)
         self.total_steps = self.config.max_num_iterations
-        if self.config.load_dir is None and self.config.load_checkpoint is None:
-            notes = start_with_dense_points(self.pipeline.model, self.pipeline.datamanager)
-            self.pipeline.notes = [*self.pipeline.notes, *notes]
+        self.start_densely()
         self.guard = Guard(self.pipeline)
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self.config.pace()
