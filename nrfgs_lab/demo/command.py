@@ -135,6 +135,7 @@ class Demo:
             "--steps-per-eval-image": 10 * steps,
             "--steps-per-eval-all-images": 10 * steps,
             "--pipeline.model.densification": "splatfacto,stop_split_at=0",
+            "--pipeline.model.dense-start": "off",  # the scene's points are exact
             "--pipeline.model.num-downscales": 0,
             **RATES[method],
         }

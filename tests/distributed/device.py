@@ -28,6 +28,7 @@ COMMON = {
 PEAK = "splatfacto,opacity_seen=peak,warmup_length=2,refine_every=4,reset_alpha_every=6,densify_grad_thresh=1e-6"
 """Densify every 4th step, reset opacity every 24th."""
 PLAIN = {"--pipeline.model.densification": PEAK, "--pipeline.model.shrinkage": 3}
+BY_ERROR = {"--pipeline.model.densification": "error-guided,warmup_length=2,refine_every=4,threshold=1e-5"}
 RICH = {
     "--pipeline.model.densification": "mcmc,warmup_length=2,refine_every=4",
     "--pipeline.model.rasterize-mode": "antialiased",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from device import PEAK, PLAIN, RICH, one_step, step_alone, step_together, told, train, trainer_of
+from device import BY_ERROR, PEAK, PLAIN, RICH, one_step, step_alone, step_together, told, train, trainer_of
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -66,7 +66,7 @@ def there_and_back(scene: Path, folder: Path) -> None:
     """Checkpoints from two devices to one and to two again. Loading is looked at before anything is trained, and the
     first checkpoint is evaluated by both."""
     world, main = dist.get_world_size(), dist.get_rank() == 0
-    two = train(scene, folder / "half", world, 6, **PLAIN, **MORE)
+    two = train(scene, folder / "half", world, 6, **BY_ERROR, **MORE)
     scores, half = [evaluation(two)], told(two)
 
     def look(name: str):
@@ -77,8 +77,8 @@ def there_and_back(scene: Path, folder: Path) -> None:
 
         return see
 
-    one = told(train(scene, folder / "one", 1, 12, load=half, watch=look("one"), **PLAIN) if main else None)
-    again = told(train(scene, folder / "two", world, 18, load=one, watch=look("two"), **PLAIN, **MORE))
+    one = told(train(scene, folder / "one", 1, 12, load=half, watch=look("one"), **BY_ERROR) if main else None)
+    again = told(train(scene, folder / "two", world, 18, load=one, watch=look("two"), **BY_ERROR, **MORE))
     torch.save(scores, folder / f"scores-{dist.get_rank()}.pt")
     if main:
         torch.save([str(path) for path in (half, one, again)], folder / "there-and-back.pt")

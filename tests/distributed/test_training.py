@@ -9,6 +9,7 @@ import torch
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE
+from nrfgs_ns.densification.error_guided import CHANGE_BEFORE, ERROR, WIDTH
 from nrfgs_ns.distributed.trainer import ShardedMean
 from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.checkpoint_files import read, read_latest
@@ -69,7 +70,7 @@ def agree_with(content: dict, held: list[dict], rows: list[slice]) -> None:
             assert torch.equal(device["splats"][name], value[part]), name
             (moments,) = content["optimizers"][name]["state"].values()
             assert torch.equal(device["moments"][name], moments["exp_avg_sq"][part]), name
-        for name in ("grad2d", "count", "radii", CHANGE):
+        for name in (ERROR, WIDTH, CHANGE, CHANGE_BEFORE):
             assert torch.equal(device["statistics"][name], statistics[name][part]), name
         assert device["sampling"] == content["pipeline"]["_extra_state"]["sampling"]["unseen_cameras"]
 

@@ -28,7 +28,7 @@ from nrfgs_lab.bench.spec import (
 )
 from nrfgs_lab.pages.methods import HEADS, best_trial
 from nrfgs_lab.pages.options import methods
-from nrfgs_ns.densification import Mcmc, Original, Splatfacto
+from nrfgs_ns.densification import ErrorGuided, Mcmc, Original
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.trainer_config import parse
 
@@ -144,7 +144,8 @@ def test_a_preset_keeps_its_steps():
 @pytest.mark.parametrize(
     "strategy, densification",
     [
-        ("own", Splatfacto()),
+        ("own", ErrorGuided()),
+        ("error-guided@77", ErrorGuided(budget=77)),
         ("original", Original()),
         ("original@77", Original(budget=77)),
         ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9)),
