@@ -17,17 +17,20 @@ INSTEAD = {
     "`mcmc`": ("mcmc: logit", "field"),
 }
 """Label -> trial in results/held-out.json, and the trial of the default that it is compared with."""
-BY_ERROR = {
-    "`original`": "3DGS",
-    "by error": "error",
-    "wide splats stay": "error: any width",
-    "wide splats are split, no noise, prune below 0.1": "error: wide split, no noise, prune 0.1",
-    "the same, threshold 0.0035": "error: wide split, no noise, prune 0.1, threshold 0.0035",
-    "the same, prune below 0.06": "error: wide split, no noise, prune 0.06",
-    "residual on the logit": "error: logit",
-    "faster growth": "error: fast all",
+RULES = {
+    "**by error, points from photographs, near plane**": "by error, dense start, near plane",
+    "without the near plane": "by error, dense start",
+    "without points from photographs": "by error, near plane",
+    "near plane at 0.8 instead of 0.5": "default: near plane 0.8",
+    "threshold 0.004 instead of 0.0025": "default: threshold 0.004",
+    "dead below 0.05 instead of 0.1": "default: dead below 0.05",
+    "u = 1": "default: u = 1",
+    "weight of SSIM 0.3 instead of 0.2": "default: SSIM 0.3",
+    "3DGS's rules, points from photographs, near plane": "3DGS's rules, dense start, near plane",
+    "splatfacto's rules, near plane": "splatfacto's rules, near plane",
+    "splatfacto's rules, points from photographs": "splatfacto's rules, dense start",
 }
-"""Label -> trial in results/error-guided.json."""
+"""Label -> trial in results/default.json."""
 COPIES = {"added": "added", "on the logit": "logit", "the same, stored": "logit, base", "none": "no opacity residual"}
 """Where the opacity residual is added -> the trial under MCMC."""
 
@@ -163,6 +166,12 @@ def gains_of(study: str, rows: Mapping[str, tuple[str, str]]) -> str:
     return grid(["", *FEW, "splats"], body)
 
 
+def _run(one: Mapping) -> str:
+    """PSNR, SSIM and splats of one training, and its seconds if it was alone on its GPU."""
+    seconds = f", {one['seconds']:.0f} s" if "seconds" in one else ""
+    return f"{one['psnr']:.2f} dB, {one['ssim']:.3f}, {one['splats'] / 1000:.0f}k splats{seconds}"
+
+
 def without(trial: str) -> str:
     """Gain of a trial over the default on `bonsai` with all its views except those held out, in both ways."""
     runs = records("held-out")
@@ -203,9 +212,8 @@ BLOCKS = {
         {"**u = V / (V + 20)**": ("field", "field: trust"), "u = 1": ("field: u = 1", "field: whole")},
     ),
     "captures.instead": lambda: gains_of("held-out", INSTEAD),
-    "captures.by_error": lambda: gains_of(
-        "error-guided", {label: (trial, "default") for label, trial in BY_ERROR.items()}
-    ),
+    "captures.rules": lambda: gains_of("default", {label: (one, "splatfacto's rules") for label, one in RULES.items()}),
+    "captures.run": lambda name: _run(records("default")[name]),
     "captures.without": without,
     "captures.test_views": test_views,
     "opacity.copies": lambda: gains_over("mcmc: harmonics", {name: [f"mcmc: {one}"] for name, one in COPIES.items()}),
