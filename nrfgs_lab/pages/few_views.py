@@ -166,6 +166,47 @@ def gains_of(study: str, rows: Mapping[str, tuple[str, str]]) -> str:
     return grid(["", *FEW, "splats"], body)
 
 
+def rules_gain() -> str:
+    """Least and most that today's rules gain over splatfacto's on the held-out views of a capture of few views."""
+    ours, theirs = (_views("default", trial) for trial in ("by error, dense start, near plane", "splatfacto's rules"))
+    pairs = [[(ours[view], theirs[view]) for view in theirs if view in ours and view[0] == scene] for scene in FEW]
+    psnr = [median(one[0] - other[0] for one, other in views) for views in pairs]
+    ssim = [fmean(one[1] - other[1] for one, other in views) for views in pairs]
+    return f"{min(psnr):.1f} to {max(psnr):.1f} dB and {min(ssim):.3f} to {max(ssim):.3f} SSIM"
+
+
+def rules_over_harmonics() -> str:
+    """Gain of `nrfgs` over harmonics with the same rules on bonsai's test views."""
+    ours, theirs = (records("default")[f"test: {name}/bonsai-42"] for name in ("nrfgs", "harmonics"))
+    share = ours["splats"] / theirs["splats"]
+    gain = f"{ours['psnr'] - theirs['psnr']:.1f} dB better than harmonics with the same training"
+    return f"{gain}, at {share:.1f} times their splats"
+
+
+def failed() -> str:
+    """PSNR of failed views of `kitchen`, whole and without each kind of suspects."""
+    trials = {
+        "splatfacto's rules, `00`": ("splatfacto's rules", "00"),
+        "with points from photographs, `00`": ("splatfacto's rules, dense start", "00"),
+        "the same, `09`": ("splatfacto's rules, dense start", "09"),
+        "by error, points from photographs, `00`": ("by error, dense start", "00"),
+    }
+    columns = {"whole": "all", "nearer than half the nearest points": "testnear<0.5", "nearer than 0.8": "testnear<0.8"}
+    columns |= {"shown by at most one training view": "n<=1", "in the image of at most one": "nf<=1"}
+    views = records("failed-views")
+    body = [
+        [label, *(f"{views[f'{name}/kitchen-42'][f'{view}.jpg'][key]:.1f}" for key in columns.values())]
+        for label, (name, view) in trials.items()
+    ]
+    return grid(["training, view", *columns], body)
+
+
+def floaters() -> str:
+    """The most that a view of those gains without what is near."""
+    views = records("failed-views")["by error, dense start/kitchen-42"]["00.jpg"]
+    return f"{views['testnear<0.5'] - views['all']:.1f}"
+
+
 def _run(one: Mapping) -> str:
     """PSNR, SSIM and splats of one training, and its seconds if it was alone on its GPU."""
     seconds = f", {one['seconds']:.0f} s" if "seconds" in one else ""
@@ -213,6 +254,10 @@ BLOCKS = {
     ),
     "captures.instead": lambda: gains_of("held-out", INSTEAD),
     "captures.rules": lambda: gains_of("default", {label: (one, "splatfacto's rules") for label, one in RULES.items()}),
+    "captures.rules_gain": rules_gain,
+    "captures.rules_over_harmonics": rules_over_harmonics,
+    "captures.failed": failed,
+    "captures.floaters": floaters,
     "captures.run": lambda name: _run(records("default")[name]),
     "captures.without": without,
     "captures.test_views": test_views,

@@ -21,7 +21,7 @@ from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.densification import STRATEGIES, DensificationConfig
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "options.md"
-PACKAGES = "nrfgs_ns", "nrfgs_lab"
+PACKAGES = "nrfgs_ns", "nrfgs_prepare", "nrfgs_lab"
 MODEL = "pipeline.model."
 APPEARANCE = "pipeline.model.appearance."
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from nrfgs_ns.prepare import pairs, structure
+from nrfgs_prepare import pairs, structure
 
 pytest.importorskip("pycolmap")
 

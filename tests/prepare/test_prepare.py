@@ -20,9 +20,9 @@ from rich.console import Console
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.prepare import photos, structure
-from nrfgs_ns.prepare.command import Prepare, Run
-from nrfgs_ns.prepare.pairs import metres
+from nrfgs_prepare import photos, structure
+from nrfgs_prepare.command import Prepare, Run
+from nrfgs_prepare.pairs import metres
 
 pytest.importorskip("pycolmap")
 

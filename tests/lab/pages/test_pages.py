@@ -130,7 +130,7 @@ def test_options_that_pages_name_are_there():
 
 def test_strategies_that_pages_name_are_there():
     text = "".join(path.read_text(encoding="utf-8") for path in pages())
-    words = set(re.findall(r"--pipeline\.model\.densification ([a-z]\w*(?:,\w+=[\w.-]*\w)*)", text))
+    words = set(re.findall(r"--pipeline\.model\.densification ([a-z][\w-]*(?:,\w+=[\w.-]*\w)*)", text))
     assert len(words) > 4
     for word in words:
         strategy_from(word)

@@ -19,8 +19,8 @@ from nrfgs_ns.data.pictures import read_exif, read_picture
 from nrfgs_ns.data.points import write_ply
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.files import write_whole
-from nrfgs_ns.prepare.pairs import Advance
-from nrfgs_ns.prepare.structure import colmap
+from nrfgs_prepare.pairs import Advance
+from nrfgs_prepare.structure import colmap
 
 DOWNSCALES = (2, 4, 8)
 """Copies that nerfstudio looks for; it takes the largest with sides of at most 1600 pixels."""

@@ -25,10 +25,10 @@ from rich.progress import Progress
 from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
-from nrfgs_ns.prepare import pairs, structure
-from nrfgs_ns.prepare import photos as files
-from nrfgs_ns.prepare.pairs import Advance
-from nrfgs_ns.prepare.structure import CameraModel
+from nrfgs_prepare import pairs, structure
+from nrfgs_prepare import photos as files
+from nrfgs_prepare.pairs import Advance
+from nrfgs_prepare.structure import CameraModel
 
 STAGES = ("import", "features", "pairs", "match", "map", "undistort", "write")
 GOOD_SHARE = 0.9
@@ -184,7 +184,7 @@ class Run:
         self.stage("undistort", "undistort", [self.undistorted], 1, undistort)
 
     def write(self) -> None:
-        from nrfgs_ns.prepare.scene import DOWNSCALES, write_scene
+        from nrfgs_prepare.scene import DOWNSCALES, write_scene
 
         folders = ["images", *(f"images_{factor}" for factor in DOWNSCALES)]
         made = [self.out / name for name in ("transforms.json", "sparse.ply", *folders)]

@@ -25,7 +25,7 @@ from nrfgs_ns.data.pictures import (
     read_size,
 )
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.prepare.pairs import Advance
+from nrfgs_prepare.pairs import Advance
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 HEIF = (".heic", ".heif")

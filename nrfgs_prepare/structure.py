@@ -14,7 +14,7 @@ import numpy as np
 
 from nrfgs_ns.data.pictures import read_picture, read_size, share_of_size
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.prepare.pairs import Advance, Pairs
+from nrfgs_prepare.pairs import Advance, Pairs
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 

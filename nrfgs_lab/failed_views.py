@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Why test views fail: their PSNR with suspect splats left out (docs/captures.md).
+
+    python -m nrfgs_lab.failed_views outputs/.../config.yml
+
+A training with `--pipeline.model.near-plane off` shows what floats before its cameras.
+"""
+
+from pathlib import Path
+
+import torch
+import tyro
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.table import Table
+from torch import Tensor
+
+from nrfgs_ns.data.views import nearest_depth
+from nrfgs_ns.image.metrics import psnr
+from nrfgs_ns.model.pinhole import world_to_camera
+from nrfgs_ns.rasterizer import contributions
+from nrfgs_ns.trained.loading import load_model
+
+LEAST_SHOWN = 1.0
+"""Contribution from which a view shows a splat, in pixels."""
+NEAR = 0.3, 0.5, 0.8
+"""A splat is near if its depth is below this share of the depth of the nearest points in the view."""
+
+
+def views_that_show(pipeline) -> tuple[Tensor, Tensor]:
+    """How many training views show each splat, and how many have its mean in their image, int64 [N] each."""
+    model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
+    shown, inside = (torch.zeros(model.num_points, dtype=torch.int64, device=model.device) for _ in range(2))
+    for index in range(len(cameras)):
+        view = model.project(cameras[index : index + 1].to(model.device))
+        share = contributions(view.projection, model.field.seen_from(view).opacities)
+        shown[view.visible] += (share > LEAST_SHOWN).long()
+        x, y = view.projection.means2d.unbind(-1)
+        width, height = view.projection.width, view.projection.height
+        inside[view.visible] += ((x > 0) & (x < width) & (y > 0) & (y < height)).long()
+    return shown, inside
+
+
+@torch.no_grad()
+def failed_views(pipeline) -> dict[str, dict[str, float]]:
+    """PSNR of each test view without each kind of suspects, in dB: image name -> what is left out -> PSNR."""
+    model, data = pipeline.model, pipeline.datamanager
+    shown, inside = views_that_show(pipeline)
+    suspects = {"shown by 1": shown <= 1, "in 1 image": inside <= 1}
+    points, result = model.seed_points[0].to(model.device), {}
+    pairs = zip(data.eval_dataset.image_filenames, data.fixed_indices_eval_dataloader, strict=True)
+    for name, (camera, batch) in pairs:
+        camera = camera.to(model.device)
+        pose = world_to_camera(camera.camera_to_worlds)[0]
+        depths = model.means @ pose[2, :3] + pose[2, 3]
+        nearest = nearest_depth(points, camera)
+        near = {f"nearer than {share}": depths < share * nearest for share in NEAR}
+        row = result[Path(name).name] = {}
+        for left_out, chosen in {"nothing": torch.zeros_like(inside, dtype=torch.bool), **near, **suspects}.items():
+            field = model.field._replace(splats={key: value[~chosen] for key, value in model.field.splats.items()})
+            outputs, _ = model.render(field, camera, field)
+            row[left_out] = psnr(outputs["rgb"], model.truth_of(batch, outputs["background"]), model.mask_of(batch))
+    return result
+
+
+def main(config: Path) -> None:
+    """Print the PSNR of each test view with suspects left out.
+
+    Args:
+        config: config.yml of a training.
+    """
+    views = failed_views(load_model(config, "test"))
+    table = Table("view", *next(iter(views.values())), title="PSNR without splats that are ...")
+    for name, row in views.items():
+        table.add_row(name, *("-" if value is None else f"{value:.2f}" for value in row.values()))
+    CONSOLE.print(table)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
