@@ -2,7 +2,7 @@
 """The registered methods: configuration only.
 
 Everything but the appearance head is splatfacto's, to the number: learning rates, schedules, densification, steps.
-`nrfgs` alone chooses its steps by the number of training views, and keeps its field from learning few of them by heart
+`nrfgs` alone suits the training to the capture: steps, growth, start, near plane, and how far the views are trusted
 (docs/captures.md). Its two presets are ends of the trade in docs/trade-off.md.
 """
 

@@ -202,6 +202,8 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
             f"noise on the camera centre in training: about {offset:.2g} scene units, {model.noise_factor:.2g} times "
             "the distance between neighbouring cameras"
         )
+    if model.config.near_plane == "auto" and model.near > 0.0:
+        notes.append(f"near plane: {model.near / model.scene_unit:.2g} scene units, half the depth of the nearest points")
     count = f"{given} training view{'s' * (given != 1)}"
     if views != given:
         count = f"{views} different training views of {given}"
