@@ -1,39 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of docs/exposure.md, docs/fewer-splats.md and docs/stability.md."""
+"""Blocks of docs/exposure.md and docs/stability.md."""
 
 import re
-from statistics import fmean, median
-from typing import Any
+from statistics import fmean
 
-from nrfgs_lab.pages.runs import grid, records, signed
-
-FEW = {
-    "keep 0.5, three rounds": "`keep 0.5`, three rounds",
-    "4e-4, keep 0.5": "`densify_grad_thresh` halved, `keep 0.5`",
-    "4e-4, keep 0.25": "halved, `keep 0.25`",
-}
-"""Trial -> label."""
-
-
-def growth_on_captures() -> str:
-    """Gains of trials over splatfacto's rules on captures of few views: median dB, mean SSIM x 1000, splats."""
-    scenes, trials = ("castle", "kitchen", "fern", "fox", "goldcape", "caliterra"), records("growth")
-
-    def gain(new: dict[str, Any] | None, old: dict[str, Any] | None) -> str:
-        if new is None or old is None:
-            return ""
-        views = list(zip(sorted(new["per_image"]), sorted(old["per_image"]), strict=True))
-        psnr, ssim = median(one[1] - other[1] for one, other in views), fmean(one[2] - other[2] for one, other in views)
-        return f"{signed(psnr, 2)}/{signed(1000 * ssim, 1)}/{new['splats'] / old['splats']:.2f}"
-
-    body = []
-    for method, head in {"nrfgs": "field", "nrfgs-sh": "harmonics"}.items():
-        for trial, label in FEW.items():
-            pairs = [[trials.get(f"{method}/{name}/{scene}-4") for name in (trial, "splatfacto")] for scene in scenes]
-            cells = [gain(*pair) for pair in pairs]
-            if any(cells):
-                body.append([f"{head}: {label}", *cells])
-    return grid(["", *(f"`{scene}`" for scene in scenes)], body)
+from nrfgs_lab.pages.runs import grid, records
 
 
 def hard() -> str:
@@ -96,7 +67,6 @@ def exposure_rule() -> str:
 BLOCKS = {
     "exposure.worth": exposure,
     "exposure.rule": exposure_rule,
-    "growth.captures": growth_on_captures,
     "stability.hard": hard,
     "stability.attack": attack,
 }

@@ -82,7 +82,7 @@ def rendered(block: Any) -> str:
         if "cell" in block:
             cells = [row if isinstance(row, str) and "{" in row else block["cell"]] * len(columns)
         places = columns if len(columns) > 1 else columns * len(cells)
-        cells = [filled(one, row, place, block.get("missing", "-")) for one, place in zip(cells, places, strict=True)]
+        cells = [filled(one, row, place, "-") for one, place in zip(cells, places, strict=True)]
         lines.append([label, *cells])
     return grid([title.strip() for title in filled(block["head"]).split("|")], lines)
 

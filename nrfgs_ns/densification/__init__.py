@@ -11,8 +11,8 @@
 The splats are a table, name -> parameter [N, ...]. Whatever a strategy does to the rows, it does to every tensor of the
 table, whichever head it belongs to, and to the optimisers' moments. The model never asks which strategy it has.
 
-`strategy.py` is the interface, `choice.py` the option on the command line, `gradient.py` and `mcmc.py` (with
-`relocation.py`) have the strategies, `thinning.py` removes splats once growth has ended.
+`strategy.py` is the interface, `choice.py` the option on the command line; `gradient.py`, `error_guided.py` and
+`mcmc.py` (with `relocation.py`) have the strategies.
 """
 
 from nrfgs_ns.densification.choice import STRATEGIES, DensificationChoice, strategy_from
@@ -25,7 +25,6 @@ from nrfgs_ns.densification.strategy import (
     Densification,
     DensificationConfig,
     OpacitySeen,
-    TrainingViews,
 )
 
 __all__ = [
@@ -40,6 +39,5 @@ __all__ = [
     "OpacitySeen",
     "Original",
     "Splatfacto",
-    "TrainingViews",
     "strategy_from",
 ]

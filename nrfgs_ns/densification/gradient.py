@@ -11,15 +11,11 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
-from nrfgs_ns.densification import thinning
 from nrfgs_ns.densification.statistics import take_statistics
-from nrfgs_ns.densification.strategy import Densification, DensificationConfig, OpacitySeen, TrainingViews
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.densification.strategy import Densification, DensificationConfig, OpacitySeen
 
 EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
-THINNED = "thinned"
-"""Name in the strategy's `state`: rounds of thinning that are done."""
 THRESHOLD = "log_threshold"
 """Name in the strategy's `state`: logarithm of what the gradient's threshold is multiplied by, to meet a budget."""
 FIRST = "first_count"
@@ -45,30 +41,10 @@ class GradientConfig(DensificationConfig):
     """refinements between two resets of opacities"""
     budget: int = 0
     """number of splats to grow to: the gradient's threshold follows (arXiv 2605.16158). 0: the threshold decides"""
-    keep: float = 1.0
-    """share of the splats to keep after growth; those that the training views would miss least are removed
-    (docs/fewer-splats.md)"""
 
     def check(self) -> None:
         super().check()
         self.require(self.reset_alpha_every >= 1, "reset_alpha_every", "at least 1")
-        self.require(0 < self.keep <= 1, "keep", "above 0 and at most 1")
-
-    def check_training(self, devices: int, steps: int) -> None:
-        if self.keep == 1.0:
-            return
-        if devices > 1:
-            raise InputError(
-                f"keep is {self.keep}, which is for one device: it compares whole pictures, and here each device has a "
-                "part of the splats. Use 1, or --machine.num-devices 1."
-            )
-        last = thinning.ROUNDS[-1] * self.stop_split_at
-        if last >= steps:
-            raise InputError(
-                f"keep is {self.keep}, but the last splats go at step {last:.0f} of {steps}: stop_split_at is "
-                f"{self.stop_split_at}. Make that smaller, or stretch the schedule to the training with "
-                "--schedule-steps 30000."
-            )
 
     def _build(self, scene_unit: float | None, reset_at_start: bool, **thresholds: Any) -> "GradientDensification":
         """Gsplat's strategy with these thresholds."""
@@ -79,9 +55,7 @@ class GradientConfig(DensificationConfig):
             reset_every=self.reset_alpha_every * self.refine_every,
             **thresholds,
         )
-        return GradientDensification(
-            self.name, rules, self.opacity_seen, scene_unit, reset_at_start, self.keep, self.budget
-        )
+        return GradientDensification(self.name, rules, self.opacity_seen, scene_unit, reset_at_start, self.budget)
 
     def share_of(self, rank: int, devices: int) -> "GradientConfig":
         return replace(self, budget=len(range(rank, self.budget, devices)))
@@ -181,8 +155,7 @@ class GradientDensification(Densification):
         opacity_seen: which opacity pruning looks at. A reset always acts on the stored one.
         scene_unit: world units in a scene unit, which sizes are measured in; None: in extents of the cameras.
         reset_at_start: reset opacities at step 0, too, as gsplat 1.4 does; 3DGS counts its steps from 1.
-        keep: share of the splats that is left when growth has ended (`thinning.py`), in (0, 1].
-        budget: splats to have when growth ends, before thinning; 0: as many as the threshold lets grow.
+        budget: splats to have when growth ends; 0: as many as the threshold lets grow.
     """
 
     def __init__(
@@ -192,7 +165,6 @@ class GradientDensification(Densification):
         opacity_seen: OpacitySeen,
         scene_unit: float | None,
         reset_at_start: bool,
-        keep: float = 1.0,
         budget: int = 0,
     ):
         super().__init__(opacity_seen)
@@ -201,11 +173,9 @@ class GradientDensification(Densification):
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
         self.reset_at_start = reset_at_start
-        self.keep, self.state[THINNED] = keep, 0
         self.budget, self.threshold = budget, strategy.grow_grad2d
         if budget:
             self.state |= {THRESHOLD: 0.0, FIRST: None}
-        self.rounds = self._rounds(round)
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
         if opacity_seen == "peak":
             strategy.seen_opacity = self.seen_opacity
@@ -220,8 +190,7 @@ class GradientDensification(Densification):
     def rests_at(self, step: int) -> bool:
         return step >= self.strategy.refine_stop_iter
 
-    def begin(self, centers: Tensor, views: TrainingViews, num_splats: int) -> None:
-        self.views = views
+    def begin(self, centers: Tensor, num_splats: int) -> None:
         if self.measure_by_cameras:
             spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
@@ -243,18 +212,6 @@ class GradientDensification(Densification):
                 reset_opa(splats, optimizers, self.state, value=2.0 * strategy.prune_opa)
         if step % strategy.reset_every == 0 or self._refines(step):
             self.forget_views()
-        done = self.state[THINNED]
-        if self.keep < 1.0 and done < len(self.rounds) and step >= self.rounds[done]:
-            self._thin(step, splats, optimizers)
-            self.state[THINNED] += 1
-
-    def _thin(self, step: int, splats, optimizers) -> None:
-        """Take out a round's share of the splats (`thinning.py`)."""
-        score = thinning.missed(self.views, len(splats["means"]), splats["means"].device)
-        gone = thinning.least_missed(score, self.keep)
-        remove(splats, optimizers, self.state, gone)
-        if self.verbose:
-            print(f"Step {step}: {int(gone.sum())} GSs thinned. Now having {len(splats['means'])} GSs.")
 
     def _take_statistics(self, info: Mapping[str, Any], count: int) -> None:
         """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side."""
@@ -305,12 +262,7 @@ class GradientDensification(Densification):
             threshold = max(threshold, gradients.kthvalue(count - room).values.item())
         return threshold
 
-    def _rounds(self, step_at: Callable[[float], int]) -> list[int]:
-        """The steps at which splats are thinned."""
-        return [step_at(times * self.bounds["refine_stop_iter"]) for times in thinning.ROUNDS]
-
     def reschedule(self, step_at: Callable[[float], int]) -> None:
-        self.rounds = self._rounds(step_at)
         for name, step in self.bounds.items():
             setattr(self.strategy, name, step_at(step) if step > 0 else step)
 

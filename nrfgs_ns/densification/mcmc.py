@@ -15,7 +15,6 @@ from nrfgs_ns.densification.strategy import (
     Densification,
     DensificationConfig,
     OpacitySeen,
-    TrainingViews,
     seen_with,
 )
 
@@ -78,7 +77,7 @@ class McmcDensification(Densification):
         self.config, self.scene_unit = config, scene_unit
         self.start, self.stop = config.warmup_length, config.stop_at
 
-    def begin(self, centers: Tensor, views: TrainingViews, num_splats: int) -> None:
+    def begin(self, centers: Tensor, num_splats: int) -> None:
         if self.verbose and num_splats > self.config.budget:
             print(
                 f"Warning: --pipeline.model.densification mcmc: budget is {self.config.budget}, but the training "

@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -89,9 +89,6 @@ class DensificationConfig(ABC):
         self.require(self.opacity_seen in ("base", "peak"), "opacity_seen", "base or peak")
         self.require(self.refine_every >= 1, "refine_every", "at least 1")
 
-    def check_training(self, devices: int, steps: int) -> None:  # noqa: B027  (most work in any training)
-        """Raise InputError where the options cannot work on this number of devices, or in this number of steps."""
-
     def require(self, holds: bool, name: str, needed: str) -> None:
         """Raise InputError naming option `name`, its value and what is `needed`, unless the condition holds."""
         if not holds:
@@ -119,24 +116,6 @@ class Shown(NamedTuple):
     """theirs, from there, [M] in [0, 1]"""
     cameras: int
     """number of cameras"""
-
-
-class TrainingViews(Protocol):
-    """What the strategy may ask of a training."""
-
-    def __len__(self) -> int:
-        """How many there are."""
-
-    def changes_without(self, index: int, generator: torch.Generator, passes: int) -> tuple[Tensor, Tensor]:
-        """How much the picture of one view would change without each splat that it sees (`rasterizer.changes_without`).
-
-        Args:
-            index: of the view.
-            generator, passes: of the estimate.
-
-        Returns:
-            Rows of the table, int64 [M], and sums over pixels and channels of the squared change, [M].
-        """
 
 
 class Densification(ABC):
@@ -170,12 +149,11 @@ class Densification(ABC):
         """Whether it looks at nothing in this step."""
         return False
 
-    def begin(self, centers: Tensor, views: TrainingViews, num_splats: int) -> None:  # noqa: B027
+    def begin(self, centers: Tensor, num_splats: int) -> None:  # noqa: B027
         """Take what is known before the first step.
 
         Args:
             centers: of the training cameras, [V, 3].
-            views: what the strategy may ask of the training views.
             num_splats: splats that the training begins with.
         """
 

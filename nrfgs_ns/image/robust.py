@@ -45,17 +45,12 @@ class Trimming(nn.Module):
         error = (prediction - truth).abs().mean(dim=-1)
         counted = error if mask is None else torch.where(mask[..., 0] >= 0.5, error, -1.0)  # beyond the bins
         self.histogram.mul_(MEMORY).add_(torch.histc(counted, BINS, 0.0, 1.0))
-        return self.kept(prediction, truth).clamp_min(max(1.0 - (step - FIRST_STEP) / FADE_STEPS, 0.0))
-
-    @torch.no_grad()
-    def kept(self, prediction: Tensor, truth: Tensor) -> Tensor:
-        """1.0 for pixels that the remembered residuals keep, else 0.0, without remembering these. [H, W, 1]"""
-        error = (prediction - truth).abs().mean(dim=-1)
         threshold = torch.maximum(self._quantile(1.0 - self.share), USUAL * self._quantile(0.5))
         kept = (error <= threshold).to(prediction.dtype)
         kept = torch.maximum(kept, (_mean_around(kept, WINDOW) > 0.5).to(kept.dtype))
         patch = 2 * round(PATCH * max(error.shape) / 2) + 1
-        return torch.maximum(kept, (_mean_around(kept, patch) > MOST_KEPT).to(kept.dtype))[..., None]
+        kept = torch.maximum(kept, (_mean_around(kept, patch) > MOST_KEPT).to(kept.dtype))[..., None]
+        return kept.clamp_min(max(1.0 - (step - FIRST_STEP) / FADE_STEPS, 0.0))
 
     def _quantile(self, share: float) -> Tensor:
         """The residual below which this share of those remembered lies, a scalar."""

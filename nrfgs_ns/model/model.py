@@ -37,7 +37,6 @@ from nrfgs_ns.model.look import look_asked_for
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.pinhole import Pinhole, Pinholes
 from nrfgs_ns.model.renderer import View, composite_view, project_view, projection_options
-from nrfgs_ns.model.training_views import TrainingPictures
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.rasterizer import ProjectionOptions
@@ -284,8 +283,7 @@ class NrfgsModel(SplatfactoModel):
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
-        views = TrainingPictures(self, attributes.pipeline.datamanager)
-        self.densification.begin(centers, views, self.num_points)
+        self.densification.begin(centers, self.num_points)
         self.camera_spacing = camera_spacing(centers)
         self.view_noise = ViewNoise(self.noise_factor * self.camera_spacing, self.view_noise.seed)
 

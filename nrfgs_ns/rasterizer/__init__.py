@@ -24,7 +24,6 @@ __all__ = [
     "Projection",
     "ProjectionOptions",
     "RasterizeMode",
-    "changes_without",
     "composite",
     "contributions",
     "load_kernels",
@@ -137,41 +136,3 @@ def contributions(projection: Projection, opacities: Tensor) -> Tensor:
         render, _, _ = composite(projection, colors, opacities.detach())
         (shares,) = torch.autograd.grad(render.sum(), colors)
     return shares.squeeze(1)
-
-
-def changes_without(
-    projection: Projection,
-    colors: Tensor,
-    opacities: Tensor,
-    counted: Tensor,
-    generator: torch.Generator,
-    *,
-    backgrounds: Tensor | None = None,
-    passes: int = 1,
-) -> Tensor:
-    """Unbiased estimate of the images' squared change without each projected splat, summed over pixels and channels.
-
-    An image I is linear in the opacity o_i of each row: without that row alone it changes by -o_i dI/do_i. With random
-    signs r for each pixel and channel, the mean of (o_i d(r I)/do_i)^2 is the sum of squares (Hutchinson), for all rows
-    from one backward pass. The variance is at most twice its square, divided by the number of passes. At pixels where a
-    row's alpha is capped or below 1/255, the change is taken as 0.
-
-    Args:
-        projection: the result of `project`, M rows.
-        colors, opacities, backgrounds: as for `composite`. [M, D], [M], [C, D]
-        counted: weight of each pixel, 0 or 1. [C, H, W, 1]
-        generator: of the signs, on the device of the projection.
-        passes: number of backward passes.
-
-    Returns:
-        Numbers >= 0, [M].
-    """
-    opacities = opacities.detach().requires_grad_()
-    with torch.enable_grad():
-        render, _, _ = composite(projection, colors.detach(), opacities, backgrounds=backgrounds)
-    total = torch.zeros_like(opacities, requires_grad=False)
-    for left in reversed(range(passes)):
-        signs = 2 * torch.randint(2, render.shape, generator=generator, device=render.device) - 1
-        (slopes,) = torch.autograd.grad(render, opacities, signs * counted.to(render.dtype), retain_graph=left > 0)
-        total += (opacities.detach() * slopes).square()
-    return total / passes

@@ -99,8 +99,6 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError("time_budget and schedule_steps are for one device. Leave them out.")
         check_types(self.pipeline, "config.yml", "pipeline.")
         self.pipeline.model.check()
-        length = self.schedule_steps or self.max_num_iterations or STEPS
-        self.pipeline.model.densification.check_training(devices, length)
         if self.load_step is not None and self.load_dir is None:
             raise InputError(f"load_step is {self.load_step}, but there is no --load-dir. Give the folder, too.")
         if self.load_dir is not None:

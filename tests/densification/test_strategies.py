@@ -74,14 +74,14 @@ def test_mcmc_rests_before_its_start_and_after_its_end():
 def test_original_measures_by_the_cameras():
     """3DGS: 1.1 times the largest distance of a camera from the mean of all."""
     rules = strategy("original")
-    rules.begin(torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0.0], [2.0, -3.0, 0.0]]), None, 4)
+    rules.begin(torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0.0], [2.0, -3.0, 0.0]]), 4)
     assert rules.state["scene_scale"] == pytest.approx(1.1 * 3.0)
     table = Table(4, scale=0.032)  # 0.01 x 3.3 = 0.033: three are duplicated, the last is split
     table.splats["scales"].data[3] = torch.tensor(0.034).log()
     table.step(rules, REFINES, gradient=1.0)
     kept = torch.bincount(table.splats["scales"].exp().amax(dim=-1).mul(1000).round().long())
     assert kept[32] == 6 and kept[round(34 / 1.6)] == 2
-    rules.begin(torch.ones(1, 3), None, 4)
+    rules.begin(torch.ones(1, 3), 4)
     assert rules.state["scene_scale"] == 1.0
 
 
@@ -124,8 +124,8 @@ def test_original_prunes_large_splats_after_the_first_reset():
         ("original", Original()),
         ("mcmc,budget=77,opacity-seen=base", Mcmc(budget=77, opacity_seen="base")),
         (
-            "splatfacto,keep=0.5,use_absgrad=False,densify_grad_thresh=4e-4",
-            Splatfacto(keep=0.5, use_absgrad=False, densify_grad_thresh=4e-4),
+            "splatfacto,use_absgrad=False,densify_grad_thresh=4e-4",
+            Splatfacto(use_absgrad=False, densify_grad_thresh=4e-4),
         ),
     ],
 )
@@ -140,7 +140,7 @@ def test_a_word_is_a_strategy_with_its_options(text, config, tmp_path):
     "text, says",
     [
         ("sparkle", "no strategy 'sparkle'; use one of splatfacto, original, mcmc"),
-        ("mcmc,keep=0.5", "mcmc has no option 'keep'; it has opacity_seen, .*budget"),
+        ("mcmc,sparkle=0.5", "mcmc has no option 'sparkle'; it has opacity_seen, .*budget"),
         ("mcmc,budget=0", "budget is 0; it must be from 1 to"),
         (f"mcmc,budget={2**24 + 1}", "budget is"),
         ("mcmc,budget=many", "budget is 'many'; it must be a whole number"),
