@@ -9,7 +9,7 @@ does not depend on the view (`base_appearance`). Shared weights are the head's o
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -44,9 +44,6 @@ class AppearanceHeadConfig:
 
     _target: type = field(default_factory=lambda: AppearanceHead)
     """the head class that this configuration builds"""
-
-    STEPS: ClassVar[tuple[str, ...]] = ()
-    """Fields that are numbers of training steps, stretched with the schedules."""
 
     def setup(self, scene_unit: float = 1.0) -> "AppearanceHead":
         """Build the head, or raise InputError if a field is out of range; `scene_unit`: world units in a scene unit."""

@@ -31,7 +31,6 @@ from nrfgs_ns.kernels.trial import Gate
 class ShConfig(AppearanceHeadConfig):
     """Spherical harmonics, as in splatfacto."""
 
-    STEPS = ("degree_interval",)
     _target: type = field(default_factory=lambda: SphericalHarmonics)
     """the head class that this configuration builds"""
     degree: int = 3

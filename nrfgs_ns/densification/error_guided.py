@@ -65,7 +65,6 @@ class ErrorGuided(DensificationConfig):
     """Growth where the error is: the number of splats follows from the capture."""
 
     name: ClassVar[str] = "error-guided"
-    steps: ClassVar[tuple[str, ...]] = (*DensificationConfig.steps, "grow_until", "stop_at")
     opacity_seen: OpacitySeen = "peak"
     """opacity by which splats are dead (docs/opacity.md). base: stored. peak: largest shown in two windows"""
     refine_every: int = 200

@@ -34,7 +34,6 @@ STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop
 class GradientConfig(DensificationConfig):
     """Options that splatfacto's and 3DGS's rules share."""
 
-    steps: ClassVar[tuple[str, ...]] = (*DensificationConfig.steps, "stop_split_at")
     stop_split_at: int = 15_000
     """step at which growth ends"""
     reset_alpha_every: int = 30
@@ -66,7 +65,6 @@ class Splatfacto(GradientConfig):
     """nerfstudio's rules, with splatfacto's names and defaults."""
 
     name: ClassVar[str] = "splatfacto"
-    steps: ClassVar[tuple[str, ...]] = (*GradientConfig.steps, "stop_screen_size_at")
     densify_grad_thresh: float = 0.0008
     """splats whose mean gradient of the loss by the screen position (normalised to [-1, 1]) is larger grow"""
     use_absgrad: bool = True

@@ -35,7 +35,6 @@ class Mcmc(DensificationConfig):
     """3DGS-MCMC (Kheradmand et al. 2024) up to a budget of splats, with gsplat's constants."""
 
     name: ClassVar[str] = "mcmc"
-    steps: ClassVar[tuple[str, ...]] = (*DensificationConfig.steps, "stop_at")
     copies_splats: ClassVar[bool] = True
     regularises: ClassVar[bool] = True
     opacity_seen: OpacitySeen = "peak"

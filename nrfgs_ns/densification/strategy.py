@@ -61,8 +61,6 @@ class DensificationConfig(ABC):
     """replaces splats by copies that share their opacity, which heads adapt to (`AppearanceHeadConfig.for_copies`)"""
     regularises: ClassVar[bool] = False
     """adds terms for opacity and size to the loss, in place of the model's `shrinkage`"""
-    steps: ClassVar[tuple[str, ...]] = ("warmup_length", "refine_every")
-    """options that are numbers of steps"""
     opacity_seen: OpacitySeen = "base"
     """opacity by which splats are pruned or moved (docs/opacity.md). base: stored. peak: largest shown since the last
     refinement"""

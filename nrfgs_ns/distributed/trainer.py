@@ -21,7 +21,6 @@ from torch.optim import Optimizer
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.model import ShardedModel
 from nrfgs_ns.distributed.shards import map_model_rows, map_moments
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched, WatchedOptimizers
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
@@ -192,9 +191,6 @@ class ShardedTrainer(NrfgsTrainer):
     """The trainer of one device; InputError where an option is for one device only."""
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        for name in ("mixed_precision", "use_grad_scaler"):
-            if getattr(config, name):
-                raise InputError(f"{name} does not work on several devices. Leave it out.")
         if config.machine.device_type == "cuda":
             torch.cuda.set_device(local_rank)
         CONSOLE.quiet = comm.rank() > 0

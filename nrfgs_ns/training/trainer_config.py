@@ -201,7 +201,9 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
             "the distance between neighbouring cameras"
         )
     if model.config.near_plane == "auto" and model.near > 0.0:
-        notes.append(f"near plane: {model.near / model.scene_unit:.2g} scene units, half the depth of the nearest points")
+        notes.append(
+            f"near plane: {model.near / model.scene_unit:.2g} scene units, half the depth of the nearest points"
+        )
     count = f"{given} training view{'s' * (given != 1)}"
     if views != given:
         count = f"{views} different training views of {given}"
