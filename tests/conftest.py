@@ -84,3 +84,17 @@ def no_cuda(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.Tensor, "cuda", refuse)
     monkeypatch.setattr(torch.nn.Module, "cuda", refuse)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """A capture of ten images (`small_capture.Capture`)."""
+    from small_capture import Capture
+
+    return Capture(tmp_path / "capture", images=10)
+
+
+@pytest.fixture
+def printed(capsys):
+    """A function: what was printed since it was last called, in one line."""
+    return lambda: " ".join(capsys.readouterr().out.split())
