@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The registered methods: configuration only.
 
-Everything but the appearance head is splatfacto's, to the number: learning rates, schedules, densification, steps.
-`nrfgs` alone suits the training to the capture: steps, growth, start, near plane, and how far the views are trusted
-(docs/captures.md). Its two presets are ends of the trade in docs/trade-off.md.
+The methods for comparison differ from splatfacto in the appearance head alone: learning rates, schedules, densification
+and steps are splatfacto's, to the number. `nrfgs` also suits the training to the capture: steps, growth, start, near
+plane, and how far the views are trusted (docs/captures.md). Its two presets are ends of the trade in docs/trade-off.md.
 """
 
 from copy import deepcopy

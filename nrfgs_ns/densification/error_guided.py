@@ -182,7 +182,7 @@ class ErrorGuidedDensification(Densification):
 
     def _refine(self, step: int, splats: Splats, optimizers: Optimizers) -> None:
         """Replace the dead, split where the error is, and take a little from all opacities."""
-        state, count = self.state, len(splats["means"])
+        state, count, self.moved_at = self.state, len(splats["means"]), step
         opacities, wide = self.seen_opacity(splats["opacities"]), state[WIDTH] > WIDEST
         dead = opacities < DEAD
         parents = draw((opacities * (state[WIDTH] > 0)).masked_fill(dead, 0.0), int(dead.sum()))

@@ -140,11 +140,13 @@ class Densification(ABC):
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
         return False
 
+    moved_at: int | None = None
+    """Last step at which rows of the table came to denote other splats although no tensor was replaced."""
     takes_all_rows: bool = False
-    """Whether it may be given rows of splats that are not visible, of radius 0, and adds nothing to the loss."""
+    """Whether steps can be recorded: it ignores rows of radius 0 (invisible splats) and adds no term to the loss."""
 
     def rests_at(self, step: int) -> bool:
-        """Whether it looks at nothing in this step."""
+        """Whether it needs no gradients of this step; splats may still be replaced."""
         return False
 
     def begin(self, centers: Tensor, num_splats: int) -> None:  # noqa: B027

@@ -6,8 +6,8 @@ Most learning rates never fall, and each step sees one view: parameters fluctuat
 mean lies closer to the centre than the last step does.
 
 Averaging is meaningless once a row denotes another splat. The mean therefore restarts where splats were added, removed,
-moved onto others or had their opacity reset: all of these replace the `Parameter` objects, even if shapes stay. MCMC's
-noise, which changes the means in place, is averaged away.
+moved onto others or had their opacity reset: these replace the `Parameter` objects, or the strategy says that it
+overwrote rows in place (`moved_at`). MCMC's noise, which changes the means in place, is averaged away.
 """
 
 from collections.abc import Mapping

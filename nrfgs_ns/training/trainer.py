@@ -268,6 +268,8 @@ class NrfgsTrainer(Trainer):
         # the last before the training was extended.
         if left >= 2 * size if timed else mean.count >= size - left:
             mean.forget()
+        if self.pipeline.model.densification.moved_at == step:
+            mean.forget()
         if left < size or mean.count > 0:
             mean.add(self.optimizers.optimizers)
 

@@ -147,6 +147,7 @@ def test_a_share_of_the_candidates_is_split_and_the_dead_are_replaced():
     table.check()
     assert len(table) == 40 + round(SHARE * 20) - 4
     assert set(table.splats["latents"][:4, 0].long().tolist()) <= set(range(4, 40))
+    assert strategy.moved_at == 600, "rows denote other splats, and a mean over steps must know"
     assert all(len(value) == len(table) for value in strategy.state.values())
 
 

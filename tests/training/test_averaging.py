@@ -114,6 +114,16 @@ def test_what_gives_rows_another_meaning_begins_anew(change, anew, trainer):
         assert_close(dict(model.gauss_params.items()), now, rtol=0, atol=0, check_stride=False)
 
 
+def test_rows_that_a_strategy_overwrites_in_place_begin_it_anew(trainer, monkeypatch):
+    strategy, counts = trainer.pipeline.model.densification, []
+    for step in range(6, 10):
+        if step == 8:
+            monkeypatch.setattr(strategy, "moved_at", step)
+        trainer._average(step)
+        counts.append(trainer.mean.count)
+    assert counts == [1, 2, 1, 2]
+
+
 @pytest.mark.parametrize(
     "asked, total, size", [(200, 30_000, 200), (200, 300, 6), (200, 20, 1), (7, 300, 6), (3, 300, 3)]
 )
