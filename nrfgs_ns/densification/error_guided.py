@@ -3,8 +3,9 @@
 
 The recipe follows brush (Arthur Brussee, Apache-2.0, `crates/brush-train`) and LichtFeld-Studio's default:
 
-- A splat's *error* is the sum over pixels of |dL/dmean2d|, with lengths in images; a window of views counts with the
-  largest. It does not depend on the size of the images, the number of views or the unit of the scene.
+- A splat's *error* is the sum over pixels of |dL/dmean2d|, with screen positions in widths and heights of the image.
+  Of the views since the last refinement the largest counts. It does not depend on the size of the images, the number of
+  views or the unit of the scene.
 - Each refinement splits a share of the splats whose error is above a threshold, drawn in proportion to the error, and
   every splat wider than three quarters of the image.
 - A splat is dead if no view of the last two windows shows it at `DEAD` or more. It is replaced by half of a live one,
@@ -84,6 +85,7 @@ class ErrorGuided(DensificationConfig):
     def check(self) -> None:
         super().check()
         self.require(self.most_splats >= 1, "most_splats", "at least 1")
+        self.require(self.budget <= self.most_splats, "budget", f"at most most_splats, {self.most_splats}")
 
     def share_of(self, rank: int, devices: int) -> "ErrorGuided":
         shares = {name: len(range(rank, getattr(self, name), devices)) for name in ("budget", "most_splats")}
@@ -244,8 +246,8 @@ def draw(weights: Tensor, count: int) -> Tensor:
 
 
 def halves(splats: Mapping[str, Tensor], rows: Tensor, signs: Tensor) -> dict[str, Tensor]:
-    """What each of two splats has that take the place of one: variances as before along each axis, the longest axis
-    shortened most, and together about as opaque.
+    """Geometry and opacity of the two halves of each splat: the variance along each axis stays, the longest axis is
+    shortened most, and both together are about as opaque.
 
     Args:
         splats: the table.

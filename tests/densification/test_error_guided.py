@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE, ErrorGuided
 from nrfgs_ns.densification.error_guided import DECAY, ERROR, SHARE, WIDTH, draw, split
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.rasterizer import composite, project
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -200,6 +201,11 @@ def test_opacities_decay_less_and_less():
         strategy.post_backward(step, info, table.splats, table.optimizers)
         taken.append(0.5 - torch.sigmoid(table.splats["opacities"][0]).item())
     assert taken == pytest.approx([DECAY * (1 - step / 30_000) for step in (600, 15_000, 24_800)], abs=1e-6)
+
+
+def test_a_budget_above_the_cap_is_refused():
+    with pytest.raises(InputError, match="budget is 50; it must be at most most_splats, 40"):
+        ErrorGuided(budget=50, most_splats=40).check()
 
 
 def test_growth_ends_at_the_cap_and_in_time():
