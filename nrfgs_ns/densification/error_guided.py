@@ -30,6 +30,7 @@ from torch.nn import Parameter
 
 from nrfgs_ns.densification.mcmc import CHANGE_BEFORE
 from nrfgs_ns.densification.relocation import Optimizers, Splats
+from nrfgs_ns.densification.statistics import take_maxima
 from nrfgs_ns.densification.strategy import (
     CHANGE,
     UNSEEN,
@@ -77,6 +78,9 @@ class ErrorGuided(DensificationConfig):
     """number of splats to grow to, whatever their error (arXiv 2605.16158). 0: the threshold decides"""
     most_splats: int = 2_000_000
     """upper bound; growth usually ends below it by itself"""
+    shrinkage: float = 0.2
+    """weight in the loss of the splats' mean opacity and mean size, in percent, beside the model's `shrinkage`: without
+    it large faint splats, which no reset removes, double the time of a step"""
     grow_until: int = 15_000
     """step after which splats are only replaced"""
     stop_at: int = 25_000
@@ -149,23 +153,19 @@ class ErrorGuidedDensification(Densification):
 
     def _take_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
         """Let the window's maxima be at least the step's."""
-        rows, radii = info["gaussian_ids"], info["radii"]
         for name in self.state.keys() & {ERROR, WIDTH, CHANGE, CHANGE_BEFORE}:
             if self.state[name] is None:
                 empty = UNSEEN if name in (CHANGE, CHANGE_BEFORE) else 0.0
-                self.state[name] = torch.full((count,), empty, device=radii.device)
-        values = {WIDTH: radii / float(max(info["width"], info["height"]))}
-        if self.opacity_seen == "peak":
-            values[CHANGE] = info["change"]
-        if step < self.grow_until:
-            x, y = info["means2d"].absgrad.unbind(dim=-1)
-            cameras = info["n_cameras"]  # over which the loss is a mean
-            values[ERROR] = torch.hypot(x * (info["width"] * cameras), y * (info["height"] * cameras)) * (radii > 0)
-        for name, value in values.items():
-            if _is_whole(info, count):
-                torch.maximum(self.state[name], value, out=self.state[name])
-            else:
-                self.state[name].scatter_reduce_(0, rows, value, "amax")
+                self.state[name] = torch.full((count,), empty, device=info["radii"].device)
+        grows = step < self.grow_until
+        take_maxima(
+            self.state[WIDTH],
+            self.state[ERROR] if grows else None,
+            self.state.get(CHANGE),
+            info,
+            info["means2d"].absgrad if grows else None,
+            info.get("change"),
+        )
 
     def _begin_another_window(self) -> None:
         if CHANGE in self.state:
@@ -220,11 +220,6 @@ class ErrorGuidedDensification(Densification):
         weights = error * (error > self.config.threshold)
         wanted = max(round(SHARE * int((weights > 0).sum())) - replaced, int(wide.sum()))
         return weights.masked_fill(wide, math.inf), wanted
-
-
-def _is_whole(info: Mapping[str, Any], count: int) -> bool:
-    """Whether a step's rows are the table's, in its order."""
-    return info["n_cameras"] == 1 and len(info["gaussian_ids"]) == count
 
 
 def draw(weights: Tensor, count: int) -> Tensor:

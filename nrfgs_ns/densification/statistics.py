@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What growth by gradients remembers of each step: how much splats wanted to move on the screen, and how large they
-were. On CUDA one Triton kernel does it (`statistics_triton.py`), elsewhere and for several cameras PyTorch does."""
+"""What growth remembers of each step: how much splats wanted to move on the screen, how large they were, and how much
+the view changed their opacity. Growth by gradients adds it up, growth by error keeps the largest.
+
+On CUDA one Triton kernel does it (`statistics_triton.py`), elsewhere and for several cameras PyTorch does.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,7 +24,7 @@ def take_statistics(state: Mapping[str, Tensor], info: Mapping[str, Any], gradie
     """
     scales = info["width"] / 2.0 * info["n_cameras"], info["height"] / 2.0 * info["n_cameras"]
     side = float(max(info["width"], info["height"]))
-    if _kernel_takes(state, info, gradients):
+    if _kernels_take(info, gradients, *(state[name] for name in ("grad2d", "count", "radii") if name in state)):
         from nrfgs_ns.densification.statistics_triton import add
 
         rows, radii = info["gaussian_ids"], info["radii"]
@@ -57,13 +60,62 @@ def add_in_torch(
         state["radii"][rows] = torch.maximum(state["radii"][rows], radii / side)
 
 
+def take_maxima(
+    widths: Tensor,
+    errors: Tensor | None,
+    changes: Tensor | None,
+    info: Mapping[str, Any],
+    gradients: Tensor | None,
+    change: Tensor | None,
+) -> None:
+    """Let the maxima be at least a step's radii, in shares of the longer side, the norms of its screen-space gradients,
+    in an image of [0, 1], and its changes of opacity.
+
+    Args:
+        widths, errors, changes: maxima [N], written to; None: not wanted.
+        info: the rasterizer's, as in `take_statistics`.
+        gradients: of the loss by the rows' centres, in pixels, [M, 2].
+        change: of the rows' opacities, [M].
+    """
+    scales = float(info["width"] * info["n_cameras"]), float(info["height"] * info["n_cameras"])
+    side = float(max(info["width"], info["height"]))
+    rows, radii = info["gaussian_ids"], info["radii"]
+    if _kernels_take(info, *(value for value in (widths, errors, changes, gradients, change) if value is not None)):
+        from nrfgs_ns.densification.statistics_triton import raise_maxima
+
+        raise_maxima(widths, errors, changes, rows, radii, gradients, change, 1.0 / side, scales)
+    else:
+        raise_in_torch(widths, errors, changes, rows, radii, gradients, change, side, scales)
+
+
+def raise_in_torch(
+    widths: Tensor,
+    errors: Tensor | None,
+    changes: Tensor | None,
+    rows: Tensor,
+    radii: Tensor,
+    gradients: Tensor | None,
+    change: Tensor | None,
+    side: float,
+    scales: tuple[float, float],
+) -> None:
+    """The kernel's twin: the same in PyTorch, with radii in pixels that are divided by `side`."""
+    seen = (radii > 0).nonzero()[:, 0]
+    rows = rows[seen]
+    widths.scatter_reduce_(0, rows, radii[seen] / side, "amax")
+    if errors is not None:
+        x, y = gradients[seen].unbind(dim=-1)
+        errors.scatter_reduce_(0, rows, torch.hypot(x * scales[0], y * scales[1]), "amax")
+    if changes is not None:
+        changes.scatter_reduce_(0, rows, change[seen], "amax")
+
+
 _GATE = Gate("What densification remembers")
 
 
-def _kernel_takes(state: Mapping[str, Tensor], info: Mapping[str, Any], gradients: Tensor) -> bool:
-    """Whether the kernel does it. Where one camera looks, no row of the state occurs twice."""
-    device = gradients.device
-    tensors = gradients, *(state[name] for name in ("grad2d", "count", "radii") if name in state)
+def _kernels_take(info: Mapping[str, Any], *tensors: Tensor) -> bool:
+    """Whether a kernel does it. Where one camera looks, no row of the state occurs twice."""
+    device = tensors[0].device
     return (
         device.type == "cuda"
         and info["n_cameras"] == 1
@@ -73,13 +125,16 @@ def _kernel_takes(state: Mapping[str, Tensor], info: Mapping[str, Any], gradient
 
 
 def try_kernel(device: torch.device) -> bool:
-    """Whether the kernel runs on a CUDA device; tried once, which compiles it: the first step would."""
-    return _GATE.opens(device, device, lambda: _try_kernel(device))
+    """Whether the kernels run on a CUDA device; tried once, which compiles them: the first step would."""
+    return _GATE.opens(device, device, lambda: _try_kernels(device))
 
 
-def _try_kernel(device: torch.device) -> None:
-    """Compile and run the kernel on one splat; raise whatever goes wrong."""
-    from nrfgs_ns.densification.statistics_triton import add
+def _try_kernels(device: torch.device) -> None:
+    """Compile and run the kernels on one splat; raise whatever goes wrong."""
+    from nrfgs_ns.densification.statistics_triton import add, raise_maxima
 
     row, one = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(1, device=device)
-    add(one, one.clone(), one.clone(), row, torch.ones(1, 2, device=device), one.int(), (1.0, 1.0), 1.0)
+    two = torch.ones(1, 2, device=device)
+    add(one, one.clone(), one.clone(), row, two, one.int(), (1.0, 1.0), 1.0)
+    for errors, gradients in ((one.clone(), two), (None, None)):  # while splats grow, and after it
+        raise_maxima(one, errors, one.clone(), row, one.int(), gradients, one, 1.0, (1.0, 1.0))

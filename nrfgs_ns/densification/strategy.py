@@ -61,6 +61,8 @@ class DensificationConfig(ABC):
     """replaces splats by copies that share their opacity, which heads adapt to (`AppearanceHeadConfig.for_copies`)"""
     regularises: ClassVar[bool] = False
     """adds terms for opacity and size to the loss, in place of the model's `shrinkage`"""
+    shrinkage: ClassVar[float] = 0.0
+    """weight that it adds to the model's `shrinkage`, in percent, however many training views there are"""
     opacity_seen: OpacitySeen = "base"
     """opacity by which splats are pruned or moved (docs/opacity.md). base: stored. peak: largest shown since the last
     refinement"""

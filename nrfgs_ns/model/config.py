@@ -42,7 +42,7 @@ class NrfgsModelConfig(ModelConfig):
     the opacity residual (docs/captures.md)"""
     shrinkage: float = 0.0
     """weight in the loss of the splats' mean opacity and mean size, in percent, halved for every 12 training views
-    (docs/captures.md). mcmc has its own instead"""
+    (docs/captures.md). error-guided adds a constant, mcmc has its own instead"""
     dense_start: Literal["auto", "off"] = "off"
     """start with points from the photographs, too. auto: the more, the fewer views there are (docs/captures.md)"""
     near_plane: Literal["auto", "off"] = "off"
@@ -119,6 +119,6 @@ class NrfgsModelConfig(ModelConfig):
         return head.for_copies() if self.densification.copies_splats else head
 
     def shrinkage_weight(self, views: int) -> float:
-        """Weight of `shrinkage` in the loss with this number of training views."""
-        weight = self.shrinkage / 100 * 0.5 ** (views / HALVING_VIEWS)
+        """Weight of `shrinkage` in the loss with this number of training views, with what the densification adds."""
+        weight = (self.shrinkage * 0.5 ** (views / HALVING_VIEWS) + self.densification.shrinkage) / 100
         return weight if weight >= NEGLIGIBLE and not self.densification.regularises else 0.0

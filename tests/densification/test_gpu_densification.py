@@ -54,8 +54,6 @@ def test_diffuse_is_gsplats_noise():
     assert_close(results[0], results[1], rtol=1e-4, atol=1e-6 * results[1].abs().max().item())
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_one_camera_is_the_kernels(monkeypatch):
     torch.manual_seed(0)
     info = {
@@ -70,3 +68,23 @@ def test_one_camera_is_the_kernels(monkeypatch):
     statistics.take_statistics(state, info, gradients)
     for name in state:
         torch.testing.assert_close(state[name], twin[name], rtol=1e-6, atol=0.0)
+
+
+def test_one_cameras_maxima_are_the_kernels(monkeypatch):
+    torch.manual_seed(0)
+    info = {
+        "width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": torch.randperm(5000, device="cuda")[:3000],
+        "radii": torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda"),
+    }  # fmt: skip
+    maxima = [
+        torch.zeros(5000, device="cuda"),
+        torch.zeros(5000, device="cuda"),
+        torch.full((5000,), -2.0, device="cuda"),
+    ]
+    step = torch.randn(3000, 2, device="cuda"), torch.rand(3000, device="cuda") - 0.5
+    twin = [value.clone() for value in maxima]
+    statistics.raise_in_torch(*twin, info["gaussian_ids"], info["radii"], *step, 640.0, (640.0, 480.0))
+    monkeypatch.setattr(statistics, "raise_in_torch", None)
+    statistics.take_maxima(*maxima, info, *step)
+    for value, other in zip(maxima, twin, strict=True):
+        torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)

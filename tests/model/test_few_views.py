@@ -10,7 +10,7 @@ from short_trainings import checkpoint_of, command_line, models_of, set_up, trai
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.densification import Mcmc
+from nrfgs_ns.densification import ErrorGuided, Mcmc, Splatfacto
 from nrfgs_ns.model.loss import shrinkage
 
 QUICK = {
@@ -112,6 +112,7 @@ def test_a_checkpoint_keeps_its_head_whatever_the_number_of_views(tiny_scene, tm
 
 def test_shrinkage_halves_with_every_twelve_views(tiny_scene, tmp_path, no_cuda):
     model = ready(tiny_scene, tmp_path, 1, {"--pipeline.model.shrinkage": 0.5}).pipeline.model
+    model.config.densification = Splatfacto()
     assert model.num_views == 8
     table, weight = model.gauss_params, 0.005 * 0.5 ** (8 / 12)
     terms = shrinkage(model, model.gauss_params)
@@ -122,6 +123,9 @@ def test_shrinkage_halves_with_every_twelve_views(tiny_scene, tmp_path, no_cuda)
         assert_close(term, terms[name] / 2)
     model.num_views = 148  # of which Adam would make whole steps
     assert shrinkage(model, model.gauss_params) == {}
+    model.config.densification = ErrorGuided(shrinkage=0.2)  # which adds a constant
+    constant = 0.002 * torch.sigmoid(table["opacities"]).mean()
+    assert_close(shrinkage(model, table)["shrink_opacities"], constant, rtol=1e-3, atol=0.0)
     model.num_views = 8
     model.config.densification = Mcmc()  # which has terms of its own
     assert shrinkage(model, model.gauss_params) == {}
