@@ -72,7 +72,7 @@ def write_file(
                 options.rate,
                 lambda bits: advance(f"Training for the file ({bits / 8e6:.2f} MB)"),
             )
-    else:  # latents in principal components, of which the small ones are rounded to 0 and take few bytes
+    else:  # the same field in fewer bytes: components of latents that hardly matter are rounded to 0
         basis = latent_basis(field, torch.ones(model.num_points, device=model.device))
         field = with_rank(field, basis, field.head.config.latent_dim)
     times.append(perf_counter())
