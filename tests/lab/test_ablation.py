@@ -12,14 +12,12 @@ from torch.testing import assert_close
 
 from nrfgs_lab.ablation import (
     Inspect,
-    diffuse_last,
     with_constant_distance,
     without_high_branch,
-    without_low_branch,
     without_opacity_residual,
 )
 from nrfgs_ns.appearance.encoding import view_geometry
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.errors import InputError
 
@@ -51,15 +49,6 @@ def test_the_command(tiny_scene, tmp_path, capsys):
         tyro.cli(Inspect, args=["--load-config", str(config), "--views", "0"]).main()
 
 
-def test_the_head_is_timed_with_diffuse_splats_last():
-    """The fused kernels save the network of whole blocks: in the order of an untrained mask they would have none."""
-    splats = {DIFFUSE: torch.arange(60) % 5 < 2}
-    visible = torch.arange(0, 60, 2)
-    rows = diffuse_last(splats, visible)
-    assert torch.equal(rows.sort().values, visible) and (splats[DIFFUSE][rows].int().diff() >= 0).all()
-    assert diffuse_last({}, visible) is visible
-
-
 def random_field(config: NrfConfig = SPLIT):
     """A field of 40 splats, the visible ones, and a camera centre for each."""
     head = awake(config, torch.float32).requires_grad_(False)
@@ -82,15 +71,6 @@ def test_without_the_high_branch_its_gate_is_shut():
     shut.high[2].weight[3], shut.high[2].bias[3] = 0.0, -1e4
     assert small.head.high is None and small.bytes < whole.bytes
     assert_same(small, Field(shut, whole.splats), visible, centers, **FLOAT32)
-
-
-def test_without_the_low_branch_colours_are_the_high_ones():
-    whole, visible, centers = random_field()
-    head, splats = whole.head, whole.splats
-    small = without_low_branch(whole)
-    parts = small.head.components(splats, visible, centers)
-    assert (parts["low branch"].values == 0).all() and parts["high branch"].values.abs().max() > 1e-3
-    assert (small.head(splats, visible, centers).opacities == head(splats, visible, centers).opacities).all()
 
 
 def test_without_opacitys_residual_only_colours_change():

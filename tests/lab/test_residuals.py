@@ -108,13 +108,6 @@ def test_loss_falls_with_the_rank(loud, field, seen, monkeypatch):
         assert slimmed.rank == 1 or scores[slimmed.rank - 2] < wanted
 
 
-def test_views_score_as_the_pipeline_does(loud, field):
-    views = FieldViews(loud.model, loud.datamanager.fixed_indices_eval_dataloader)
-    expected = loud.get_average_eval_image_metrics()["psnr"]
-    loud.eval()
-    assert views.psnr(field) == pytest.approx(expected, abs=1e-4)
-
-
 def test_latents_of_diffuse_splats_do_not_count(field):
     diffuse = torch.arange(len(field.splats["means"])) % 2 == 0
     line = torch.linspace(-3.0, 3.0, len(diffuse))[:, None] * torch.ones(6)

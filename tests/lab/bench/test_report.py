@@ -2,17 +2,15 @@
 """Tables and crops from hand-made records."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from nrfgs_lab.bench import crops
-from nrfgs_lab.bench.crops import crop_sheet, crop_side, largest_disagreement, numbered
-from nrfgs_lab.bench.report import pictures_of, report
+from nrfgs_lab.bench.crops import crop_side, largest_disagreement, numbered
+from nrfgs_lab.bench.report import report
 from nrfgs_lab.bench.spec import cells_of, identity, make_spec
-from nrfgs_lab.bench.table import BY_NAME, COLUMNS, Row, markdown, ranks, with_averages
+from nrfgs_lab.bench.table import BY_NAME, Row, markdown, ranks, with_averages
 from nrfgs_lab.results import pack, unpack
 
 PSNR = BY_NAME["PSNR"]
@@ -35,65 +33,10 @@ def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=
     }
 
 
-def rows():
-    """Two scenes, two runs; NRF's second seed on the second scene failed."""
-    return [
-        Row("s", "SH", "mcmc", {1: record(30.0, train=31.0), 2: record(31.0, train=33.0)}).fill(),
-        Row("s", "NRF", "mcmc", {1: record(32.0, splats=500), 2: record(34.0, splats=700)}).fill(),
-        Row("t_1", "SH", "mcmc", {1: record(20.0), 2: record(22.0)}).fill(),
-        Row("t_1", "NRF", "mcmc", {1: record(21.0)}, {2: "FAILED"}).fill(),
-    ]
-
-
-def test_markdown():
-    """By hand: means, sample deviations |a - b| / sqrt(2), best bold, second in italics, averages seed by seed."""
-    lines = markdown(with_averages(rows())).splitlines()
-    psnr = [column.name for column in COLUMNS].index("PSNR")
-    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    assert table[0][: 4 + 3] == ["scene", "run", "strategy", "seeds", "splats", "time s", "SSIM"]
-    body = {(line[0], line[1]): line for line in table[2:]}
-    assert body["s", "SH"][4 + psnr] == "_30.50 ± 0.71_"
-    assert body["s", "NRF"][4 + psnr] == "**33.00 ± 1.41**"
-    assert body["s", "NRF"][4] == "**600 ± 141**" and body["s", "SH"][4] == "_1,000 ± 0_"
-    # Equal as written: no ranking.
-    assert body["s", "SH"][6] == body["s", "NRF"][6] == "0.9000 ± 0.0000"
-    assert (
-        body["s", "SH"][-1] == "1.50 ± 0.71" and body["s", "SH"][-2] == "32.00 ± 1.41" and body["s", "NRF"][-1] == "-"
-    )
-    assert body["t_1", "NRF"][3] == "1 (1 FAILED)" and body["t_1", "NRF"][4 + psnr] == "21.00"
-    assert body["average", "SH"][4 + psnr] == "_25.75 ± 1.06_"  # (30 + 20) / 2 and (31 + 22) / 2
-    assert body["average", "NRF"][3] == "1 (1 FAILED)" and body["average", "NRF"][4 + psnr] == "**26.50**"
-    assert any("Made on: a card, torch 2.11." in line for line in lines)
-    assert body["s", "SH"][8] == "-", "LPIPS was not measured"
-
-
-def test_what_is_no_number_is_not_there():
-    rows = [Row("s", "a", "own", {1: record(float("nan"))}).fill(), Row("s", "b", "own", {1: record(30.0)}).fill()]
-    assert rows[0].text(PSNR) == "-" and ranks(rows, PSNR) == {}
-    assert "nan" not in markdown(rows)
-
-
 def test_ranks_share_and_skip():
     group = [Row("s", str(i), "own", {1: record(psnr)}).fill() for i, psnr in enumerate([20.0, 21.004, 21.001, 19.0])]
     assert ranks(group, PSNR) == {0: 2, 1: 1, 2: 1}
     assert ranks(group, BY_NAME["L1"]) == {}
-
-
-def table_of(rows):
-    """Markdown's cells, (scene, run, strategy) -> column -> text; and the lines below."""
-    lines = markdown(rows).splitlines()
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    body = {tuple(line[:3]): dict(zip(cells[0], line, strict=True)) for line in cells[2:]}
-    return body, [line for line in lines if line and not line.startswith("|")]
-
-
-def test_marks_are_among_rows_of_one_strategy():
-    """A budget of a tenth is not best in bytes beside methods that chose their number themselves."""
-    plan = [("original", "SH", 30.0, 900), ("original", "NRF", 31.0, 400), ("mcmc@9", "SH", 20.0, 9)]
-    group = [Row("s", run, strategy, {1: record(psnr, splats=n)}).fill() for strategy, run, psnr, n in plan]
-    body, _ = table_of(group)
-    assert body["s", "SH", "mcmc@9"]["splats"] == "9" and body["s", "SH", "mcmc@9"]["PSNR"] == "20.00"
-    assert body["s", "SH", "original"]["splats"] == "_900_" and body["s", "NRF", "original"]["PSNR"] == "**31.00**"
 
 
 def test_times_are_of_runs_that_were_alone_and_ranked_on_one_machine():
@@ -163,38 +106,6 @@ def test_disagreement_is_found(pictures):
     assert score == pytest.approx(0.5 * 50 / 255 * 100 / side**2, rel=1e-5)
     _, top, left = largest_disagreement(truth, renders[1:], side)  # of one run: where it is wrong
     assert top <= 40 and top + side >= 50
-
-
-def test_sheet_shows_the_views_where_runs_differ(pictures, tmp_path, monkeypatch):
-    assert crop_sheet(pictures, tmp_path / "sheet.png")
-    two = Image.open(tmp_path / "sheet.png")
-    monkeypatch.setattr(crops, "VIEWS", 1)
-    assert crop_sheet(pictures, tmp_path / "chosen.png")
-    one = Image.open(tmp_path / "chosen.png")
-    assert two.height == 2 * one.height and two.width == one.width
-    # The best view comes first: the upper half of the automatic sheet is the sheet of view 2.
-    assert np.array_equal(np.asarray(two)[: one.height], np.asarray(one))
-    below = np.asarray(one)[-200:-10, -200:-10]  # inside B's error map: 4 x 50 in the patch, else black
-    assert set(np.unique(below)) == {0, 200}
-
-
-def test_crops_are_of_the_seed_that_was_run(tmp_path, pictures):
-    """A has seed 43 alone, B both, C no pictures; where the seeds differ the labels say them."""
-    content = {"runs": {"A": "nrfgs", "B": "nrfgs-sh", "C": "nrfgs-sg"}, "scenes": ["s"], "seeds": [42, 43]}
-    spec = make_spec(content, "test")
-    runs, work = tmp_path / "runs", tmp_path / "work"
-    runs.mkdir()
-
-    def labels(*names):
-        for name in names:
-            (runs / f"{name}.json").touch()
-            if name[0] != "C":
-                shutil.copytree(pictures[name[0]], work / name / "pictures")
-        return {text: folder.parent.name for text, folder in pictures_of(cells_of(spec), runs, work).items()}
-
-    assert labels() == {}
-    assert labels("A-own-s-43", "B-own-s-43", "C-own-s-42") == {"A": "A-own-s-43", "B": "B-own-s-43"}
-    assert labels("B-own-s-42") == {"A, seed 43": "A-own-s-43", "B, seed 42": "B-own-s-42"}
 
 
 def test_report_of_hand_made_records(tmp_path, pictures, capsys):

@@ -2,28 +2,22 @@
 """Knobs become a benchmark, its records become a front and prices, and noise is called noise."""
 
 import math
-import re
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import t as student
 
-from nrfgs_lab.bench.spec import cells_of, make_spec
+from nrfgs_lab.bench.spec import make_spec
 from nrfgs_lab.bench.table import BY_NAME, Row
 from nrfgs_lab.bench.trade import (
-    HEAD,
     PSNR,
     Change,
-    change_text,
     changes,
-    draw,
-    front_of,
     noise_bound,
     pareto_front,
     pooled_deviation,
     price,
-    table,
 )
 from nrfgs_ns.errors import InputError
 
@@ -42,24 +36,10 @@ KNOBS = {
 }
 
 
-def test_knobs_become_runs():
-    spec = make_spec(KNOBS, "knobs.yaml")
-    runs = {run.name: run for run in spec.runs}
-    assert list(runs) == ["default", "D 4", "D 8", "steps 50", "budget mcmc@200", "head SH", "head one"]
-    assert [run.knob for run in spec.runs] == ["default", "D", "D", "steps", "budget", "head", "head"]
-    assert runs["D 4"].options == ("--a", "1", D, "4") and runs["D 4"].method == "nrfgs"
-    assert runs["steps 50"].steps == 50 and runs["default"].steps is None
-    assert runs["budget mcmc@200"].strategies == ("mcmc@200",)
-    assert runs["head SH"].method == "nrfgs-sh" and runs["head SH"].options == ("--b", "2")  # not the default's
-    assert runs["head one"].options == ("--a", "1", "--c", "3")
-    assert len(cells_of(spec)) == 7 * 2
-
-
 @pytest.mark.parametrize(
     "change, words",
     [
         ({"knobs": []}, "knobs must map"),
-        ({"knobs": {"D": {"values": [1]}}}, "needs option and a list of values, or a list of steps"),
         ({"knobs": {"steps": {"steps": 5}}}, "needs option and a list of values, or a list of steps"),
         ({"knobs": {"head": {"settings": {"x": {"option": "--a"}}}}}, "head x: unknown key"),
         ({"knobs": {"head": {"settings": {"x": 5}}}}, "head x must be a method, or"),
@@ -151,33 +131,3 @@ def test_prices():
     assert price(up, ratio(0.5)) == "better and cheaper" and price(down, ratio(2.0)) == "worse and more expensive"
     assert price(up, ratio(0.97)) == "gain, cost unclear" and price(down, ratio(1.0)) == "loss, cost unclear"
     assert price(nothing, ratio(2.0)) == "PSNR unclear" and price(nothing, ratio(1.02)) == "unclear"
-
-
-def test_front_by_frames_wants_many():
-    rows = [row("slow", record(32.0, fps=10.0)), row("fast", record(30.0, fps=90.0)), row("bad", record(29.0, fps=50))]
-    assert front_of(rows, "time for a frame") == ["fast", "slow"]
-
-
-def cells(markdown: str) -> list[list[str]]:
-    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in markdown.splitlines()]
-
-
-def test_table_and_figure(tmp_path):
-    """Half the time for 1 dB: 1 dB per doubling. 0.01 dB is noise; peak memory is unknown; a setting has no record."""
-    rows = [
-        row("default", record(30.0), record(30.01, 10.1)),
-        row("D_4|", record(29.0, 5.0), record(29.01, 5.05)),
-        row("D 8", record(30.01, 9.0), record(30.02, 9.09)),
-        row("none"),
-    ]
-    knobs = {"default": "default", "D_4|": "D", "D 8": "D", "none": "K $"}
-    assert front_of(rows, "training time") == ["D_4|", "D 8"]
-    lines = {line[0].strip("*"): line for line in cells(table(rows, rows[0]))}
-    assert lines[r"D_4\|"][1:3] == ["2", "-1.00"] and lines[r"D_4\|"][-3] == "1.00 ★"
-    assert lines["D 8"][2] == "(+0.01)" and lines["D 8"][-3] == "PSNR unclear ★"
-    assert lines["D 8"][HEAD.index("peak memory")] == "-" and lines["none"][1:] == ["0", *["-"] * 11]
-    assert change_text(Change(1.0, math.inf), "FPS") == "[x 1.00]"
-    shared = [row("default", record(30.0, jobs=2)), row("D 8", record(31.0, jobs=2))]  # without times
-    draw(shared, knobs, tmp_path / "figure.png")
-    draw(rows, knobs, tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").stat().st_size > 5000

@@ -8,15 +8,6 @@ from hypothesis import strategies as st
 
 from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras
 from nrfgs_lab.scenes.geometry import CAMERA, FIRST_SOLID, GROUND, SKY, Box, Sphere, World
-from nrfgs_lab.scenes.shading import (
-    Ambient,
-    Finish,
-    fresnel,
-    ggx_lobe,
-    highlight,
-    mean_fresnel,
-    tone_curve,
-)
 
 SPHERE = Sphere((0.3, -0.2, 0.7), 0.7)
 BOX = Box((-0.9, 0.8, 0.5), (0.3, 0.4, 0.5), yaw=0.6)
@@ -104,126 +95,6 @@ def test_first_hit_is_the_nearest_surface_and_the_world_is_closed():
     np.testing.assert_allclose(t, distance, atol=1e-6)
 
 
-def test_surface_that_is_left_is_skipped():
-    points = np.array([[0.3, -0.2, 1.4]]).T  # the top of the sphere
-    down = np.array([[0.0, 0.0, -1.0]]).T
-    _, surface = WORLD.first_hit(points, down, np.array([FIRST_SOLID]))
-    assert surface[0] == GROUND
-    _, surface = WORLD.first_hit(np.array([[3.0, 0.0, 0.0]]).T, down, np.array([GROUND]))
-    assert surface[0] == SKY
-
-
-def test_shadow_is_full_through_the_middle_none_in_the_open_and_soft_between():
-    lamp = np.array([0.3, -0.2, 5.0])
-    points = np.array([[0.3, -0.2, 0.0], [4.0, 4.0, 0.0]] + [[0.3 + x, -0.2, 0.0] for x in np.linspace(0.0, 1.2, 50)])
-    towards = lamp - points
-    distance = np.linalg.norm(towards, axis=1)
-
-    def share(distances, surface=GROUND):
-        rays = points.T, (towards / distance[:, None]).T
-        return WORLD.shadow(*rays, distances, np.full(len(points), surface), softness=0.35)
-
-    blocked, open_, *rim = share(distance)
-    assert blocked == rim[0] == 0.0 and open_ == rim[-1] == 1.0
-    assert (np.diff(rim) >= 0.0).all() and ((np.array(rim) > 0.05) & (np.array(rim) < 0.95)).any()
-    # The sphere does not shade itself, nor does what lies behind the lamp: it touches the ground at the first point.
-    assert share(distance, surface=FIRST_SOLID)[0] == 1.0
-    assert share(np.full(len(points), 1e-3))[0] > 1.0 - 3e-5
-
-
-def test_openness_is_the_unblocked_share_of_cosine_weighted_directions():
-    ball = Sphere((0.8, 0.3, 1.6), 0.6)  # wholly above the horizon of the points, where the formula is exact
-    world = World(sky_radius=10.0, solids=(ball,))
-    point = np.array([[0.1, 0.0, 0.0]]).T
-    up = np.array([[0.0, 0.0, 1.0]]).T
-    rng = np.random.default_rng(0)
-    count = 200_000
-    height, azimuth = np.sqrt(rng.uniform(size=count)), rng.uniform(0, 2 * np.pi, count)  # density cos / pi
-    across = np.sqrt(1.0 - height**2)
-    directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height])
-    enter, leave = ball.interval(np.broadcast_to(point, directions.shape), directions)
-    blocked = (enter < leave).mean()
-    assert 0.05 < blocked < 0.3
-    # Standard error sqrt(p (1 - p) / n) < 0.5 / sqrt(2e5) = 1.1e-3; five of them.
-    assert world.openness(point, up, np.array([GROUND]))[0] == pytest.approx(1.0 - blocked, abs=5.6e-3)
-
-
-def hemisphere(polar_steps=2000, azimuth_steps=64):
-    """Midpoint rule over the upper hemisphere: directions [3, N] and solid angles [N] that sum to 2 pi."""
-    # Midpoints in u with cos = 1 - u^2 crowd towards the pole, where narrow lobes live; |d cos / d u| = 2 u.
-    u = (np.arange(polar_steps) + 0.5) / polar_steps
-    azimuth = 2 * np.pi * (np.arange(azimuth_steps) + 0.5) / azimuth_steps
-    u, azimuth = (a.ravel() for a in np.meshgrid(u, azimuth, indexing="ij"))
-    height = 1.0 - u * u
-    across = np.sqrt(1.0 - height**2)
-    weight = 2.0 * u * (2 * np.pi) / (polar_steps * azimuth_steps)
-    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height]), weight
-
-
-def test_mean_fresnel_is_the_cosine_weighted_mean():
-    directions, weight = hemisphere()
-    f0 = np.array([[0.04], [0.5], [1.0]])
-    mean = (fresnel(f0, directions[2]) * directions[2] * weight).sum(axis=1) / np.pi
-    # The midpoint rule with 2000 steps errs by about (1 / 2000)^2 times second derivatives of order 10.
-    np.testing.assert_allclose([mean_fresnel(value) for value in f0[:, 0]], mean, atol=1e-5)
-
-
-@pytest.mark.parametrize("tilt", [0.0, 0.7, 1.5, 3.0])
-def test_ambient_irradiance_is_the_integral_of_its_radiance(tilt):
-    ambient = Ambient(below=(0.1, 0.4, 0.2), above=(0.5, 0.3, 0.2))
-    directions, weight = hemisphere(400, 256)
-    # Turn the hemisphere about the y axis, so that its pole is the normal.
-    c, s = np.cos(tilt), np.sin(tilt)
-    height = -s * directions[0] + c * directions[2]
-    below, above = np.array(ambient.below)[:, None], np.array(ambient.above)[:, None]
-    radiance = 0.5 * (below + above) + 0.5 * (above - below) * height
-    integral = (radiance * directions[2] * weight).sum(axis=1)
-    normal = np.array([[s], [0.0], [c]])
-    np.testing.assert_allclose(ambient.irradiance(normal)[:, 0], integral, rtol=1e-4)  # midpoint rule, (1 / 400)^2 x 10
-
-
-@pytest.mark.parametrize("roughness", [0.14, 0.3, 1.0])
-def test_ggx_microfacets_cover_the_surface_once(roughness):
-    """Projected areas of the microfacets add up to the surface: integral of D (n.h) over directions = 1."""
-    directions, weight = hemisphere()
-    one = np.ones_like(weight)
-    # With n.l = n.v = 1 the visibility term is 0.5 / (2 (1 - a) + 2 a) = 1/4, which leaves D.
-    distribution = 4.0 * ggx_lobe(one, one, directions[2], roughness)
-    assert (distribution * directions[2] * weight).sum() == pytest.approx(1.0, abs=1e-4)
-
-
-@pytest.mark.parametrize("roughness", [0.14, 0.3])
-@pytest.mark.parametrize("view_angle", [0.0, 0.8, 1.4])
-def test_rough_lobe_reflects_no_more_than_arrives(roughness, view_angle):
-    """A perfectly reflecting rough metal (F = 1) under uniform light of radiance 1 sends at most 1 to any viewer."""
-    directions, weight = hemisphere(1000, 256)
-    finish = Finish(f0=(1.0, 1.0, 1.0), roughness=roughness, mirror=0.0)
-    normals = np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), directions.shape)
-    viewer = np.broadcast_to(np.array([[np.sin(view_angle)], [0.0], [np.cos(view_angle)]]), directions.shape)
-    out = (highlight(finish, normals, directions, viewer) * weight).sum(axis=1)
-    # Hammon's visibility exceeds Smith's by at most some 2 % near grazing, and the grid resolves the lobe to 1 %.
-    assert (out < 1.03).all()
-    assert (out > 0.5).all()
-
-
-def test_highlight_is_reciprocal_and_dark_from_behind():
-    rng = np.random.default_rng(0)
-    a, b = (v / np.linalg.norm(v, axis=0) for v in rng.normal(size=(2, 3, 200)))
-    a[2], b[2] = np.abs(a[2]), np.abs(b[2])
-    normals = np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), a.shape)
-    finish = Finish(f0=(0.2, 0.5, 0.9), roughness=0.3, mirror=0.0)
-    there, back = highlight(finish, normals, a, b) / a[2], highlight(finish, normals, b, a) / b[2]
-    np.testing.assert_allclose(there, back, rtol=1e-9)
-    np.testing.assert_array_equal(highlight(finish, -normals, a, b), 0.0)
-
-
-@given(st.floats(0.0, 10.0), st.floats(1e-3, 10.0))
-def test_tone_curve_grows_and_never_clips(radiance, more):
-    """The scene's radiance stays below 10; exp(-20) is still far above double precision's last bit."""
-    low, high = tone_curve(np.array([radiance, radiance + more]))
-    assert 0.0 <= low < high < 1.0
-
-
 SMALL = dict(views=12, width=40, height=30)
 
 
@@ -269,59 +140,6 @@ def test_view_dependence_grows_with_gloss():
     assert variances[0] < 1e-30  # the mean of equal numbers may differ from them by rounding: (1e-16)^2
     assert (np.diff(variances) > 0.0).all()
     assert variances[1] > 1e-5
-
-
-def test_sky_and_floor_are_never_glossy():
-    scene = build_scene(SceneConfig(gloss=1.0, **SMALL))
-    points, surfaces = surface_points(scene)
-    matt = surfaces < FIRST_SOLID
-    a, b = (scene.outgoing_radiance(points, surfaces, v) for v in views_above(scene, points, surfaces, 2))
-    np.testing.assert_array_equal(a[matt], b[matt])
-    assert (np.abs(a[~matt] - b[~matt]).max(axis=1) > 1e-6).mean() > 0.95
-
-
-def test_radiance_is_outgoing_radiance_of_the_first_hit():
-    scene = build_scene(SceneConfig(gloss=0.7, **SMALL))
-    origins, directions = (a.astype(np.float64) for a in _image_rays(scene.config))
-    points, surfaces = scene.first_hit(origins, directions)
-    np.testing.assert_allclose(
-        scene.radiance(origins, 3.0 * directions), scene.outgoing_radiance(points, surfaces, -directions), rtol=1e-9
-    )
-
-
-def test_single_precision_is_enough():
-    scene = build_scene(SceneConfig(**SMALL))
-    origins, directions = _image_rays(scene.config)
-    single = scene.radiance(origins, directions)
-    double = scene.radiance(origins.astype(np.float64), directions.astype(np.float64))
-    assert single.dtype == np.float32 and np.isfinite(single).all() and (single >= 0.0).all()
-    # A ray at an object's edge may hit in one precision and miss in the other; all others agree far below 1/255.
-    assert (np.abs(single - double).max(axis=1) < 5e-4).mean() > 0.995
-
-
-@pytest.mark.parametrize("studio", [False, True])
-def test_no_surface_reflects_more_than_arrives(studio):
-    scene = build_scene(SceneConfig(studio=studio))
-    rng = np.random.default_rng(0)
-    local = rng.uniform(-1.0, 1.0, size=(3, 20_000))
-    assert 0.0 <= scene.floor(10 * local, scene.noises[GROUND]).min()
-    assert scene.floor(10 * local, scene.noises[GROUND]).max() <= 1.0
-    for item, noise in zip(scene.objects, scene.noises[FIRST_SOLID:], strict=True):
-        specular = mean_fresnel(max(item.finish.f0))
-        diffuse = (1.0 - specular) * item.paint(local, noise)
-        assert diffuse.min() >= 0.0 and diffuse.max() + specular <= 1.0
-
-
-def test_seed_changes_the_textures_and_nothing_else():
-    a, b = (build_scene(SceneConfig(seed=seed, **SMALL)) for seed in (0, 1))
-    origins, directions = _image_rays(a.config)
-    assert (a.objects, a.lamps) == (b.objects, b.lamps)
-    assert np.abs(a.radiance(origins, directions) - b.radiance(origins, directions)).mean() > 1e-3
-
-
-def _image_rays(config):
-    xs, ys = np.meshgrid(np.arange(config.width) + 0.5, np.arange(config.height) + 0.5)
-    return camera_rays(config, dome_cameras(config)[5], np.stack([xs, ys], axis=-1).reshape(-1, 2))
 
 
 @pytest.mark.parametrize("studio", [False, True])
