@@ -33,16 +33,3 @@ def test_what_is_no_lattice_coordinate():
     features.sum().backward()
     assert features[2:4].isnan().all()
     assert torch.isfinite(features[[0, 1, 4]]).all() and torch.isfinite(x.grad[[0, 1, 4]]).all()
-
-
-def test_memory_is_that_of_features_and_gradients():
-    """No rows, weights or corners' features: those of PyTorch's path are [M, 4, 8] and [M, 4, 8, 4]."""
-    grid, _ = grids("cuda", **PAPER)
-    x = torch.rand(500_000, 3, device="cuda", requires_grad=True)
-    grid(x[:1])
-    torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
-    interpolate(grid, x).sum().backward()
-    # Features, and their gradient made dense; the gradients of positions and of the table; 4 MiB of crumbs.
-    limit = 4 * (2 * len(x) * grid.width + x.numel() + grid.table.numel()) + 2**22
-    assert torch.cuda.max_memory_allocated() - before <= limit

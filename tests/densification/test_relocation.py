@@ -51,14 +51,6 @@ def test_copies_show_a_residual_as_the_one_did_if_it_is_on_the_logit(opacity, co
         assert errors["straight-through"] > 5 * errors["logit"]
 
 
-def test_the_example_of_docs_opacity_md():
-    stored = torch.tensor([0.05, split_evenly(torch.tensor([0.05]), torch.ones(1, 3), torch.tensor([20]))[0].item()])
-    for bound, before, after, half_a_digit in (("straight-through", 0.20, 0.96, 5e-3), ("logit", 0.088, 0.089, 5e-4)):
-        one, each = bounded_opacity(torch.logit(stored)[:, None], torch.ones(2, 1), 0.15, bound)[:, 0].tolist()
-        assert one == pytest.approx(before, abs=half_a_digit)
-        assert 1 - (1 - each) ** 20 == pytest.approx(after, abs=half_a_digit)
-
-
 def test_more_copies_than_the_limit_count_as_the_limit():
     one = split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([51]))
     many = split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([1000]))

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 
 from nrfgs_ns.data.views import distinct_places
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 
 NRFGS = {
@@ -104,8 +103,3 @@ def test_evaluation_sees_no_noise(tiny_scene, tmp_path, no_cuda):
 
     assert torch.equal(*pictures(training=False))
     assert not torch.equal(*pictures(training=True))
-
-
-def test_a_negative_length_is_refused(tiny_scene, tmp_path, no_cuda):
-    with pytest.raises(InputError, match="view_noise is -1"):
-        set_up(command_line("nrfgs", tiny_scene, tmp_path, 1, {"--pipeline.model.view-noise": -1}))
