@@ -26,7 +26,7 @@ sys.argv = ["nrfgs", *sys.argv[1:]]
 try:
     entrypoint()
 finally:
-    heavy = {"torch", "nerfstudio", "gsplat"} & set(sys.modules)
+    heavy = {"torch", "nerfstudio", "gsplat", "cv2", "pycolmap"} & set(sys.modules)
     assert not heavy, heavy
 """
 
@@ -52,6 +52,7 @@ def test_the_list_has_every_command_and_its_first_sentence(tmp_path):
         (["xyz"], "There are bench, demo, eval"),
         (["eval"], "no folder outputs here"),
         (["view", "."], "no config.yml in this folder or below"),
+        (["prepare", "nowhere", "out"], "no such folder or video"),
         (["export", "ply", "--load-config", "nowhere", "--output", "x.ply"], "nowhere: no such file or folder"),
         (["export", "web", "nowhere", "--output", "x.html"], "nowhere: no such file or folder"),
     ],
