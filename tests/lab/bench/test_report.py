@@ -33,6 +33,12 @@ def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=
     }
 
 
+def test_what_is_no_number_is_not_there():
+    rows = [Row("s", "a", "own", {1: record(float("nan"))}).fill(), Row("s", "b", "own", {1: record(30.0)}).fill()]
+    assert rows[0].text(PSNR) == "-" and ranks(rows, PSNR) == {}
+    assert "nan" not in markdown(rows)
+
+
 def test_ranks_share_and_skip():
     group = [Row("s", str(i), "own", {1: record(psnr)}).fill() for i, psnr in enumerate([20.0, 21.004, 21.001, 19.0])]
     assert ranks(group, PSNR) == {0: 2, 1: 1, 2: 1}

@@ -164,6 +164,22 @@ def test_depth_is_in_the_unit_of_the_data(trained, tiny_scene):
         method.close()
 
 
+def test_masks_transparency_and_the_background(tiny_scene):
+    dataset = read(tiny_scene, "train")
+    alpha = np.full((36, 48, 1), 255, np.uint8)
+    alpha[:, :10] = 0
+    dataset["images"] = [np.concatenate([image, alpha], axis=-1) for image in dataset["images"]]
+    dataset["masks"] = [alpha[..., 0] > 0 for _ in dataset["images"]]
+    dataset["metadata"]["background_color"] = np.array([255, 255, 255], dtype=np.uint8)
+    method = Nrfgs(train_dataset=dataset, config_overrides={**OPTIONS, "pipeline.model.num_random": 10})
+    assert method.config.pipeline.model.background_color == "white"
+    _, batch = method.trainer.pipeline.datamanager.next_train(0)
+    assert batch["image"].shape == (36, 48, 4) and batch["mask"].shape == (36, 48, 1)
+    assert not batch["mask"][:, :10].any() and batch["mask"][:, 10:].all()
+    train(method, 0, 1)
+    method.close()
+
+
 def test_the_last_steps_are_averaged(tiny_scene, monkeypatch):
     """As `ns-train` does it, once nerfbaselines has made the last of the steps."""
     monkeypatch.setattr("nrfgs_ns.training.averaging.LARGEST_SHARE", 1.0)
