@@ -8,10 +8,7 @@ from fused_cases import assert_near, compare, evaluate, float32_tolerance, heads
 from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.nrf import NrfConfig
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = pytest.mark.gpu
 
 # The card's own exp, log, sqrt and division are good to 2 ULP or so each, and its three tf32 products leave 2^-21 of a
 # product instead of 2^-24: eight times the float32 that the interpreter computes.

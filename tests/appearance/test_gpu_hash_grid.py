@@ -5,10 +5,7 @@ import pytest
 import torch
 from hash_grid_cases import assert_near_twin, grids, positions
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = pytest.mark.gpu
 
 PAPER = {"levels": 4, "log2_table_size": 15, "base_resolution": 16}
 

@@ -54,8 +54,6 @@ def test_diffuse_is_gsplats_noise():
     assert_close(results[0], results[1], rtol=1e-4, atol=1e-6 * results[1].abs().max().item())
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_one_camera_is_the_kernels(monkeypatch):
     torch.manual_seed(0)
     info = {

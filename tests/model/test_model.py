@@ -190,7 +190,6 @@ def test_another_camera_than_a_pinhole_is_drawn_as_one_and_that_is_said_once(cap
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
     pinholes, gpu = Pinholes(), torch.device("cuda")
     camera = Cameras(torch.eye(4)[None, :3], fx=100.0, fy=90.0, cx=50.0, cy=31.0, width=101, height=63)[0:1].to("cuda")

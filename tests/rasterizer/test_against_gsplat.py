@@ -4,7 +4,7 @@
 from pathlib import Path
 
 import pytest
-from agreement import BOUNDS, assert_agrees, judge, needs_cuda
+from agreement import BOUNDS, assert_agrees, judge
 from gsplat_call import rasterization
 from make_gsplat_fixtures import CASES, evaluate, load, upstream
 
@@ -41,7 +41,6 @@ def test_cpu_agrees_with_gsplat(recorded, monkeypatch):
     assert (ours["radii"] - gsplat["radii"]).abs()[seen].le(1).all()
 
 
-@needs_cuda
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_gpu_back_end_agrees_with_the_twin(name):
