@@ -4,7 +4,6 @@
 import math
 
 import pytest
-import scipy.spatial
 import torch
 from hard_trainings import rescale
 from nerfstudio.cameras.cameras import Cameras
@@ -80,29 +79,6 @@ def test_a_view_that_another_one_is_does_not_count():
     far = torch.cat([ring, ring])
     far[:, :, 3] = 1e6 + 1e-3 * far[:, :, 3]
     assert different_views(far) == 44
-
-
-@pytest.mark.parametrize("kind", ["copies", "different", "one place"])
-def test_the_work_for_many_views_is_linear(monkeypatch, kind):
-    """Rows that the tree returns, a constant number for each view: not one for each pair."""
-    rows = []
-
-    class Counting(scipy.spatial.cKDTree):
-        def query_ball_point(self, *args):
-            near = super().query_ball_point(*args)
-            rows.extend(near)
-            return near
-
-    monkeypatch.setattr(scipy.spatial, "cKDTree", Counting)
-    count, generator = 5000, torch.Generator().manual_seed(0)
-    poses = torch.eye(4).repeat(count, 1, 1)
-    if kind != "copies":
-        poses[:, :3, :3] = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator)).Q
-    if kind == "different":
-        poses[:, :3, 3] = torch.randn(count, 3, generator=generator)
-    different = different_views(poses)
-    assert different == 1 if kind == "copies" else different > count / 2
-    assert len(rows) <= 4 * count
 
 
 def test_views_from_one_place_in_other_directions_count():

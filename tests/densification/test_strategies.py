@@ -209,8 +209,7 @@ def simulated(rules, table: Table, steps: range, seed: int = 0) -> list[int]:
     return sizes
 
 
-@pytest.mark.parametrize("name", ["splatfacto", "original"])
-@pytest.mark.parametrize("budget", [40, 120, 400])
+@pytest.mark.parametrize("name, budget", [("splatfacto", 40), ("original", 120), ("splatfacto", 400)])
 def test_growth_ends_at_the_budget(name, budget):
     rules = strategy(name, budget=budget)
     rules.verbose = False

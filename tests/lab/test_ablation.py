@@ -7,7 +7,7 @@ import pytest
 import torch
 import tyro
 from head_cases import awake, scene
-from short_trainings import command_line, trained
+from short_trainings import LOUD, command_line, trained
 from torch.testing import assert_close
 
 from nrfgs_lab.ablation import (
@@ -25,12 +25,6 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 SPLIT = NrfConfig(latent_dim=8, hidden_width=16)
 FLOAT32 = {"rtol": 0, "atol": 2e-5}
 """Sums of up to 60 products of numbers of order 1 to 10, rounded at 2^-24 each, behind slopes of at most 0.2."""
-LOUD = {
-    "--pipeline.model.appearance.output-init": "default",
-    "--pipeline.model.appearance.latent-dim": 6,
-    "--pipeline.model.warmup-steps": 0,
-    "--pipeline.model.few-views": "off",
-}
 
 
 def test_the_command(tiny_scene, tmp_path, capsys):

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agreement import FLOAT32, FLOAT64, assert_agrees, judge
+from agreement import BOUNDS, FLOAT32, FLOAT64, assert_agrees, devices, judge
 from gsplat_call import rasterization
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from make_gsplat_fixtures import CASES, Case, _camera, evaluate, upstream
 
+from nrfgs_ns.rasterizer import ProjectionOptions, contributions, project
 from nrfgs_ns.rasterizer.torch_cpu import batches, compositing, projection
 
 
@@ -33,6 +34,31 @@ def check(case: Case, dtype: torch.dtype = torch.float32, **limits) -> None:
 def test_hard_cases(name, dtype):
     """In float64 the same formulas with 29 bits more: what differs would be a wrong formula, not rounding."""
     check(CASES[name](), dtype)
+
+
+@devices
+@pytest.mark.parametrize("name", CASES)
+def test_contributions_to_hard_cases(name, device):
+    """The twin's gradient of the image by a colour; where a cut-off lies within rounding, a share is anything up to
+    1."""
+    case = CASES[name]()
+    projecting = ("near_plane", "far_plane", "rasterize_mode")
+    case = replace(case, options={name: value for name, value in case.options.items() if name in projecting})
+    upper, alphas = upstream(case, bounds=BOUNDS[device])  # 0 at such pixels, else +-1
+    verdict = judge(case, (upper.abs(), torch.zeros_like(alphas)), bounds=BOUNDS[device])
+
+    means, quats, scales, opacities, _, viewmats, Ks = (t.to(device) for t in case.arguments()[:-2])
+    options = ProjectionOptions(**case.options)
+    projection = project(means, quats, scales, viewmats, Ks, case.width, case.height, options)
+    shares = contributions(projection, opacities[projection.gaussian_ids])
+    assert not shares.requires_grad
+    total = torch.zeros(len(viewmats), len(means), dtype=torch.float64)
+    total[projection.camera_ids.cpu(), projection.gaussian_ids.cpu()] = shares.cpu().double()
+    free = (upper[..., 0] == 0).sum(dim=(1, 2)).double()[:, None]
+    expected, tolerance = (table["grad_colors"][..., 0] for table in (verdict.values, verdict.tolerances))
+    if case.colors.dim() == 2:
+        total, free = total.sum(dim=0), free.sum()
+    assert ((total - expected).abs() <= tolerance + free).all()
 
 
 @pytest.mark.parametrize("name", ["ordinary", "opaque_layers", "several_cameras"])
