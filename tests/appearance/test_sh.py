@@ -32,21 +32,6 @@ def test_degree_ramp_is_splatfactos():
         assert head.active_degree == degree
 
 
-def test_degree_zero_is_the_same_from_everywhere_and_colours_are_not_negative():
-    head = ShConfig(degree=3).setup()
-    head.set_step(0)
-    splats = {"means": unit(9), "opacities": torch.zeros(9, 1).double(), **head.splat_params(torch.rand(9, 3).double())}
-    splats["features_rest"] = torch.randn(9, 15, 3).double()
-    visible = torch.arange(9)
-    here = head(splats, visible, torch.tensor([3.0, 0, 0]).double())
-    assert_close(here.colors, head(splats, visible, torch.tensor([0, -2.0, 1]).double()).colors)
-    head.set_step(3000)
-    there = head(splats, visible, torch.tensor([3.0, 0, 0]).double())
-    assert not torch.allclose(here.colors, there.colors)
-    assert (there.colors >= 0).all() and (there.colors == 0).any()
-    assert_close(there.opacities, torch.full((9,), 0.5).double())
-
-
 def test_impossible_degree_is_named():
     with pytest.raises(ValueError, match="appearance.degree is 4"):
         ShConfig(degree=4).setup()

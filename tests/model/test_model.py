@@ -46,16 +46,6 @@ def first_view(pipeline):
     return pipeline.datamanager.fixed_indices_eval_dataloader[0]
 
 
-def test_a_field_that_adds_nothing_renders_its_base_colour(build):
-    pipeline = build()
-    pipeline.eval()
-    camera, _ = first_view(pipeline)
-    model = pipeline.model
-    assert torch.equal(model.get_base_color(camera), model.get_outputs_for_camera(camera)["rgb"])
-    torch.nn.init.normal_(model.head.low[-1].weight)
-    assert not torch.allclose(model.get_base_color(camera), model.get_outputs_for_camera(camera)["rgb"], atol=0.01)
-
-
 def test_the_head_sees_only_what_the_camera_sees(build, monkeypatch):
     pipeline = build()
     model = pipeline.model.eval()
