@@ -14,6 +14,7 @@ from nrfgs_lab.ablation import (
     Inspect,
     with_constant_distance,
     without_high_branch,
+    without_low_branch,
     without_opacity_residual,
 )
 from nrfgs_ns.appearance.encoding import view_geometry
@@ -65,6 +66,15 @@ def test_without_the_high_branch_its_gate_is_shut():
     shut.high[2].weight[3], shut.high[2].bias[3] = 0.0, -1e4
     assert small.head.high is None and small.bytes < whole.bytes
     assert_same(small, Field(shut, whole.splats), visible, centers, **FLOAT32)
+
+
+def test_without_the_low_branch_colours_are_the_high_ones():
+    whole, visible, centers = random_field()
+    head, splats = whole.head, whole.splats
+    small = without_low_branch(whole)
+    parts = small.head.components(splats, visible, centers)
+    assert (parts["low branch"].values == 0).all() and parts["high branch"].values.abs().max() > 1e-3
+    assert (small.head(splats, visible, centers).opacities == head(splats, visible, centers).opacities).all()
 
 
 def test_without_opacitys_residual_only_colours_change():

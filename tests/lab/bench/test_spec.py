@@ -12,7 +12,7 @@ import yaml
 from nerfstudio.utils.eval_utils import eval_setup  # noqa: F401  (registers the data parsers once, before the timing)
 from PIL import Image
 
-from nrfgs_lab.bench.data import parser_options
+from nrfgs_lab.bench.data import held_out_views, parser_options
 from nrfgs_lab.bench.spec import (
     PRESET_STEPS,
     Scene,
@@ -248,6 +248,13 @@ def test_nerfstudios_layout_without_a_split_has_every_8th_by_name(tiny_scene, tm
     file.write_text(json.dumps({**meta, "frames": meta["frames"][::-1]}))
     data = load(parser_options(tmp_path, Scene("plain"), tmp_path / "mirrors"))
     assert names_of(data.eval_dataset) == ["view_000.png", "view_008.png"]
+
+
+def test_every_eighth_is_held_out_and_more_of_few():
+    names = [f"{i:03}" for i in range(74)]
+    assert held_out_views(names, 4) == ["004", "012", "020", "028", "036", "044", "052", "060", "068"]
+    assert held_out_views(names[:17], 4) == ["004", "010", "016"]
+    assert not set(held_out_views(names[:26], 0)) & set(held_out_views(names[:26], 4))
 
 
 def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size(tiny_scene, tmp_path):
