@@ -6,17 +6,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-import torch
 from rich.console import Console
 
-from nrfgs_ns import threads
 from nrfgs_ns.cli import commands, summary
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.progress import SECONDS_BETWEEN_LINES, progress
-from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.find import NamesTraining, config_of
 
 RUN = """
@@ -26,7 +22,7 @@ sys.argv = ["nrfgs", *sys.argv[1:]]
 try:
     entrypoint()
 finally:
-    heavy = {"torch", "nerfstudio", "gsplat"} & set(sys.modules)
+    heavy = {"torch", "nerfstudio", "gsplat", "cv2", "pycolmap"} & set(sys.modules)
     assert not heavy, heavy
 """
 
@@ -52,6 +48,7 @@ def test_the_list_has_every_command_and_its_first_sentence(tmp_path):
         (["xyz"], "There are bench, demo, eval"),
         (["eval"], "no folder outputs here"),
         (["view", "."], "no config.yml in this folder or below"),
+        (["prepare", "nowhere", "out"], "no such folder or video"),
         (["export", "ply", "--load-config", "nowhere", "--output", "x.ply"], "nowhere: no such file or folder"),
         (["export", "web", "nowhere", "--output", "x.html"], "nowhere: no such file or folder"),
     ],
@@ -83,29 +80,6 @@ def test_a_training_is_named_in_any_form(tmp_path, monkeypatch, capsys):
     assert NamesTraining(load_config=older).config() == NamesTraining(older).config() == older
     with pytest.raises(InputError, match="Give one"):
         NamesTraining(older, load_config=older).config()
-
-
-def test_small_work_takes_one_thread(monkeypatch):
-    used = []
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
-    monkeypatch.setattr(torch, "set_num_threads", used.append)
-    for side, splats in ((100, 2000), (1000, 2000), (100, 10**6)):
-        sides = torch.full((3, 1), side)
-        data = SimpleNamespace(train_dataset=SimpleNamespace(cameras=Sized(sides, sides)))
-        with few_threads() as chosen:
-            chosen.suit_to(SimpleNamespace(model=SimpleNamespace(num_points=splats), datamanager=data))
-    assert used == [1, 8, 1, 8, 8, 1, 8, 8]
-    assert threads.SMALL > 160 * 120 + 6000, "the demo's scene is small"
-
-
-class Sized(SimpleNamespace):
-    """Cameras that are nothing but their sizes."""
-
-    def __init__(self, width, height):
-        super().__init__(width=width, height=height)
-
-    def __len__(self):
-        return len(self.width)
 
 
 def test_progress_is_told_in_a_log(monkeypatch):

@@ -12,7 +12,6 @@ import tyro
 from nerfstudio.configs import external_methods
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods, method_configs
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
-from nerfstudio.scripts.train import entrypoint
 
 from nrfgs_ns.appearance.gsnb import NeuralBasis
 from nrfgs_ns.appearance.nrf import NeuralResidualField
@@ -116,22 +115,6 @@ def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):
     changed = {key: ours[key] for key in ours if str(ours[key]) != str(base[key])}
     assert changed == {"method_name": name, **differs}
     assert PRESETS[name].config.pipeline.model.appearance is not nrfgs.config.pipeline.model.appearance
-
-
-def test_every_option_of_the_head_is_reachable_and_explained(monkeypatch, capsys):
-    args = ["nrfgs", "--pipeline.model.appearance.latent-dim", "16", "--pipeline.model.appearance.split-bands", "False"]
-    appearance = tyro.cli(AnnotatedBaseConfigUnion, args=args).pipeline.model.appearance
-    assert (appearance.latent_dim, appearance.split_bands) == (16, False)
-    monkeypatch.setattr(sys, "argv", ["ns-train", "nrfgs", "--help"])
-    with pytest.raises(SystemExit) as ended:
-        entrypoint()
-    assert not ended.value.code
-    plain = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for field in fields(nrfgs.config.pipeline.model.appearance):
-        if not field.name.startswith("_"):
-            assert f"--pipeline.model.appearance.{field.name.replace('_', '-')}" in plain
-    assert "numbers in a splat's latent" in plain
-    assert "--pipeline.model.sh-degree" not in plain, "the head's degree, and splatfacto's that does nothing"
 
 
 def test_nerfstudio_still_knows_who_asks_for_an_external_method(capsys):

@@ -4,7 +4,7 @@
 import os
 import subprocess
 import sys
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -27,31 +27,13 @@ def test_it_is_the_last_line_and_the_status_1(debug):
 
 def test_writers_do_not_meet(tmp_path):
     """Four writers and a reader: nobody fails, and what is read is what one of them wrote."""
-    file, faults, done = tmp_path / "table.md", [], threading.Event()
-    texts = [letter * 200_000 for letter in "abcd"]
+    file, texts = tmp_path / "table.md", [letter * 200_000 for letter in "abcd"]
     write_whole(file, texts[0])
-
-    def write(text: str) -> None:
-        try:
-            for _ in range(30):
-                write_whole(file, text)
-        except OSError as error:
-            faults.append(error)
-
-    def read() -> None:
-        while not done.is_set():
-            if file.read_text() not in texts:
-                faults.append("torn")
-
-    reader = threading.Thread(target=read)
-    writers = [threading.Thread(target=write, args=(text,)) for text in texts]
-    for thread in (reader, *writers):
-        thread.start()
-    for thread in writers:
-        thread.join()
-    done.set()
-    reader.join()
-    assert faults == [] and [path.name for path in tmp_path.iterdir()] == ["table.md"]
+    with ThreadPoolExecutor() as pool:
+        writers = [pool.submit(lambda text=text: [write_whole(file, text) for _ in range(30)]) for text in texts]
+        while not all(writer.done() for writer in writers):
+            assert file.read_text() in texts, "torn"
+    assert all(writer.result() for writer in writers) and [path.name for path in tmp_path.iterdir()] == ["table.md"]
 
 
 def test_a_write_that_fails_leaves_the_older_file(tmp_path):

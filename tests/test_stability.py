@@ -3,17 +3,11 @@
 
 import ast
 import json
-import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
-from hard_trainings import SCENE, hard_trainings, run
-from PIL import Image
-from plyfile import PlyData
+from hard_trainings import hard_trainings, run
 from stability_catalogue import CATALOGUE
-
-from nrfgs_lab.scenes import write_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -33,32 +27,6 @@ def test_the_record_has_every_hard_training_and_all_ended_finite():
     runs = json.loads((ROOT / "results" / "stability.json").read_text())["records"]["trainings"]["runs"]
     assert set(runs) == {training.name for training in hard_trainings()}
     assert all(one["finite"] for seeds in runs.values() for one in seeds.values())
-
-
-def test_data_sets_of_the_hard_trainings_differ_as_they_say(tmp_path):
-    edits = {training.name: training.edit for training in hard_trainings()}
-    scene = write_scene(SCENE, tmp_path / "plain")
-
-    def edited(name):
-        folder = shutil.copytree(scene, tmp_path / name.replace(" ", "_"))
-        edits[name](folder)
-        return folder, json.loads((folder / "transforms.json").read_text())
-
-    folder, meta = edited("nrfgs, unit x 1000, auto-scaling on")
-    plain = json.loads((scene / "transforms.json").read_text())
-    before, after = (np.array([frame["transform_matrix"] for frame in each["frames"]]) for each in (plain, meta))
-    before[:, :3, 3] *= 1000
-    assert np.allclose(before, after)
-    points = [PlyData.read(str(f / "sparse.ply"))["vertex"]["x"] for f in (scene, folder)]
-    assert np.allclose(points[1], 1000 * points[0], rtol=1e-6)
-    folder, _ = edited("white images")
-    assert all((np.array(Image.open(path)) == 255).all() for path in (folder / "images").glob("*.png"))
-    _, meta = edited("one image")
-    assert len(meta["frames"]) == len(meta["train_filenames"]) == 1
-    folder, meta = edited("two identical images")
-    first, second = meta["frames"]
-    assert first["transform_matrix"] == second["transform_matrix"]
-    assert (folder / first["file_path"]).read_bytes() == (folder / second["file_path"]).read_bytes()
 
 
 HARD = [training for training in hard_trainings() if training.method == "nrfgs"]

@@ -30,10 +30,5 @@ def scene(head: AppearanceHead, count: int = 11, dtype: torch.dtype = torch.floa
     return splats, visible, 6 * rand(len(visible), 3) - 3
 
 
-def numbers_per_splat(head: AppearanceHead) -> int:
-    """Numbers that a splat stores for its colour."""
-    return sum(value[0].numel() for value in head.splat_params(torch.rand(2, 3)).values())
-
-
 def shared_weights(module: torch.nn.Module) -> int:
     return sum(weights.numel() for weights in module.parameters())

@@ -5,7 +5,6 @@ import pytest
 import torch
 from fused_cases import heads, scene
 
-from nrfgs_ns.appearance.fused.packing import pack
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.errors import InputError
 
@@ -34,14 +33,3 @@ def test_demanding_the_impossible_names_the_reason(interpreted, dtype, sizes, re
     splats, visible, centers = scene(head, 20, 15)
     with pytest.raises(InputError, match=f"implementation is 'fused', but {reason}.*auto or torch"):
         head({**splats, "latents": splats["latents"].to(dtype)}, visible, centers)
-
-
-@pytest.mark.parametrize("config", [{}, {"split_bands": False}, {"num_bands": 1}, {"num_bands": 5, "latent_dim": 7}])
-def test_packing_places_every_weight_once(config):
-    head = NrfConfig(**config).setup()
-    branches = [branch for branch in (head.low, head.high) if branch is not None]
-    layout = pack(head.config.latent_dim, head.config.num_bands, head.config.use_distance, branches)
-    weights = sum(parameter.numel() for parameter in head.parameters())
-    positions, counts = layout.gather.unique(return_counts=True)
-    assert torch.equal(positions[:weights], torch.arange(weights)) and (counts[:weights] == 1).all()
-    assert torch.equal(layout.gather[layout.scatter], torch.arange(weights))

@@ -71,23 +71,23 @@ POSE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]
 LONG = "x" * 300
 
 FIELDS = {
-    "fl_x": (1e38, 1e-30, True, None, [10.0], 10**400),
+    "fl_x": (0.0, 1e38, 1e-30, "long", True, None, [10.0], 10**400),
     "fl_y": (0.8,),
     "cx": (1e30,),
     "cy": (math.nan,),
     "w": (1e300, -12, None),
-    "camera_model": ("EQUIRECTANGULAR", "FISHEYE624", ["OPENCV"], None, {}, "opencv", LONG),
+    "camera_model": ("PINE", "EQUIRECTANGULAR", "FISHEYE624", ["OPENCV"], None, {}, "opencv", LONG),
     "orientation_override": ("sideways", None, [], 3),
     "ply_file_path": (None, 3, [], {}, True, "", ".", "no.ply", "\0", "\ud800", LONG, "/dev/zero", "images/000.png"),
     "distortion_params": ([0.1, 0.2, 0.3], [math.nan] * 6, "abc", {}, None, 0.1, [[0.0] * 6], ["x"] * 6, [0.0] * 12),
-    "k1": (1e10, -1e5, -5.0, None, [0.1]),  # -5 folds the image
+    "k1": (math.inf, 1e10, -1e5, -5.0, None, [0.1]),  # -5 folds the image
     "k4": (0.1,),
     "k6": (0.1,),
     "is_fisheye": (True,),
-    "applied_transform": (None, [], "x", [[math.nan] * 4] * 3, POSE),
-    "applied_scale": (None, "x", math.nan, math.inf, -1, [], 10**400),
-    "frames": (None, {}, 3, "x", [None], [[]], [{}]),
-    "train_filenames": (None, {}, 3, [[]], [1], [None], ["\0"], [LONG], "images/000.png"),
+    "applied_transform": (None, [], [[1, 0], [0]], "x", [[math.nan] * 4] * 3, POSE),
+    "applied_scale": (0, None, "x", math.nan, math.inf, -1, [], 10**400),
+    "frames": ([], None, {}, 3, "x", [None], [[]], [{}]),
+    "train_filenames": ([], None, {}, 3, [[]], [1], [None], ["\0"], [LONG], "images/000.png"),
 }
 OF_A_FRAME = {
     "file_path": (None, 7, [], "", ".", "images", "\0", LONG, "\ud800", "a\nb\x1b[2J", "/dev/zero", "x/" * 5000),
@@ -98,16 +98,21 @@ OF_A_FRAME = {
     "camera_model": ("OPENCV_FISHEYE",),
     "w": (13,),
 }
+NAMES = {"distortion_params": "distortion", "k1": "distortion", "file_path": "path"}
+"""Of fields that messages call otherwise."""
 
 
 def fields(values: dict, frame: int | None = None) -> list[Case]:
-    """Other values of a field at the top level, or of one frame."""
+    """Other values of a field at the top level, or of one frame, which the message must name."""
 
     def case(key: str, value) -> Case:
         def change(capture: Capture) -> None:
             (capture.meta if frame is None else capture.meta["frames"][frame])[key] = value
 
-        return broken(f"{key} {ascii(value)[:30]}{'' if frame is None else ' of one frame'}", change)
+        says = "transforms.json", NAMES.get(key, key), *(["006.png"] if frame == 3 and "path" not in key else [])
+        return broken(f"{key} {ascii(value)[:30]}{'' if frame is None else ' of one frame'}", change)._replace(
+            says=says
+        )
 
     return [case(key, value) for key, them in values.items() for value in them]
 

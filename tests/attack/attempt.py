@@ -43,6 +43,8 @@ class Case(NamedTuple):
     """Writes the input into an empty folder; returns what reads it as a user's command would."""
     hostile: bool = True
     """It must be refused; otherwise it may be read as well."""
+    says: tuple[str, ...] = ()
+    """What the message must name."""
 
 
 class Outcome(NamedTuple):

@@ -24,8 +24,9 @@ AREAS = {area.AREA: area for area in areas()}
 @pytest.mark.parametrize("area", AREAS)
 def test_every_input_of_the_list(area):
     cases = AREAS[area].CASES
-    outcomes = zip(cases, attempts(cases), strict=True)
+    outcomes = list(zip(cases, attempts(cases), strict=True))
     assert not {case.name: outcome for case, outcome in outcomes if outcome.kind not in GOOD}
+    assert not {case.name: outcome for case, outcome in outcomes if not all(word in outcome.said for word in case.says)}
 
 
 @pytest.mark.parametrize("area", AREAS)

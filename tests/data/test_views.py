@@ -4,11 +4,10 @@
 import math
 
 import pytest
-import scipy.spatial
 import torch
 from hard_trainings import rescale
 from nerfstudio.cameras.cameras import Cameras
-from short_trainings import set_up
+from short_trainings import command_line, set_up
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -82,29 +81,6 @@ def test_a_view_that_another_one_is_does_not_count():
     assert different_views(far) == 44
 
 
-@pytest.mark.parametrize("kind", ["copies", "different", "one place"])
-def test_the_work_for_many_views_is_linear(monkeypatch, kind):
-    """Rows that the tree returns, a constant number for each view: not one for each pair."""
-    rows = []
-
-    class Counting(scipy.spatial.cKDTree):
-        def query_ball_point(self, *args):
-            near = super().query_ball_point(*args)
-            rows.extend(near)
-            return near
-
-    monkeypatch.setattr(scipy.spatial, "cKDTree", Counting)
-    count, generator = 5000, torch.Generator().manual_seed(0)
-    poses = torch.eye(4).repeat(count, 1, 1)
-    if kind != "copies":
-        poses[:, :3, :3] = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator)).Q
-    if kind == "different":
-        poses[:, :3, 3] = torch.randn(count, 3, generator=generator)
-    different = different_views(poses)
-    assert different == 1 if kind == "copies" else different > count / 2
-    assert len(rows) <= 4 * count
-
-
 def test_views_from_one_place_in_other_directions_count():
     ring = ring_of_poses(44)
     assert different_views(torch.cat([ring, ring_of_poses(44, outwards=True)])) == 88
@@ -133,14 +109,13 @@ def test_a_head_sees_the_same_in_any_unit(config, unit):
         assert (ours - theirs).abs().max() < 1e-5
 
 
-def first_step(folder, factor, out, *options):
+def first_step(folder, factor, out, densification):
     """A trainer after backward of step 0 on one small scene, every length times `factor`, auto-scaling off."""
     write_scene(SceneConfig(views=8, width=32, height=24, points=150, samples=1), folder)
     rescale(folder, factor)
-    args = ["nrfgs", "--output-dir", str(out), "--vis", "tensorboard", "--pipeline.model.num-downscales", "0"]
-    args += ["--pipeline.model.background-color", "black", "--pipeline.model.appearance.output-init", "default"]
-    args += [*options, "nrfgs-data", "--data", str(folder), "--auto-scale-poses", "False"]
-    trainer = set_up(args)
+    plain = {"--pipeline.model.num-downscales": 0, "--pipeline.model.background-color": "black"}
+    plain |= {"--pipeline.model.appearance.output-init": "default", "--pipeline.model.densification": densification}
+    trainer = set_up([*command_line("nrfgs", folder, out, 1, plain), "nrfgs-data", "--auto-scale-poses", "False"])
     model = trainer.pipeline.model
     model.step_cb(trainer.optimizers, 0)
     outputs, losses, _ = trainer.pipeline.get_train_loss_dict(0)
@@ -153,9 +128,9 @@ def first_step(folder, factor, out, *options):
 def test_a_step_without_auto_scaling_is_the_same_in_any_unit(strategy, factor, tmp_path):
     """Powers of two are exact: what differs is the rounding of log-scales and log distances, 2^-20 of what they scale,
     some ten layers deep."""
-    options = ["--pipeline.model.densification", "mcmc,budget=200" if strategy == "mcmc" else strategy]
-    base, base_rgb, base_loss = first_step(tmp_path / "one", 1.0, tmp_path / "out", *options)
-    other, rgb, loss = first_step(tmp_path / "other", factor, tmp_path / "out", *options)
+    densification = "mcmc,budget=200" if strategy == "mcmc" else strategy
+    base, base_rgb, base_loss = first_step(tmp_path / "one", 1.0, tmp_path / "out", densification)
+    other, rgb, loss = first_step(tmp_path / "other", factor, tmp_path / "out", densification)
     assert base_rgb.std() > 0.01
     # A contribution at the cut-off of 1/255 may come or go with the rounding.
     assert ((rgb - base_rgb).abs() > 1e-4).float().mean() < 0.01

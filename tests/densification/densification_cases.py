@@ -130,11 +130,3 @@ def one_step(trainer, step: int) -> dict:
             for callback in trainer.callbacks:
                 callback.run_callback_at_location(step, where)
     return losses
-
-
-def tensors(tree, prefix="") -> dict:
-    """The tensors of a checkpoint's part, by path."""
-    if isinstance(tree, torch.Tensor):
-        return {prefix: tree}
-    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, (list, tuple)) else ()
-    return {path: leaf for key, value in items for path, leaf in tensors(value, f"{prefix}/{key}").items()}

@@ -22,6 +22,15 @@ def rules(**options):
     return strategy
 
 
+def refine(table: Table, strategy, step: int = 600, gradient: float = 0.0, shown=0.5, absgrad=None, **changed) -> None:
+    """One step. `shown` is the opacity of all splats or of each, and `changed` are other entries of `info`."""
+    info = table.info(gradient) | changed
+    if absgrad is not None:
+        info["means2d"].absgrad = absgrad
+    strategy.pre_backward(step, info, torch.as_tensor(shown).expand(len(table)), table.splats["opacities"])
+    strategy.post_backward(step, info, table.splats, table.optimizers)
+
+
 def errors(size: int, scale: float = 1.0, views: int = 2, cameras_at_once: bool = False) -> torch.Tensor:
     """The statistic of twelve splats after so many views of `size` pixels of a scene that is `scale` times as large."""
     generator = torch.Generator().manual_seed(3)
@@ -140,11 +149,8 @@ def test_a_share_of_the_candidates_is_split_and_the_dead_are_replaced():
     table, strategy = Table(40), rules(threshold=0.01)
     for row in range(4):
         table.set_opacity(row, 0.001)
-    info = table.info()
-    info["means2d"].absgrad = torch.zeros(40, 2)
-    info["means2d"].absgrad[20:] = 1.0
-    strategy.pre_backward(0, info, torch.sigmoid(table.splats["opacities"]).flatten(), table.splats["opacities"])
-    strategy.post_backward(600, info, table.splats, table.optimizers)
+    stored = torch.sigmoid(table.splats["opacities"].detach()).flatten()
+    refine(table, strategy, shown=stored, absgrad=(torch.arange(40) >= 20).float()[:, None].repeat(1, 2))
     table.check()
     assert len(table) == 40 + round(SHARE * 20) - 4
     assert set(table.splats["latents"][:4, 0].long().tolist()) <= set(range(4, 40))
@@ -159,19 +165,14 @@ def test_the_shown_opacity_decides_what_is_dead():
     shown = torch.full((10,), 0.3)
     shown[4:] = 0.001
     shown[9] = 0.9
-    info = table.info()
-    strategy.pre_backward(0, info, shown, table.splats["opacities"])
-    strategy.post_backward(600, info, table.splats, table.optimizers)
+    refine(table, strategy, shown=shown)
     assert table.splats["latents"][:4, 0].long().tolist() == [0, 1, 2, 3]
     assert set(table.splats["latents"][:, 0].long().tolist()) <= {0, 1, 2, 3, 9}
 
 
 def test_wide_splats_are_split_whatever_their_error():
     table, strategy = Table(10), rules(threshold=10.0)
-    info = table.info()
-    info["radii"][7] = 80
-    strategy.pre_backward(0, info, torch.full((10,), 0.5), table.splats["opacities"])
-    strategy.post_backward(600, info, table.splats, table.optimizers)
+    refine(table, strategy, radii=torch.where(torch.arange(10) == 7, 80, 1))
     assert len(table) == 11
     assert table.splats["latents"][10, 0] == 7 and table.splats["scales"][7, 0].exp().item() < 0.001
 
@@ -182,10 +183,7 @@ def test_a_budget_decides_how_many_splats_there_are_when_growth_ends(budget):
     table, strategy = Table(40), rules(budget=budget)
     counts = []
     for step in range(0, 16_000, 200):
-        info = table.info()
-        strategy.pre_backward(step, info, torch.full((len(table),), 0.5), table.splats["opacities"])
-        info["means2d"].absgrad = torch.rand(len(table), 2) * 1e-6
-        strategy.post_backward(step, info, table.splats, table.optimizers)
+        refine(table, strategy, step, absgrad=torch.rand(len(table), 2) * 1e-6)
         counts.append(len(table))
     assert counts == sorted(counts)
     assert counts[-1] == max(budget, 40)
@@ -196,9 +194,7 @@ def test_opacities_decay_less_and_less():
     for step in (600, 15_000, 24_800):
         table, strategy = Table(5), rules()
         strategy.state[WIDTH] = torch.full((5,), 0.5)
-        info = table.info()
-        strategy.pre_backward(step, info, torch.full((5,), 0.5), table.splats["opacities"])
-        strategy.post_backward(step, info, table.splats, table.optimizers)
+        refine(table, strategy, step)
         taken.append(0.5 - torch.sigmoid(table.splats["opacities"][0]).item())
     assert taken == pytest.approx([DECAY * (1 - step / 30_000) for step in (600, 15_000, 24_800)], abs=1e-6)
 
@@ -211,7 +207,5 @@ def test_a_budget_above_the_cap_is_refused():
 def test_growth_ends_at_the_cap_and_in_time():
     for step, options, count in ((600, {"most_splats": 43}, 43), (15_000, {}, 40), (25_000, {}, 40)):
         table, strategy = Table(40), rules(**options)
-        info = table.info(1.0)
-        strategy.pre_backward(step, info, torch.full((40,), 0.5), table.splats["opacities"])
-        strategy.post_backward(step, info, table.splats, table.optimizers)
+        refine(table, strategy, step, gradient=1.0)
         assert len(table) == count

@@ -180,19 +180,6 @@ def test_what_views_have_shown_is_forgotten_after_the_last_relocation_too():
     assert moved == {step: step >= 25_200 for step in moved}
 
 
-def test_checkpoints_of_older_versions_start_anew():
-    """They hold the largest opacities, not changes, under names of their own."""
-    table = Table(50)
-    rules = strategy("mcmc", budget=50)
-    rules.load_state({"peak": torch.rand(50), "peak_before": torch.rand(50)}, torch.device("cpu"))
-    logits = table.splats["opacities"]
-    assert torch.equal(rules.seen_opacity(logits), torch.sigmoid(logits.detach().flatten()))
-    assert not {"peak", "peak_before"} & rules.state.keys()
-    table.step(rules, REFINES, shown=0.7)
-    table.step(rules, REFINES + 100, shown=0.7)
-    assert len(table) == 50
-
-
 def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
     """MCMC: the cameras' mean of (what they show, else the stored opacity) over all splats, and its gradients."""
     rules = strategy("mcmc")

@@ -6,7 +6,6 @@ import torch
 from densification_cases import Table
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.nrf import bounded_opacity
 from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate, split_evenly
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -29,34 +28,6 @@ def test_copies_have_the_opacity_and_the_mass_of_the_one(opacity, copies):
         blended = 1 - (1 - each * torch.exp(-0.5 * (x * width / scale[0, axis]) ** 2)) ** copies
         alone = opacity * torch.exp(-0.5 * x**2)
         assert_close(torch.trapezoid(blended, x), torch.trapezoid(alone, x), rtol=5e-6, atol=0)
-
-
-@pytest.mark.parametrize("opacity", [0.05, 0.2, 0.5, 0.8])
-@pytest.mark.parametrize("copies", [2, 5, 20])
-@pytest.mark.parametrize("residual", [-1.0, 1.0])
-def test_copies_show_a_residual_as_the_one_did_if_it_is_on_the_logit(opacity, copies, residual):
-    def shown(stored, bound):
-        return bounded_opacity(torch.logit(stored)[:, None], torch.full((1, 1), residual), 0.15, bound)[:, 0]
-
-    one = torch.tensor([opacity])
-    each, _ = split_evenly(one, torch.ones(1, 3), torch.tensor([copies]))
-    errors = {
-        bound: (1 - (1 - shown(each, bound)) ** copies - shown(one, bound)).abs().item()
-        for bound in ("logit", "straight-through")
-    }
-    # Odds are multiplied by exp(0.6 t), so that many copies together show 1 - (1 - o)^exp(0.6 t). That is farthest from
-    # the one, by 0.100, for o = 0.8 and t = -1; 20 copies are a little nearer.
-    assert errors["logit"] < 0.1
-    if residual > 0 and opacity < 0.5:
-        assert errors["straight-through"] > 5 * errors["logit"]
-
-
-def test_the_example_of_docs_opacity_md():
-    stored = torch.tensor([0.05, split_evenly(torch.tensor([0.05]), torch.ones(1, 3), torch.tensor([20]))[0].item()])
-    for bound, before, after, half_a_digit in (("straight-through", 0.20, 0.96, 5e-3), ("logit", 0.088, 0.089, 5e-4)):
-        one, each = bounded_opacity(torch.logit(stored)[:, None], torch.ones(2, 1), 0.15, bound)[:, 0].tolist()
-        assert one == pytest.approx(before, abs=half_a_digit)
-        assert 1 - (1 - each) ** 20 == pytest.approx(after, abs=half_a_digit)
 
 
 def test_more_copies_than_the_limit_count_as_the_limit():

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from short_trainings import command_line
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
 from nrfgs_ns.distributed import launch
@@ -107,20 +108,14 @@ def workers(parent: int) -> list[int]:
 def endless(tiny_scene, tmp_path):
     """A training on two CPU processes that lasts longer than anybody waits, once it has written a checkpoint."""
     options = {
-        "--data": tiny_scene,
-        "--output-dir": tmp_path,
         "--machine.num-devices": 2,
         "--machine.device-type": "cpu",
-        "--max-num-iterations": 100_000,
         "--steps-per-save": 10,
-        "--vis": "tensorboard",
-        "--steps-per-eval-image": 0,
-        "--steps-per-eval-all-images": 0,
         "--pipeline.model.densification": "splatfacto,stop_split_at=0",
     }
-    words = [str(word) for option in options.items() for word in option]
+    words = command_line("nrfgs", tiny_scene, tmp_path, 100_000, options)
     process = subprocess.Popen(
-        [sys.executable, "-m", "nrfgs_ns.distributed.launch", "nrfgs", *words],
+        [sys.executable, "-m", "nrfgs_ns.distributed.launch", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

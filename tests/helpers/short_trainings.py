@@ -21,6 +21,18 @@ QUIET = {
     "--pipeline.model.dense-start": "off",
 }
 """No viewer, no tables on the console, no evaluation within a thousand steps, no plane sweep, which takes seconds."""
+REFINING = {
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4",
+}
+"""Full size, and a refinement at every fourth step."""
+LOUD = {
+    "--pipeline.model.appearance.output-init": "default",
+    "--pipeline.model.appearance.latent-dim": 6,
+    "--pipeline.model.warmup-steps": 0,
+    "--pipeline.model.few-views": "off",
+}
+"""A small field that says something before it is trained."""
 
 
 def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict[str, Any]) -> list[str]:

@@ -9,10 +9,7 @@ from nrfgs_ns.image import ssim as module
 from nrfgs_ns.image.metrics import SSIM_C2
 from nrfgs_ns.image.ssim import photometric_loss
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = pytest.mark.gpu
 
 
 @pytest.fixture(autouse=True)

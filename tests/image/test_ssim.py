@@ -5,7 +5,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pytorch_msssim import SSIM
 from ssim_cases import MOMENT_ROUNDINGS, TOLERANCE, ULP, assert_near, pair, reference
 
 from nrfgs_ns.image.metrics import SSIM_C2
@@ -47,21 +46,6 @@ def test_flat_images_in_float32(value):
     assert loss.abs() <= FLAT
     # Slopes are at most 2 / C2; the gradient is made of three of them, which cancel except for their relative errors.
     assert (prediction.grad * 3 * 20 * 30).abs().max() <= 3 * 2 / SSIM_C2 * FLAT
-
-
-def test_nearly_flat_images_lose_no_more_than_the_library():
-    generator = torch.Generator().manual_seed(3)
-    truth = 0.9 + 1e-3 * torch.randn(60, 50, 3, generator=generator)
-    prediction = (truth + 1e-3 * torch.randn(60, 50, 3, generator=generator)).requires_grad_()
-    loss = photometric_loss(prediction, truth, 1.0)
-    expected, gradient = reference(prediction, truth, 1.0)
-    assert (loss - expected).abs() <= FLAT
-    ours = (torch.autograd.grad(loss, prediction)[0] - gradient).abs().max()
-    library = prediction.detach().requires_grad_()
-    images = (image.permute(2, 0, 1)[None] for image in (library, truth))
-    (1 - SSIM(data_range=1.0, size_average=True, channel=3)(*images)).backward()
-    # Both round the same sums in another order; neither error is more than a draw from the same distribution.
-    assert ours <= 3 * (library.grad - gradient).abs().max()
 
 
 def test_black_against_white():

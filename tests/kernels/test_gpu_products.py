@@ -24,10 +24,7 @@ from nrfgs_ns.viewer.pictures import (
     picture,
 )
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels"),
-]
+pytestmark = pytest.mark.gpu
 FROZEN = "full, as seen from another camera"
 STEPS = 60
 

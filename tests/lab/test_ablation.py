@@ -7,19 +7,18 @@ import pytest
 import torch
 import tyro
 from head_cases import awake, scene
-from short_trainings import command_line, trained
+from short_trainings import LOUD, command_line, trained
 from torch.testing import assert_close
 
 from nrfgs_lab.ablation import (
     Inspect,
-    diffuse_last,
     with_constant_distance,
     without_high_branch,
     without_low_branch,
     without_opacity_residual,
 )
 from nrfgs_ns.appearance.encoding import view_geometry
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.errors import InputError
 
@@ -27,12 +26,6 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 SPLIT = NrfConfig(latent_dim=8, hidden_width=16)
 FLOAT32 = {"rtol": 0, "atol": 2e-5}
 """Sums of up to 60 products of numbers of order 1 to 10, rounded at 2^-24 each, behind slopes of at most 0.2."""
-LOUD = {
-    "--pipeline.model.appearance.output-init": "default",
-    "--pipeline.model.appearance.latent-dim": 6,
-    "--pipeline.model.warmup-steps": 0,
-    "--pipeline.model.few-views": "off",
-}
 
 
 def test_the_command(tiny_scene, tmp_path, capsys):
@@ -49,15 +42,6 @@ def test_the_command(tiny_scene, tmp_path, capsys):
     assert "can be left out together" in capsys.readouterr().out
     with pytest.raises(InputError, match="0 of 2 test views"):
         tyro.cli(Inspect, args=["--load-config", str(config), "--views", "0"]).main()
-
-
-def test_the_head_is_timed_with_diffuse_splats_last():
-    """The fused kernels save the network of whole blocks: in the order of an untrained mask they would have none."""
-    splats = {DIFFUSE: torch.arange(60) % 5 < 2}
-    visible = torch.arange(0, 60, 2)
-    rows = diffuse_last(splats, visible)
-    assert torch.equal(rows.sort().values, visible) and (splats[DIFFUSE][rows].int().diff() >= 0).all()
-    assert diffuse_last({}, visible) is visible
 
 
 def random_field(config: NrfConfig = SPLIT):

@@ -6,22 +6,17 @@ import shutil
 
 import pytest
 import torch
-from short_trainings import checkpoint_of, command_line, models_of, set_up, trained
+from short_trainings import REFINING, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import ErrorGuided, Mcmc, Splatfacto
 from nrfgs_ns.model.loss import shrinkage
 
-QUICK = {
-    "--pipeline.model.num-downscales": 0,
-    "--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4",
-}
-
 
 def ready(scene, out, steps, *options):
     """A trainer before its first step."""
-    return set_up(command_line("nrfgs", scene, out, steps, QUICK, *options))
+    return set_up(command_line("nrfgs", scene, out, steps, REFINING, *options))
 
 
 def test_the_fewer_the_views_the_less_the_head_is_trusted(tiny_scene, tmp_path, no_cuda, capsys):
@@ -63,7 +58,7 @@ def test_copies_of_photographs_raise_no_trust(twice, tiny_scene, tmp_path, no_cu
 
 
 def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_cuda):
-    config = trained(command_line("nrfgs", twice, tmp_path / "new", 2, QUICK))
+    config = trained(command_line("nrfgs", twice, tmp_path / "new", 2, REFINING))
     again = ready(twice, tmp_path / "again", 4, {"--load-dir": models_of(config)}).pipeline.model
     trust = 8 / 28
     assert again.num_views == 8 and again.trust == trust
@@ -73,7 +68,7 @@ def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_c
 
 def test_nothing_is_drawn_before_half_the_nearest_depth(tiny_scene, tmp_path, no_cuda):
     """A checkpoint keeps the plane of its training."""
-    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "new", 2, QUICK))
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "new", 2, REFINING))
     state = checkpoint_of(config)["pipeline"]["_model._extra_state"]
     model = ready(tiny_scene, tmp_path / "on", 4, {"--load-dir": models_of(config)}).pipeline.model
     assert model.projection_options.near_plane == model.near == state["near"] > 0.01 * model.scene_unit
@@ -83,7 +78,7 @@ def test_nothing_is_drawn_before_half_the_nearest_depth(tiny_scene, tmp_path, no
 
 def test_mcmc_has_residuals_on_the_logit(tiny_scene, tmp_path, no_cuda, capsys):
     mcmc = {"--pipeline.model.densification": "mcmc,warmup_length=2,refine_every=4,budget=300"}
-    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "mcmc", 3, QUICK, mcmc))
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path / "mcmc", 3, REFINING, mcmc))
     assert "view dependence reduced" in capsys.readouterr().out
     again = ready(tiny_scene, tmp_path / "again", 4, mcmc, {"--load-dir": models_of(config)}).pipeline.model
     assert again.head.config == NrfConfig(opacity_scale=8 / 28 * 0.2, opacity_bound="logit")
@@ -93,12 +88,6 @@ def test_mcmc_has_residuals_on_the_logit(tiny_scene, tmp_path, no_cuda, capsys):
     assert ready(tiny_scene, tmp_path / "other", 1).pipeline.model.head.config.bound == "straight-through"
     alone = NrfConfig(opacity_residual=False)
     assert alone.for_copies() == alone.trusted(0.5) == alone
-
-
-def test_more_points_than_mcmc_may_have_are_told(tiny_scene, tmp_path, no_cuda, capsys):
-    mcmc = {"--pipeline.model.densification": "mcmc,budget=299"}
-    ready(tiny_scene, tmp_path, 1, mcmc)
-    assert "budget is 299, but the training begins with 300 points" in capsys.readouterr().out
 
 
 def test_a_checkpoint_keeps_its_head_whatever_the_number_of_views(tiny_scene, tmp_path, no_cuda):

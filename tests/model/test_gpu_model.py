@@ -10,10 +10,7 @@ from torch.testing import assert_close
 from nrfgs_lab.training_run import evaluate, parse, train
 from nrfgs_ns.appearance.sh import eval_sh
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels"),
-]
+pytestmark = pytest.mark.gpu
 
 
 @pytest.mark.parametrize("degree", range(4))

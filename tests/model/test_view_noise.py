@@ -7,16 +7,10 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+from short_trainings import REFINING, assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 
 from nrfgs_ns.data.views import distinct_places
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
-
-NRFGS = {
-    "--pipeline.model.num-downscales": 0,
-    "--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4",
-}
 
 
 def ring(count: int, radius: float = 1.0) -> torch.Tensor:
@@ -74,7 +68,7 @@ def test_noise_is_the_steps_and_the_seeds_alone():
 
 def test_training_on_is_the_unbroken_training_to_the_bit(tiny_scene, tmp_path, no_cuda):
     def train(name, steps, *more):
-        return trained(command_line("nrfgs", tiny_scene, tmp_path / name, steps, NRFGS, *more))
+        return trained(command_line("nrfgs", tiny_scene, tmp_path / name, steps, REFINING, *more))
 
     whole = checkpoint_of(train("whole", 8))
     rest = checkpoint_of(train("rest", 8, {"--load-dir": models_of(train("half", 4))}))
@@ -85,7 +79,7 @@ def test_training_on_is_the_unbroken_training_to_the_bit(tiny_scene, tmp_path, n
 
 
 def test_evaluation_sees_no_noise(tiny_scene, tmp_path, no_cuda):
-    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, 1, NRFGS))
+    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, 1, REFINING))
     model = trainer.pipeline.model
     camera = trainer.pipeline.datamanager.eval_dataset.cameras[:1]
     with torch.no_grad():
@@ -104,8 +98,3 @@ def test_evaluation_sees_no_noise(tiny_scene, tmp_path, no_cuda):
 
     assert torch.equal(*pictures(training=False))
     assert not torch.equal(*pictures(training=True))
-
-
-def test_a_negative_length_is_refused(tiny_scene, tmp_path, no_cuda):
-    with pytest.raises(InputError, match="view_noise is -1"):
-        set_up(command_line("nrfgs", tiny_scene, tmp_path, 1, {"--pipeline.model.view-noise": -1}))

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fast path against the float64 twin: values, gradients, absgrad, over the hard cases and over random scenes."""
+"""The fast path, gsplat's recorded results and the float64 twin: any two agree up to rounding, in values, gradients
+and absgrad, over the hard cases and over random scenes."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
-from agreement import FLOAT32, FLOAT64, assert_agrees, judge
+from agreement import BOUNDS, FLOAT32, FLOAT64, assert_agrees, devices, judge
 from gsplat_call import rasterization
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from make_gsplat_fixtures import CASES, Case, _camera, evaluate, upstream
+from make_gsplat_fixtures import CASES, Case, _camera, evaluate, load, upstream
 
+from nrfgs_ns.rasterizer import ProjectionOptions, contributions, project
 from nrfgs_ns.rasterizer.torch_cpu import batches, compositing, projection
 
 
@@ -33,6 +36,31 @@ def check(case: Case, dtype: torch.dtype = torch.float32, **limits) -> None:
 def test_hard_cases(name, dtype):
     """In float64 the same formulas with 29 bits more: what differs would be a wrong formula, not rounding."""
     check(CASES[name](), dtype)
+
+
+@devices
+@pytest.mark.parametrize("name", CASES)
+def test_contributions_to_hard_cases(name, device):
+    """The twin's gradient of the image by a colour; where a cut-off lies within rounding, a share is anything up to
+    1."""
+    case = CASES[name]()
+    projecting = ("near_plane", "far_plane", "rasterize_mode")
+    case = replace(case, options={name: value for name, value in case.options.items() if name in projecting})
+    upper, alphas = upstream(case, bounds=BOUNDS[device])  # 0 at such pixels, else +-1
+    verdict = judge(case, (upper.abs(), torch.zeros_like(alphas)), bounds=BOUNDS[device])
+
+    means, quats, scales, opacities, _, viewmats, Ks = (t.to(device) for t in case.arguments()[:-2])
+    options = ProjectionOptions(**case.options)
+    projection = project(means, quats, scales, viewmats, Ks, case.width, case.height, options)
+    shares = contributions(projection, opacities[projection.gaussian_ids])
+    assert not shares.requires_grad
+    total = torch.zeros(len(viewmats), len(means), dtype=torch.float64)
+    total[projection.camera_ids.cpu(), projection.gaussian_ids.cpu()] = shares.cpu().double()
+    free = (upper[..., 0] == 0).sum(dim=(1, 2)).double()[:, None]
+    expected, tolerance = (table["grad_colors"][..., 0] for table in (verdict.values, verdict.tolerances))
+    if case.colors.dim() == 2:
+        total, free = total.sum(dim=0), free.sum()
+    assert ((total - expected).abs() <= tolerance + free).all()
 
 
 @pytest.mark.parametrize("name", ["ordinary", "opaque_layers", "several_cameras"])
@@ -108,3 +136,44 @@ def test_random_scenes(dtype, case):
 def test_many_random_scenes(case, dtype):
     """New scenes every time: the search, where the two above are the regression test."""
     check(case, dtype)
+
+
+# gsplat.
+
+RECORDED = Path(__file__).resolve().parents[1] / "fixtures" / "gsplat.npz"
+DENSE_FLOOR = 0.01
+"""`MIN_DISCRIMINANT` of gsplat 1.4's dense kernel, which made the records."""
+
+
+@pytest.fixture(scope="module", params=sorted(CASES))
+def recorded(request):
+    case, grads, gsplat = load(RECORDED, request.param)
+    return case, grads, gsplat, judge(case, grads, floor=DENSE_FLOOR)
+
+
+def test_gsplat_agrees_with_the_twin(recorded):
+    """The twin is what the CPU rasterizer is tested by everywhere else: gsplat itself must satisfy it."""
+    _, _, gsplat, verdict = recorded
+    assert_agrees(verdict, gsplat)
+
+
+def test_cpu_agrees_with_gsplat(recorded, monkeypatch):
+    """Both lie within the twin's tolerance, so they are within twice of each other."""
+    case, grads, gsplat, verdict = recorded
+    monkeypatch.setattr(projection, "MIN_DISCRIMINANT", DENSE_FLOOR)
+    ours = evaluate(rasterization, case, grads, "cpu", packed=False)
+    assert_agrees(verdict, ours)
+    for name, tolerance in verdict.tolerances.items():
+        difference = (ours[name].double() - gsplat[name].double()).abs()
+        seen = verdict.visible if name in ("means2d", "depths", "conics") else ...
+        assert (difference <= 2 * tolerance)[seen].all(), name
+    seen = verdict.visible
+    assert (ours["radii"] - gsplat["radii"]).abs()[seen].le(1).all()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_gpu_back_end_agrees_with_the_twin(name):
+    case, bounds = CASES[name](), BOUNDS["cuda"]
+    grads = upstream(case, bounds=bounds)
+    assert_agrees(judge(case, grads, bounds=bounds), evaluate(rasterization, case, grads, "cuda", packed=False))

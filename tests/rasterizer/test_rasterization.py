@@ -99,25 +99,6 @@ def test_hidden_splats_cost_nothing(monkeypatch):
     assert looked_at == [(1, batches.SLAB)]  # tiles, splats
 
 
-def test_threads_widen_the_batches_and_change_nothing(monkeypatch):
-    """With three threads a batch has three times the tiles; a tile's arithmetic is its own, in any company."""
-    monkeypatch.setattr(batches, "BATCH_ELEMENTS", 64 * (batches.SLAB + 1) * 5)
-    widest = []
-    batch = compositing.Batch
-    monkeypatch.setattr(compositing, "Batch", lambda *a: widest[-1].append(len(a[0])) or batch(*a))
-    case, images = CASES["opaque_layers"](), []
-    before = torch.get_num_threads()
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            widest.append([])
-            images.append(rasterization(*case.arguments(), **case.options)[0])
-    finally:
-        torch.set_num_threads(before)
-    assert max(widest[0]) == 5 and max(widest[1]) == 15
-    torch.testing.assert_close(images[0], images[1], rtol=1e-6, atol=1e-6)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("size", ["200000x1600x1200", "200000x800x600"])
 def test_peak_memory_is_bounded(size):

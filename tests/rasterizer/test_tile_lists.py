@@ -10,7 +10,6 @@ from nrfgs_ns.rasterizer import ProjectionOptions, composite, project
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 class TestOnCuda:
     def test_tiles_list_what_draws_in_them(self):
         from nrfgs_ns.rasterizer.tile_lists import tile_lists

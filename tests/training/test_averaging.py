@@ -56,21 +56,6 @@ def trainer(ready) -> NrfgsTrainer:
     return ready
 
 
-def test_mean_of_known_numbers():
-    parameter, mean = torch.nn.Parameter(torch.zeros(2)), ParameterMean()
-    optimizers = {"means": torch.optim.Adam([parameter])}
-    mean.install()
-    assert parameter.tolist() == [0.0, 0.0]  # there is none yet
-    for numbers in ([1.0, 3e38], [2.0, 3e38], [6.0, 3e38]):  # whose sum float32 does not hold
-        parameter.data.copy_(torch.tensor(numbers))
-        mean.add(optimizers)
-    assert mean.count == 3 and parameter.tolist() == [6.0, torch.tensor(3e38).item()]
-    mean.install()
-    # Three roundings of numbers up to 6, and of numbers up to 3e38.
-    assert_close(parameter.detach(), torch.tensor([3.0, 3e38]), rtol=1e-6, atol=0.0)
-    assert mean.count == 0
-
-
 def relocated(model, optimizers):
     dead = torch.arange(len(model.means)) < 3
     relocation.relocate(model.gauss_params, optimizers.optimizers, dead, 0.005)

@@ -293,17 +293,6 @@ def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, 
         assert capsys.readouterr().out.splitlines() == [f"nrfgs on {tiny_scene}"]
 
 
-def test_only_who_needs_the_advice_gets_it(tiny_scene, tmp_path, capsys):
-    """A long training on a CPU; not one that follows the advice."""
-    for steps, more, advised in ((0, {}, True), (0, {"--time-budget": 10}, False)):
-        ready(tiny_scene, tmp_path / str(advised), more, steps=steps)
-        said = capsys.readouterr().out
-        assert ("A result in ten minutes: nrfgs-fast, --time-budget 10 and " in said) == advised
-        assert "opacity_scale" not in said and "trusted" not in said
-    notes = next(tmp_path.rglob("choices.txt")).read_text()
-    assert "8 training views" in notes and "opacity_scale 0.057" in notes
-
-
 # Signals and states, without a training.
 
 

@@ -195,7 +195,6 @@ def test_weights_that_overflow_stop_the_training(start):
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat's kernels")
 @pytest.mark.parametrize(("name", "value"), [("means", NAN), ("latents", INF), ("loss", NAN)])
 def test_on_a_gpu(start, name, value):
     """The verdict stays on the device; parameters and moments are those of before, and training goes on."""

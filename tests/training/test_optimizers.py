@@ -13,7 +13,6 @@ from nrfgs_ns.training.optimizers import LeanOptimizers, step_at_once
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_all_tensors_in_one_kernel_step_as_torchs():
     """Forty tensors, small and large, and a step that is skipped on the device. The twin is not fused: torch's fused
     Adam takes 1 - beta2^step in float32, 3e-5 off in the first steps."""

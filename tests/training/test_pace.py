@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils.eval_utils import eval_setup
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+from short_trainings import REFINING, assert_same_training, checkpoint_of, command_line, models_of, trained
 
 from nrfgs_lab.training_run import parse, train
 from nrfgs_ns.errors import InputError
@@ -206,12 +206,6 @@ def test_they_are_for_one_device(option, tiny_scene, tmp_path):
         parse(options(tiny_scene, tmp_path, "nrfgs", 5, {option: 5})).setup(local_rank=0, world_size=2)
 
 
-SMALL = {
-    "--pipeline.model.num-downscales": 0,
-    "--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4",
-}
-
-
 def test_what_is_left_open_is_chosen_and_what_is_given_stays():
     few_and_many = {1: 10_000, 83: 10_000, 84: 10_080, 250: 30_000, 5000: 30_000}
     assert {views: steps_for(views) for views in few_and_many} == few_and_many
@@ -236,7 +230,7 @@ def test_the_chosen_steps_are_made_and_a_training_goes_on_to_their_end(
             monkeypatch.setattr(module, name, value)
 
     def train_on(name, steps, *more):
-        return trained(command_line("nrfgs", tiny_scene, tmp_path / name, steps, SMALL, *more))
+        return trained(command_line("nrfgs", tiny_scene, tmp_path / name, steps, REFINING, *more))
 
     whole = train_on("whole", 0, {"--steps-per-save": 5})
     assert "8 training views: 12 steps, view dependence reduced" in " ".join(capsys.readouterr().out.split())

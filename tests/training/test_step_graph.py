@@ -16,11 +16,6 @@ from nrfgs_ns.training.photographs import compare_photographs
 from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs
 
 
-def gpu(test):
-    """Mark a test, or a class of tests, that needs a CUDA device and gsplat's kernels."""
-    return pytest.mark.gpu(pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")(test))
-
-
 @pytest.fixture
 def build(tiny_scene, tmp_path):
     """The pipeline of a training on a device, at full resolution, and its graphs."""
@@ -110,7 +105,7 @@ def test_what_is_not_recorded_is_said_once(build, option, capsys, monkeypatch):
     assert capsys.readouterr().out.count("not recorded") == 1
 
 
-@gpu
+@pytest.mark.gpu
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-best"])
 @pytest.mark.parametrize("step", [10, 100, 20_000], ids=["head rests", "growing", "at rest"])
 class TestOnCuda:
@@ -138,7 +133,7 @@ class TestOnCuda:
         assert not graphs._given_up
 
 
-@gpu
+@pytest.mark.gpu
 def test_a_photographs_exposure_is_learnt_the_same(build):
     pipeline, graphs = build("cuda", "nrfgs", "--pipeline.model.photographs", "on")
     with torch.no_grad():
@@ -150,7 +145,7 @@ def test_a_photographs_exposure_is_learnt_the_same(build):
         assert_same(recorded(pipeline, graphs, 100 + view, view), expected)
 
 
-@gpu
+@pytest.mark.gpu
 def test_each_photograph_has_its_mask(build):
     pipeline, graphs = build("cuda", "nrfgs")
     height, width = pipeline.datamanager.train_view(0)[1]["image"].shape[:2]
@@ -162,7 +157,7 @@ def test_each_photograph_has_its_mask(build):
     assert (expected[0] - eager(pipeline, 105, 5)[0]).abs() > 1e-3
 
 
-@gpu
+@pytest.mark.gpu
 def test_a_training_learns_the_same(tiny_scene, tmp_path, monkeypatch):
     """With refinements, resets and three resolutions on the way."""
     psnr = []
@@ -182,7 +177,7 @@ def tried(model) -> dict[str, set]:
     return {gate.what: set(gate) for gate in (*gates, model.head.fused.ready) if gate}
 
 
-@gpu
+@pytest.mark.gpu
 def test_no_kernel_is_left_to_the_first_steps(tiny_scene, tmp_path):
     trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, 3))
     before = tried(trainer.pipeline.model)
@@ -191,7 +186,7 @@ def test_no_kernel_is_left_to_the_first_steps(tiny_scene, tmp_path):
     assert tried(trainer.pipeline.model) == before
 
 
-@gpu
+@pytest.mark.gpu
 def test_photographs_are_compared_without_memory_that_stays():
     """cuBLAS keeps 32 MiB of an H100 for each thread that multiplies matrices."""
     cameras = Cameras(torch.eye(4)[:3].repeat(8, 1, 1), 30.0, 30.0, 16.0, 16.0, 32, 32)

@@ -6,12 +6,10 @@
 Pictures are compared as the screen shows them. The viewer sends PNG here, so that what looks the same is the same.
 """
 
-import json
 import re
 import time
 from itertools import combinations
 
-import numpy as np
 import pytest
 
 from nrfgs_lab.pages.browser import CHROMIUM, PATIENCE, TRAIN, VIEWER, Page, Served, chromium, different
@@ -101,26 +99,6 @@ def test_every_mode_of_a_running_training(browser, training):
     while page.step() <= at_pause + 30:
         assert time.time() < deadline and training[0].process.poll() is None, "training did not go on"
         time.sleep(0.5)
-    page.page.close()
-
-
-def test_a_camera_path_from_the_render_tab(browser, training, tiny_scene):
-    """Two views and a loop become the file that ns-render reads."""
-    page = Page(browser, training[0].port)
-    page.page.get_by_role("tab", name="Render").click()
-    page.page.get_by_role("button", name="Add Keyframe").click()
-    for _ in range(2):
-        page.turn()
-        page.page.get_by_role("button", name="Add Keyframe").click()
-    page.control("Loop").check()
-    page.page.get_by_role("button", name="Generate Command").click()
-    page.page.get_by_text("ns-render camera-path").wait_for()
-    (path,) = (tiny_scene / "camera_paths").glob("*.json")
-    frames = json.loads(path.read_text())["camera_path"]
-    places = np.array([frame["camera_to_world"] for frame in frames]).reshape(-1, 4, 4)[:, :3, 3]
-    assert len(frames) > 30 and np.isfinite(places).all()
-    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    assert 0 < steps.max() < 0.2 * np.ptp(places, axis=0).max(), "a smooth path"
     page.page.close()
 
 

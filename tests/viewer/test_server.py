@@ -7,13 +7,11 @@ import os
 import socket
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 
 import msgspec
 import psutil
 import pytest
 from nerfstudio.configs.base_config import ViewerConfig
-from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.viewer.viewer import Viewer
 from short_trainings import command_line, set_up, trained
 from viser._messages import ResetGuiMessage, ViewerCameraMessage
@@ -311,30 +309,6 @@ def test_a_camera_path_is_saved_in_its_folder(to_all):
     handle = to_all.viser_server.gui._gui_input_handle_from_id[name]
     send(to_all.viser_server.get_port(), [update(handle, "../../../a\\bc")], lambda: "a_b" in handle.value)
     assert handle.value == ".._.._.._a_bc"
-
-
-def test_ns_viewer_listens_to_this_machine_alone(config, monkeypatch, interface):
-    """Its own main function, with its own default of 0.0.0.0."""
-    opened = []
-
-    def viewer(*args, **more):
-        opened.append(Viewer(*args, **more))
-        return opened[-1]
-
-    def look(_):
-        port = opened[0].viser_server.get_port()
-        assert reachable("127.0.0.1", port) and not reachable(interface, port)
-        assert answer("127.0.0.1", port, "/")[0] == 200
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(run_viewer, "ViewerState", viewer)
-    monkeypatch.setattr(run_viewer, "time", SimpleNamespace(sleep=look))
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            run_viewer.RunViewer(config).main()
-    finally:
-        for one in opened:
-            one.viser_server.stop()
 
 
 def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):

@@ -26,7 +26,7 @@ from viser.transforms import SO3
 
 import nrfgs_ns.training.trainer
 from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import SplatAppearance, base_colors
+from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.densification import Splatfacto
@@ -229,9 +229,8 @@ class Browser(RenderStateMachine):
         return thread.outputs
 
 
-@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])
-def test_every_output_can_be_shown(build, open_viewer, method):
-    viewer = open_viewer(build(method))
+def test_every_output_can_be_shown(build, open_viewer):
+    viewer = open_viewer(build())
     model, pose = viewer.pipeline.model, two_cameras(viewer.pipeline)[0].camera_to_worlds[0]
     model.train()
     for mode in model.viewer_panel.legends:
@@ -411,16 +410,6 @@ def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):
         panel.render(camera)
     assert panel.count.value == f"{pipeline.model.num_points:,}"
     assert not lock.locked()
-
-
-def test_base_class_shows_what_forward_adds():
-    head = ShConfig(degree=1).setup()
-    splats = {"means": torch.zeros(4, 3), "opacities": torch.zeros(4, 1), **head.splat_params(torch.full((4, 3), 0.5))}
-    splats["features_rest"] = torch.full((4, 3, 3), 0.1)
-    visible, center = torch.tensor([1, 3]), torch.tensor([0.0, 0.0, 2.0])
-    (component,) = head.components(splats, visible, center).values()
-    added = head(splats, visible, center).colors - base_colors(splats["features_dc"][visible])
-    assert component.kind == "color" and torch.equal(component.values, added) and added.abs().max() > 0.01
 
 
 def test_a_browser_begins_at_the_first_photograph(build):

@@ -226,19 +226,6 @@ def test_flags_have_precedence_over_the_file(tmp_path):
         bench_in(tmp_path, text, runs=("A", "B")).chosen()
 
 
-def test_time_that_is_up_leaves_the_rest_for_the_next_call(fake, capsys):
-    behave(fake, **{"NRF-own-scene-1": "hangs"})
-
-    class Clock:
-        sleep, monotonic = staticmethod(time.sleep), staticmethod(lambda: 0.0 if not hung.exists() else 61.0)
-
-    hung = fake / "work" / "NRF-own-scene-1" / "pid"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench, "time", Clock)
-        bench_in(fake, minutes=1.0).main()
-    assert [name for name, _ in ran(fake)] == ALL[:1] and "3 runs are left" in capsys.readouterr().err
-
-
 def test_a_plan_with_knobs_reports_the_trade(fake):
     """A knob or a single setting is chosen by its name; the default is always there."""
     knobs = "default: nrfgs\nscenes: [scene]\nseeds: [1, 2]\nsteps: 100\n"

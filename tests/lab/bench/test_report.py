@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables and crops from hand-made records."""
+"""Tables, crops, a front and prices from hand-made records; and noise is called noise."""
 
 import json
-import shutil
+import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
+from scipy.stats import t as student
 
-from nrfgs_lab.bench import crops
-from nrfgs_lab.bench.crops import crop_sheet, crop_side, largest_disagreement, numbered
-from nrfgs_lab.bench.report import pictures_of, report
+from nrfgs_lab.bench.report import report
 from nrfgs_lab.bench.spec import cells_of, identity, make_spec
-from nrfgs_lab.bench.table import BY_NAME, COLUMNS, Row, markdown, ranks, with_averages
+from nrfgs_lab.bench.table import BY_NAME, Row, markdown, ranks, with_averages
+from nrfgs_lab.bench.trade import Change, changes, noise_bound, pareto_front, pooled_deviation, price
 from nrfgs_lab.results import pack, unpack
+from nrfgs_ns.errors import InputError
 
 PSNR = BY_NAME["PSNR"]
 
@@ -35,38 +38,6 @@ def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=
     }
 
 
-def rows():
-    """Two scenes, two runs; NRF's second seed on the second scene failed."""
-    return [
-        Row("s", "SH", "mcmc", {1: record(30.0, train=31.0), 2: record(31.0, train=33.0)}).fill(),
-        Row("s", "NRF", "mcmc", {1: record(32.0, splats=500), 2: record(34.0, splats=700)}).fill(),
-        Row("t_1", "SH", "mcmc", {1: record(20.0), 2: record(22.0)}).fill(),
-        Row("t_1", "NRF", "mcmc", {1: record(21.0)}, {2: "FAILED"}).fill(),
-    ]
-
-
-def test_markdown():
-    """By hand: means, sample deviations |a - b| / sqrt(2), best bold, second in italics, averages seed by seed."""
-    lines = markdown(with_averages(rows())).splitlines()
-    psnr = [column.name for column in COLUMNS].index("PSNR")
-    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    assert table[0][: 4 + 3] == ["scene", "run", "strategy", "seeds", "splats", "time s", "SSIM"]
-    body = {(line[0], line[1]): line for line in table[2:]}
-    assert body["s", "SH"][4 + psnr] == "_30.50 ± 0.71_"
-    assert body["s", "NRF"][4 + psnr] == "**33.00 ± 1.41**"
-    assert body["s", "NRF"][4] == "**600 ± 141**" and body["s", "SH"][4] == "_1,000 ± 0_"
-    # Equal as written: no ranking.
-    assert body["s", "SH"][6] == body["s", "NRF"][6] == "0.9000 ± 0.0000"
-    assert (
-        body["s", "SH"][-1] == "1.50 ± 0.71" and body["s", "SH"][-2] == "32.00 ± 1.41" and body["s", "NRF"][-1] == "-"
-    )
-    assert body["t_1", "NRF"][3] == "1 (1 FAILED)" and body["t_1", "NRF"][4 + psnr] == "21.00"
-    assert body["average", "SH"][4 + psnr] == "_25.75 ± 1.06_"  # (30 + 20) / 2 and (31 + 22) / 2
-    assert body["average", "NRF"][3] == "1 (1 FAILED)" and body["average", "NRF"][4 + psnr] == "**26.50**"
-    assert any("Made on: a card, torch 2.11." in line for line in lines)
-    assert body["s", "SH"][8] == "-", "LPIPS was not measured"
-
-
 def test_what_is_no_number_is_not_there():
     rows = [Row("s", "a", "own", {1: record(float("nan"))}).fill(), Row("s", "b", "own", {1: record(30.0)}).fill()]
     assert rows[0].text(PSNR) == "-" and ranks(rows, PSNR) == {}
@@ -77,23 +48,6 @@ def test_ranks_share_and_skip():
     group = [Row("s", str(i), "own", {1: record(psnr)}).fill() for i, psnr in enumerate([20.0, 21.004, 21.001, 19.0])]
     assert ranks(group, PSNR) == {0: 2, 1: 1, 2: 1}
     assert ranks(group, BY_NAME["L1"]) == {}
-
-
-def table_of(rows):
-    """Markdown's cells, (scene, run, strategy) -> column -> text; and the lines below."""
-    lines = markdown(rows).splitlines()
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    body = {tuple(line[:3]): dict(zip(cells[0], line, strict=True)) for line in cells[2:]}
-    return body, [line for line in lines if line and not line.startswith("|")]
-
-
-def test_marks_are_among_rows_of_one_strategy():
-    """A budget of a tenth is not best in bytes beside methods that chose their number themselves."""
-    plan = [("original", "SH", 30.0, 900), ("original", "NRF", 31.0, 400), ("mcmc@9", "SH", 20.0, 9)]
-    group = [Row("s", run, strategy, {1: record(psnr, splats=n)}).fill() for strategy, run, psnr, n in plan]
-    body, _ = table_of(group)
-    assert body["s", "SH", "mcmc@9"]["splats"] == "9" and body["s", "SH", "mcmc@9"]["PSNR"] == "20.00"
-    assert body["s", "SH", "original"]["splats"] == "_900_" and body["s", "NRF", "original"]["PSNR"] == "**31.00**"
 
 
 def test_times_are_of_runs_that_were_alone_and_ranked_on_one_machine():
@@ -129,72 +83,17 @@ def test_an_average_is_of_rows_that_have_all_scenes():
 # Crops.
 
 
-def picture(truth, render, path):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.concatenate([truth, render], axis=1)).save(path)
-
-
 @pytest.fixture
 def pictures(tmp_path):
-    """Three views, 60 x 80, of two runs. They differ in view 2 alone, at (40..50, 10..20); both are wrong in view 0."""
+    """Three views, 60 x 80, of two runs, which differ in the last."""
     rng = np.random.default_rng(0)
-    for view in range(3):
-        truth = rng.integers(0, 200, size=(60, 80, 3), dtype=np.uint8)
-        for run in ("a", "b"):
-            render = truth.copy()
-            if view == 0:
-                render += 30
-            if view == 2 and run == "b":
-                render[40:50, 10:20] += 50
-            name = f"eval_img_{view:04d}" + ("_photo.png" if run == "a" else ".png")  # ours, and nerfstudio's
-            picture(truth, render, tmp_path / run / name)
-    return {"A": tmp_path / "a", "B": tmp_path / "b"}
-
-
-def test_disagreement_is_found(pictures):
-    """The window of 18 pixels must hold the whole patch of 10 where the errors differ, 50 / 255 against 0."""
-    files = {label: numbered(folder) for label, folder in pictures.items()}
-    pairs = [np.asarray(Image.open(found[2]), dtype=np.float32) / 255 for found in files.values()]
-    truth, renders = pairs[0][:, :80], [pair[:, 80:] for pair in pairs]
-    side = crop_side(60, 80)
-    assert side == 18
-    score, top, left = largest_disagreement(truth, renders, side)
-    assert top <= 40 and top + side >= 50 and left <= 10 and left + side >= 20
-    assert score == pytest.approx(0.5 * 50 / 255 * 100 / side**2, rel=1e-5)
-    _, top, left = largest_disagreement(truth, renders[1:], side)  # of one run: where it is wrong
-    assert top <= 40 and top + side >= 50
-
-
-def test_sheet_shows_the_views_where_runs_differ(pictures, tmp_path, monkeypatch):
-    assert crop_sheet(pictures, tmp_path / "sheet.png")
-    two = Image.open(tmp_path / "sheet.png")
-    monkeypatch.setattr(crops, "VIEWS", 1)
-    assert crop_sheet(pictures, tmp_path / "chosen.png")
-    one = Image.open(tmp_path / "chosen.png")
-    assert two.height == 2 * one.height and two.width == one.width
-    # The best view comes first: the upper half of the automatic sheet is the sheet of view 2.
-    assert np.array_equal(np.asarray(two)[: one.height], np.asarray(one))
-    below = np.asarray(one)[-200:-10, -200:-10]  # inside B's error map: 4 x 50 in the patch, else black
-    assert set(np.unique(below)) == {0, 200}
-
-
-def test_crops_are_of_the_seed_that_was_run(tmp_path, pictures):
-    """A has seed 43 alone, B both, C no pictures; where the seeds differ the labels say them."""
-    content = {"runs": {"A": "nrfgs", "B": "nrfgs-sh", "C": "nrfgs-sg"}, "scenes": ["s"], "seeds": [42, 43]}
-    spec = make_spec(content, "test")
-    runs, work = tmp_path / "runs", tmp_path / "work"
-    runs.mkdir()
-
-    def labels(*names):
-        for name in names:
-            (runs / f"{name}.json").touch()
-            if name[0] != "C":
-                shutil.copytree(pictures[name[0]], work / name / "pictures")
-        return {text: folder.parent.name for text, folder in pictures_of(cells_of(spec), runs, work).items()}
-
-    assert labels() == {}
-    assert labels("A-own-s-43", "B-own-s-43", "C-own-s-42") == {"A": "A-own-s-43", "B": "B-own-s-43"}
-    assert labels("B-own-s-42") == {"A, seed 43": "A-own-s-43", "B, seed 42": "B-own-s-42"}
+    for run, suffix in (("A", "_photo.png"), ("B", ".png")):  # ours, and nerfstudio's
+        (tmp_path / run).mkdir()
+        for view in range(3):
+            truth = np.full((60, 80, 3), 90, np.uint8) + rng.integers(0, 9, (60, 80, 3), dtype=np.uint8)
+            both = np.concatenate([truth, truth + 50 * (view == 2 and run == "B")], axis=1).astype(np.uint8)
+            Image.fromarray(both).save(tmp_path / run / f"eval_img_{view:04d}{suffix}")
+    return tmp_path
 
 
 def test_report_of_hand_made_records(tmp_path, pictures, capsys):
@@ -204,7 +103,7 @@ def test_report_of_hand_made_records(tmp_path, pictures, capsys):
         (tmp_path / "out" / "runs").mkdir(parents=True, exist_ok=True)
         (tmp_path / "out" / "runs" / f"{cell.name}.json").write_text(json.dumps(content))
         (tmp_path / "work" / cell.name).mkdir(parents=True)
-        pictures[cell.run.name].rename(tmp_path / "work" / cell.name / "pictures")
+        (pictures / cell.run.name).rename(tmp_path / "work" / cell.name / "pictures")
     report(spec, cells_of(spec), tmp_path / "out", tmp_path / "work", {})
     assert (tmp_path / "out" / "crops" / "x_s.png").exists()
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -235,3 +134,108 @@ def test_a_folder_comes_back(tmp_path):
     assert found["train"]["splats"] == [[0, 0], [500, 5000], [1000, 10000], [1149, 7]]
     assert found["eval"] == {"psnr": 0.3333333} and found["splats"] == 123456789
     assert found["measured"]["test"]["per_image"] == [{"image": "a.png", "psnr": 30.12346}]
+
+
+# The trade: knobs become a front and prices.
+
+D = "--pipeline.model.appearance.latent-dim"
+KNOBS = {
+    "default": {"method": "nrfgs", "options": "--a 1"},
+    "scenes": ["s"],
+    "seeds": [1, 2],
+    "steps": 100,
+    "knobs": {
+        "D": {"option": D, "values": [4, 8]},
+        "steps": {"steps": [50]},
+        "budget": {"strategies": ["mcmc@200"]},
+        "head": {"settings": {"SH": {"method": "nrfgs-sh", "options": "--b 2"}, "one": {"options": "--c 3"}}},
+    },
+}
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"knobs": []}, "knobs must map"),
+        ({"knobs": {"steps": {"steps": 5}}}, "needs option and a list of values, or a list of steps"),
+        ({"knobs": {"head": {"settings": {"x": {"option": "--a"}}}}}, "head x: unknown key"),
+        ({"knobs": {"head": {"settings": {"x": 5}}}}, "head x must be a method, or"),
+        ({"knobs": {"a": {"settings": {"b c": {}}}, "a b": {"settings": {"c": {}}}}}, "there twice"),
+        ({"default": {"options": "--a"}}, "default names no method"),
+        ({"runs": {"x": "nrfgs"}}, "Leave runs out"),
+        ({"strategies": ["splatfacto", "original"]}, "strategies names several"),
+    ],
+)
+def test_a_bad_file_is_named(change, words):
+    with pytest.raises(InputError, match=words):
+        make_spec({**KNOBS, **change}, "knobs.yaml")
+
+
+@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
+def test_front_is_what_nothing_beats(points):
+    """Against the definition, on a grid so coarse that ties are common."""
+
+    def beats(a, b):
+        return a[0] <= b[0] and a[1] >= b[1] and a != b
+
+    expected = {i for i, point in enumerate(points) if not any(beats(other, point) for other in points)}
+    front = pareto_front(points)
+    assert set(front) == expected and len(front) == len(expected)
+    assert [points[i][0] for i in front] == sorted(points[i][0] for i in front)
+
+
+def test_pooled_deviation_by_hand():
+    # Variances 2 (1 degree of freedom) and 1 (2): s^2 = (2 + 2) / 3. A sample of one adds nothing.
+    deviation, freedom = pooled_deviation([[1.0, 3.0], [4.0, 5.0, 6.0], [9.0]])
+    assert freedom == 3 and deviation == pytest.approx(math.sqrt(4 / 3))
+    bound = noise_bound(deviation, freedom, 2, 3)
+    assert bound == pytest.approx(student.ppf(0.975, 3) * math.sqrt(4 / 3) * math.sqrt(1 / 2 + 1 / 3))
+    assert pooled_deviation([[1.0], [2.0]]) == (None, 0) and noise_bound(None, 0, 1, 1) == math.inf
+
+
+def row(name, *records):
+    return Row("s", name, "own", dict(enumerate(records))).fill()
+
+
+def test_differences_inside_the_noise_are_marked():
+    """One deviation for all: pairs 0.2 apart have s = 0.1414, 3 degrees of freedom, so the bound is
+    t(3) 0.1414 = 3.182 * 0.1414 = 0.450."""
+    rows = [
+        row("default", record(30.0), record(30.2)),
+        row("near", record(30.4), record(30.6)),
+        row("far", record(30.5), record(30.7)),
+    ]
+    result = changes(rows, rows[0], PSNR, ratio=False)
+    assert result["near"].value == pytest.approx(0.4) and result["near"].is_noise
+    assert result["far"].value == pytest.approx(0.5) and not result["far"].is_noise
+    assert result["far"].noise == pytest.approx(0.4501, abs=1e-4)
+    # One seed each: the spread is unknown.
+    single = [row("default", record(30.0)), row("far", record(40.0))]
+    assert changes(single, single[0], PSNR, ratio=False)["far"].is_noise
+
+
+def test_costs_are_ratios_of_geometric_means():
+    rows = [
+        row("default", record(30.0, seconds=10.0), record(30.0, seconds=40.0)),
+        row("half", record(30.0, seconds=5.0), record(30.0, seconds=20.0)),
+        row("shared", record(30.0, jobs=2), record(30.0, jobs=2)),
+    ]
+    result = changes(rows, rows[0], BY_NAME["time s"], ratio=True)
+    assert result["half"].value == pytest.approx(0.5)
+    # The same spread, a factor of 4, in both: s = ln 4 / sqrt 2, 2 degrees of freedom, bound t(2) s = 4.303 * 0.980.
+    assert result["half"].noise == pytest.approx(math.exp(4.3027 * math.log(4) / math.sqrt(2)), rel=1e-4)
+    assert result["half"].is_noise and "shared" not in result  # its time was not measured alone
+    rows = [row("default", record(30.0)), row("empty", record(5.0, splats=0))]
+    assert set(changes(rows, rows[0], BY_NAME["splats"], ratio=True)) == {"default"}
+
+
+def test_prices():
+    def ratio(value):
+        return Change(value, 1.05, True)
+
+    up, down, nothing = Change(0.6, 0.1), Change(-0.6, 0.1), Change(0.05, 0.1)
+    assert price(up, ratio(4.0)) == price(down, ratio(0.25)) == "0.30"
+    assert price(up, ratio(0.25), power=-1) == "0.30"  # a quarter of the frames
+    assert price(up, ratio(0.5)) == "better and cheaper" and price(down, ratio(2.0)) == "worse and more expensive"
+    assert price(up, ratio(0.97)) == "gain, cost unclear" and price(down, ratio(1.0)) == "loss, cost unclear"
+    assert price(nothing, ratio(2.0)) == "PSNR unclear" and price(nothing, ratio(1.02)) == "unclear"

@@ -2,15 +2,9 @@
 """One run of a benchmark: what is continued after a kill, only evaluated, or begun anew; where it runs."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 import nrfgs_ns
 from nrfgs_lab.bench import run as bench_run
@@ -77,62 +71,11 @@ def test_checkpoints_of_other_arguments_are_cleared(tmp_path):
     assert last_checkpoint(tmp_path) is None and not (tmp_path / "train.json").exists()
 
 
-def test_a_quick_run_leaves_its_record_alone(tmp_path, monkeypatch, trained):
-    """No ns-eval, no frame rates, no files."""
-    measured = []
-    measure = "nrfgs_lab.bench.run.measure"
-    monkeypatch.setattr(measure, lambda config, views, timed: measured.append(timed) or {"test": {}})
-    job = job_in(tmp_path / "work", steps=41)
-    job.record, job.quick = str(tmp_path / "record.json"), True
-    (tmp_path / "work").mkdir()
-    forget_other_arguments(tmp_path / "work", job.identity)
-    interrupted(tmp_path / "work", 40, reached=40)
-    bench_run.run(job)
-    assert measured == [False] and "eval" not in json.loads(Path(job.record).read_text())
-    assert not (tmp_path / "work").exists()
-
-
 def test_a_finished_run_is_not_repeated_by_a_late_child(tmp_path, trained):
     job = job_in(tmp_path)
     Path(job.record).write_text("{}")
     bench_run.run(job)
     assert not trained and Path(job.record).read_text() == "{}"
-
-
-SPEC = """
-runs: {NRF: nrfgs}
-strategies: ['mcmc@400,warmup_length=10,refine_every=10']
-scenes: [tiny]
-seeds: [1]
-steps: 120
-checkpoint_every: 20
-train_views: 3
-options: --pipeline.model.num-downscales 0
-"""
-
-
-@pytest.mark.slow
-def test_killed_in_the_middle_and_resumed(tiny_scene, tmp_path):
-    (tmp_path / "spec.yaml").write_text(SPEC)
-    command = [sys.executable, "-m", "nrfgs_ns.cli", "bench", str(tmp_path / "spec.yaml")]
-    command += ["--scenes", str(tiny_scene.parent), "--out", str(tmp_path / "out"), "--work", str(tmp_path / "work")]
-    first = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
-    while not list((tmp_path / "work").rglob("nerfstudio_models/step-0000000[4-9]*.ckpt")):
-        assert first.poll() is None
-        time.sleep(0.02)
-    os.killpg(first.pid, signal.SIGKILL)  # the benchmark and its child, as when a machine goes down
-    first.wait()
-    assert not list((tmp_path / "out" / "runs").iterdir())
-
-    subprocess.run(command, check=True)
-    (record,) = (json.loads(file.read_text()) for file in (tmp_path / "out" / "runs").glob("*.json"))
-    assert record["train"]["parts"] == 2 and record["train"]["steps"] == 120
-    steps = [step for step, _ in record["train"]["splats"]]
-    assert steps == [0, 100, 119], "the resumed training must count on where it was cut off"
-    assert record["measured"]["splats"] == 400 and len(record["measured"]["train"]["per_image"]) == 3
-    assert str(tmp_path) not in json.dumps(record), "a record must not name places"
-    assert "interrupted" in (tmp_path / "out" / "table.md").read_text()
-    assert Image.open(tmp_path / "out" / "crops" / "tiny.png").width > 2 * 220
 
 
 def test_the_digest_is_of_names_and_contents(tmp_path):

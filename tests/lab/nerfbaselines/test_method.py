@@ -22,10 +22,8 @@ from plyfile import PlyData
 from torch.testing import assert_close
 
 from nrfgs_lab import nerfbaselines as package
-from nrfgs_lab.nerfbaselines.method import Nrfgs, NrfgsFast, World, configure
-from nrfgs_lab.pages.options import methods
+from nrfgs_lab.nerfbaselines.method import Nrfgs, NrfgsFast, World
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.errors import InputError
 
 needs_nerfbaselines = pytest.mark.skipif(
     find_spec("nerfbaselines") is None, reason="nerfbaselines is not installed: pip install --no-deps nerfbaselines"
@@ -105,15 +103,6 @@ def test_cameras_and_points_are_where_nerfstudio_has_them(tiny_scene):
     assert_close(points, train.metadata["points3D_xyz"], rtol=0, atol=1e-6)
 
 
-def test_training_reports_numbers_now_and_then(trained):
-    method, _, _, metrics = trained
-    assert [bool(step) for step in metrics] == [True, False] * 3
-    assert {"loss", "psnr", "main_loss"} <= metrics[-2].keys() and np.isfinite(list(metrics[-2].values())).all()
-    info = method.get_info()
-    assert info["num_iterations"] == 50 and info["loaded_step"] is None
-    assert info["hparams"]["pipeline.model.appearance.latent_dim"] == 32
-
-
 def test_a_checkpoint_renders_without_the_images(trained, tiny_scene, tmp_path):
     method, _, folder, _ = trained
     loaded = Nrfgs(checkpoint=str(folder))
@@ -191,22 +180,6 @@ def test_masks_transparency_and_the_background(tiny_scene):
     method.close()
 
 
-def test_options_are_those_of_ns_train():
-    overrides = {"pipeline.model.appearance.latent_dim": "16", "pipeline.model.background_color": "white"}
-    config = configure("nrfgs", overrides, {"background_color": [0] * 3})
-    assert config.pipeline.model.appearance.latent_dim == 16
-    assert config.pipeline.model.background_color == "white", "an override outranks the data set"
-    assert configure("nrfgs-fast", {}, {}).schedule_steps == 30_000
-    with pytest.raises(InputError, match="time_budget"):
-        configure("nrfgs", {"time_budget": 3}, {})
-    with pytest.raises(InputError, match="only black and white"):
-        configure("nrfgs", {}, {"background_color": np.array([255, 0, 0])})
-
-
-def test_every_method_has_a_class():
-    assert {kind.method for kind in (Nrfgs, *Nrfgs.__subclasses__())} == {one.config.method_name for one in methods()}
-
-
 def test_the_last_steps_are_averaged(tiny_scene, monkeypatch):
     """As `ns-train` does it, once nerfbaselines has made the last of the steps."""
     monkeypatch.setattr("nrfgs_ns.training.averaging.LARGEST_SHARE", 1.0)
@@ -218,22 +191,6 @@ def test_the_last_steps_are_averaged(tiny_scene, monkeypatch):
     train(method, 5, 6)
     assert mean.count == 0, "the mean was not installed"
     method.close()
-
-
-@needs_nerfbaselines
-def test_registered_methods_are_nerfbaselines_methods(monkeypatch):
-    import nerfbaselines
-    from nerfbaselines import _registry
-
-    monkeypatch.setenv("NERFBASELINES_REGISTER", str(SPEC))
-    if "nrfgs" not in nerfbaselines.get_supported_methods():  # unless the entry point has done it
-        for spec in _registry._load_specs_from_environment():
-            nerfbaselines.register(spec)
-    for name in [one.config.method_name for one in methods()]:
-        spec = nerfbaselines.get_method_spec(name)
-        with nerfbaselines.build_method_class(spec, backend="python") as method:
-            assert issubclass(method, Nrfgs) and isinstance(method.__new__(method), nerfbaselines.Method)
-            assert method.get_method_info()["method_id"] == method.method == name
 
 
 @pytest.mark.slow

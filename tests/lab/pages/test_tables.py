@@ -10,7 +10,7 @@ from nrfgs_lab.pages import tables
 from nrfgs_lab.pages.few_views import runs_of
 from nrfgs_lab.pages.methods import gain, half
 from nrfgs_lab.pages.runs import VIEWS
-from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, rendered, written
+from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, written
 
 PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
 LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -83,54 +83,10 @@ def test_a_number_that_is_not_the_record_s_is_noticed():
     assert changed != text and written(changed) == text
 
 
-def test_a_block_is_a_table_on_its_lines_or_a_number_in_a_sentence(monkeypatch):
-    monkeypatch.setattr(tables, "declared", lambda: {"x.rows": {"head": "a", "rows": {"3.4": []}}})
-    monkeypatch.setitem(BLOCKS, "x.number", lambda whole, part: whole + part)
-    page = "Gains <!-- table x.number(1, .2) --><!-- end --> dB.\n\n<!-- table x.rows -->\n<!-- end -->\n"
-    result = written(page)
-    assert result == (
-        "Gains <!-- table x.number(1, .2) -->1.2<!-- end --> dB.\n\n"
-        "<!-- table x.rows -->\n\n| a |\n| --- |\n| 3.4 |\n\n<!-- end -->\n"
-    )
-    assert written(result) == result
-    with pytest.raises(ValueError, match="no end"):
-        written("<!-- table x.number -->1.2")
-
-
 def test_every_block_is_on_a_page():
     used = {match[1] + (match[2] or "") for text in PAGES.values() for match in BLOCK.finditer(text)}
     assert set(declared()) <= used
     assert set(BLOCKS) <= {name.partition("(")[0] for name in used}
-
-
-def test_a_declared_block_is_worked_out_from_records(monkeypatch):
-    runs = [{"name": "a", "psnr": 30.0, "views": [1.0, 3.0], "bytes": 2_500_000}, {"name": "b", "psnr": 31.5}]
-    monkeypatch.setattr(
-        tables, "records", lambda study: {"s": {"runs": runs, "mean": {"1": {"x": 2.0}, "2": {"x": 4.0}}}}[study]
-    )
-    assert rendered("{s|runs|name=b|psnr - s|runs|name=a|psnr / 3:.2f} of {s|runs|0|bytes:.1fM} MB") == "0.50 of 2.5 MB"
-    assert rendered("{s|runs|name=a|views|max:.0f} {s|mean|mean x:.1f} {0 - s|runs|1|psnr:signed}") == "3 3.0 -31.50"
-    table = {
-        "head": " | PSNR | MB",
-        "rows": {"A": "a", "B": "b"},
-        "cells": ["{s|runs|name=$row|psnr:.1f}", "{s|runs|name=$row|bytes:MB}"],
-    }
-    assert rendered(table).splitlines()[2:] == ["| A | 30.0 | 2.50 |", "| B | 31.5 | - |"]
-    table = {
-        "head": " | 1 | 2",
-        "rows": {"A": "x", "B": "-$column"},
-        "columns": ["1", "2"],
-        "cell": "{s|mean|$column|$row:.0f}",
-    }
-    assert rendered(table).splitlines()[2] == "| A | 2 | 4 |"
-    with pytest.raises(LookupError):
-        rendered("{s|runs|name=c|psnr:.1f}")
-
-
-def test_every_record_is_named_in_the_index():
-    index = PAGES["docs/measurements.md"]
-    named = {word for line in re.findall(r"^\| ([\w, -]+) \|", index, re.MULTILINE) for word in line.split(", ")}
-    assert {path.stem for path in (ROOT / "results").glob("*.json")} <= named
 
 
 def test_every_record_is_shown_or_used():
