@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import tyro
-from compact_fields import field, matched, through_a_file
+from compact_fields import RENDER, field, matched, through_a_file
 from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.scripts.render import DatasetRender
@@ -147,7 +147,7 @@ def test_large_weights_and_a_lone_splat(tmp_path):
 )
 def test_tables_of_no_field_are_refused(change, says, tmp_path):
     """Headers of none are in tests/attack."""
-    header, streams = encode(field(), {})
+    header, streams = encode(field(), RENDER)
     change(streams)
     write_container(tmp_path / "f.nrf", header, streams)
     with pytest.raises(InputError, match=says):
@@ -158,7 +158,7 @@ def test_tables_much_larger_than_the_file_are_refused(tmp_path):
     """Diffuse splats have no latents in the file, and need them in memory."""
     wide = NrfConfig(latent_dim=1024, hidden_width=16).setup().requires_grad_(False)
     diffuse = {**field(4).splats, "latents": torch.zeros(4, 1024), DIFFUSE: torch.ones(4, dtype=torch.bool)}
-    header, streams = encode(Field(wide, diffuse), {})
+    header, streams = encode(Field(wide, diffuse), RENDER)
     header["splats"][DIFFUSE] = 20_000
     streams |= {"means": Table(np.zeros((2, 20_000)), signed=False), "splats": Table(np.ones((11, 20_000)))}
     write_container(tmp_path / "f.nrf", header, streams)
@@ -181,13 +181,13 @@ def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
     write_container(tmp_path / "f.nrf", header, streams)
     assert load_file(tmp_path / "f.nrf").projection_options.near_plane == 2.5, "of the training, in world units"
     write_container(tmp_path / "f.nrf", {**header, "render": {"rasterize_mode": "classic"}}, streams)
-    with pytest.raises(InputError, match="does not say how it is rendered"):
+    with pytest.raises(InputError, match="render has not the keys rasterize_mode, background"):
         load_file(tmp_path / "f.nrf")
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node: the page's reader is tried by pytest -m browser")
 def test_the_page_reads_the_same_splats(tmp_path):
-    write_container(tmp_path / "f.nrf", *encode(field(), {}))
+    write_container(tmp_path / "f.nrf", *encode(field(), RENDER))
     decoded = decode(tmp_path / "f.nrf")
     (tmp_path / "read.js").write_text((files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + READ)
     said = subprocess.run(["node", "read.js", "f.nrf"], cwd=tmp_path, capture_output=True, check=True)
@@ -350,6 +350,6 @@ def test_what_training_expects_is_what_a_file_has(tmp_path):
     splats = {**rows, "means": means(rounded=True).detach(), DIFFUSE: torch.ones(20_000, dtype=torch.bool)}
     steps = {name: np.ones(n) for name, n in (("turns", 3), ("scales", 3), ("opacities", 1), ("colors", 3))}
     steps |= {"latents": np.ones(8), "means": means.steps.detach().double().numpy()}
-    write_container(tmp_path / "f.nrf", *encode(Field(one.head, splats), {}, steps))
+    write_container(tmp_path / "f.nrf", *encode(Field(one.head, splats), RENDER, steps))
     entries = read_container((tmp_path / "f.nrf").read_bytes())[0]["streams"]
     assert of_places == pytest.approx({entry["name"]: entry["bytes"] for entry in entries}["means"], rel=0.03)
