@@ -34,7 +34,7 @@ import lzma
 import math
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -89,12 +89,15 @@ class Table(NamedTuple):
     """from -2^31 to 2^31 - 1, and like their neighbours; False: from 0 to 2^32 - 1"""
 
 
-def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> int:
-    """Write a file, whole or not at all; returns its size.
+def container(
+    header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table], advance: Callable[[], None] = lambda: None
+) -> bytes:
+    """The bytes of a file.
 
     Args:
         header: what JSON can hold; "streams" is added.
         streams: arrays of DTYPES, and tables.
+        advance: called after each stream.
     """
     entries, bodies = [], []
     for name, stream in streams.items():
@@ -103,12 +106,19 @@ def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str,
         sizes = {"dtype": array.dtype.name, "shape": list(array.shape), "bytes": len(body)}
         entries.append({"name": name, "coding": coding, **sizes, "crc32": zlib.crc32(body)})
         bodies.append(body)
+        advance()
     text = json.dumps({**header, "streams": entries}, allow_nan=False).encode("utf-8")
     total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
     start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
+    return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
+
+
+def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> int:
+    """Write a file (`container`), whole or not at all; returns its size."""
+    data = container(header, streams)
     with whole(path) as aside:
-        aside.write_bytes(b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies]))
-    return total
+        aside.write_bytes(data)
+    return len(data)
 
 
 def read_container(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

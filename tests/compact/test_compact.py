@@ -353,3 +353,37 @@ def test_what_training_expects_is_what_a_file_has(tmp_path):
     write_container(tmp_path / "f.nrf", *encode(Field(one.head, splats), RENDER, steps))
     entries = read_container((tmp_path / "f.nrf").read_bytes())[0]["streams"]
     assert of_places == pytest.approx({entry["name"]: entry["bytes"] for entry in entries}["means"], rel=0.03)
+
+
+@pytest.mark.parametrize("words", ["", "--finetune 120"])
+def test_a_size_is_reached_and_not_exceeded(words, exported, tmp_path, capsys):
+    config, _, _ = exported
+    plain, sizes = exported[1].stat().st_size, {}
+    for share in (0.95, 0.8):
+        output, report = tmp_path / f"{share}.nrf", tmp_path / f"{share}.json"
+        torch.manual_seed(0)
+        line = f"compact --load-config {config} --output {output} --report {report} {words}"
+        tyro.cli(Export, args=[*line.split(), "--size-mb", str(share * plain / 1e6)]).main()
+        sizes[share] = output.stat().st_size
+        found = json.loads(report.read_text())
+        assert 0.95 * share * plain <= sizes[share] <= share * plain and found["bytes"] == sizes[share]
+        assert "Encoding, attempt 1" in capsys.readouterr().out
+    if not words:
+        assert found["coarser"] > 1 and found["rate"] is None
+    assert found["loss_db"] < 1.0
+
+
+def test_a_size_that_is_too_small_is_refused_with_the_smallest(exported, tmp_path):
+    config, _, _ = exported
+    words = ["compact", "--load-config", str(config), "--output", str(tmp_path / "x.nrf"), "--no-measure"]
+    for size, said in (
+        ("1e-4", "the smallest output of this model has 0.0"),
+        ("0", "must be positive"),
+        ("nan", "must be"),
+    ):
+        with pytest.raises(InputError, match=said):
+            tyro.cli(Export, args=[*words, "--size-mb", size]).main()
+    with pytest.raises(InputError, match="the smallest output"):
+        tyro.cli(Export, args=[*words, "--size-mb", "1e-4", "--finetune", "10"]).main()
+    tyro.cli(Export, args=[*words, "--size-mb", "50"]).main()
+    assert (tmp_path / "x.nrf").stat().st_size < 1e6, "a file that is small enough stays as precise as it is"
