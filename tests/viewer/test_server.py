@@ -16,7 +16,7 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.viewer.viewer import Viewer
 from short_trainings import command_line, set_up, trained
-from viser._messages import ResetGuiMessage, ViewerCameraMessage
+from viser._messages import ResetGuiMessage, ThemeConfigurationMessage, ViewerCameraMessage
 from websockets.asyncio.client import connect
 
 from nrfgs_ns.compact.format import MAGIC
@@ -335,6 +335,22 @@ def test_ns_viewer_listens_to_this_machine_alone(config, monkeypatch, interface)
     finally:
         for one in opened:
             one.viser_server.stop()
+
+
+def test_a_finished_training_cannot_be_paused_and_shows_its_step(open_viewer, pipeline):
+    viewer = open_viewer(pipeline)
+    viewer.update_scene(step=1499)
+    assert not viewer.pause_train.visible and not viewer.resume_train.visible
+    assert viewer.stats_markdown.content.startswith("Step: 1499 ")
+    viewer.pause_train.visible = True  # as in a training, which ends now
+    viewer.training_complete()
+    assert not viewer.pause_train.visible
+
+
+def test_the_page_shows_no_picture_of_another_site(open_viewer, pipeline):
+    buffer = open_viewer(pipeline).viser_server._websock_server._broadcast_buffer
+    themes = [one for one in buffer.message_from_id.values() if isinstance(one, ThemeConfigurationMessage)]
+    assert themes and all(one.titlebar_content["image"] is None for one in themes)
 
 
 def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):
