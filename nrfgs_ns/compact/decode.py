@@ -167,7 +167,8 @@ def _splats(counts: dict[str, int], grids: dict[str, Grid], streams: dict[str, n
     codes = {"means": from_morton(places), "latents": streams["latents"].T}
     ends = np.cumsum(list(WIDTHS.values()))
     codes |= zip(WIDTHS, np.split(streams["splats"][1:].T, ends[:-1], axis=1), strict=True)
-    values = {name: torch.from_numpy(grids[name].values(table.astype(np.float64))) for name, table in codes.items()}
+    with np.errstate(over="ignore"):  # what overflows is refused below
+        values = {name: torch.from_numpy(grids[name].values(table.astype(np.float64))) for name, table in codes.items()}
     values["latents"] = values["latents"].float()  # the largest table by far, and no rotations to work out
     splats = splats_of(values, torch.from_numpy(diffuse))
     splats = {name: value if name == DIFFUSE else value.float() for name, value in splats.items()}

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -371,6 +372,17 @@ def test_a_size_is_reached_and_not_exceeded(words, exported, tmp_path, capsys):
     if not words:
         assert found["coarser"] > 1 and found["rate"] is None
     assert found["loss_db"] < 1.0
+
+
+@pytest.mark.parametrize("name", ["page.html", "folder"])
+def test_a_page_reaches_its_size_with_all_that_is_in_it(name, exported, tmp_path):
+    def written(output: Path, *options: str) -> int:
+        line = ["web", "--load-config", str(exported[0]), "--output", str(output), "--no-measure", *options]
+        tyro.cli(Export, args=line).main()
+        return output.stat().st_size if output.is_file() else sum(path.stat().st_size for path in output.iterdir())
+
+    limit = written(tmp_path / "plain" / name) - 1000
+    assert 0.95 * limit <= written(tmp_path / name, "--size-mb", str(limit / 1e6)) <= limit
 
 
 def test_a_size_that_is_too_small_is_refused_with_the_smallest(exported, tmp_path):
