@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compact files read back as the tables of a model. `format.py`, `encode.py` and `entropy.py` specify the file."""
 
-import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.encode import FORMAT, GROUPS
-from nrfgs_ns.compact.format import BROKEN, LARGEST_RATIO, SMALL, read_container
+from nrfgs_ns.compact.format import BROKEN, LARGEST_RATIO, SMALL, check_keys, read_header, read_streams
 from nrfgs_ns.compact.tables import COLUMNS, Grid, from_morton, splats_of
 from nrfgs_ns.errors import InputError
 
@@ -25,6 +24,21 @@ LONGEST_REASON = 200
 """Characters of a message that may quote the file."""
 WIDTHS = dict(zip(COLUMNS, (1, 3, 3, 3), strict=True))
 """Columns of each table in the stream "splats"."""
+HEADER = ("format", "splats", "head", "render", "grids", "streams")
+TABLES = {"means": ("uint32",), "splats": ("int16", "int32"), "latents": ("int16", "int32")}
+"""Coded tables, and the types of their numbers."""
+LARGEST = 1e18
+"""Largest number among the options, and largest unit of length; the smallest unit is one over it. Products of two must
+fit into float32."""
+
+
+class Render(NamedTuple):
+    """How a file is rendered."""
+
+    mode: Literal["classic", "antialiased"]
+    background: tuple[float, float, float]
+    near: float
+    """depth from which splats are drawn, in world units; 0: splatfacto's"""
 
 
 class Decoded(NamedTuple):
@@ -36,34 +50,32 @@ class Decoded(NamedTuple):
     """the head's, float32, by their names in its `state_dict`"""
     splats: dict[str, Tensor]
     """the table, float32, and "diffuse", bool [N]; latents of diffuse splats are 0"""
+    render: Render
     header: dict[str, Any]
-
-    @property
-    def near(self) -> float:
-        """Depth from which splats are drawn, in world units; 0: splatfacto's."""
-        return self.header.get("render", {}).get("near_plane", 0.0)
 
 
 def decode(path: Path) -> Decoded:
-    """Read a compact file; InputError if it cannot be read, is damaged, or describes no field."""
+    """Read a compact file; InputError if it breaks a rule of docs/compact-format.md."""
     try:
         if not path.is_file():
             raise ValueError("it is no file")
-        header, streams = read_container(path.read_bytes())
+        header, first = read_header(data := path.read_bytes())
+        check_keys(header, HEADER, "the header")
+        check_keys(header["head"], ("name", "config", "scene_unit"), "the head")
+        check_keys(header["splats"], GROUPS, "splats")
         if header["format"] != FORMAT or header["head"]["name"] != "nrf":
             raise ValueError(f"it holds {header['format']!r} with a head named {header['head']['name']!r}")
-        config = _config(header["head"])
+        config, render = _config(header["head"]), _render(header["render"])
+        grids = _grids(header["grids"], config.latent_dim)
+        streams = read_streams(data, header["streams"], first)
+        _check_kinds(header["streams"])
         heads = {name: stream.astype(np.float32) for name, stream in streams.items() if name.startswith("head.")}
         weights = {name.removeprefix("head."): torch.from_numpy(stream) for name, stream in heads.items()}
-        build(config, weights, header["head"]["scene_unit"])  # RuntimeError for weights of other shapes
+        build(config, weights, header["head"]["scene_unit"])  # RuntimeError for weights of other names and shapes
         if not all(weight.isfinite().all() for weight in weights.values()):
             raise ValueError("the head's weights are not finite")
-        grids = _grids(header["grids"], config.latent_dim)
         _check_size(header["splats"], config.latent_dim, sum(stream.nbytes for stream in streams.values()))
-        decoded = Decoded(config, weights, _splats(header["splats"], grids, streams), header)
-        if type(decoded.near) not in (int, float) or not 0 <= decoded.near < math.inf:
-            raise ValueError(f"the near plane is {ascii(decoded.near)}")
-        return decoded
+        return Decoded(config, weights, _splats(header["splats"], grids, streams), render, header)
     except BROKEN as error:
         reason = " ".join(str(error).split())[:LONGEST_REASON]
         raise InputError(
@@ -72,30 +84,60 @@ def decode(path: Path) -> Decoded:
         ) from error
 
 
+def _is_number(value: Any, low: float, high: float) -> bool:
+    return type(value) in (int, float) and low <= value <= high
+
+
 def _config(head: dict[str, Any]) -> NrfConfig:
-    usual = NrfConfig(opacity_bound=NrfConfig().bound)
+    usual, options = NrfConfig(opacity_bound=NrfConfig().bound), {}
     for name, value in head["config"].items():
         kind = type(getattr(usual, name))
-        right = type(value) is kind or (type(value), kind) == (int, float)
-        if not right or kind is float and not math.isfinite(value):
+        if not (_is_number(value, -LARGEST, LARGEST) if kind is float else type(value) is kind):
             raise ValueError(f"the head's {name} is {ascii(value)}")
-    config, unit = NrfConfig(**head["config"]), head["scene_unit"]
+        options[name] = kind(value)
+    config = NrfConfig(**options)
     config.validate()
     if config.num_bands > MOST_BANDS:
         raise ValueError(f"the head has {config.num_bands} bands")
-    if type(unit) not in (int, float) or not 0 < unit < math.inf:
-        raise ValueError(f"the head's scene_unit is {ascii(unit)}")
+    if not _is_number(head["scene_unit"], 1 / LARGEST, LARGEST):
+        raise ValueError(f"the head's scene_unit is {ascii(head['scene_unit'])}")
     return config
 
 
+def _render(render: dict[str, Any]) -> Render:
+    check_keys(render, ("rasterize_mode", "background"), "render", optional=("near_plane",))
+    mode, background, near = render["rasterize_mode"], render["background"], render.get("near_plane", 0)
+    if mode not in ("classic", "antialiased"):
+        raise ValueError(f"it is rendered by {ascii(mode)}")
+    if type(background) is not list or len(background) != 3 or not all(_is_number(c, 0, 1) for c in background):
+        raise ValueError(f"its background is {ascii(background)}")
+    if not _is_number(near, 0, LARGEST):
+        raise ValueError(f"the near plane is {ascii(near)}")
+    return Render(mode, tuple(background), float(near))
+
+
+def _check_kinds(entries: list[dict[str, Any]]) -> None:
+    """Raise ValueError unless the streams are the three tables and weights, in codings and types that suit them."""
+    kinds = {entry["name"]: (entry["coding"], entry["dtype"]) for entry in entries}
+    if (tables := {name for name in kinds if not name.startswith("head.")}) != set(TABLES):
+        raise ValueError(f"its tables are {ascii(sorted(tables))} instead of {sorted(TABLES)}")
+    for name, (coding, dtype) in kinds.items():
+        if coding != ("rans" if name in TABLES else "xz") or dtype not in TABLES.get(name, ("float16", "float32")):
+            raise ValueError(f"{name} is of {coding} and {dtype}")
+
+
 def _grids(grids: dict[str, Any], latent_dim: int) -> dict[str, Grid]:
+    counts = {"means": 3, **WIDTHS, "latents": latent_dim}
+    check_keys(grids, tuple(counts), "grids")
     read = {}
-    for name, count in {"means": 3, **WIDTHS, "latents": latent_dim}.items():
-        low, step = (np.asarray(grids[name][part]) for part in ("low", "step"))
-        right = low.shape == step.shape == (count,) and {low.dtype.kind, step.dtype.kind} <= {"i", "f"}
-        if not right or not np.isfinite([low, step]).all() or not (step > 0).all():
-            raise ValueError(f"the grid of {name} is not {count} numbers with positive steps")
-        read[name] = Grid(low, step)
+    for name, count in counts.items():
+        check_keys(grids[name], ("low", "step"), f"the grid of {name}")
+        lists = [grids[name][part] for part in ("low", "step")]
+        if not all(type(row) is list and len(row) == count and {*map(type, row)} <= {int, float} for row in lists):
+            raise ValueError(f"the grid of {name} is not {count} numbers")
+        read[name] = Grid(*np.array(lists, dtype=np.float64))
+        if not (read[name].step > 0).all():
+            raise ValueError(f"the grid of {name} has steps that are not positive")
     return read
 
 
@@ -103,8 +145,8 @@ def _check_size(splats: dict[str, int], latent_dim: int, unpacked: int) -> None:
     """Raise ValueError for impossible counts, and for tables much larger than the unpacked file: diffuse splats need
     latents in memory, and have none in the file."""
     counts = [splats[group] for group in GROUPS]
-    if not all(isinstance(count, int) and count >= 0 for count in counts):
-        raise ValueError(f"{counts} splats")
+    if not all(type(count) is int and count >= 0 for count in counts) or not any(counts):
+        raise ValueError(f"{ascii(counts)} splats")
     if 4 * sum(counts) * (latent_dim + NUMBERS) > max(LARGEST_RATIO * unpacked, SMALL):
         raise ValueError(f"{sum(counts)} splats with latents of {latent_dim}, unpacked from {unpacked} bytes")
 
@@ -113,7 +155,7 @@ def _splats(counts: dict[str, int], grids: dict[str, Grid], streams: dict[str, n
     count, of_view, rank = sum(counts[group] for group in GROUPS), counts["view"], len(grids["latents"].step)
     shapes = {"means": (2, count), "splats": (1 + sum(WIDTHS.values()), count), "latents": (rank, of_view)}
     for name, shape in shapes.items():
-        if streams[name].shape != shape or streams[name].dtype.kind not in "iu":
+        if streams[name].shape != shape:
             raise ValueError(f"{name} of shape {list(streams[name].shape)} instead of {list(shape)}")
     upper, lower = streams["means"].astype(np.uint64)
     if upper.max(initial=0) >= 2**31:
@@ -125,7 +167,8 @@ def _splats(counts: dict[str, int], grids: dict[str, Grid], streams: dict[str, n
     codes = {"means": from_morton(places), "latents": streams["latents"].T}
     ends = np.cumsum(list(WIDTHS.values()))
     codes |= zip(WIDTHS, np.split(streams["splats"][1:].T, ends[:-1], axis=1), strict=True)
-    values = {name: torch.from_numpy(grids[name].values(table.astype(np.float64))) for name, table in codes.items()}
+    with np.errstate(over="ignore"):  # what overflows is refused below
+        values = {name: torch.from_numpy(grids[name].values(table.astype(np.float64))) for name, table in codes.items()}
     values["latents"] = values["latents"].float()  # the largest table by far, and no rotations to work out
     splats = splats_of(values, torch.from_numpy(diffuse))
     splats = {name: value if name == DIFFUSE else value.float() for name, value in splats.items()}
@@ -147,6 +190,6 @@ def model_state(model, decoded: Decoded) -> dict[str, Any]:
             "head": decoded.header["head"]["name"],
             "densification": model.densification.name,
             "strategy": {DIFFUSE: diffuse} if diffuse.any() else {},
-            "near": decoded.near,
+            "near": decoded.render.near,
         },
     }

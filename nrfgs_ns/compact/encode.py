@@ -49,13 +49,14 @@ GROUPS = ("view", DIFFUSE)
 
 
 def encode(
-    field: Field, render: dict[str, Any], steps: Mapping[str, np.ndarray] | None = None
+    field: Field, render: dict[str, Any], steps: Mapping[str, np.ndarray] | None = None, coarser: float = 1.0
 ) -> tuple[dict[str, Any], dict[str, np.ndarray | Table]]:
     """The header and streams of a compact file of the finite splats; InputError if there are none.
 
     Args:
         render: the header's "render".
         steps: of a fine-tuned field's tables; None: `steps_of`.
+        coarser: factor of all steps.
     """
     finite = torch.cat([value.detach().flatten(1) for value in field.splats.values() if value.dim() > 1], dim=1)
     finite = finite.isfinite().all(dim=1)
@@ -65,7 +66,7 @@ def encode(
     tables, diffuse = tables_of({name: value[finite] for name, value in field.splats.items()})
     tables["opacities"] = tables["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
     tables["colors"][diffuse] = tables["colors"][diffuse].clamp_min(0.0)  # as it is drawn
-    steps = steps_of(tables) if steps is None else dict(steps)
+    steps = {name: coarser * step for name, step in (steps_of(tables) if steps is None else steps).items()}
     needed = np.ptp(tables["means"].cpu().numpy(), axis=0) / (2**MOST_BITS - 1)
     if (needed > steps["means"]).any():
         CONSOLE.print(

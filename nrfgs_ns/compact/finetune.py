@@ -2,8 +2,9 @@
 """Fine-tuning of a finished field for its file: tables that cost less, and learnt steps of their grids.
 
 The loss is the training's, of images rendered from tables as the file would give them back, plus `rate` for each byte
-that a splat is estimated to cost on average (`rate.py`). Diffuse splats stay diffuse. A few times, splats are removed
-whose bytes cost more than images lose without them (`growth_without`).
+that a splat is estimated to cost on average (`rate.py`). For a given size the rate is adapted while it trains: it grows
+where the tables are estimated too large, and falls where there is room. Diffuse splats stay diffuse. A few times,
+splats are removed whose bytes cost more than images lose without them (`growth_without`).
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -37,6 +38,13 @@ PRUNINGS = (0.08, 0.16, 0.24, 0.32)
 neighbours, which hide behind each other, must not be removed together."""
 WORTH = 1.0
 """Weight of a splat's bytes against the growth of the loss without it."""
+RATES_FOR_SIZE = (1e-7, 0.1)
+"""Smallest and largest rate that is tried for a size."""
+HASTE = 30.0
+"""Speed at which a rate is adapted to a size: over the steps, its logarithm moves by so much times the size's error (as
+a logarithm). A size is about the cube root of one over the rate, so that a tenth of the steps takes back two thirds."""
+HASTIEST = 0.2
+"""Largest change of the rate's logarithm in a count of the bits, for the same error."""
 LAST = 0.03
 """Final share of the learning rates, which fall by a cosine."""
 
@@ -148,17 +156,18 @@ def contributions_to(model, cameras: Cameras) -> Tensor:
 
 
 def fine_tune(
-    pipeline, steps: int, rate: float, on_report: Callable[[float], None]
-) -> tuple[Field, dict[str, np.ndarray]]:
+    pipeline, steps: int, rate: float, on_report: Callable[[float], None], size: float | None = None
+) -> tuple[Field, dict[str, np.ndarray], float]:
     """Fine-tune a trained field for its size in a file.
 
     Args:
         pipeline: of the trained model, in evaluation mode; its own splats stay as they are.
         rate: loss for a byte of each splat.
         on_report: called with the bits of all splats every REPORT_EVERY steps.
+        size: bytes of the tables to arrive at, with whatever rate; `rate` begins. None: `rate` stays.
 
     Returns:
-        the field, and the grids' steps for each table's columns: its numbers lie on them.
+        the field; the grids' steps for each table's columns, on which its numbers lie; and the last rate.
     """
     model, data = pipeline.model, pipeline.datamanager
     view_count = len(data.cached_train)  # before the cameras: undistortion crops them while it loads the images
@@ -170,7 +179,9 @@ def fine_tune(
     field = with_rank(field, basis, field.head.config.latent_dim)
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
     coded, count = CodedSplats(field.splats), len(field.splats["means"])
-    of_bits = rate / (8 * count)  # loss of a bit
+    of_bits = torch.tensor(rate / (8 * count), device=coded.diffuse.device)  # loss of a bit
+    smallest, largest = (limit / (8 * count) for limit in RATES_FOR_SIZE)
+    haste = min(HASTE * EVERY / steps, HASTIEST)
     rates = RATES | {"means": RATES["means"] * model.scene_unit}
     if len(latents := coded.tables["latents"].values) > 1:
         rates["latents"] *= float(latents.detach().std(dim=0, correction=0).max())
@@ -207,6 +218,8 @@ def fine_tune(
         if step % EVERY == 0:
             bits = coded.bits(tables).sum()
             loss = loss + EVERY * of_bits * bits
+            if size is not None:
+                of_bits = (of_bits * (bits.detach() / (8 * size)) ** haste).clamp(smallest, largest)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
@@ -221,4 +234,4 @@ def fine_tune(
     used = (splats["latents"] != 0).any(dim=0).nonzero()[:, 0]
     if 0 < len(used) < splats["latents"].shape[1]:
         field, grids["latents"] = with_components(field, used), grids["latents"][used.cpu().numpy()]
-    return field, grids
+    return field, grids, float(of_bits) * 8 * count

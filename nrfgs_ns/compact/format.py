@@ -13,8 +13,9 @@
 All numbers are little-endian. An entry of "streams" has "name", "coding", "dtype" (of the numbers), "shape", "bytes"
 (in the file) and "crc32" (of these bytes).
 
-"xz": the xz format; unpacked, the numbers' bytes by significance: first every number's lowest byte, then every number's
-next, and so on; numbers (uint8, uint16, uint32, uint64, float16 or float32) in row-major order.
+"xz": the xz format, as one block of LZMA2 without sizes in its header and without a check; unpacked, the numbers'
+bytes by significance: first every number's lowest byte, then every number's next, and so on; numbers (uint8, uint16,
+uint32, uint64, float16 or float32) in row-major order.
 "rans": a table [columns, rows] of int16, int32 or uint32, by an entropy coder:
 
     bytes
@@ -23,10 +24,9 @@ next, and so on; numbers (uint8, uint16, uint32, uint64, float16 or float32) in 
            the model, int32 numbers, packed as in "xz"
            the coder's output (`entropy.py`)
 
-`encode.py` lists the streams. The version is 2. A reader refuses other versions, wrong lengths and wrong checksums.
+`encode.py` lists the streams. The version is 2.
 
-Nothing in a file is ever run. Sizes are checked before anything is allocated: a file may unpack to 16 MB, or to 32
-times its own size.
+Nothing in a file is ever run. docs/compact-format.md lists what every reader refuses.
 """
 
 import json
@@ -34,7 +34,7 @@ import lzma
 import math
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,6 +62,10 @@ LARGEST_DICTIONARY = 2**26
 """Bytes within which xz looks for repetitions."""
 LARGEST_MEMORY = 2**28
 """Bytes that xz may take to unpack: more than the dictionary needs."""
+ONE_BLOCK = b"\x02\x00\x21\x01"
+"""How the header of a block begins: its length, no sizes, LZMA2, one byte of properties."""
+ENTRY = ("name", "coding", "dtype", "shape", "bytes", "crc32")
+"""Keys of an entry of "streams"."""
 BROKEN = (
     OSError,
     LookupError,
@@ -85,12 +89,15 @@ class Table(NamedTuple):
     """from -2^31 to 2^31 - 1, and like their neighbours; False: from 0 to 2^32 - 1"""
 
 
-def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> int:
-    """Write a file, whole or not at all; returns its size.
+def container(
+    header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table], advance: Callable[[], None] = lambda: None
+) -> bytes:
+    """The bytes of a file.
 
     Args:
         header: what JSON can hold; "streams" is added.
         streams: arrays of DTYPES, and tables.
+        advance: called after each stream.
     """
     entries, bodies = [], []
     for name, stream in streams.items():
@@ -99,16 +106,29 @@ def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str,
         sizes = {"dtype": array.dtype.name, "shape": list(array.shape), "bytes": len(body)}
         entries.append({"name": name, "coding": coding, **sizes, "crc32": zlib.crc32(body)})
         bodies.append(body)
+        advance()
     text = json.dumps({**header, "streams": entries}, allow_nan=False).encode("utf-8")
     total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
     start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
+    return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
+
+
+def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> int:
+    """Write a file (`container`), whole or not at all; returns its size."""
+    data = container(header, streams)
     with whole(path) as aside:
-        aside.write_bytes(b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies]))
-    return total
+        aside.write_bytes(data)
+    return len(data)
 
 
 def read_container(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The header and the streams, by name, of a file's bytes; one of BROKEN if they are damaged or of another kind."""
+    header, first = read_header(data)
+    return header, read_streams(data, header["streams"], first)
+
+
+def read_header(data: bytes) -> tuple[dict[str, Any], int]:
+    """The header of a file's bytes, and where its streams begin; errors as `read_container`."""
     if not data.startswith(MAGIC):
         raise ValueError(f"it begins with {data[: len(MAGIC)]!r}")
     _, version, length, total = PREAMBLE.unpack_from(data)
@@ -117,14 +137,21 @@ def read_container(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     header_end = PREAMBLE.size + length
     if len(data) != total or zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
         raise ValueError(f"it is damaged or cut short: {len(data)} bytes, of {total}")
-    header, first = json.loads(data[PREAMBLE.size : header_end]), header_end + CHECKSUM.size
+    return read_json(data[PREAMBLE.size : header_end]), header_end + CHECKSUM.size
+
+
+def read_streams(data: bytes, entries: list[dict[str, Any]], first: int) -> dict[str, np.ndarray]:
+    """The streams, from byte `first` on, that the header's entries describe; errors as `read_container`."""
     unpacked, streams = 0, {}
-    for entry in header["streams"]:
-        named, sizes = f"the stream {ascii(entry)}", entry["shape"]
-        if entry["dtype"] not in CODINGS[entry["coding"]] or not all(isinstance(size, int) for size in sizes):
+    for entry in entries:
+        check_keys(entry, ENTRY, named := f"the stream {ascii(entry)}")
+        sizes, kinds = entry["shape"], (type(entry["name"]), type(entry["shape"]), type(entry["bytes"]))
+        if kinds != (str, list, int) or entry["dtype"] not in CODINGS[entry["coding"]] or entry["name"] in streams:
+            raise ValueError(named)
+        if not all(type(size) is int and size >= 0 for size in sizes):
             raise ValueError(named)
         unpacked += math.prod(max(size, 1) for size in sizes) * np.dtype(entry["dtype"]).itemsize
-        if min(sizes, default=0) < 0 or unpacked > max(LARGEST_RATIO * len(data), SMALL):
+        if unpacked > max(LARGEST_RATIO * len(data), SMALL):
             raise ValueError(f"{named} would unpack to more than {LARGEST_RATIO} times the file")
         body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
         if len(body) != entry["bytes"] or zlib.crc32(body) != entry["crc32"]:
@@ -132,7 +159,24 @@ def read_container(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         streams[entry["name"]] = (_uncoded if entry["coding"] == "rans" else _unpack)(entry, body)
     if first != len(data):
         raise ValueError(f"it has {len(data) - first} bytes after its last stream")
-    return header, streams
+    return streams
+
+
+def read_json(text: bytes) -> dict[str, Any]:
+    """An object in UTF-8 as every JSON reader has it: numbers are finite float64, and those without a fraction int."""
+
+    def number(digits: str) -> int | float:
+        if not math.isfinite(value := float(digits)):
+            raise ValueError(f"{digits[:20]} is no number")
+        return int(value) if value.is_integer() else value
+
+    return json.loads(text.decode("utf-8"), parse_int=number, parse_float=number, parse_constant=number)
+
+
+def check_keys(value: Any, keys: Sequence[str], what: str, optional: Sequence[str] = ()) -> None:
+    """Raise ValueError unless a value is an object with these keys."""
+    if not isinstance(value, dict) or not set(keys) <= value.keys() <= {*keys, *optional}:
+        raise ValueError(f"{what} has not the keys {', '.join(keys)}, or has others")
 
 
 def _pack(array: np.ndarray) -> bytes:
@@ -148,10 +192,19 @@ def _unpack(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     count, size = math.prod(entry["shape"]), np.dtype(entry["dtype"]).itemsize
     unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=LARGEST_MEMORY)
     raw = unpacker.decompress(body, max_length=count * size + 1) if body else b""
-    if len(raw) != count * size:
+    whole = not body or unpacker.eof and not unpacker.unused_data and unpacker.check == lzma.CHECK_NONE
+    if len(raw) != count * size or not whole:
         raise ValueError(f"it does not hold {count} numbers of {size} bytes")
+    blocks = _blocks(body)
+    if blocks > 1 or blocks == 1 and not body.startswith(ONE_BLOCK, 12):
+        raise ValueError(f"it is packed in {blocks} blocks or with other filters")
     planes = np.frombuffer(raw, dtype=np.uint8).reshape(size, count)
     return np.ascontiguousarray(planes.T).view(np.dtype(entry["dtype"]).newbyteorder("<")).reshape(entry["shape"])
+
+
+def _blocks(body: bytes) -> int:
+    """Blocks of a valid xz stream, up to 127: its index, whose length is at the end, begins with 0 and their number."""
+    return body[-12 - 4 * (int.from_bytes(body[-8:-4], "little") + 1) + 1] if body else 0
 
 
 def _coded(table: Table) -> tuple[np.ndarray, bytes]:

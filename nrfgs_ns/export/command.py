@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`nrfgs export FORMAT`."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -87,9 +88,11 @@ class Web(_Format):
 
 
 def check_compact(options: CompactOptions) -> None:
-    for name, value in vars(options).items():
-        if not value >= 0:
+    for name in ("finetune", "rate"):
+        if not (value := getattr(options, name)) >= 0:
             raise InputError(f"--{name} is {value}; it must be zero or positive.")
+    if options.size_mb is not None and not 0 < options.size_mb < math.inf:
+        raise InputError(f"--size-mb is {options.size_mb}; it must be positive, in millions of bytes.")
 
 
 @dataclass

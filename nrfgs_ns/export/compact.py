@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`nrfgs export compact`: write the file, and a config.yml with which nerfstudio's commands read it."""
 
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -9,21 +11,28 @@ import numpy as np
 import torch
 import yaml
 
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 from nrfgs_ns.appearance.reduce import latent_basis, with_rank
-from nrfgs_ns.compact.decode import decode
+from nrfgs_ns.compact.decode import TABLES, decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.finetune import REPORT_EVERY, fine_tune
-from nrfgs_ns.compact.format import write_container
+from nrfgs_ns.compact.format import container
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.options import CompactOptions
-from nrfgs_ns.files import write_whole
+from nrfgs_ns.files import whole, write_whole
 from nrfgs_ns.progress import progress
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import find_data, finish, load_model, lost, measure_loss
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.pipeline import NrfgsPipeline
 
+COARSEST = 16.0
+"""Largest factor of the grids' steps for a size: a step is then half a standard deviation of the median splat, 1/32 of
+white, and a factor of e of a splat's size."""
+AIM, ENOUGH = 0.98, 0.95
+"""Shares of a size: aimed at, and good enough."""
+MOST_ATTEMPTS = 10
 PLY_BYTES = 62 * 4
 """Bytes of a splat in 3DGS's PLY file, with harmonics of degree 3."""
 
@@ -59,26 +68,39 @@ def load_field(load_config: Path) -> NrfgsPipeline:
 
 
 def write_file(
-    pipeline, load_config: Path, output: Path, options: CompactOptions, measure: bool
+    pipeline,
+    load_config: Path,
+    output: Path,
+    options: CompactOptions,
+    measure: bool,
+    total: Callable[[int], int] = lambda size: size,
 ) -> tuple[Path, dict[str, Any]]:
-    """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report."""
-    model, times = pipeline.model, [perf_counter()]
+    """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report.
+
+    Args:
+        total: bytes of all that is written with a compact file of so many bytes, for `options.size_mb`.
+    """
+    model, times, rate = pipeline.model, [perf_counter()], None
     field, steps = model.field.detached(), None
+    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
+    render["near_plane"] = model.projection_options.near_plane
+    limit = None if options.size_mb is None else 1e6 * options.size_mb
     if options.finetune > 0:
         with progress("Training for the file", -(-options.finetune // REPORT_EVERY)) as advance:
-            field, steps = fine_tune(
+            field, steps, rate = fine_tune(
                 pipeline,
                 options.finetune,
                 options.rate,
                 lambda bits: advance(f"Training for the file ({bits / 8e6:.2f} MB)"),
+                None if limit is None else size_of_tables(field, render, limit, total),
             )
     else:  # the same field in fewer bytes: components of latents that hardly matter are rounded to 0
         basis = latent_basis(field, torch.ones(model.num_points, device=model.device))
         field = with_rank(field, basis, field.head.config.latent_dim)
     times.append(perf_counter())
-    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
-    render["near_plane"] = model.projection_options.near_plane
-    size = write_container(output, *encode(field, render, steps))
+    data, coarser = encoded(field, render, steps, limit, total)
+    with whole(output) as aside:
+        aside.write_bytes(data)
     times.append(perf_counter())
     decoded = decode(output)
     times.append(perf_counter())
@@ -89,8 +111,9 @@ def write_file(
         "rank": decoded.config.latent_dim,
         "seconds": dict(zip(("finetune", "encode", "decode"), np.diff(times).tolist(), strict=True)),
         "finetune": options.finetune,
-        "rate": options.rate if options.finetune else None,
-        "bytes": size,
+        "rate": rate,
+        "coarser": coarser,
+        "bytes": (size := len(data)),
         "ply_bytes": PLY_BYTES * count,
         "ply_ratio": PLY_BYTES * count / size,
         "stream_bytes": {entry["name"]: entry["bytes"] for entry in decoded.header["streams"]},
@@ -99,6 +122,61 @@ def write_file(
         file = load_model(config, "test").model  # as ns-eval reads it
         numbers |= measure_loss(pipeline, lambda camera: {"file": file.get_outputs_for_camera(camera)["rgb"]})
     return config, numbers
+
+
+def size_of_tables(field: Field, render: dict[str, Any], limit: float, total: Callable[[int], int]) -> float:
+    """Bytes of the tables with which all that is written has AIM of a limit; InputError if nothing would be left."""
+    header, streams = encode(field, render)
+    rest = len(container(header, {name: stream for name, stream in streams.items() if name not in TABLES}))
+    size = (AIM * limit - total(rest)) / ((total(rest + 3 * rest) - total(rest)) / (3 * rest))
+    if size <= 0:
+        raise too_small(limit, total(rest))
+    return size
+
+
+def encoded(
+    field: Field,
+    render: dict[str, Any],
+    steps: Mapping[str, np.ndarray] | None,
+    limit: float | None,
+    total: Callable[[int], int],
+) -> tuple[bytes, float]:
+    """A compact file, and the factor of its grids' steps: 1, unless all that is written would have more than `limit`
+    bytes. Then it has at most these, and more than ENOUGH of them after few attempts; InputError if the coarsest file
+    has more."""
+    found: dict[float, bytes] = {}  # by the logarithm (base 2) of the factor
+
+    def attempt(log: float) -> int:
+        header, streams = encode(field, render, steps, 2.0**log)
+        count = "" if limit is None else f", attempt {len(found) + 1}"
+        with progress(f"Encoding{count}", len(streams)) as advance:
+            found[log] = container(header, streams, advance)
+        return total(len(found[log]))
+
+    log, size = 0.0, attempt(0.0)
+    if limit is None or size <= limit:
+        return found[log], 1.0
+    slope = (
+        13 * len(field.splats["means"]) + field.splats["latents"].numel()
+    ) / 8  # a bit for each number and doubling
+    while len(found) < MOST_ATTEMPTS and not ENOUGH * limit <= size <= limit:
+        last = log, size
+        log = min(max(log + (size - AIM * limit) / slope, 0.0), math.log2(COARSEST))
+        if log in found:
+            break
+        size = attempt(log)
+        slope = max((last[1] - size) / (log - last[0]), 1.0)
+    fitting = [log for log, data in found.items() if total(len(data)) <= limit]
+    if not fitting:
+        raise too_small(limit, min(total(len(data)) for data in found.values()))
+    return found[best := min(fitting)], 2.0**best
+
+
+def too_small(limit: float, smallest: int) -> InputError:
+    return InputError(
+        f"--size-mb is {limit / 1e6:g}, and the smallest output of this model has "
+        f"{math.ceil(smallest / 1e4) / 100:.2f} MB. Ask for more, or train with fewer splats (docs/fewer-splats.md)."
+    )
 
 
 def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:

@@ -26,6 +26,9 @@ class CompactOptions:
     """steps of a fine-tune for the file: tables that cost less, learnt rounding. 0: the model's numbers, rounded"""
     rate: float = 1e-4
     """with finetune: the training's loss that one byte for each splat is worth. More: a smaller file"""
+    size_mb: float | None = None
+    """millions of bytes that the output may have: it becomes as precise as that allows. With finetune the rate is
+    found while it trains, and rate is where it begins"""
 
 
 @dataclass

@@ -93,15 +93,8 @@ def load_file(path: Path) -> "NrfgsModel":
 
     decoded = decode(path)
     means = decoded.splats["means"]
-    match decoded.header.get("render"):
-        case {
-            "rasterize_mode": "classic" | "antialiased" as mode,
-            "background": [int() | float(), int() | float(), int() | float()] as background,
-        }:
-            pass
-        case _:
-            raise InputError(f"{path} does not say how it is rendered. Export it again with nrfgs export compact.")
-    name = {(0, 0, 0): "black", (1, 1, 1): "white"}.get(tuple(background), "random")
+    mode, background, _ = decoded.render
+    name = {(0, 0, 0): "black", (1, 1, 1): "white"}.get(background, "random")
     config = NrfgsModelConfig(appearance=decoded.config, rasterize_mode=mode, background_color=name, near_plane="auto")
     model = config.setup(
         scene_box=SceneBox(torch.stack([means.amin(0), means.amax(0)])),

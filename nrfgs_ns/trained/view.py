@@ -59,8 +59,9 @@ def view_file(path: Path, config):
     pipeline = SimpleNamespace(model=model, datamanager=SimpleNamespace(includes_time=False))
     viewer = Viewer(config, path.parent / "viewer.log", datapath=path.parent, pipeline=pipeline)
     viewer.camera_handles, viewer.original_c2w = {}, {}
-    for button in (viewer.pause_train, viewer.resume_train, viewer.hide_images):
-        button.visible = False
+    viewer.hide_images.visible = False
+    viewer.make_stats_markdown = lambda _, resolution: f"Resolution: {resolution}"  # a file knows no step
+    viewer.stats_markdown.content = viewer.make_stats_markdown(None, "0x0px")
 
     means = model.means.detach()
     middle = means.median(dim=0).values

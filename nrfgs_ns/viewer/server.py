@@ -71,6 +71,7 @@ def protect() -> None:
     _infra.websockets = SimpleNamespace(server=SimpleNamespace(serve=_serve), exceptions=websockets.exceptions)
     Viewer.__init__ = _guarded(Viewer.__init__)
     Viewer.update_scene = _harmless(Viewer.update_scene)
+    Viewer.training_complete = _without_pause(Viewer.training_complete)
     ViewerLegacyState.__init__ = _refused
 
 
@@ -83,6 +84,8 @@ def _guarded(open_viewer):
             config = replace(config, websocket_host=LOCAL)
         _check_address(config.websocket_host, config.websocket_port)
         open_viewer(self, config, *args, **options)
+        if self.trainer is None:
+            _hide_pause(self)
         server, tunnel = self.viser_server, self.viser_server._share_tunnel
         if tunnel is not None and tunnel.get_url():
             server._websock_server.names.add(urlsplit(tunnel.get_url()).hostname)
@@ -101,14 +104,32 @@ def _guarded(open_viewer):
 
 def _harmless(update_scene):
     """Nerfstudio's `Viewer.update_scene`, which a training calls after each step, without exceptions: a browser that
-    leaves, or whose camera is odd, must not end the training."""
+    leaves, or whose camera is odd, must not end the training. It also shows the step of a training that is over."""
 
     @functools.wraps(update_scene)
-    def update(self, *args, **options) -> None:
+    def update(self, step: int, *args, **options) -> None:
         with contextlib.suppress(Exception):
-            update_scene(self, *args, **options)
+            if self.trainer is None:
+                self.update_step(step)
+            update_scene(self, step, *args, **options)
 
     return update
+
+
+def _without_pause(training_complete):
+    """Nerfstudio's `Viewer.training_complete`, which leaves a button that pauses nothing."""
+
+    @functools.wraps(training_complete)
+    def complete(self) -> None:
+        training_complete(self)
+        _hide_pause(self)
+
+    return complete
+
+
+def _hide_pause(viewer: Viewer) -> None:
+    for button in (viewer.pause_train, viewer.resume_train):
+        button.visible = False
 
 
 def _check_address(host: str, port: int | None) -> None:
@@ -153,6 +174,8 @@ class GuardedServer(infra.WebsockServer):
             self.file_names.add(message.id)
         elif isinstance(message, _messages.ThemeConfigurationMessage):
             message.show_share_button = False
+            if message.titlebar_content:
+                message.titlebar_content["image"] = None  # of another site, which may be out of reach
         super().queue_message(message)
 
     @contextlib.contextmanager

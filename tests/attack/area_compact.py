@@ -26,13 +26,14 @@ def written() -> bytes:
     from nrfgs_ns.compact.encode import encode
     from nrfgs_ns.compact.format import write_container
 
+    render = {"rasterize_mode": "classic", "background": [0.0, 0.0, 0.0]}
     torch.manual_seed(3)
     head = NrfConfig(latent_dim=8, hidden_width=16, output_init="default").setup().requires_grad_(False)
     columns = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "features_dc": 3, "latents": 8}
     splats = {name: torch.randn(60, count) for name, count in columns.items()}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "field.nrf"
-        write_container(path, *encode(Field(head, splats), {}))
+        write_container(path, *encode(Field(head, splats), render))
         return path.read_bytes()
 
 
@@ -148,7 +149,7 @@ CLAIMS = {
     ("grids", "means", "low"): ([[0.0]] * 3,),
     ("head", "name"): ("sh",),
     ("head", "scene_unit"): (0, -1, float("nan"), "1"),
-    ("head", "config", "latent_dim"): (0, -1, 9, 10**9, 2**63, 8.0, "8", None, [8], True),
+    ("head", "config", "latent_dim"): (0, -1, 9, 10**9, 2**63, 8.5, "8", None, [8], True),
     ("head", "config", "hidden_width"): (0, 17, 10**30, "16"),
     ("head", "config", "num_bands"): (0, 4, 10**9, "3"),
     ("head", "config", "color_scale"): (-1, float("nan"), float("inf"), "x", None),

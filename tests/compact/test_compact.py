@@ -7,12 +7,13 @@ import shutil
 import subprocess
 from dataclasses import replace
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import tyro
-from compact_fields import field, matched, through_a_file
+from compact_fields import RENDER, field, matched, through_a_file
 from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.scripts.render import DatasetRender
@@ -147,7 +148,7 @@ def test_large_weights_and_a_lone_splat(tmp_path):
 )
 def test_tables_of_no_field_are_refused(change, says, tmp_path):
     """Headers of none are in tests/attack."""
-    header, streams = encode(field(), {})
+    header, streams = encode(field(), RENDER)
     change(streams)
     write_container(tmp_path / "f.nrf", header, streams)
     with pytest.raises(InputError, match=says):
@@ -158,7 +159,7 @@ def test_tables_much_larger_than_the_file_are_refused(tmp_path):
     """Diffuse splats have no latents in the file, and need them in memory."""
     wide = NrfConfig(latent_dim=1024, hidden_width=16).setup().requires_grad_(False)
     diffuse = {**field(4).splats, "latents": torch.zeros(4, 1024), DIFFUSE: torch.ones(4, dtype=torch.bool)}
-    header, streams = encode(Field(wide, diffuse), {})
+    header, streams = encode(Field(wide, diffuse), RENDER)
     header["splats"][DIFFUSE] = 20_000
     streams |= {"means": Table(np.zeros((2, 20_000)), signed=False), "splats": Table(np.ones((11, 20_000)))}
     write_container(tmp_path / "f.nrf", header, streams)
@@ -181,13 +182,13 @@ def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
     write_container(tmp_path / "f.nrf", header, streams)
     assert load_file(tmp_path / "f.nrf").projection_options.near_plane == 2.5, "of the training, in world units"
     write_container(tmp_path / "f.nrf", {**header, "render": {"rasterize_mode": "classic"}}, streams)
-    with pytest.raises(InputError, match="does not say how it is rendered"):
+    with pytest.raises(InputError, match="render has not the keys rasterize_mode, background"):
         load_file(tmp_path / "f.nrf")
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node: the page's reader is tried by pytest -m browser")
 def test_the_page_reads_the_same_splats(tmp_path):
-    write_container(tmp_path / "f.nrf", *encode(field(), {}))
+    write_container(tmp_path / "f.nrf", *encode(field(), RENDER))
     decoded = decode(tmp_path / "f.nrf")
     (tmp_path / "read.js").write_text((files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + READ)
     said = subprocess.run(["node", "read.js", "f.nrf"], cwd=tmp_path, capture_output=True, check=True)
@@ -342,6 +343,51 @@ def test_what_training_expects_is_what_a_file_has(tmp_path):
     splats = {**rows, "means": means(rounded=True).detach(), DIFFUSE: torch.ones(20_000, dtype=torch.bool)}
     steps = {name: np.ones(n) for name, n in (("turns", 3), ("scales", 3), ("opacities", 1), ("colors", 3))}
     steps |= {"latents": np.ones(8), "means": means.steps.detach().double().numpy()}
-    write_container(tmp_path / "f.nrf", *encode(Field(one.head, splats), {}, steps))
+    write_container(tmp_path / "f.nrf", *encode(Field(one.head, splats), RENDER, steps))
     entries = read_container((tmp_path / "f.nrf").read_bytes())[0]["streams"]
     assert of_places == pytest.approx({entry["name"]: entry["bytes"] for entry in entries}["means"], rel=0.03)
+
+
+@pytest.mark.parametrize("words", ["", "--finetune 120"])
+def test_a_size_is_reached_and_not_exceeded(words, exported, tmp_path, capsys):
+    config, _, _ = exported
+    plain, sizes = exported[1].stat().st_size, {}
+    for share in (0.95, 0.8):
+        output, report = tmp_path / f"{share}.nrf", tmp_path / f"{share}.json"
+        torch.manual_seed(0)
+        line = f"compact --load-config {config} --output {output} --report {report} {words}"
+        tyro.cli(Export, args=[*line.split(), "--size-mb", str(share * plain / 1e6)]).main()
+        sizes[share] = output.stat().st_size
+        found = json.loads(report.read_text())
+        assert 0.95 * share * plain <= sizes[share] <= share * plain and found["bytes"] == sizes[share]
+        assert "Encoding, attempt 1" in capsys.readouterr().out
+    if not words:
+        assert found["coarser"] > 1 and found["rate"] is None
+    assert found["loss_db"] < 1.0
+
+
+@pytest.mark.parametrize("name", ["page.html", "folder"])
+def test_a_page_reaches_its_size_with_all_that_is_in_it(name, exported, tmp_path):
+    def written(output: Path, *options: str) -> int:
+        line = ["web", "--load-config", str(exported[0]), "--output", str(output), "--no-measure", *options]
+        tyro.cli(Export, args=line).main()
+        return output.stat().st_size if output.is_file() else sum(path.stat().st_size for path in output.iterdir())
+
+    limit = written(tmp_path / "plain" / name) - 1000
+    assert 0.95 * limit <= written(tmp_path / name, "--size-mb", str(limit / 1e6)) <= limit
+
+
+def test_a_size_that_is_too_small_is_refused_with_the_smallest(exported, tmp_path):
+    config, _, _ = exported
+    words = ["compact", "--load-config", str(config), "--output", str(tmp_path / "x.nrf"), "--no-measure"]
+    for size, said in (
+        ("1e-4", "the smallest output of this model has 0.0"),
+        ("0", "must be positive"),
+        ("nan", "must be"),
+    ):
+        with pytest.raises(InputError, match=said):
+            tyro.cli(Export, args=[*words, "--size-mb", size]).main()
+    with pytest.raises(InputError, match="the smallest output"):
+        tyro.cli(Export, args=[*words, "--size-mb", "1e-4", "--finetune", "10"]).main()
+    tyro.cli(Export, args=[*words, "--size-mb", "50"]).main()
+    assert (tmp_path / "x.nrf").stat().st_size < 1e6, "a file that is small enough stays as precise as it is"

@@ -132,7 +132,7 @@ READ = """
 const fs = require("fs"), crypto = require("crypto");
 const { streams } = readContainer(new Uint8Array(fs.readFileSync(process.argv[2])), () => {});
 const found = {};
-for (const [name, { columns }] of Object.entries(streams)) {
+for (const [name, { columns }] of streams) {
   if (!columns) continue;
   const hash = crypto.createHash("sha256");
   for (const column of columns) hash.update(new Uint8Array(column.buffer));

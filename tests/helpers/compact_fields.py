@@ -13,6 +13,9 @@ from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 
+RENDER = {"rasterize_mode": "classic", "background": [0.0, 0.0, 0.0]}
+"""How a file says that it is rendered."""
+
 
 def field(count: int = 60) -> Field:
     torch.manual_seed(3)
@@ -31,7 +34,7 @@ def field(count: int = 60) -> Field:
 
 
 def through_a_file(one: Field, tmp_path: Path) -> Decoded:
-    header, streams = encode(one, {"rasterize_mode": "classic"})
+    header, streams = encode(one, RENDER)
     write_container(tmp_path / "f.nrf", header, streams)
     return decode(tmp_path / "f.nrf")
 

@@ -14,7 +14,7 @@ import pytest
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.viewer.viewer import Viewer
 from short_trainings import command_line, set_up, trained
-from viser._messages import ResetGuiMessage, ViewerCameraMessage
+from viser._messages import ResetGuiMessage, ThemeConfigurationMessage, ViewerCameraMessage
 from websockets.asyncio.client import connect
 
 from nrfgs_ns.compact.format import MAGIC
@@ -309,6 +309,22 @@ def test_a_camera_path_is_saved_in_its_folder(to_all):
     handle = to_all.viser_server.gui._gui_input_handle_from_id[name]
     send(to_all.viser_server.get_port(), [update(handle, "../../../a\\bc")], lambda: "a_b" in handle.value)
     assert handle.value == ".._.._.._a_bc"
+
+
+def test_a_finished_training_cannot_be_paused_and_shows_its_step(open_viewer, pipeline):
+    viewer = open_viewer(pipeline)
+    viewer.update_scene(step=1499)
+    assert not viewer.pause_train.visible and not viewer.resume_train.visible
+    assert viewer.stats_markdown.content.startswith("Step: 1499 ")
+    viewer.pause_train.visible = True  # as in a training, which ends now
+    viewer.training_complete()
+    assert not viewer.pause_train.visible
+
+
+def test_the_page_shows_no_picture_of_another_site(open_viewer, pipeline):
+    buffer = open_viewer(pipeline).viser_server._websock_server._broadcast_buffer
+    themes = [one for one in buffer.message_from_id.values() if isinstance(one, ThemeConfigurationMessage)]
+    assert themes and all(one.titlebar_content["image"] is None for one in themes)
 
 
 def test_the_legacy_viewer_is_refused(tiny_scene, tmp_path):

@@ -48,12 +48,14 @@ def export_web(
                 f"{load_config}: the field's weights fill {vectors} vectors of a shader, and some phones have room for "
                 f"{MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
             )
+        about, poster = surroundings(pipeline)
+        title = output.stem if web.title is None else web.title
+        around = len(page(about, poster, b"" if alone else SCENE, title, web.author).encode())
         with TemporaryDirectory() as temporary:
             file = Path(temporary) / SCENE
-            _, numbers = write_file(pipeline, load_config, file, options, measure)
+            total = lambda size: around + (-(-size // 3) * 4 if alone else size)  # noqa: E731 -- base64 in a page
+            _, numbers = write_file(pipeline, load_config, file, options, measure, total)
             scene = file.read_bytes()
-        about, poster = surroundings(pipeline)
-    title = output.stem if web.title is None else web.title
     text = page(about, poster, scene if alone else SCENE, title, web.author)
     contents = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
     for path, content in contents.items():

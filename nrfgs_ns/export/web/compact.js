@@ -4,41 +4,145 @@
 const MAGIC = [0x89, 0x4e, 0x52, 0x46, 0x0d, 0x0a, 0x1a, 0x0a];
 const VERSION = 2;
 const BYTES = { uint8: 1, uint16: 2, uint32: 4, uint64: 8, float16: 2, float32: 4, int16: 2, int32: 4 };
-const LARGEST_STREAM = 2 ** 31;
+const CODINGS = new Map([
+  ["xz", ["uint8", "uint16", "uint32", "uint64", "float16", "float32"]], ["rans", ["int16", "int32", "uint32"]],
+]);
+const LARGEST_RATIO = 32, SMALL = 2 ** 24;  // what a file may unpack to: times its size, and bytes that any file may
+const LARGEST = 1e18;  // of an option, and of the unit of length
+const TABLES = new Map([["means", ["uint32"]], ["splats", ["int16", "int32"]], ["latents", ["int16", "int32"]]]);
+const WIDTHS = { means: 3, opacities: 1, scales: 3, colors: 3, turns: 3 };  // numbers of a splat in each grid
+const SH_C0 = 0.28209479177387814;
+
+// The field's options, and what is assumed of one that a file leaves out.
+const OPTIONS = {
+  "latent_dim": 32, "num_bands": 3, "hidden_width": 64, "split_bands": true, "opacity_residual": true,
+  "use_distance": true, "color_scale": 0.2, "opacity_scale": 0.2, "distance_eps": 0.01, "output_init": "zero",
+  "opacity_bound": "straight-through", "implementation": "auto", "precision": "bf16"
+};
+const LIMITS = {
+  latent_dim: [1, 1024], num_bands: [1, 16], hidden_width: [1, 4096], color_scale: [0, LARGEST],
+  opacity_scale: [0, LARGEST], distance_eps: [Number.MIN_VALUE, LARGEST],
+};
+const CHOICES = {
+  output_init: ["zero", "default"], opacity_bound: ["straight-through", "logit"],
+  implementation: ["auto", "torch", "fused"], precision: ["fp32", "tf32", "bf16", "fp16"],
+};
 
 // What is said to a reader: a fault of the file, or what a device lacks.
 class BadFile extends Error {}
 class Lacking extends Error {}
 
-// The scene in a file's bytes. `progress` is told the share that is done.
+function expect(right, what) {
+  if (!right) throw new BadFile(`The scene is damaged: ${what}.`);
+}
+const isCount = (value) => Number.isInteger(value) && value >= 0;
+const isNumber = (value, low, high) => typeof value === "number" && value >= low && value <= high;
+
+// Whether a value is an object with these keys, and no others except the optional ones.
+function hasKeys(value, keys, optional = []) {
+  if (typeof value !== "object" || value === null || Array.isArray(value)) return false;
+  const own = Object.keys(value);
+  return keys.every((key) => own.includes(key)) && own.every((key) => keys.includes(key) || optional.includes(key));
+}
+
+// The scene in a file's bytes; BadFile where docs/compact-format.md has a file refused. `progress` is told the share
+// that is done.
 //   table    Float32Array [N, 16]: mean, logit of opacity; rotation (w, x, y, z); standard deviations, 0; base colour, 0
 //   latents  Float32Array [V, rank filled up to a multiple of 4]; the first V of the N splats are view-dependent
 //   weights  name -> {shape, values}
 function readScene(bytes, progress) {
-  const { header, streams } = readContainer(bytes, progress);
-  if (header.format !== "nrfgs-compact" || header.head.name !== "nrf") {
-    throw new BadFile("The scene is not a neural residual field.");
+  try {
+    const { header, streams } = readContainer(bytes, progress);
+    checkHeader(header);
+    return sceneOf(header, streams);
+  } catch (error) {
+    if (error instanceof BadFile) throw error;
+    throw new BadFile("The scene cannot be read: it is damaged, or needs more memory than this device has.");
   }
-  const count = { view: header.splats.view, diffuse: header.splats.diffuse };
-  const rank = header.head.config.latent_dim;
-  const scene = {
-    header,
-    count: count.view + count.diffuse,
-    viewDependent: count.view,
-    table: new Float32Array(16 * (count.view + count.diffuse)),
-    latents: new Float32Array(4 * Math.ceil(rank / 4) * count.view),
-    weights: {},
-  };
-  for (const [name, stream] of Object.entries(streams)) {
-    if (name.startsWith("head.")) {
-      const values = stream.dtype === "float32" ? new Float32Array(numbers(stream).buffer) : halves(numbers(stream));
-      scene.weights[name.slice("head.".length)] = { shape: stream.shape, values };
+}
+
+// Fills in what a file may leave out.
+function checkHeader(header) {
+  const { head, render, grids, splats } = header;
+  expect(hasKeys(header, ["format", "splats", "head", "render", "grids", "streams"]), "its header is of another kind");
+  expect(hasKeys(head, ["name", "config", "scene_unit"]), "its header does not describe a field");
+  expect(header.format === "nrfgs-compact" && head.name === "nrf", "it is not a neural residual field");
+  expect(hasKeys(head.config, [], Object.keys(OPTIONS)), "its field has unknown options");
+  head.config = { ...OPTIONS, ...head.config };
+  for (const [name, value] of Object.entries(head.config)) {
+    const [low, high] = LIMITS[name] ?? [];
+    const whole = low === undefined || Number.isInteger(value) || !Number.isInteger(OPTIONS[name]);
+    const right = low === undefined ? CHOICES[name]?.includes(value) ?? typeof value === "boolean" : isNumber(value, low, high);
+    expect(right && whole, `its field's ${name} is out of range`);
+  }
+  expect(isNumber(head.scene_unit, 1 / LARGEST, LARGEST), "its unit of length is out of range");
+  expect(hasKeys(render, ["rasterize_mode", "background"], ["near_plane"]), "it does not say how it is drawn");
+  expect(["classic", "antialiased"].includes(render.rasterize_mode), "it does not say how it is drawn");
+  const { background } = render;
+  expect(Array.isArray(background) && background.length === 3, "its background is no colour");
+  expect(background.every((value) => isNumber(value, 0, 1)), "its background is no colour");
+  if ("near_plane" in render) expect(isNumber(render.near_plane, 0, LARGEST), "its near plane is out of range");
+  render.near_plane ||= 0.01 * head.scene_unit;
+  const widths = { ...WIDTHS, latents: head.config.latent_dim };
+  expect(hasKeys(grids, Object.keys(widths)), "its grids are of another kind");
+  for (const [name, width] of Object.entries(widths)) {
+    expect(hasKeys(grids[name], ["low", "step"]), `the grid of its ${name} is of another kind`);
+    for (const part of ["low", "step"]) {
+      const row = grids[name][part];
+      const right = Array.isArray(row) && row.length === width && row.every(Number.isFinite);
+      expect(right, `the grid of its ${name} is of another kind`);
     }
+    expect(grids[name].step.every((step) => step > 0), `the grid of its ${name} has steps that are not positive`);
+  }
+  expect(hasKeys(splats, ["view", "diffuse"]) && Object.values(splats).every(isCount), "its number of splats is unknown");
+  expect(splats.view + splats.diffuse > 0, "it has no splats");
+}
+
+// The network's weights and their shapes.
+function shapesOf(config) {
+  const { latent_dim, num_bands, hidden_width, split_bands } = config;
+  const shared = latent_dim + 3 + config.use_distance, low = 10, high = 6 * (num_bands - 1);
+  const outputs = 3 + config.opacity_residual;
+  const shapes = new Map();
+  const branch = (name, inputs, units, out) => {
+    const parts = { "0.weight": [units, inputs], "0.bias": [units], "2.weight": [out, units], "2.bias": [out] };
+    for (const [part, shape] of Object.entries(parts)) shapes.set(`head.${name}.${part}`, shape);
+  };
+  if (split_bands) branch("low", shared + low, hidden_width, outputs);
+  else branch("low", shared + low + high, 2 * hidden_width, outputs);
+  if (split_bands && high > 0) branch("high", shared + high, hidden_width, 4);
+  return shapes;
+}
+
+function sceneOf(header, streams) {
+  const { view, diffuse } = header.splats, count = view + diffuse, { config } = header.head, rank = config.latent_dim;
+  const shapes = shapesOf(config).set("means", [2, count]).set("splats", [11, count]).set("latents", [rank, view]);
+  expect(streams.size === shapes.size, "it has other streams than its field needs");
+  let unpacked = 0;
+  for (const [name, shape] of shapes) {
+    const stream = streams.get(name), table = TABLES.get(name);
+    expect(stream && String(stream.shape) === String(shape), `its ${name} does not fit its field or its splats`);
+    expect(stream.coding === (table ? "rans" : "xz"), `its ${name} is in another coding`);
+    expect((table ?? ["float16", "float32"]).includes(stream.dtype), `its ${name} holds other numbers`);
+    unpacked += BYTES[stream.dtype] * shape.reduce((a, b) => a * b, 1);
+  }
+  expect(4 * count * (rank + 14) <= Math.max(LARGEST_RATIO * unpacked, SMALL), "it asks for too much memory");
+  const scene = {
+    header, count, viewDependent: view, weights: {},
+    table: new Float32Array(16 * count),
+    latents: new Float32Array(4 * Math.ceil(rank / 4) * view),
+  };
+  for (const [name, stream] of streams) {
+    if (TABLES.has(name)) continue;
+    const values = stream.dtype === "float32" ? new Float32Array(numbers(stream).buffer) : halves(numbers(stream));
+    expect(values.every(Number.isFinite), `its ${name} is not finite`);
+    scene.weights[name.slice("head.".length)] = { shape: stream.shape, values };
   }
   readTables(streams, scene, rank);
   return scene;
 }
 
+// The header, and name -> {coding, dtype, shape; columns or planes}.
 function readContainer(bytes, progress) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   if (bytes.length < 28 || MAGIC.some((byte, i) => bytes[i] !== byte)) {
@@ -50,59 +154,74 @@ function readContainer(bytes, progress) {
   if (total !== bytes.length || 28 + length > total) {
     throw new BadFile(`The scene has ${bytes.length} bytes instead of ${total}: the page is cut short.`);
   }
-  if (crc32(bytes.subarray(0, 24 + length)) !== view.getUint32(24 + length, true)) {
-    throw new BadFile("The scene is damaged: the checksum of its header does not hold.");
+  expect(crc32(bytes.subarray(0, 24 + length)) === view.getUint32(24 + length, true), "the checksum of its header does not hold");
+  let header = null;
+  try {
+    header = JSON.parse(new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(bytes.subarray(24, 24 + length)));
+  } catch {
+    expect(false, "its header is no JSON");
   }
-  const header = JSON.parse(new TextDecoder().decode(bytes.subarray(24, 24 + length)));
-  const streams = {};
-  let at = 28 + length;
-  for (const { name, dtype, shape, bytes: size, crc32: sum, coding } of header.streams) {
+  expect(Array.isArray(header?.streams), "its header is of another kind");
+  const streams = new Map();
+  let at = 28 + length, unpacked = 0;
+  for (const entry of header.streams) {
+    const fits = hasKeys(entry, ["name", "coding", "dtype", "shape", "bytes", "crc32"]) && typeof entry.name === "string";
+    expect(fits && CODINGS.get(entry.coding)?.includes(entry.dtype), "one of its streams is of another kind");
+    const { name, dtype, shape, bytes: size, coding } = entry;
+    expect(Array.isArray(shape) && shape.every(isCount) && isCount(size), `its stream ${name} has no size`);
+    expect(!streams.has(name), `it has two streams ${name}`);
+    unpacked += BYTES[dtype] * shape.reduce((a, b) => a * Math.max(b, 1), 1);
+    expect(unpacked <= Math.max(LARGEST_RATIO * total, SMALL), `its stream ${name} is too large`);
     const body = bytes.subarray(at, at + size);
     at += size;
-    if (body.length !== size || crc32(body) !== sum) {
-      throw new BadFile(`The scene is damaged: the checksum of its stream ${name} does not hold.`);
-    }
-    const unpacked = BYTES[dtype] * shape.reduce((a, b) => a * b, 1);
-    if (!(unpacked <= LARGEST_STREAM)) throw new BadFile(`The scene's stream ${name} is too large.`);
-    streams[name] = { dtype, shape };
-    if (coding === "rans") streams[name].columns = decodeTable(body, shape[0], shape[1]);
-    else streams[name].planes = unxz(body, unpacked);
+    expect(body.length === size && crc32(body) === entry.crc32, `the checksum of its stream ${name} does not hold`);
+    const stream = { coding, dtype, shape };
+    if (coding === "rans") stream.columns = decodeTable(body, shape, dtype);
+    else stream.planes = unxz(body, BYTES[dtype] * shape.reduce((a, b) => a * b, 1));
+    streams.set(name, stream);
     progress(at / total);
   }
+  expect(at === total, "it goes on after its last stream");
   return { header, streams };
 }
 
 // The tables: all splats in one order; the scene has the view-dependent ones first.
-function readTables({ means, splats, latents }, scene, rank) {
-  const n = scene.count, of = scene.viewDependent, { grids } = scene.header;
-  const fits = ({ columns, shape } = {}, c, rows) => columns && shape[0] === c && shape[1] === rows;
-  if (!fits(means, 2, n) || !fits(splats, 11, n) || !fits(latents, rank, of)) {
-    throw new BadFile("The scene's tables do not fit its number of splats.");
-  }
-  const diffuse = splats.columns[0], place = new Uint32Array(n);
+function readTables(streams, scene, rank) {
+  const [means, splats, latents] = ["means", "splats", "latents"].map((name) => streams.get(name).columns);
+  const n = scene.count, of = scene.viewDependent, { grids } = scene.header, { table } = scene;
+  const diffuse = splats[0], place = new Uint32Array(n);
   let first = 0, last = of;
   for (let i = 0; i < n; i++) place[i] = diffuse[i] ? last++ : first++;
-  if (first !== of) throw new BadFile("The scene's tables do not fit its number of splats.");
-  readPlaces(means.columns[1], means.columns[0], grids.means, scene.table, place);
-  const put = (column, { low, step }, c, offset, value) => {
-    for (let i = 0; i < n; i++) scene.table[16 * place[i] + offset] = value(low[c] + step[c] * column[i]);
+  expect(first === of, "its tables do not fit its number of splats");
+  expect(means[0].every((upper) => upper < 2 ** 31), "its means are beyond 63 bits");
+  readPlaces(means[1], means[0], grids.means, table, place);
+  // `stored` is what Python keeps of a value, and must be finite in float32; `drawn` what the page keeps.
+  const same = (x) => x;
+  const put = (column, { low, step }, c, offset, stored = same, drawn = same) => {
+    for (let i = 0; i < n; i++) {
+      const value = low[c] + step[c] * column[i];
+      expect(Number.isFinite(Math.fround(stored(value))), "its splats are not finite");
+      table[16 * place[i] + offset] = drawn(value);
+    }
   };
-  put(splats.columns[1], grids.opacities, 0, 3, (x) => x);
+  put(splats[1], grids.opacities, 0, 3);
   for (let c = 0; c < 3; c++) {
-    put(splats.columns[2 + c], grids.scales, c, 8 + c, Math.exp);
-    put(splats.columns[5 + c], grids.colors, c, 12 + c, (x) => x);
+    put(splats[2 + c], grids.scales, c, 8 + c, same, Math.exp);
+    put(splats[5 + c], grids.colors, c, 12 + c, (x) => (x - 0.5) / SH_C0);
   }
-  const turns = splats.columns.slice(8), { low, step } = grids.turns;
+  const turns = splats.slice(8), { low, step } = grids.turns;
   for (let i = 0; i < n; i++) {
     const [x, y, z] = turns.map((column, c) => low[c] + step[c] * column[i]);
     const w = Math.sqrt(Math.max(1 - (x * x + y * y + z * z), 1e-6)), norm = Math.sqrt(w * w + x * x + y * y + z * z);
-    scene.table.set([w / norm, x / norm, y / norm, z / norm], 16 * place[i] + 4);
+    table.set([w / norm, x / norm, y / norm, z / norm], 16 * place[i] + 4);
+    for (const c of [0, 1, 2, 4, 5, 6, 7]) expect(Number.isFinite(table[16 * place[i] + c]), "its splats are not finite");
   }
   const width = 4 * Math.ceil(rank / 4);
   for (let r = 0; r < rank; r++) {
-    const column = latents.columns[r], low = grids.latents.low[r], step = grids.latents.step[r];
+    const column = latents[r], low = grids.latents.low[r], step = grids.latents.step[r];
     for (let i = 0; i < of; i++) scene.latents[width * i + r] = low + step * column[i];
   }
+  expect(scene.latents.every(Number.isFinite), "its latents are not finite");
 }
 
 let crcTable = null;
@@ -167,13 +286,17 @@ function readPlaces(lowers, uppers, { low, step }, table, place) {
 // ---- coded tables: rANS in lanes, as entropy.py's docstring has it. Whole numbers alone, so that every reader agrees.
 
 const PRECISION = 14, LOWEST = 1 << 16, DIRECT = 32, TOKENS = 140, MOST_ACTIVITY = 4 * 16 * 139;
+const MOST_CONTEXTS = 16, MOST_MODEL = 13 + MOST_CONTEXTS * (3 + TOKENS), LARGEST_WEIGHT = 1 << 16;
 
-// The columns of a table [C, n]: Int32Array where they are signed, Uint32Array where they are not.
-function decodeTable(body, C, n) {
+// The columns of a table: Uint32Array for uint32, else Int32Array.
+function decodeTable(body, shape, dtype) {
   const broken = () => new BadFile("The scene is damaged: one of its tables cannot be decoded.");
-  const view = new DataView(body.buffer, body.byteOffset, body.byteLength);
+  if (shape.length !== 2 || shape[0] > 1024 || body.length < 8) throw broken();
+  const [C, n] = shape, view = new DataView(body.buffer, body.byteOffset, body.byteLength);
+  const lowest = { int16: -(2 ** 15), int32: -(2 ** 31), uint32: 0 }[dtype];
+  const highest = { int16: 2 ** 15 - 1, int32: 2 ** 31 - 1, uint32: 2 ** 32 - 1 }[dtype];
   const count = view.getUint32(0, true), size = view.getUint32(4, true);
-  if (count > 4096 * C || 8 + size > body.length) throw broken();
+  if (count > MOST_MODEL * C || 8 + size > body.length) throw broken();
   const model = new Int32Array(numbers({ dtype: "int32", planes: unxz(body.subarray(8, 8 + size), 4 * count) }).buffer);
   let read = 0;
   const take = () => {
@@ -186,6 +309,7 @@ function decodeTable(body, C, n) {
   let at = 8 + size;
   if (at + 4 * lanes > body.length) throw broken();
   for (let l = 0; l < lanes; l++, at += 4) state[l] = view.getUint32(at, true);
+  if (state.some((x) => x < LOWEST)) throw broken();
   const word = () => {
     at += 2;
     if (at > body.length) throw broken();
@@ -197,13 +321,16 @@ function decodeTable(body, C, n) {
   for (let c = 0; c < C; c++) {
     const signed = take() !== 0;
     const weights = Array.from({ length: 7 }, take), shares = Array.from({ length: 4 }, take);
-    const thresholds = Array.from({ length: take() }, take);
+    const contexts = take();
+    if (contexts < 0 || contexts >= MOST_CONTEXTS || weights.some((w) => Math.abs(w) > LARGEST_WEIGHT)) throw broken();
+    const thresholds = Array.from({ length: contexts }, take);
+    if (thresholds.some((value, k) => k > 0 && value <= thresholds[k - 1])) throw broken();
     const frequencies = new Uint16Array((thresholds.length + 1) * TOKENS), starts = new Uint16Array(frequencies.length);
     const lookup = new Uint8Array((thresholds.length + 1) << PRECISION);
     for (let k = 0; k <= thresholds.length; k++) {
       const first = take(), used = take();
       let sum = 0;
-      if (first < 0 || first + used > TOKENS) throw broken();
+      if (first < 0 || used <= 0 || first + used > TOKENS) throw broken();
       for (let token = first; token < first + used; token++) {
         const frequency = take();
         if (frequency < 0 || sum + frequency > 1 << PRECISION) throw broken();
@@ -221,7 +348,7 @@ function decodeTable(body, C, n) {
     }
     if (shares.some((share) => share < 0 || share > 16)) throw broken();
     const [w0, w1, w2, w3, w4, w5, w6] = weights, [s1, s2, s3, s4] = shares;
-    const own = tokens[c % 3], out = signed ? new Int32Array(n) : new Uint32Array(n);
+    const own = tokens[c % 3], out = dtype === "uint32" ? new Uint32Array(n) : new Int32Array(n);
     const left = c > 0 ? columns[c - 1] : zeros, left2 = c > 1 ? columns[c - 2] : zeros;
     const near = c > 0 ? tokens[(c + 2) % 3] : zeros, near2 = c > 1 ? tokens[(c + 1) % 3] : zeros;
     for (let t = 0; t < S; t++) {
@@ -257,12 +384,16 @@ function decodeTable(body, C, n) {
           }
         }
       }
-      if (!signed) continue;
       for (let l = 0, i = t; l < active; l++, i += S) {
         const u = out[i] >>> 0, b = t > 0 ? i - 1 : -1;
-        const sum = w0 + 128 + w1 * (t > 0 ? out[i - 1] : 0) + w2 * (t > 1 ? out[i - 2] : 0) +
-          w3 * left[i] + w4 * (b < 0 ? 0 : left[b]) + w5 * left2[i] + w6 * (b < 0 ? 0 : left2[b]);
-        out[i] = Math.floor(sum / 256) + ((u >>> 1) ^ -(u & 1));
+        let x = u;
+        if (signed) {
+          const sum = w0 + 128 + w1 * (t > 0 ? out[i - 1] : 0) + w2 * (t > 1 ? out[i - 2] : 0) +
+            w3 * left[i] + w4 * (b < 0 ? 0 : left[b]) + w5 * left2[i] + w6 * (b < 0 ? 0 : left2[b]);
+          x = Math.floor(sum / 256) + ((u >>> 1) ^ -(u & 1));
+        }
+        if (x < lowest || x > highest) throw broken();
+        out[i] = x;
       }
     }
     columns.push(out);
@@ -271,23 +402,40 @@ function decodeTable(body, C, n) {
   return columns;
 }
 
-// ---- xz (https://tukaani.org/xz/xz-file-format.txt): blocks with the LZMA2 filter and no check, as the format has them.
+// ---- xz (https://tukaani.org/xz/xz-file-format.txt): one block of LZMA2 or none, without sizes and checks.
+
+const LARGEST_DICTIONARY = 31;  // as the header has it: 192 MB
+const XZ_HEAD = [0xfd, 0x37, 0x7a, 0x58, 0x5a, 0, 0, 0, 0xff, 0x12, 0xd9, 0x41], ONE_BLOCK = [2, 0, 0x21, 1];
 
 function unxz(input, size) {
   if (size === 0 && input.length === 0) return new Uint8Array(0);
   const broken = () => new BadFile("The scene is damaged: one of its streams cannot be unpacked.");
-  if (input.length < 32 || input[0] !== 0xfd || input[1] !== 0x37 || input[7] !== 0) throw broken();
-  const output = new Uint8Array(size);
-  let at = 12, filled = 0;
-  while (input[at] !== 0) {  // 0 begins the index, which nothing here needs
-    const flags = input[at + 1], end = at + 4 * (input[at] + 1);
-    let p = at + 2;
-    for (const bit of [0x40, 0x80]) if (flags & bit) while (input[p++] & 0x80);
-    if (flags & 0x3f || input[p] !== 0x21 || input[p + 1] !== 1) throw broken();
-    [at, filled] = lzma2(input, end, output, filled, broken);
-    at += -at & 3;
+  const need = (at, bytes) => {
+    if (bytes.some((byte, i) => input[at + i] !== byte)) throw broken();
+    return at + bytes.length;
+  };
+  const word = (value) => [0, 8, 16, 24].map((shift) => (value >>> shift) & 255);
+  const summed = (bytes) => [...bytes, ...word(crc32(bytes))];
+  const output = new Uint8Array(size), index = [0, 0];
+  let at = need(0, XZ_HEAD), filled = 0;
+  if (input[at] !== 0) {
+    const properties = input[at + 4];
+    need(at, summed([...ONE_BLOCK, properties, 0, 0, 0]));
+    if (!(properties <= LARGEST_DICTIONARY)) throw broken();
+    const dictionary = Math.max(2 ** 12, (2 | (properties & 1)) * 2 ** ((properties >> 1) + 11));
+    [at, filled] = lzma2(input, at + 12, output, dictionary, broken);
+    index[1] = 1;
+    for (let value of [at - XZ_HEAD.length, filled]) {  // sizes, seven bits in a byte
+      for (; value > 127; value = value >>> 7) index.push((value & 127) | 128);
+      index.push(value);
+    }
+    at = need(at, Array(-at & 3).fill(0));
   }
-  if (filled !== size) throw broken();
+  while (index.length & 3) index.push(0);
+  at = need(at, summed(index));
+  const foot = [...word(index.length / 4), 0, 0];
+  at = need(at, [...word(crc32(foot)), ...foot, 0x59, 0x5a]);
+  if (filled !== size || at !== input.length) throw broken();
   return output;
 }
 
@@ -296,9 +444,11 @@ const IS_MATCH = 0, IS_REP = 192, IS_REP0 = 204, IS_REP1 = 216, IS_REP2 = 228, I
 const SLOT = 432, SPECIAL = 688, ALIGN = 816, LENGTH = 832, REP_LENGTH = 1346, LITERAL = 1860;
 
 // Unpacks LZMA2 chunks from input[at]; returns where they end, and how many bytes of `output` are filled.
-function lzma2(input, at, output, filled, broken) {
+function lzma2(input, at, output, dictionary, broken) {
   const coder = new Uint32Array(2);  // range, code: a typed array keeps them whole numbers
-  let probs = new Uint16Array(0), lc = 0, lp = 0, pb = 0, state = 0, rep0 = 0, rep1 = 0, rep2 = 0, rep3 = 0, origin = 0;
+  let probs = new Uint16Array(0), lc = 0, lp = 0, pb = 0, state = 0, rep0 = 0, rep1 = 0, rep2 = 0, rep3 = 0;
+  let filled = 0, origin = 0;  // bytes of the output, and where what may be repeated begins
+  let needed = 3;  // what the next chunk must reset at least: 3 all, 2 the properties, 0 nothing
 
   function bit(index) {
     const p = probs[index], bound = (coder[0] >>> 11) * p;
@@ -394,7 +544,7 @@ function lzma2(input, at, output, filled, broken) {
     state = state < 4 ? 0 : state < 10 ? state - 3 : state - 6;
   }
   function copy(count, end) {
-    if (rep0 >= filled - origin || filled + count > end) throw broken();
+    if (rep0 >= Math.min(filled - origin, dictionary) || filled + count > end) throw broken();
     for (let from = filled - rep0 - 1; count > 0; count--) output[filled++] = output[from++];
   }
 
@@ -405,8 +555,9 @@ function lzma2(input, at, output, filled, broken) {
     let count = ((input[at] << 8) | input[at + 1]) + 1;
     at += 2;
     if (control < 0x80) {
-      if (control > 2 || filled + count > output.length) throw broken();
-      if (control === 1) origin = filled;
+      if (control > 2 || (control === 2 && needed === 3)) throw broken();
+      if (at + count > input.length || filled + count > output.length) throw broken();
+      if (control === 1) [origin, needed] = [filled, 2];
       output.set(input.subarray(at, at + count), filled);
       at += count;
       filled += count;
@@ -415,6 +566,8 @@ function lzma2(input, at, output, filled, broken) {
     count += (control & 0x1f) << 16;
     const chunk = ((input[at] << 8) | input[at + 1]) + 1, reset = (control >> 5) & 3;
     at += 2;
+    if (reset < needed) throw broken();
+    needed = 0;
     if (reset === 3) origin = filled;
     if (reset >= 2) {
       const properties = input[at++];
@@ -429,7 +582,7 @@ function lzma2(input, at, output, filled, broken) {
       state = rep0 = rep1 = rep2 = rep3 = 0;
     }
     const chunkEnd = at + chunk, end = filled + count;
-    if (probs.length === 0 || chunkEnd > input.length || end > output.length) throw broken();
+    if (chunkEnd > input.length || end > output.length || input[at] !== 0) throw broken();
     coder[0] = 0xffffffff;
     coder[1] = (input[at + 1] << 24) | (input[at + 2] << 16) | (input[at + 3] << 8) | input[at + 4];
     at += 5;
@@ -467,6 +620,6 @@ function lzma2(input, at, output, filled, broken) {
         copy(count, end);
       }
     }
-    at = chunkEnd;
+    if (at !== chunkEnd || coder[1] !== 0) throw broken();
   }
 }

@@ -23,9 +23,7 @@ function plan(config, weights) {
   }
   let first = 0;
   for (const branch of branches) {
-    const layer = weights[`${branch.name}.0.weight`];
-    if (!layer || layer.shape[1] !== branch.inputs.length) throw new BadFile("The scene's network is of another kind.");
-    branch.units = layer.shape[0];
+    branch.units = weights[`${branch.name}.0.weight`].shape[0];
     branch.first = first;
     branch.groups = Math.ceil(branch.units / GROUP);
     branch.view = branch.inputs.filter((name) => !isOwn(name));

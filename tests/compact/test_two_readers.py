@@ -1,0 +1,518 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Python's reader and the page's refuse the same files, and read the same numbers in the others.
+
+A small file is changed in its header, its streams and its bytes, one place at a time, with lengths and checksums that
+hold again. docs/compact-format.md has the rules. pytest -m browser tests/compact: the page's reader in Chromium.
+"""
+
+import base64
+import json
+import lzma
+import shutil
+import struct
+import subprocess
+import zlib
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from compact_fields import RENDER, field
+from torch.testing import assert_close
+
+from nrfgs_lab.pages.browser import CHROMIUM, chromium
+from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.head import base_colors
+from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.compact.decode import Decoded, decode
+from nrfgs_ns.compact.encode import encode
+from nrfgs_ns.compact.format import CHECKSUM, MAGIC, MODEL, PREAMBLE, VERSION, Table, _coded, _pack, _unpack
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.trained.loading import load_file
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+NUMBERS = [0, -1, 1, 17, 1025, 2**31, 2**63, 10**400, 0.5, 8.0, 1e-320, 1e30, 1e39, 1e308, float("nan")]
+OTHERS = [None, True, False, "", "8", "logit", "rans", "uint32", [], {}, [[1.0]] * 3, [1, 0.5, 1e300]]
+VALUES = [*NUMBERS, *OTHERS, "__proto__", {"length": 3}, "\ud800"]
+COUNT = 20
+"""Splats of the file that is damaged. Python's reader takes milliseconds for each."""
+BYTES = (0x01, 0x80, 0xFF)
+"""What a byte is changed by (exclusive or)."""
+SECONDS = 60
+"""Until a reader counts as hanging."""
+
+Parts = tuple[dict, list[bytes]]
+
+
+@cache
+def written(count: int = COUNT, **options) -> bytes:
+    """A file of some splats."""
+    one = field(count)
+    if options:
+        head = NrfConfig(**{"latent_dim": 8, "hidden_width": 16, "output_init": "default"} | options).setup()
+        one = Field(head.requires_grad_(False), one.splats)
+    return joined(*parts_of(*encode(one, dict(RENDER))))
+
+
+def parts_of(header: dict, streams: dict) -> Parts:
+    """What `write_container` writes, in parts."""
+    entries, bodies = [], []
+    for name, stream in streams.items():
+        array, body = _coded(stream) if isinstance(stream, Table) else (stream, _pack(stream))
+        coding = "rans" if isinstance(stream, Table) else "xz"
+        entries.append({"name": name, "coding": coding, "dtype": array.dtype.name, "shape": list(array.shape)})
+        bodies.append(body)
+    return {**header, "streams": entries}, bodies
+
+
+def parts() -> Parts:
+    """A new copy of the file's header and of its streams' bytes."""
+    data = written()
+    length = PREAMBLE.unpack_from(data)[2]
+    header, at, bodies = json.loads(data[PREAMBLE.size : PREAMBLE.size + length]), PREAMBLE.size + length + 4, []
+    for entry in header["streams"]:
+        bodies.append(data[at : at + entry["bytes"]])
+        at += entry["bytes"]
+    return header, bodies
+
+
+def joined(header: dict | bytes, bodies: list[bytes], sizes: bool = True) -> bytes:
+    """A file whose lengths and checksums hold; `sizes` False: its header's own claims about the streams' bytes stay."""
+    if sizes and isinstance(header, dict):
+        for entry, body in zip(header["streams"], bodies, strict=True):
+            entry |= {"bytes": len(body), "crc32": zlib.crc32(body)}
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
+    start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
+    return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
+
+
+def places(tree, at: tuple = ()) -> Iterator[tuple]:
+    """The paths to the nodes of a header; of a list, only to the first, and to the last if it is a stream."""
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, value in items:
+        if key == 0 or not isinstance(tree, list) or isinstance(value, dict) and key == len(tree) - 1:
+            yield (*at, key)
+            yield from places(value, (*at, key))
+
+
+def at_place(tree, place: tuple, act: Callable) -> None:
+    for key in place[:-1]:
+        tree = tree[key]
+    act(tree, place[-1])
+
+
+def headers() -> Iterator[tuple[str, bytes]]:
+    """Each value of the header replaced, removed, and joined by another key."""
+    seen = list(places(parts()[0]))
+    for place in seen:
+        for value in VALUES:
+            header, bodies = parts()
+            at_place(header, place, lambda node, key, v=value: node.__setitem__(key, deepcopy(v)))
+            yield f"{place} = {value!r:.40}", joined(header, bodies, sizes=False)
+        header, bodies = parts()
+        at_place(header, place, lambda node, key: node.pop(key))
+        yield f"without {place}", joined(header, bodies, sizes=False)
+    for place in [(), *(place for place in seen if place[-1] in ("splats", "head", "config", "render", "means", 0))]:
+        for key in ("x", "__proto__", "bound", "_target"):
+            header, bodies = parts()
+            node = header
+            for step in place:
+                node = node[step]
+            if isinstance(node, dict):
+                node[key] = 1
+                yield f"{key} in {place}", joined(header, bodies, sizes=False)
+
+
+def texts() -> Iterator[tuple[str, bytes]]:
+    """Headers that are JSON for some readers, or for none."""
+    header, bodies = parts()
+    text = json.dumps(header)
+    unit = f'"scene_unit": {json.dumps(header["head"]["scene_unit"])}'
+    assert unit in text
+    for number in ("NaN", "Infinity", "1.", ".5", "01", "+1", "0x1", "1e400", "9" * 5000, "-0", "1E0", "1e-400", "1_0"):
+        yield f"a unit of {number[:9]}", joined(text.replace(unit, f'"scene_unit": {number}').encode(), bodies)
+    for name, other in {
+        "nothing": b"",
+        "no JSON": b"{",
+        "null": b"null",
+        "a list": b"[]",
+        "deep": b"[" * 100_000 + b"]" * 100_000,
+        "a mark of the byte order": b"\xef\xbb\xbf" + text.encode(),
+        "UTF-16": text.encode("utf-16-le"),
+        "a byte that is no UTF-8": text.encode().replace(b"nrfgs", b"nrf\xffs"),
+        "half a pair": text.encode().replace(b"nrfgs", b"nrf\xed\xa0\x80s"),
+        "a key twice": text.replace(unit, f'"scene_unit": 0, {unit}').encode(),
+        "the other twice": text.replace(unit, f'{unit}, "scene_unit": 0').encode(),
+        "a comment": text.encode() + b"// x",
+        "a space": text.encode() + b" \n",
+        "a zero": text.encode() + b"\0",
+        "a comma": text.encode()[:-1] + b",}",
+        "a line in a string": text.encode().replace(b'"nrf"', b'"n\nrf"'),
+        "an escape": text.encode().replace(b'"nrf"', b'"\\u006erf"'),
+    }.items():
+        yield f"text: {name}", joined(other, bodies)
+
+
+def containers() -> Iterator[tuple[str, bytes]]:
+    """Bytes before the streams changed, and files cut and continued."""
+    data = written()
+    for at in [*range(PREAMBLE.size), *range(PREAMBLE.size, len(data), len(data) // 40)]:
+        yield f"byte {at}", data[:at] + bytes([data[at] ^ 0x55]) + data[at + 1 :]
+        yield f"cut at {at}", data[:at]
+    yield "a byte more", data + b"\0"
+    yield "nothing", b""
+    header, bodies = parts()
+    yield "a byte after the streams", joined(header, [*bodies[:-1], bodies[-1] + b"\0"], sizes=False)
+    for name, change in {
+        "in another order": lambda h, b: (h["streams"].reverse(), b.reverse()),
+        "a stream twice": lambda h, b: (h["streams"].append(dict(h["streams"][0])), b.append(b[0])),
+        "a stream of another name": lambda h, b: (
+            h["streams"].append({**h["streams"][0], "name": "x"}),
+            b.append(b[0]),
+        ),
+        "a weight too many": lambda h, b: (
+            h["streams"].append({**h["streams"][-1], "name": "head.x"}),
+            b.append(b[-1]),
+        ),
+        "a stream less": lambda h, b: (h["streams"].pop(), b.pop()),
+    }.items():
+        header, bodies = parts()
+        change(header, bodies)
+        yield name, joined(header, bodies)
+
+
+def with_body(name: str, change: Callable[[bytes], bytes], **entry) -> bytes:
+    header, bodies = parts()
+    index = next(i for i, one in enumerate(header["streams"]) if one["name"] == name)
+    bodies[index] = change(bodies[index])
+    header["streams"][index] |= entry
+    return joined(header, bodies)
+
+
+def flipped(at: int, by: int) -> Callable[[bytes], bytes]:
+    return lambda body: body[:at] + bytes([body[at] ^ by]) + body[at + 1 :]
+
+
+def xz_header(at: int, value: int) -> Callable[[bytes], bytes]:
+    """A byte of the block's header, and the header's checksum for it."""
+
+    def change(body: bytes) -> bytes:
+        header = bytearray(body[12:20])
+        header[at] = value
+        return body[:12] + bytes(header) + struct.pack("<I", zlib.crc32(header)) + body[24:]
+
+    return change
+
+
+def packed(raw: bytes, **options) -> bytes:
+    return lzma.compress(raw, **{"format": lzma.FORMAT_XZ, "check": lzma.CHECK_NONE} | options)
+
+
+def xz_streams() -> Iterator[tuple[str, bytes]]:
+    """Bytes of packed weights changed: everywhere in the frame, here and there inside."""
+    name = "head.low.2.weight"
+    header, bodies = parts()
+    index = [entry["name"] for entry in header["streams"]].index(name)
+    size, raw = len(bodies[index]), lzma.decompress(bodies[index])
+    for at in [*range(32), *range(32, size - 32, 5), *range(size - 32, size)]:
+        for by in BYTES:
+            yield f"xz byte {at} ^ {by}", with_body(name, flipped(at, by))
+    for at, values in ((0, (1, 3)), (1, (1, 0x40, 0x80)), (2, (3, 4)), (3, (0, 2)), (4, range(0, 44, 3)), (5, (1,))):
+        for value in values:
+            yield f"xz header {at} = {value}", with_body(name, xz_header(at, value))
+    for at in (0, 11, 12, 24, 25, size - 12, size - 1):
+        yield f"xz cut at {at}", with_body(name, lambda body, at=at: body[:at])
+    delta = [{"id": lzma.FILTER_DELTA}, {"id": lzma.FILTER_LZMA2}]
+    for kind, body in {
+        "no stream": b"",
+        "padding": bodies[index] + bytes(4),
+        "two streams": packed(raw[:8]) + packed(raw[8:]),
+        "another filter first": packed(raw, filters=delta),
+        "a checksum": packed(raw, check=lzma.CHECK_CRC32),
+        "less": packed(raw[:-1]),
+        "more": packed(raw + b"\0"),
+        "lzma": lzma.compress(raw, format=lzma.FORMAT_ALONE),
+        "other properties": packed(raw, filters=[{"id": lzma.FILTER_LZMA2, "lc": 1, "lp": 2, "pb": 3}]),
+        "a bomb": packed(bytes(2**22)),
+    }.items():
+        yield f"xz of {kind}", with_body(name, lambda _, body=body: body)
+    yield "a bomb that says so", with_body(name, lambda _: packed(bytes(2**22)), shape=[2**27])
+
+
+def chunks() -> Iterator[tuple[str, bytes]]:
+    """Chunks of LZMA2, written by hand: stored bytes, with and without resets."""
+    name, raw = "head.low.2.bias", bytes(range(8))
+
+    def xz(content: bytes, claimed: int = len(raw)) -> bytes:
+        header = b"\x02\x00\x21\x01\x10\x00\x00\x00"
+        unpadded = 12 + len(content)
+        index = bytes([0, 1, unpadded, claimed])
+        foot = struct.pack("<I", (len(index) + 4) // 4 - 1) + b"\0\0"
+        return b"".join(
+            [b"\xfd7zXZ\0\0\0", struct.pack("<I", zlib.crc32(b"\0\0")), header, struct.pack("<I", zlib.crc32(header))]
+            + [content, bytes(-unpadded % 4), index, struct.pack("<I", zlib.crc32(index))]
+            + [struct.pack("<I", zlib.crc32(foot)), foot, b"YZ"]
+        )
+
+    stored = b"\x00\x07" + raw
+    lzma_chunk = lzma.compress(raw, format=lzma.FORMAT_RAW, filters=[{"id": lzma.FILTER_LZMA2}])
+    for kind, content in {
+        "stored": b"\x01" + stored + b"\0",
+        "without a reset": b"\x02" + stored + b"\0",
+        "in two": b"\x01\x00\x03" + raw[:4] + b"\x02\x00\x03" + raw[4:] + b"\0",
+        "a second reset": b"\x01\x00\x03" + raw[:4] + b"\x01\x00\x03" + raw[4:] + b"\0",
+        "an unknown control": b"\x03" + stored + b"\0",
+        "without an end": b"\x01" + stored,
+        "a byte after the end": b"\x01" + stored + b"\0\0",
+        "as it is packed": lzma_chunk,
+        "coded without properties": b"\xa0" + b"\0\x07\0\x07" + bytes(8) + b"\0",
+        "coded after stored, without properties": b"\x01\x00\x03" + raw[:4] + b"\xa0\0\x03\0\x07" + bytes(8) + b"\0",
+    }.items():
+        yield f"chunk {kind}", with_body(name, lambda _, c=content: xz(c))
+    yield "an index of another size", with_body(name, lambda _: xz(b"\x01" + stored + b"\0", 9))
+
+
+def rans_streams() -> Iterator[tuple[str, bytes]]:
+    """Models and words of coded tables changed."""
+    for name in ("means", "splats", "latents"):
+        header, bodies = parts()
+        body = bodies[[entry["name"] for entry in header["streams"]].index(name)]
+        count, size = MODEL.unpack_from(body)
+        model = _unpack({"shape": [count], "dtype": "int32"}, body[MODEL.size : MODEL.size + size])
+        words = MODEL.size + size
+        for at in [*range(16), *range(16, count, max(count // 12, 1)), count - 1]:
+            for value in (-1, 0, 1, 15, 16, 140, 2**14, 2**16 + 1, 2**31 - 1, -(2**31)):
+                other = model.copy()
+                other[at] = value
+                new = _pack(other)
+                changed = MODEL.pack(count, len(new)) + new + body[words:]
+                yield f"{name}: model {at} = {value}", with_body(name, lambda _, c=changed: c)
+        for at in [*range(8), *range(8, words, 6), *range(words, len(body), max((len(body) - words) // 30, 1))]:
+            for by in BYTES:
+                yield f"{name}: byte {at} ^ {by}", with_body(name, flipped(at, by))
+        for at in (0, 1, 4, 7, 8, words - 1, words, words + 3, words + 4, len(body) - 2, len(body) - 1):
+            yield f"{name}: cut at {at}", with_body(name, lambda body, at=at: body[:at])
+        for more in (b"\0", b"\0\0", bytes(100)):
+            yield f"{name}: {len(more)} bytes more", with_body(name, lambda body, more=more: body + more)
+        for sizes in ((0, 0), (2**32 - 1, size), (count, 2**32 - 1), (2**30, 8)):
+            yield f"{name}: sizes {sizes}", with_body(name, lambda b, s=sizes: MODEL.pack(*s) + b[8:])
+        rows = {"means": 2, "splats": 11, "latents": 8}[name]
+        for shape in (
+            [rows, 10**6],
+            [10**6, 1],
+            [1024, 2000],
+            [rows, 0],
+            [0, COUNT],
+            [rows, COUNT - 1],
+            [rows - 1, COUNT],
+        ):
+            yield f"{name}: shape {shape}", with_body(name, lambda body: body, shape=shape)
+        for dtype in ("int16", "int32", "uint32"):
+            yield f"{name}: {dtype}", with_body(name, lambda body: body, dtype=dtype)
+
+
+@cache
+def encoded() -> tuple[dict, dict]:
+    return encode(field(COUNT), dict(RENDER))
+
+
+def with_stream(name: str, stream, **header) -> bytes:
+    """A file in which one stream, or none, is another array or table."""
+    fields, streams = deepcopy(encoded())
+    streams |= {name: stream} if name else {}
+    for place, value in header.items():
+        at_place(fields, tuple(place.split("__")), lambda node, key, v=value: node.__setitem__(key, v))
+    return joined(*parts_of(fields, streams))
+
+
+def contents() -> Iterator[tuple[str, bytes]]:
+    """Numbers in tables and weights that no field has, or that just fit."""
+    fields, streams = encoded()
+    weights = streams["head.low.0.weight"]
+    for value in (np.nan, np.inf, -np.inf, 6e4, 1e-7, -0.0):
+        for dtype in ("float16", "float32"):
+            other = weights.astype(dtype)
+            other[3, 5] = value
+            yield f"a weight {value} in {dtype}", with_stream("head.low.0.weight", other)
+    for kind, other in {
+        "turned": weights.T,
+        "flat": weights.ravel(),
+        "of a unit more": np.concatenate([weights, weights[:1]]),
+        "uint8": weights.astype(np.uint8),
+        "uint16": weights.astype(np.uint16),
+        "a table": Table(np.rint(weights * 100).astype(np.int64)),
+    }.items():
+        yield f"weights {kind}", with_stream("head.low.0.weight", other)
+    for name, table in {name: stream for name, stream in streams.items() if isinstance(stream, Table)}.items():
+        for value in (-(2**31), -1, 2**15, 2**31 - 1, 2**31, 2**32 - 1):
+            for row in (0, 1, len(table.numbers) - 1):
+                for signed in (True, False):
+                    numbers = table.numbers.astype(np.int64).copy()
+                    numbers[row, 7] = value
+                    if (signed or numbers.min() >= 0) and not (signed and numbers.max() >= 2**31):
+                        yield f"{name}: {value} in {row}, {signed}", with_stream(name, Table(numbers, signed))
+        yield f"{name} in xz", with_stream(name, np.abs(table.numbers).astype(np.uint32))
+    steps = np.full((2, COUNT), 2**31 - 1)
+    yield "means beyond 64 bits", with_stream("means", Table(steps, signed=False))
+    for value in (0, 1):
+        numbers = streams["splats"].numbers.copy()
+        numbers[0] = value
+        yield f"diffuse {value}", with_stream("splats", Table(numbers))
+    for name, grid in fields["grids"].items():
+        for part in ("low", "step"):
+            for value in (1e-320, 1e37, 1e38, 3.5e38, 1e308, -1e38, 0):
+                yield (
+                    f"{name} {part} {value}",
+                    with_stream("", None, **{f"grids__{name}__{part}": [value] * len(grid[part])}),
+                )
+
+
+def whole_files() -> Iterator[tuple[str, bytes]]:
+    """Fields of other kinds, which both read, and tables of few splats or none."""
+    for options in (
+        {},
+        {"split_bands": False},
+        {"num_bands": 1},
+        {"num_bands": 16},
+        {"opacity_residual": False, "use_distance": False, "hidden_width": 3},
+        {"opacity_bound": "logit", "color_scale": 0, "precision": "fp32", "implementation": "torch"},
+    ):
+        yield f"with {options}", written(12, **options)
+    yield "a lone splat", written(1)
+    header, streams = encode(field(4), dict(RENDER))
+    header["splats"] = {"view": 0, DIFFUSE: 0}
+    streams |= {"means": Table(np.zeros((2, 0)), signed=False)}
+    streams |= {"splats": Table(np.zeros((11, 0))), "latents": Table(np.zeros((8, 0)))}
+    yield "no splat", joined(*parts_of(header, streams))
+    wide = NrfConfig(latent_dim=1024, hidden_width=1).setup().requires_grad_(False)
+    for count in (3_000, 20_000):  # diffuse splats need latents in memory, and have none in the file
+        splats = {**field(4).splats, "latents": torch.zeros(4, 1024), DIFFUSE: torch.ones(4, dtype=torch.bool)}
+        header, streams = encode(Field(wide, splats), dict(RENDER))
+        header["splats"][DIFFUSE] = count
+        streams |= {"means": Table(np.zeros((2, count)), signed=False), "splats": Table(np.ones((11, count)))}
+        yield f"{count} diffuse splats with wide latents", joined(*parts_of(header, streams))
+    for name in ("near_plane", "background"):
+        for value in (0, 0.5, 1, -1, 1e-30, 1e30, True, None, [0, 0.5, 1], [0, 0, 2], [0, 0, True], [0, 0, -0.1]):
+            header, bodies = parts()
+            header["render"][name] = value
+            yield f"{name} {value}", joined(header, bodies)
+
+
+GROUPS = (headers, texts, containers, xz_streams, chunks, rans_streams, contents, whole_files)
+
+
+@pytest.fixture(scope="module", params=GROUPS, ids=lambda group: group.__name__)
+def cases(request) -> dict[str, bytes]:
+    return dict(request.param())
+
+
+READ = """
+const heard = (bytes) => {
+  let scene = null, said = null, raw = false;
+  try {
+    scene = readScene(bytes, () => {});
+  } catch (error) {
+    [said, raw] = [error.message, !(error instanceof BadFile)];
+  }
+  const part = (values) => btoa(String.fromCharCode(...new Uint8Array(values.buffer).subarray(0, 6400)));
+  return scene ? { table: part(scene.table), latents: part(scene.latents) } : { said, raw };
+};
+"""
+
+
+def script() -> str:
+    return (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + READ
+
+
+def in_node(cases: dict[str, bytes], folder: Path) -> list[dict]:
+    """What the page's reader says of each file, in Node."""
+    (folder / "read.js").write_text(
+        script() + "const all = JSON.parse(require('fs').readFileSync('cases.json', 'utf-8'));"
+        "console.log(JSON.stringify(all.map((text) => heard(new Uint8Array(Buffer.from(text, 'base64'))))));"
+    )
+    (folder / "cases.json").write_text(json.dumps([base64.b64encode(data).decode() for data in cases.values()]))
+    said = subprocess.run(["node", "read.js"], cwd=folder, capture_output=True, check=True, timeout=SECONDS)
+    return json.loads(said.stdout)
+
+
+def in_python(data: bytes, path: Path) -> Decoded | str:
+    path.write_bytes(data)
+    try:
+        return decode(path)
+    except InputError as error:
+        return str(error)
+
+
+def same_numbers(decoded: Decoded, heard: dict) -> None:
+    """The page's table and latents, of the first hundred splats, are Python's."""
+    order = decoded.splats[DIFFUSE].to(torch.uint8).argsort(stable=True)  # the page has view-dependent splats first
+    splats = {name: value[order] for name, value in decoded.splats.items()}
+    table = np.frombuffer(base64.b64decode(heard["table"]), "<f4").reshape(-1, 16)
+    count, rank = len(table), decoded.config.latent_dim
+    assert count == min(len(order), 100)
+    alike = {"rtol": 2**-20, "atol": 2**-22}
+    for first, value in (
+        (0, splats["means"]),
+        (3, splats["opacities"]),
+        (4, splats["quats"]),
+        (8, splats["scales"].exp()),
+        (12, base_colors(splats["features_dc"])),
+    ):
+        assert_close(torch.tensor(table[:, first : first + value.shape[1]]), value[:count], **alike)
+    latents = np.frombuffer(base64.b64decode(heard["latents"]), "<f4")
+    latents = latents[: len(latents) // (rank + -rank % 4) * (rank + -rank % 4)].reshape(-1, rank + -rank % 4)[:, :rank]
+    view = splats["latents"][: int((~splats[DIFFUSE]).sum())]
+    assert_close(torch.tensor(latents.copy()), view[: len(latents)], **alike)
+
+
+def agree(cases: dict[str, bytes], found: list[dict], folder: Path) -> None:
+    wrong, read = [], 0
+    for (name, data), heard in zip(cases.items(), found, strict=True):
+        python = in_python(data, folder / "f.nrf")
+        if isinstance(python, Decoded) == ("said" in heard):
+            wrong.append((name, python if isinstance(python, str) else "read", heard.get("said", "read")))
+        elif isinstance(python, Decoded):
+            same_numbers(python, heard)
+            read += 1
+        elif heard["raw"] or not heard["said"].startswith("The ") or heard["said"].count(". ") or "\n" in heard["said"]:
+            wrong.append((name, "unclear", heard["said"]))
+    assert not wrong, (len(wrong), wrong[:20])
+    assert read < len(cases)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node: the page's reader is tried by pytest -m browser")
+def test_both_readers_refuse_the_same_files(cases, tmp_path):
+    agree(cases, in_node(cases, tmp_path), tmp_path)
+
+
+@pytest.mark.browser
+def test_both_readers_refuse_the_same_files_in_a_browser(cases, tmp_path):
+    pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e '.[browser]'")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on the path: apt-get install chromium")
+    act = "(all) => all.map((text) => heard(Uint8Array.from(atob(text), (one) => one.charCodeAt(0))))"
+    with chromium() as browser:
+        page = browser.new_page()
+        page.set_default_timeout(1000 * SECONDS)
+        page.add_script_tag(content=script())
+        agree(cases, page.evaluate(act, [base64.b64encode(data).decode() for data in cases.values()]), tmp_path)
+
+
+def test_what_is_read_can_be_shown(tmp_path):
+    """`nrfgs view` takes what the reader takes."""
+    for name, data in whole_files():
+        if isinstance(in_python(data, tmp_path / "f.nrf"), Decoded):
+            assert load_file(tmp_path / "f.nrf").num_points > 0, name
+
+
+def test_the_pages_defaults_are_pythons():
+    text = (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8")
+    found = json.loads(text.split("const OPTIONS = ")[1].split(";")[0])
+    usual = NrfConfig(opacity_bound=NrfConfig().bound)
+    assert found == {name: value for name, value in vars(usual).items() if name != "_target"}
