@@ -143,7 +143,7 @@ def random_scene(folder: Path, mode: str, options: dict) -> tuple[Path, list[dic
 
 
 def page_with(scene: bytes | str, photographs: list[dict]) -> str:
-    about = {"photographs": photographs, "start": 0, "up": [0, 0, 1], "nearest": 0.05, "speed": 1.0}
+    about = {"photographs": photographs, "start": 0, "up": [0, 0, 1]}
     poster = io.BytesIO()
     Image.new("RGB", (8, 6), "red").save(poster, "jpeg")
     return page_of(about, poster.getvalue(), scene, "Splats <1 & 2>", 'Me & "you"')
