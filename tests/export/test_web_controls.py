@@ -231,7 +231,7 @@ def test_marks_say_how_many_are_in_view_and_lead_there(wall):
 
 
 def projected(page: Page, points: list) -> np.ndarray:
-    """Where points are seen, CSS pixels [N, 2], after the lens has been put in the middle, with a field of view of 50."""
+    """Where points are seen, CSS pixels [N, 2], once the lens is in the middle, with a field of view of 50."""
     page.call("setCamera", page.call("getCamera") | {"fov": 50})
     matrix = np.array(page.call("getMatrix")).reshape(4, 4).T
     x, y, z = np.linalg.inv(matrix)[:3, :3] @ np.array(points).T + np.linalg.inv(matrix)[:3, 3:]
