@@ -3,6 +3,8 @@
 
 import functools
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -199,9 +201,9 @@ def test_every_control_changes_the_picture(window, demo, browser):
     page.page.keyboard.press("Escape")
     page.tab("View")
     page.page.click("#full-screen")
-    page.page.wait_for_function("document.fullscreenElement !== null")
+    page.until("document.fullscreenElement !== null")
     page.page.click("#full-screen")
-    page.page.wait_for_function("document.fullscreenElement === null")
+    page.until("document.fullscreenElement === null")
     assert not page.errors
     page.page.close()
 
@@ -379,3 +381,13 @@ def test_whoever_cannot_see_the_page_is_told_what_is_there(demo, browser):
         assert page.page.get_by_role("button", name=expanded, exact=True).get_attribute("aria-expanded") == role
     assert not page.errors
     page.page.close()
+
+
+def test_pictures_for_the_docs(demo, tmp_path):
+    run = subprocess.run(
+        [sys.executable, "-m", "nrfgs_lab.page_pictures", demo[1], tmp_path / "out"], capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert written == [f"{window}-{name}.jpg" for window in ("desktop", "phone") for name in ("page", "share", "view")]
+    assert all(np.asarray(Image.open(tmp_path / "out" / name)).std() > 5 for name in written)

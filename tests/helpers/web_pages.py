@@ -60,6 +60,12 @@ class Page:
     def visit(self, index: int) -> None:
         self.call("visit", index)
 
+    def until(self, condition: str) -> None:
+        """Wait for a condition; the page's policy forbids what Playwright's own waiting needs."""
+        self.page.evaluate(
+            f"new Promise((done) => {{ const look = () => (({condition}) ? done() : setTimeout(look, 20)); look(); }})"
+        )
+
     def camera(self) -> tuple[np.ndarray, np.ndarray]:
         """Position and target of a camera that has come to rest."""
         self.call("finished")
