@@ -2,6 +2,7 @@
 """Options of the three formats, which are read before torch is imported."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 
@@ -33,9 +34,17 @@ class CompactOptions:
 
 @dataclass
 class WebOptions:
-    """Texts of a page."""
+    """What a page says, and what it does by itself until the first touch."""
 
     title: str | None = None
     """heading of the page. None: the output's name"""
     author: str = ""
     """a line below the heading"""
+    tour: tuple[str, ...] = ()
+    """a tour: two or more photographs by number or name, or one JSON file, saved in a page or by nerfstudio's viewer"""
+    rotate: bool = False
+    """without a tour: turn slowly around the subject"""
+    notes: Path | None = None
+    """JSON file of notes at points of the scene, as a page saves it"""
+    address: str | None = None
+    """where the page will be, https://...: writes a picture beside it, which is shown where the address is shared"""

@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.web.command import weight_vectors
+from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import READER, VIEWER, page
 
 REPOSITORY = Path(__file__).parents[2]
@@ -61,7 +63,6 @@ def test_the_style_and_the_scripts_are_installed_with_the_package():
     folder = REPOSITORY / "nrfgs_ns" / "export" / "web"
     installed = {path.name for pattern in patterns for path in folder.glob(pattern)}
     assert {*READER, *VIEWER, "page.html", "page.css"} <= installed
-    assert sum((folder / name).stat().st_size for name in installed) < 100_000
 
 
 @pytest.mark.parametrize(
@@ -75,3 +76,90 @@ def test_the_style_and_the_scripts_are_installed_with_the_package():
 )
 def test_how_many_weights_a_view_needs(options, vectors):
     assert weight_vectors(NrfConfig(**options).setup()) == vectors
+
+
+def test_the_code_of_a_page_is_small():
+    """What a reader downloads besides the scene and the picture; without comments and indentation, with the licence."""
+    text = page({}, b"", b"", "")
+    assert len(text.encode()) <= 100_000
+    assert not re.search(r"^(?: |// (?!SPDX))", text, re.M) and "SPDX-License-Identifier" in text
+
+
+def test_what_is_shown_where_an_address_is_shared():
+    properties = {
+        attributes["property"]: attributes["content"]
+        for _, attributes in Elements(page(ABOUT, b"", b"", 'Tea & "cake"', "Me", "https://x.org/tea.jpg")).tags
+        if "property" in attributes
+    }
+    picture = {"og:image": "https://x.org/tea.jpg"}
+    assert properties == {"og:type": "website", "og:title": 'Tea & "cake"', "og:description": "Me"} | picture
+    assert "og:image" not in page(ABOUT, b"", b"", "Tea"), "no picture is named that no crawler can fetch"
+
+
+NAMES = ["a.jpg", "b.jpg", "7.jpg"]
+POSE = [1, 0, 0, 10, 0, 1, 0, 20, 0, 0, 1, 30, 0, 0, 0, 1]
+FRAMES = [{"camera_to_world": POSE, "fov": 50 + k, "aspect": 1.5} for k in range(24)]
+PATH = {"camera_type": "perspective", "seconds": 1.0, "is_cycle": False, "camera_path": FRAMES}
+CAMERA = {"position": [1, 2, 3], "target": [0, 0, 0]}
+
+
+def test_a_tour_of_photographs_or_of_a_camera_path(tmp_path):
+    assert read_tour([], NAMES) is None
+    assert read_tour(["2", "a.jpg", "7.jpg"], NAMES) == {"views": [1, 0, 2]}
+    file = tmp_path / "path.json"
+    for cycle in (False, True):
+        file.write_text(json.dumps(PATH | {"is_cycle": cycle}))
+        tour = read_tour([str(file)], NAMES)
+        assert (tour["seconds"], tour["loop"]) == (1.0, cycle)
+        assert [view["fov"] for view in tour["views"]] == (
+            [50, 55, 60, 64, 69, 50] if cycle else [50, 55, 59, 64, 68, 73]
+        )
+        assert tour["views"][0]["matrix"] == [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 10, 20, 30, 1], "column by column"
+    file.write_text(json.dumps({"tour": [CAMERA, CAMERA]}))
+    assert read_tour([str(file)], NAMES) == {"views": [CAMERA, CAMERA]}
+
+
+@pytest.mark.parametrize(
+    "content, said",
+    [
+        (None, "notes.json"),
+        ("[", "JSON"),
+        ("[]", "no JSON object"),
+        ({}, "camera_path"),
+        ({"tour": [CAMERA]}, "two views"),
+        ({"tour": [CAMERA, {}]}, r"tour\[1\].position"),
+        ({"tour": [CAMERA, None]}, r"tour\[1\]"),
+        ({"tour": [CAMERA, CAMERA | {"target": [1, 2, 3]}]}, "equal"),
+        ({"tour": [CAMERA, CAMERA | {"fov": 180}]}, "fov"),
+        ({"tour": [CAMERA, CAMERA | {"position": [1, 2, float("nan")]}]}, "position"),
+        (PATH | {"seconds": 0}, "seconds"),
+        (PATH | {"camera_type": "fisheye"}, "fisheye"),
+        (PATH | {"camera_path": [FRAMES[0], FRAMES[1] | {"camera_to_world": POSE[:12]}]}, "camera_to_world"),
+        (PATH | {"camera_path": [FRAMES[0], {"camera_to_world": POSE}]}, "fov"),
+    ],
+    ids=str,
+)
+def test_a_tour_that_cannot_be_used_is_refused(content, said, tmp_path):
+    file = tmp_path / "notes.json"
+    if content is not None:
+        file.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(InputError, match=said):
+        read_tour([str(file)], NAMES)
+    with pytest.raises(InputError, match="notes.json"):
+        read_notes(file)
+
+
+@pytest.mark.parametrize("words", [["1"], ["1", "4"], ["0", "1"], ["1", "c.jpg"]])
+def test_photographs_that_are_not_there_are_refused(words):
+    with pytest.raises(InputError, match="--tour"):
+        read_tour(words, NAMES)
+
+
+@pytest.mark.parametrize(
+    "note, said",
+    [({}, "text"), ({"text": "x"}, "position"), ({"text": "x", "position": [0, 0, 0], "camera": {}}, "camera")],
+)
+def test_notes_that_cannot_be_used_are_refused(note, said, tmp_path):
+    (tmp_path / "notes.json").write_text(json.dumps({"notes": [note]}))
+    with pytest.raises(InputError, match=said):
+        read_notes(tmp_path / "notes.json")

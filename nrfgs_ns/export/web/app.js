@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The page: reads the scene, moves the camera, keeps the picture up to date, and listens to people.
+// The page: reads the scene, moves the camera, and keeps the picture up to date.
 
 const byId = (id) => document.getElementById(id);
 const about = JSON.parse(byId("about").textContent);
@@ -13,6 +13,7 @@ function fail(error) {
   byId("failed").hidden = false;
   byId("failed").textContent = message + hint;
   refuse(error);
+  emit("failed", { message });
 }
 window.addEventListener("error", (event) => fail(event.error ?? event.message));
 window.addEventListener("unhandledrejection", (event) => fail(event.reason));
@@ -21,27 +22,18 @@ let begin, refuse;
 const ready = new Promise((resolve, reject) => ([begin, refuse] = [resolve, reject]));
 ready.catch(() => {});  // the page tells
 
-// ---- the camera: where it is, its axes as rows (right, down, forwards), and how far in front what it turns around is
+// ---- the camera
 
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const plus = (a, b, factor = 1) => a.map((value, k) => value + factor * b[k]);
-const minus = (a, b) => plus(a, b, -1);
-const unit = (a) => a.map((value) => value / Math.hypot(...a));
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-
-function turned(vector, axis, angle) {
-  const c = Math.cos(angle), s = Math.sin(angle), across = cross(axis, vector), along = dot(axis, vector) * (1 - c);
-  return vector.map((value, k) => c * value + s * across[k] + along * axis[k]);
-}
-
-const photographs = about.photographs.map(({ pose, distance, ...photograph }) => {
-  const column = (c, sign) => [0, 4, 8].map((row) => sign * pose[row + c]);
-  return { ...photograph, camera: { eye: column(3, 1), axes: [column(0, 1), column(1, -1), column(2, -1)], distance } };
+const photographs = about.photographs.map(({ name, pose, distance, lens: [fx, fy, cx, cy], size: [w, h] }) => {
+  const matrix = [0, 1, 2, 3].flatMap((column) => [0, 4, 8].map((row) => pose[row + column]).concat(column === 3 ? 1 : 0));
+  return { name, camera: { ...poseOf(matrix), distance, lens: [fx / h, fy / h, cx / h, cy / h, w / h] } };
 });
-
+const typical = photographs.map(({ camera }) => camera.distance).sort((a, b) => a - b)[photographs.length >> 1];
+const CLOSEST = 0.1;  // of the typical distance to the subject: nearer to a surface the hand does not bring the camera
+const FARTHEST = 0.8;  // of it, from the nearest photograph: what lies beyond, nobody has seen
 const state = {
   camera: photographs[about.start].camera,
-  photograph: about.start,  // whose lens it has
+  photograph: about.start,  // the last one visited
   show: "full",
   gain: 1,
   frozen: null,  // where splats are seen from, if that is not where the camera is
@@ -49,17 +41,9 @@ const state = {
   marks: false,
 };
 
-// The lens on a canvas of this size: the whole photograph, unless that would show more than 90 degrees.
-function lensFor({ lens: [fx, fy, cx, cy], size: [w, h] }, width, height) {
-  const whole = Math.min(width / w, height / h), filling = Math.max(width / w, height / h);
-  const s = Math.max(whole, Math.min(filling, (0.5 * Math.max(width, height)) / fx));
-  return [s * fx, s * fy, s * cx + (width - s * w) / 2, s * cy + (height - s * h) / 2];
-}
-
-function seenBy({ eye, axes }, scale = 1) {
+function seenBy({ eye, axes, lens }, scale = 1) {
   const size = [canvas.width, canvas.height].map((side) => Math.max(1, Math.round(scale * side)));
-  const view = axes.flatMap((axis) => [...axis, -dot(axis, eye)]);
-  return { view, lens: lensFor(photographs[state.photograph], ...size), size };
+  return { view: axes.flatMap((axis) => [...axis, -dot(axis, eye)]), lens: lensOn(lens, ...size), size };
 }
 
 function move(change) {
@@ -67,76 +51,143 @@ function move(change) {
   wake();
 }
 
-function turn(right, down) {
-  const { eye, axes, distance } = state.camera;
-  const around = state.drag === "orbit" ? plus(eye, axes[2], distance) : eye;
-  const sign = state.drag === "orbit" ? 1 : -1;
-  const steep = Math.asin(Math.max(-1, Math.min(1, dot(axes[2], about.up))));
-  const tilt = Math.max(-1.5, Math.min(1.5, steep - sign * down)) - steep;
-  const all = [minus(eye, around), ...axes].map((v) => turned(turned(v, axes[0], tilt), about.up, -sign * right));
-  const forward = unit(all[3]), side = unit(minus(all[1], forward.map((x) => x * dot(all[1], forward))));
-  move({ eye: plus(around, all[0]), axes: [side, cross(forward, side), forward] });
+const strays = (eye) => Math.min(...photographs.map(({ camera }) => norm(minus(eye, camera.eye)))) - FARTHEST * typical;
+
+// Go as far as is allowed of the way: make(share) is the change. Scripts and links may lead further out than hands do.
+function go(make) {
+  const most = Math.max(strays(state.camera.eye), 1e-9 * typical);
+  for (let share = 1; share > 0.05; share /= 2) {
+    const change = make(share);
+    if (strays(change.eye) <= most) {
+      move(change);
+      return true;
+    }
+  }
+  return false;
+}
+
+let surface = null;  // {point, axis}: where the last sorted camera's middle ray ends
+
+// How far the camera may go forwards.
+function room() {
+  const { eye, axes } = state.camera;
+  if (!surface || dot(surface.axis, axes[2]) < 0.95) return Infinity;
+  return Math.max(0, dot(minus(surface.point, eye), axes[2]) - CLOSEST * typical);
+}
+
+function turn(right, down, orbit = state.drag === "orbit") {
+  const turnedBy = (right, down) => {
+    const { eye, axes, distance } = state.camera;
+    const around = orbit ? plus(eye, axes[2], distance) : eye;
+    const sign = orbit ? 1 : -1;
+    const steep = Math.asin(Math.max(-1, Math.min(1, dot(axes[2], about.up))));
+    const tilt = Math.max(-1.5, Math.min(1.5, steep - sign * down)) - steep;
+    const all = [minus(eye, around), ...axes].map((v) => turned(turned(v, axes[0], tilt), about.up, -sign * right));
+    return { eye: plus(around, all[0]), axes: facing(all[3], all[1]) };
+  };
+  const moved = right === 0 || go((share) => turnedBy(share * right, 0));
+  return (down === 0 || go((share) => turnedBy(0, share * down))) && moved;
 }
 
 function pan(right, down) {
-  const { eye, axes, distance } = state.camera;
-  move({ eye: plus(plus(eye, axes[0], -right * distance), axes[1], -down * distance) });
+  const { distance } = state.camera;
+  fly(-right * distance, down * distance, 0);
 }
 
 function zoom(factor) {
   const { eye, axes, distance } = state.camera;
-  const next = Math.max(distance * factor, about.nearest);
-  move({ eye: plus(eye, axes[2], distance - next), distance: next });
+  const next = Math.max(distance * factor, Math.min(distance, CLOSEST * typical), distance - room());
+  go((share) => {
+    const step = share * (distance - next);
+    return { eye: plus(eye, axes[2], step), distance: distance - step };
+  });
 }
 
 function fly(right, up, forward) {
-  const { eye, axes } = state.camera;
-  move({ eye: plus(plus(plus(eye, axes[0], right), axes[1], -up), axes[2], forward) });
+  const { eye, axes } = state.camera, ahead = Math.min(forward, room());
+  const step = plus(plus(axes[0].map((v) => v * right), axes[1], -up), axes[2], ahead);
+  go((share) => ({ eye: plus(eye, step, share) }));
 }
 
-let journey = null;
+// ---- what moves by itself: {way, start, done, again}, and which way the camera turns, or 0
+
+let journey = null, turning = 0, turnedAt = 0;
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 
-function visit(index, at_once = false) {
+function stop() {
+  journey?.done(false);
+  journey = null;
+  turning = 0;
+  playing(null);
+}
+
+// A promise of whether the camera gets there.
+function follow(way, again = false) {
+  journey?.done(false);
+  return new Promise((done) => {
+    journey = { way, start: performance.now(), done, again };
+    wake();
+  });
+}
+
+function flyTo(camera, seconds = 0.7) {
+  stop();
+  if (seconds > 0 && !still.matches) return follow(wayThrough([state.camera, camera], typical, seconds));
+  move(camera);
+  return Promise.resolve(true);
+}
+
+function visit(index, seconds) {
   state.photograph = index;
   byId("photograph").value = index;
-  const { camera, name } = photographs[index];
-  byId("said").textContent = `Photograph ${index + 1} of ${photographs.length}: ${name}`;
-  if (at_once || still.matches) {
-    journey = null;
-    move(camera);
-  } else {
-    journey = { from: state.camera, to: camera, start: performance.now() };
+  say(`Photograph ${index + 1} of ${photographs.length}: ${photographs[index].name}`);
+  return flyTo(photographs[index].camera, seconds);
+}
+
+async function play(what) {
+  stop();
+  if (what === "rotation") {
+    playing(what);
+    turning = 1;
+    turnedAt = performance.now();
     wake();
+    return;
+  }
+  const { views, seconds = null, loop = false } = about.tour;
+  const cameras = views.map((view) => (typeof view === "number" ? photographs[view].camera : cameraOf(view)));
+  playing(what);
+  if (await follow(wayThrough([state.camera, cameras[0]], typical, 0.7))) {
+    if (await follow(wayThrough(cameras, typical, seconds, seconds !== null), loop)) playing(null);
   }
 }
 
 function travel(now) {
-  const share = Math.min(1, (now - journey.start) / 700), t = share * share * (3 - 2 * share);
-  const { from, to } = journey;
-  if (share === 1) {
-    journey = null;
-    move(to);
-    return;
+  if (turning) {
+    if (!turn((turning * 2 * Math.PI * Math.min(100, now - turnedAt)) / 60000, 0, true)) turning = -turning;
+    turnedAt = now;
   }
-  const mixed = (a, b) => a.map((value, k) => value + t * (b[k] - value));
-  // Axes are mixed and made square again; halfway between opposite views any way round will do.
-  const forward = unit(plus(mixed(from.axes[2], to.axes[2]), to.axes[0], 1e-4));
-  const side = mixed(from.axes[0], to.axes[0]);
-  const right = unit(plus(minus(side, forward.map((x) => x * dot(side, forward))), cross(forward, about.up), 1e-4));
-  const distance = from.distance + t * (to.distance - from.distance);
-  move({ eye: mixed(from.eye, to.eye), axes: [right, cross(forward, right), forward], distance });
+  if (!journey) return;
+  const { way, start, done, again } = journey, share = (now - start) / (1000 * way.seconds);
+  move(way.at(share));
+  if (share < 1) return;
+  if (again) {
+    journey.start = now;
+  } else {
+    journey = null;
+    done(true);
+  }
 }
 
 // ---- pictures: what must be done for the next, and how much of it fits into a frame
 
 let painter = null, reader = null;
 let drawnFor = null;          // camera, size and settings of the last picture
-let sorting = false, sortedFor = null;
+let sorting = false, sortedFor = null, sortedOnce = false;
 let fieldFor = null, row = 0, rowsLeft = 0;
 let share = Infinity;         // rows of the field in a frame, while it moves
 let scale = 1;                // resolution while it moves, of the whole
 let stale = true, scheduled = false, movedAt = -Infinity, lastFrame = null, pace = 16;
+let measuring = false, sortTook = 0;
 const waiting = [];           // who waits for the picture to be finished
 
 function wake() {
@@ -149,20 +200,22 @@ function wake() {
 function frame(now) {
   scheduled = false;
   const before = state.camera;
-  if (journey) travel(now);
+  travel(now);
   flyByKeys(now);
   fit();
   if (state.camera !== before || state.camera !== drawnFor?.camera) movedAt = now;
+  tellMoved();
   const moving = now - movedAt < 200 && drawnFor !== null;
   if (moving && lastFrame !== null) keepPace(now - lastFrame);
   lastFrame = moving ? now : null;
 
-  const size = `${canvas.width} ${canvas.height} ${state.photograph}`;
+  const size = `${canvas.width} ${canvas.height}`;
   if (!sorting && (sortedFor?.camera !== state.camera || sortedFor.size !== size)) {
     sorting = true;
     sortedFor = { camera: state.camera, size };
     const { view, lens, size: pixels } = seenBy(state.camera);
-    reader.post({ camera: { view, lens, size: pixels, near: painter.near } });
+    const { eye, axes } = state.camera;
+    reader.post({ camera: { view, lens, size: pixels, near: painter.near, eye, direction: axes[2] } });
   }
   if (measuring) return;
 
@@ -200,21 +253,20 @@ function frame(now) {
   }
   const done = finished();
   if (done) for (const resolve of waiting.splice(0)) resolve();
-  if (moving || journey || rowsLeft > 0 || held.size > 0 || stale || (drawnFor && drawnFor.resolution !== 1)) wake();
+  if (moving || journey || turning || rowsLeft > 0 || held.size > 0 || stale || (drawnFor && drawnFor.resolution !== 1)) wake();
 }
 
 function paint(resolution) {
   painter.draw(seenBy(state.camera, resolution), state.show.endsWith("residual") ? "grey" : "full");
   drawMarks();
+  placeNotes();
 }
 
-let sortedOnce = false;
-
-let measuring = false, sortTook = 0;
-
-function sorted({ rows, seconds }) {
+function sorted({ rows, seconds, along }) {
   sortTook = seconds;
   painter.setOrder(rows);
+  const { eye, axes } = sortedFor.camera;
+  surface = along === null ? null : { point: plus(eye, axes[2], along), axis: axes[2] };
   sorting = false;
   sortedOnce = stale = true;
   wake();
@@ -222,11 +274,17 @@ function sorted({ rows, seconds }) {
 
 // Whether the canvas shows what was asked for, in full.
 function finished() {
-  const size = `${canvas.width} ${canvas.height} ${state.photograph}`;
+  const size = `${canvas.width} ${canvas.height}`;
   return (
-    painter && sortedOnce && !sorting && !journey && !picking && rowsLeft === 0 && !stale && drawnFor?.resolution === 1 &&
-    drawnFor.camera === state.camera && sortedFor.camera === state.camera && sortedFor.size === size
+    painter && sortedOnce && !sorting && !journey && !turning && !picking && rowsLeft === 0 && !stale &&
+    drawnFor?.resolution === 1 && drawnFor.camera === state.camera && sortedFor.camera === state.camera && sortedFor.size === size
   );
+}
+
+// What the canvas shows, as the address of a PNG.
+function picture() {
+  paint(1);
+  return canvas.toDataURL("image/png");
 }
 
 // Slow frames: first the field is spread over several, then pictures get smaller. Fast ones: the other way round.
@@ -252,8 +310,22 @@ function fit() {
   }
 }
 
-// ---- where photographs were taken
+let picking = null;
 
+// The point of the scene that is seen at a place of the canvas, CSS pixels; null for none, and while another is sought.
+async function pick(left, top) {
+  if (picking) return null;
+  const { lens, size } = seenBy(state.camera), { eye, axes } = state.camera;
+  const [x, y] = [left / canvas.clientWidth, top / canvas.clientHeight].map((v, k) => v * size[k]);
+  const direction = unit(plus(plus(axes[2], axes[0], (x - lens[2]) / lens[0]), axes[1], (y - lens[3]) / lens[1]));
+  reader.post({ pick: { eye, direction } });
+  const along = await new Promise((resolve) => (picking = resolve));
+  picking = null;
+  wake();
+  return along === null ? null : plus(eye, direction, along);
+}
+
+// Where a point is seen, CSS pixels; null behind the camera.
 function onScreen(point) {
   const { view, lens, size } = seenBy(state.camera);
   const p = [0, 4, 8].map((r) => dot(view.slice(r, r + 3), point) + view[r + 3]);
@@ -261,200 +333,6 @@ function onScreen(point) {
   return [(lens[0] * p[0]) / p[2] + lens[2], (lens[1] * p[1]) / p[2] + lens[3]].map(
     (value, k) => (value * [canvas.clientWidth, canvas.clientHeight][k]) / size[k],
   );
-}
-
-function drawMarks() {
-  const marks = byId("marks");
-  if (!state.marks && marks.width === 0) return;
-  marks.width = state.marks ? canvas.clientWidth : 0;  // also clears
-  marks.height = state.marks ? canvas.clientHeight : 0;
-  if (!state.marks) return;
-  const pen = marks.getContext("2d");
-  for (const { camera } of photographs) {
-    const at = onScreen(camera.eye);
-    if (!at) continue;
-    pen.beginPath();
-    pen.arc(...at, 5, 0, 2 * Math.PI);
-    pen.fillStyle = "#ffd369cc";
-    pen.fill();
-    pen.strokeStyle = "#000";
-    pen.stroke();
-  }
-}
-
-// The photograph whose mark is under the pointer, if any.
-function markAt(x, y) {
-  let best = null, nearest = 12;
-  photographs.forEach(({ camera }, index) => {
-    const at = onScreen(camera.eye), away = at ? Math.hypot(at[0] - x, at[1] - y) : Infinity;
-    if (away < nearest) [best, nearest] = [index, away];
-  });
-  return best;
-}
-
-// ---- people
-
-const pointers = new Map();
-
-canvas.addEventListener("pointerdown", (event) => {
-  canvas.setPointerCapture(event.pointerId);
-  canvas.focus({ preventScroll: true });
-  pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, path: 0, button: event.button });
-  journey = null;
-});
-canvas.addEventListener("pointermove", (event) => {
-  const pointer = pointers.get(event.pointerId);
-  if (!pointer) return;
-  const dx = event.clientX - pointer.x, dy = event.clientY - pointer.y;
-  const unitLength = 1 / Math.min(canvas.clientWidth, canvas.clientHeight);
-  if (pointers.size === 2) {
-    const [other] = [...pointers].filter(([id]) => id !== event.pointerId).map(([, value]) => value);
-    const apart = (p) => Math.hypot(p.x - other.x, p.y - other.y);
-    const was = apart(pointer);
-    pan(0.5 * dx * unitLength, 0.5 * dy * unitLength);
-    if (was > 0) zoom(was / Math.max(apart({ x: event.clientX, y: event.clientY }), 1));
-  } else if (pointer.button !== 0 || event.shiftKey) {
-    pan(dx * unitLength, dy * unitLength);
-  } else {
-    turn(3 * dx * unitLength, 3 * dy * unitLength);
-  }
-  Object.assign(pointer, { x: event.clientX, y: event.clientY, path: pointer.path + Math.hypot(dx, dy) });
-});
-for (const kind of ["pointerup", "pointercancel"]) {
-  canvas.addEventListener(kind, (event) => {
-    const pointer = pointers.get(event.pointerId);
-    pointers.delete(event.pointerId);
-    if (kind === "pointerup" && pointer?.path < 4 && state.marks) {
-      const index = markAt(event.clientX, event.clientY);
-      if (index !== null) visit(index);
-    }
-  });
-}
-canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-canvas.addEventListener("wheel", (event) => {
-  event.preventDefault();
-  const lines = event.deltaMode === 1 ? 16 : 1;
-  zoom(Math.exp(Math.max(-1, Math.min(1, 0.0015 * lines * event.deltaY))));
-}, { passive: false });
-canvas.addEventListener("dblclick", (event) => {
-  if (!painter || picking) return;
-  const { lens, size } = seenBy(state.camera);
-  const [x, y] = [event.clientX / canvas.clientWidth, event.clientY / canvas.clientHeight].map((v, k) => v * size[k]);
-  const { eye, axes } = state.camera;
-  const right = (x - lens[2]) / lens[0], down = (y - lens[3]) / lens[1];
-  picking = { eye, direction: unit(plus(plus(axes[2], axes[0], right), axes[1], down)), spread: 3 / lens[0] };
-  reader.post({ pick: picking });
-});
-
-let picking = null;
-
-// Look at what was double-clicked, and turn around it from now on.
-function picked(along) {
-  const { eye, direction } = picking, { axes } = state.camera;
-  picking = null;
-  wake();
-  if (along === null) return;
-  const side = unit(minus(axes[0], direction.map((value) => value * dot(axes[0], direction))));
-  const to = { eye, axes: [side, cross(direction, side), direction], distance: along };
-  journey = { from: state.camera, to, start: performance.now() - (still.matches ? 700 : 0) };
-}
-canvas.addEventListener("webglcontextlost", () => fail(new Lacking("The graphics device has gone away. Load the page again.")));
-
-const held = new Set();  // keys that fly
-let flewAt = null;
-
-function flyByKeys(now) {
-  if (held.size === 0) {
-    flewAt = null;
-    return;
-  }
-  const step = about.speed * Math.min(0.1, flewAt === null ? 0.016 : (now - flewAt) / 1000);
-  flewAt = now;
-  const sign = (one, other) => (held.has(one) ? step : 0) - (held.has(other) ? step : 0);
-  fly(sign("d", "a"), sign("e", "q"), sign("w", "s"));
-}
-
-document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || /INPUT|SELECT|TEXTAREA/.test(event.target.tagName)) return;
-  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-  const step = (by) => visit((state.photograph + by + photographs.length) % photographs.length);
-  const actions = {
-    ArrowLeft: () => turn(0.08, 0), ArrowRight: () => turn(-0.08, 0), ArrowUp: () => turn(0, 0.08),
-    ArrowDown: () => turn(0, -0.08), "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
-    "[": () => step(-1), "]": () => step(1), Home: () => visit(about.start),
-    f: () => byId("freeze").click(), h: () => byId("toggle").click(),
-  };
-  if ("wasdqe".includes(key)) {
-    held.add(key);
-    wake();
-  } else if (actions[key]) {
-    event.preventDefault();
-    actions[key]();
-  }
-});
-document.addEventListener("keyup", (event) => held.delete(event.key.toLowerCase()));
-window.addEventListener("blur", () => held.clear());
-window.addEventListener("resize", wake);
-
-const legends = {
-  full: "The picture as trained, with the residual times the gain.",
-  base: "What does not depend on the view.",
-  residual: "Grey: no change of colour. Otherwise the change times the gain, times 4.",
-  "opacity residual": "Grey: no change. Orange: more opaque, blue: less; times the gain, times 4.",
-};
-
-function listen() {
-  const on = (id, kind, act) => byId(id).addEventListener(kind, (event) => {
-    act(event.target);
-    wake();
-  });
-  byId("panel").addEventListener("submit", (event) => event.preventDefault());
-  on("show", "change", ({ value }) => {
-    state.show = value;
-    byId("legend").textContent = legends[value];
-  });
-  on("gain", "input", ({ value }) => {
-    state.gain = Number(value);
-    byId("gain-value").textContent = value;
-  });
-  on("freeze", "change", ({ checked }) => (state.frozen = checked ? state.camera.eye : null));
-  on("drag", "change", ({ value }) => (state.drag = value));
-  on("mark", "change", ({ checked }) => {
-    state.marks = checked;
-    stale = true;
-  });
-  on("photograph", "change", ({ value }) => visit(Number(value)));
-  on("previous", "click", () => visit((state.photograph + photographs.length - 1) % photographs.length));
-  on("next", "click", () => visit((state.photograph + 1) % photographs.length));
-  on("home", "click", () => visit(about.start));
-  on("save", "click", () => {
-    const link = document.createElement("a");
-    link.href = picture();
-    link.download = "picture.png";
-    link.click();
-  });
-  on("full-screen", "click", () => {
-    if (document.fullscreenElement) document.exitFullscreen();
-    else document.documentElement.requestFullscreen?.().catch(() => {});
-  });
-  on("embed", "click", () => {
-    const code = byId("embed-code"), address = location.protocol.startsWith("http") ? location.href : "https://...";
-    const text = document.createElement("i");
-    text.textContent = document.title;
-    const title = text.innerHTML.replaceAll('"', "&quot;");
-    code.hidden = !code.hidden;
-    code.value = `<iframe src="${address.split("#")[0]}" title="${title}" width="800" height="500" style="border:0" ` +
-      `allow="fullscreen" loading="lazy"></iframe>`;
-    code.select();
-  });
-  byId("toggle").addEventListener("click", () => {
-    const open = (byId("panel").hidden = !byId("panel").hidden);
-    byId("toggle").setAttribute("aria-expanded", String(!open));
-  });
-  byId("photograph").append(...photographs.map(({ name }, index) => new Option(`${index + 1}. ${name}`, index)));
-  byId("photograph").value = state.photograph;
-  byId("legend").textContent = legends.full;
-  if (innerWidth > 700 && window === window.top) byId("toggle").click();
 }
 
 // ---- the scene
@@ -509,7 +387,7 @@ function startReader() {
     progress: (value) => tell("Unpacking", value),
     failed: (message) => fail(new BadFile(message)),
     sorted,
-    picked,
+    picked: (along) => picking(along),
   };
   const receive = (message) => {
     for (const [name, value] of Object.entries(message)) handlers[name](value);
@@ -534,66 +412,23 @@ function startReader() {
   };
 }
 
-// What the canvas shows, as the address of a PNG.
-function picture() {
-  paint(1);
-  return canvas.toDataURL("image/png");
-}
-
-// For pages that embed this one, and for tests.
-window.nrfgs = {
-  ready,
-  picture,
-  finished: () => new Promise((resolve) => {
-    waiting.push(resolve);
-    wake();
-  }),
-  visit: (index) => visit(index, true),
-  // Seconds for a picture while the camera goes around: the field of all that is seen, projection, blending, on the
-  // GPU until they are done. Splats are sorted beside that, in the worker: the last sorting's seconds.
-  async measure(count) {
-    await ready;
-    measuring = true;
-    let seconds = 0;
-    for (let i = 0; i < count; i++) {
-      turn(0.02, 0);
-      const camera = seenBy(state.camera), start = performance.now();
-      painter.evaluate({ center: state.camera.eye, camera, mode: "full", gain: 1 }, 0, painter.rows);
-      paint(1);
-      painter.finish();
-      seconds += (performance.now() - start) / 1000;
-      await new Promise((resolve) => requestAnimationFrame(resolve));
-    }
-    measuring = false;
-    fieldFor = null;
-    wake();
-    const info = painter.gl.getExtension("WEBGL_debug_renderer_info");
-    return {
-      seconds_per_picture: seconds / count,
-      seconds_to_sort: sortTook,
-      size: [canvas.width, canvas.height],
-      splats: painter.count,
-      renderer: painter.gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : painter.gl.RENDERER),
-      browser: navigator.userAgent,
-    };
-  },
-};
-
 async function main() {
+  offer();
   reader = startReader();
   const scene = await reader.read(await packedBytes());
   tell("Preparing", 1);
   fit();
   painter = new Painter(canvas, scene);
-  byId("count").textContent = `${scene.count.toLocaleString("en")} splats, ${scene.viewDependent.toLocaleString("en")} view-dependent`;
+  byId("count").textContent = `${scene.count.toLocaleString("en")} splats, ${scene.viewDependent.toLocaleString("en")} view-dependent.`;
   listen();
-  const asked = /photograph=(\d+)/.exec(location.hash);
-  if (asked && photographs[asked[1] - 1]) visit(asked[1] - 1, true);
+  const asked = readAddress();
   wake();
   await window.nrfgs.finished();
   byId("loading").hidden = true;
   byId("poster").hidden = true;
+  byId("bar").hidden = false;
   begin();
+  if (!asked && !still.matches && (about.tour || about.rotate)) play(about.tour ? "tour" : "rotation");
 }
 
 main().catch(fail);

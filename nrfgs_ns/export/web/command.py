@@ -7,6 +7,7 @@ from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.parse import urljoin
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -18,6 +19,7 @@ from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.compact import load_field, write_file
 from nrfgs_ns.export.options import CompactOptions, WebOptions
+from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import whole
 from nrfgs_ns.image.metrics import psnr
@@ -39,9 +41,13 @@ def export_web(
     load_config: Path, output: Path, options: CompactOptions, web: WebOptions, measure: bool, report: Path | None
 ) -> None:
     """Write a page, or into a folder a page beside its scene; see `nrfgs export web --help`."""
+    if web.address is not None and not web.address.startswith(("https://", "http://")):
+        raise InputError(f"--address {web.address} is no web address. Give all of it, with https://.")
     alone = output.suffix.lower() in (".html", ".htm")
     with few_threads() as threads:
         pipeline = load_field(load_config)
+        names = [Path(name).name for name in pipeline.datamanager.train_dataset.image_filenames]
+        guide = {"tour": read_tour(web.tour, names), "notes": read_notes(web.notes), "rotate": web.rotate}
         threads.suit_to(pipeline)
         if (vectors := weight_vectors(pipeline.model.head)) > MOST_WEIGHTS:
             raise InputError(
@@ -50,15 +56,17 @@ def export_web(
             )
         about, poster = surroundings(pipeline)
         title = output.stem if web.title is None else web.title
-        around = len(page(about, poster, b"" if alone else SCENE, title, web.author).encode())
+        picture = output.with_suffix(".jpg") if alone else output / "preview.jpg"
+        preview = "" if web.address is None else urljoin(web.address if alone else f"{web.address}/", picture.name)
+        around = len(page(about | guide, poster, b"" if alone else SCENE, title, web.author, preview).encode())
         with TemporaryDirectory() as temporary:
             file = Path(temporary) / SCENE
             total = lambda size: around + (-(-size // 3) * 4 if alone else size)  # noqa: E731 -- base64 in a page
             _, numbers = write_file(pipeline, load_config, file, options, measure, total)
             scene = file.read_bytes()
-    text = page(about, poster, scene if alone else SCENE, title, web.author)
+    text = page(about | guide, poster, scene if alone else SCENE, title, web.author, preview)
     contents = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
-    for path, content in contents.items():
+    for path, content in (contents | ({picture: poster} if preview else {})).items():
         with whole(path) as aside:
             aside.write_bytes(content)
     size, name = sum(map(len, contents.values())), about["photographs"][about["start"]]["name"]
@@ -67,6 +75,7 @@ def export_web(
         f"{numbers['ply_bytes'] / 1e6:.2f} MB. It begins where {name} was taken."
     ]
     lines += [lost(numbers)] if measure else []
+    lines += [f"{picture}: the picture for {preview}."] if preview else []
     lines.append("Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md.")
     finish(lines, numbers | {"bytes": size, "scene_bytes": len(scene), "start": name}, report)
 
@@ -88,7 +97,7 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
 
     The values: "photographs", each with its name, pose [12] (camera to world, x right, y up, z backwards, row by row),
     lens (focal lengths, principal point) and size in pixels, and "distance" to the subject; "start", an index; "up", a
-    direction; "nearest", the shortest distance to the point that is orbited; "speed", units a second.
+    direction.
     """
     model, data = pipeline.model, pipeline.datamanager
     images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
@@ -118,8 +127,7 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
         }
         for i, name in enumerate(data.train_dataset.image_filenames)
     ]
-    places = {"photographs": photographs, "start": start, "up": _rounded(up)}
-    return places | {"nearest": typical / 50, "speed": typical / 2}, _jpeg(poster)
+    return {"photographs": photographs, "start": start, "up": _rounded(up)}, _jpeg(poster)
 
 
 def distance(camera: Cameras, means: torch.Tensor) -> float | None:

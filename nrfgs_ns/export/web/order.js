@@ -32,8 +32,14 @@ class Order {
       for (let a = 0; a < 3; a++) this.means[3 * i + a] = table[16 * i + a];
       this.reach[i] = SIGMAS * Math.max(table[16 * i + 8], table[16 * i + 9], table[16 * i + 10]);
     }
-    this.opaque = new Uint8Array(n);
-    for (let i = 0; i < n; i++) this.opaque[i] = table[16 * i + 3] > -1 ? 1 : 0;  // a logit: opacity above 0.27
+    // For rays, in bytes: the quaternion (w, x, y, z), scales as shares of the largest, and the opacity.
+    this.shapes = new Uint8Array(8 * n);
+    for (let i = 0; i < n; i++) {
+      const at = 16 * i, largest = this.reach[i] / SIGMAS;
+      for (let k = 0; k < 4; k++) this.shapes[8 * i + k] = Math.round(128 + 127 * table[at + 4 + k]);
+      for (let k = 0; k < 3; k++) this.shapes[8 * i + 4 + k] = Math.max(1, Math.round((255 * table[at + 8 + k]) / largest));
+      this.shapes[8 * i + 7] = Math.round(255 / (1 + Math.exp(-table[at + 3])));
+    }
     this.keys = [new Uint32Array(n), new Uint32Array(n)];
     this.rows = [new Uint32Array(n), new Uint32Array(n)];
     this.depths = new Float32Array(this.keys[0].buffer);
@@ -61,19 +67,34 @@ class Order {
     return this.rows[0].slice(0, m).reverse();
   }
 
-  // How far along a ray the first splat lies that somebody would see there; null for none.
-  picked({ eye, direction, spread }) {
-    const { means, reach, opaque } = this;
-    let nearest = Infinity;
+  // How far along a ray (a unit direction) half of the light has been stopped; null if it goes through.
+  along({ eye, direction }) {
+    const { means, reach, shapes } = this, hits = [];
     for (let i = 0; i < this.count; i++) {
-      if (!opaque[i]) continue;
       const x = means[3 * i] - eye[0], y = means[3 * i + 1] - eye[1], z = means[3 * i + 2] - eye[2];
-      const along = x * direction[0] + y * direction[1] + z * direction[2];
-      if (along <= 0 || along >= nearest) continue;
-      const beside = Math.sqrt(Math.max(0, x * x + y * y + z * z - along * along));
-      if (beside < Math.min(reach[i] / SIGMAS, 0.1 * along) + spread * along) nearest = along;
+      const far = x * direction[0] + y * direction[1] + z * direction[2];
+      if (far <= 0 || x * x + y * y + z * z - far * far > reach[i] * reach[i]) continue;
+      // Where the ray passes nearest to the mean, in standard deviations along the splat's own axes.
+      const [qw, qx, qy, qz] = [0, 1, 2, 3].map((k) => (shapes[8 * i + k] - 128) / 127);
+      const axes = [
+        [1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)],
+        [2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)],
+        [2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)],
+      ];
+      let oo = 0, od = 0, dd = 0;
+      for (let k = 0; k < 3; k++) {
+        const [a, b, c] = axes[k], deviation = (shapes[8 * i + 4 + k] / 255) * (reach[i] / SIGMAS);
+        const o = (a * x + b * y + c * z) / deviation, d = (a * direction[0] + b * direction[1] + c * direction[2]) / deviation;
+        oo += o * o;
+        od += o * d;
+        dd += d * d;
+      }
+      const alpha = (shapes[8 * i + 7] / 255) * Math.exp(0.5 * ((od * od) / dd - oo));
+      if (od > 0 && alpha >= 1 / 255) hits.push([od / dd, alpha]);
     }
-    return nearest < Infinity ? nearest : null;
+    let left = 1;
+    for (const [depth, alpha] of hits.sort((a, b) => a[0] - b[0])) if ((left *= 1 - alpha) < 0.5) return depth;
+    return null;
   }
 
   // Stable sort of the first m keys with their rows, by four bytes; the result is back in the first of each pair.
@@ -108,10 +129,11 @@ function answer(post) {
         order = new Order(scene.table);
         post({ scene }, [scene.table.buffer, scene.latents.buffer]);
       } else if (pick) {
-        post({ picked: order.picked(pick) });
+        post({ picked: order.along(pick) });
       } else {
         const start = performance.now(), rows = order.sorted(camera);
-        post({ sorted: { rows, seconds: (performance.now() - start) / 1000 } }, [rows.buffer]);
+        const seconds = (performance.now() - start) / 1000;
+        post({ sorted: { rows, seconds, along: order.along(camera) } }, [rows.buffer]);
       }
     } catch (error) {
       post({ failed: error instanceof BadFile ? error.message : `The scene cannot be read (${error.message}).` });

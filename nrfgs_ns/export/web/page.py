@@ -4,15 +4,18 @@
 import base64
 import html
 import json
+import re
 from importlib.resources import files
 from typing import Any
 
 READER = ("compact.js", "order.js")
 """Scripts that also run in a worker."""
-VIEWER = ("field.js", "draw.js", "app.js")
+VIEWER = ("field.js", "draw.js", "camera.js", "people.js", "interface.js", "app.js")
 
 
-def page(about: dict[str, Any], poster: bytes, scene: bytes | str, title: str, author: str = "") -> str:
+def page(
+    about: dict[str, Any], poster: bytes, scene: bytes | str, title: str, author: str = "", preview: str = ""
+) -> str:
     """The HTML of a page that shows a scene.
 
     Args:
@@ -20,12 +23,17 @@ def page(about: dict[str, Any], poster: bytes, scene: bytes | str, title: str, a
         poster: a JPEG for the time of loading.
         scene: a compact file's bytes, or the name of one beside the page.
         title, author: plain text.
+        preview: the address of a picture that messengers and search engines may show with the page's.
     """
     beside = isinstance(scene, str)
+    tags = {"og:type": "website", "og:title": title, "og:description": author, "og:image": preview}
     parts = {
         "connect": "'self'" if beside else "'none'",
         "title": html.escape(title),
         "byline": f"<p>{html.escape(author)}</p>" if author else "",
+        "preview": "\n".join(
+            f'<meta property="{name}" content="{html.escape(value)}">' for name, value in tags.items() if value
+        ),
         "poster": "data:image/jpeg;base64," + base64.b64encode(poster).decode(),
         "style": _asset("page.css"),
         "reader": "".join(map(_asset, READER)),
@@ -40,4 +48,6 @@ def page(about: dict[str, Any], poster: bytes, scene: bytes | str, title: str, a
 
 
 def _asset(name: str) -> str:
-    return (files(__package__) / name).read_text(encoding="utf-8")
+    """A file of this folder without indentation and lines of comment, except its licence."""
+    text = (files(__package__) / name).read_text(encoding="utf-8")
+    return re.sub(r"^ +(?://.*\n)?|^// (?!SPDX).*\n", "", text, flags=re.M)

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+from short_trainings import command_line, trained
+
+from nrfgs_lab.pages.browser import CHROMIUM, chromium
+from nrfgs_ns.export.command import Web
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on the path: apt-get install chromium")
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="session")
+def demo(tiny_scene, tmp_path_factory):
+    """config.yml of a short training on the procedural scene, and its page."""
+    folder = tmp_path_factory.mktemp("demo")
+    options = {
+        "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.few-views": "off",
+        "--pipeline.model.shrinkage": 0,
+        "--pipeline.model.densification": "splatfacto,warmup_length=20,refine_every=20",
+        "--pipeline.model.rasterize-mode": "antialiased",
+        "--optimizers.field.optimizer.lr": 0.05,  # something to show after a few steps
+    }
+    config = trained(command_line("nrfgs", tiny_scene, folder, 80, options))
+    Web(config, output=folder / "page.html").main()
+    return config, folder / "page.html"

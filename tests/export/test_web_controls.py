@@ -1,0 +1,393 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every control of a page, by mouse, finger and key, in windows of a desktop and of a phone held both ways."""
+
+import functools
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+from web_pages import Page, page_with, wall_scene
+
+from nrfgs_lab.pages.browser import different
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
+
+pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e '.[browser]'")
+
+WINDOWS = {
+    "desktop": ((800, 560), {}),
+    "phone": ((360, 640), {"has_touch": True}),
+    "turned": ((640, 360), {"has_touch": True}),
+}
+TABS = ["View", "Photographs", "Share", "Help"]
+LARGE = 44
+"""CSS pixels that a fingertip needs."""
+CONTROLS = (
+    "#bar button, #panel button, #panel select, #panel input:not([type=checkbox]), #panel label.line, #panel summary"
+)
+
+
+@pytest.fixture(params=WINDOWS)
+def window(request):
+    return WINDOWS[request.param]
+
+
+@pytest.fixture
+def wall(browser, tmp_path):
+    """Open a page of a wall, with more values for its scripts."""
+    opened = []
+
+    def page(size=(480, 360), before="", **more) -> Page:
+        scene, photographs = wall_scene(tmp_path)
+        (tmp_path / "page.html").write_text(page_with(scene.read_bytes(), photographs, **more))
+        opened.append(Page(browser, (tmp_path / "page.html").as_uri(), size, before).begun())
+        return opened[-1]
+
+    yield page
+    for page in opened:
+        assert not page.errors
+        page.page.close()
+
+
+def boxes(page: Page, selector: str) -> list[dict]:
+    """Places of what is visible, with its "name"."""
+    found = []
+    for one in page.page.locator(selector).all():
+        if one.is_visible():
+            found.append(one.bounding_box() | {"name": one.evaluate("(element) => element.id || element.textContent")})
+    return found
+
+
+def test_the_picture_comes_first(window, demo, browser):
+    (width, height), touch = window
+    page = Page(browser, demo[1].as_uri(), (width, height), **touch).begun()
+    assert page.page.locator("#panel").is_hidden()
+    assert [button["name"] for button in boxes(page, "button")] == TABS
+    (bar,) = boxes(page, "#bar")
+    assert bar["width"] * bar["height"] < 0.15 * width * height
+    for tab in TABS:
+        page.page.get_by_role("button", name=tab, exact=True).click()
+        assert [section["name"] for section in boxes(page, "#panel section")] == [tab.lower()]
+        (panel,) = boxes(page, "#panel")
+        assert panel["x"] >= 0 and panel["x"] + panel["width"] <= width
+        assert panel["y"] >= 0 and panel["y"] + panel["height"] <= bar["y"] + 1
+        if width < 600:
+            assert panel["height"] <= 0.56 * height, "the scene is seen above the sheet"
+        assert page.page.locator("#show").is_hidden() and page.page.locator("#freeze").is_hidden()
+    page.page.keyboard.press("Escape")
+    assert page.page.locator("#panel").is_hidden()
+    assert page.page.evaluate("document.activeElement.textContent") == "Help"
+    page.page.get_by_role("button", name="View", exact=True).click()
+    page.page.mouse.click(40, 120)
+    assert page.page.locator("#panel").is_hidden() == (width < 600), "a sheet gives way to the scene"
+    assert not page.errors
+    page.page.close()
+
+
+def test_fingers_hit_every_control(window, demo, browser):
+    size, touch = window
+    page = Page(browser, demo[1].as_uri(), size, **touch).begun()
+    page.page.evaluate("nrfgs.setNotes([{ text: 'here', position: nrfgs.getCamera().target }])")
+    seen = set()
+    for tab in TABS:
+        page.tab(tab)
+        if tab == "Share":
+            page.page.click("#embed")
+            page.page.click("#copy-link")
+        for box in boxes(page, CONTROLS + ", .note button"):
+            assert box["width"] >= LARGE and box["height"] >= LARGE, box
+            seen.add(box["name"])
+        overflow = page.page.evaluate(
+            "(() => { const { scrollWidth, clientWidth } = document.getElementById('panel');"
+            " return scrollWidth - clientWidth; })()"
+        )
+        assert overflow <= 0, tab
+    assert {"home", "drag", "gain", "photograph", "copy-link", "embed", "add-note", "save-tour"} <= seen
+    page.page.close()
+
+
+def test_controls_stay_within_the_safe_area(demo, browser):
+    page = Page(browser, demo[1].as_uri(), (360, 640), has_touch=True).begun()
+    insets = {"top": 40, "bottom": 34, "left": 0, "right": 0}
+    page.page.context.new_cdp_session(page.page).send("Emulation.setSafeAreaInsetsOverride", {"insets": insets})
+    assert all(box["y"] + box["height"] <= 640 - 34 for box in boxes(page, "#bar button"))
+    page.tab("Share")
+    assert boxes(page, "#caption")[0]["y"] >= 40
+    page.page.close()
+
+
+def test_every_control_changes_the_picture(window, demo, browser):
+    size, touch = window
+    page = Page(browser, demo[1].as_uri(), size, **touch).begun()
+    first = page.picture()
+
+    def changed(act, than=first):
+        act()
+        now = page.picture()
+        assert different(255 * now.numpy(), 255 * than.numpy())
+        return now
+
+    def same(act) -> None:
+        act()
+        assert not different(255 * page.picture().numpy(), 255 * first.numpy())
+
+    def home() -> None:
+        page.tab("View")
+        page.page.click("#home")
+
+    page.tab("View")
+    for mode in ["base", "residual", "opacity residual"]:
+        changed(lambda mode=mode: page.page.select_option("#show", mode))
+    same(lambda: page.page.select_option("#show", "full"))
+    for gain in ("0", "2"):
+        changed(lambda gain=gain: page.page.fill("#gain", gain))
+    same(lambda: page.page.fill("#gain", "1"))
+
+    # Frozen, the picture from another place differs from the one that is seen there.
+    same(lambda: page.page.check("#freeze"))
+    page.tab("Photographs")
+    start = int(page.page.locator("#photograph").input_value())
+    frozen = changed(lambda: page.page.select_option("#photograph", str((start + 3) % 8)))  # of 8 training views
+    page.tab("View")
+    changed(lambda: page.page.uncheck("#freeze"), than=frozen)
+    same(home)
+
+    turned = changed(
+        lambda: page.page.check("#rotate") or page.page.wait_for_timeout(1500) or page.page.uncheck("#rotate")
+    )
+    changed(lambda: None)
+    assert turned is not None
+    same(home)
+    for button in ("previous", "next"):
+        page.tab("Photographs")
+        changed(lambda button=button: page.page.click(f"#{button}"))
+        same(home)
+    page.page.keyboard.press("Escape")
+
+    press_home = functools.partial(page.page.keyboard.press, "Home")
+    changed(page.drag)
+    same(press_home)
+    changed(lambda: page.drag(shift=True))
+    same(press_home)
+    changed(lambda: page.page.mouse.wheel(0, -300))
+    same(press_home)
+    page.set("drag", "fly", "change")
+    where = page.camera()[0]
+    changed(page.drag)
+    assert np.allclose(page.camera()[0], where), "looking around leaves the camera where it is"
+    page.set("drag", "orbit", "change")
+    same(press_home)
+    for key in ("ArrowLeft", "ArrowUp", "+", "]"):
+        page.page.keyboard.press(key)
+        changed(lambda: None)
+        same(press_home)
+    for key in "wsadqe":
+        changed(lambda key=key: page.page.keyboard.press(key, delay=300))
+        same(press_home)
+    changed(lambda: page.page.mouse.dblclick(120, 200))
+    assert np.allclose(page.camera()[0], where), "what is double-clicked is looked at, from the same place"
+    same(press_home)
+
+    page.page.keyboard.press("h")
+    assert not boxes(page, "#bar, #caption, #panel")
+    page.page.keyboard.press("h")
+    page.tab("Share")
+    with page.page.expect_download() as download:
+        page.page.click("#save")
+    assert Image.open(download.value.path()).size == size
+    page.page.keyboard.press("Escape")
+    page.tab("View")
+    page.page.click("#full-screen")
+    page.until("document.fullscreenElement !== null")
+    page.page.click("#full-screen")
+    page.until("document.fullscreenElement === null")
+    assert not page.errors
+    page.page.close()
+
+
+def test_marks_say_how_many_are_in_view_and_lead_there(wall):
+    page = wall((480, 480))
+    page.tab("Photographs")
+    page.page.check("#mark")
+    page.call("finished")
+    assert re.findall(r"\d+", page.page.inner_text("#mark-said")) == ["9"], "all are where the camera is, or beside it"
+    page.call("setCamera", {"position": [8, 0.1, 0.1], "target": [0, 0.1, 0.1]})
+    page.call("finished")
+    assert re.findall(r"\d+", page.page.inner_text("#mark-said")) == ["9", "9"]
+    page.page.keyboard.press("Escape")
+    camera = page.page.evaluate("nrfgs.photographs()[8].position")
+    x, y = projected(page, [camera])[0]
+    page.page.mouse.click(x, y)
+    page.call("finished")
+    assert np.allclose(page.camera()[0], camera) and page.page.locator("#photograph").input_value() == "8"
+    page.tab("Photographs")
+    page.page.uncheck("#mark")
+    assert page.page.locator("#mark-said").is_hidden()
+    page.page.keyboard.press("Escape")
+    page.call("setCamera", {"position": [8, 0.1, 0.1], "target": [0, 0.1, 0.1]})
+    page.page.mouse.click(x, y)
+    assert np.allclose(page.camera()[0], [8, 0.1, 0.1]), "what is not shown leads nowhere"
+
+
+def projected(page: Page, points: list) -> np.ndarray:
+    """Where points are seen, CSS pixels [N, 2], once the lens is in the middle, with a field of view of 50."""
+    page.call("setCamera", page.call("getCamera") | {"fov": 50})
+    matrix = np.array(page.call("getMatrix")).reshape(4, 4).T
+    x, y, z = np.linalg.inv(matrix)[:3, :3] @ np.array(points).T + np.linalg.inv(matrix)[:3, 3:]
+    size = page.page.viewport_size
+    focal = size["height"] / 2 / np.tan(np.radians(25))
+    return np.stack([size["width"] / 2 - focal * x / z, size["height"] / 2 + focal * y / z], axis=1)
+
+
+def test_the_view_never_ends_inside_or_behind_the_scene(wall):
+    """The wall is at x = 0; photographs at x = 3 take its distance for 5: they turn around a point behind it."""
+    page = wall()
+    eyes = np.array([photograph["position"] for photograph in page.call("photographs")])
+
+    def away(position) -> float:
+        return float(np.linalg.norm(eyes - position, axis=1).min())
+
+    for key in (None, "w"):
+        for _ in range(40):
+            page.page.mouse.move(240, 180)
+            page.page.mouse.wheel(0, -200) if key is None else page.page.keyboard.press(key, delay=60)
+        position, _ = page.camera()
+        assert 0.3 < position[0] < 1.5, "close to the wall, and before it"
+        assert page.picture().std() > 0.02, "the wall is seen"
+        page.page.keyboard.press("Home")
+    page.call("finished")
+    for _ in range(40):
+        page.page.mouse.wheel(0, 500)
+    position, _ = page.camera()
+    assert position[0] > 4 and away(position) <= 4.01
+    page.page.keyboard.press("Home")
+    for direction in (1, -1):
+        for _ in range(12):  # more than all the way around
+            page.page.mouse.move(240 - 200 * direction, 180)
+            page.page.mouse.down()
+            page.page.mouse.move(240 + 200 * direction, 180, steps=8)
+            page.page.mouse.up()
+            assert page.camera()[0][0] > 0, "never behind the wall"
+        assert 1 < away(page.camera()[0]) <= 4.01
+        page.page.keyboard.press("Home")
+
+    # A script may go further, and hands come back from there.
+    page.call("setCamera", {"position": [20, 0, 0], "target": [0, 0, 0]})
+    page.page.mouse.wheel(0, 200)
+    assert np.allclose(page.camera()[0], [20, 0, 0])
+    page.page.mouse.wheel(0, -200)
+    assert page.camera()[0][0] < 19
+
+
+def test_no_frame_around_what_a_mouse_drags(wall):
+    page = wall()
+    style = "getComputedStyle(document.getElementById('scene')).outlineStyle"
+    page.page.keyboard.press("Tab")
+    page.page.focus("#scene")
+    assert page.page.evaluate(style) == "solid", "the keyboard's place is seen"
+    page.drag()
+    assert page.page.evaluate("document.activeElement.id") == "scene"
+    assert page.page.evaluate(style) == "none"
+    page.page.keyboard.press("ArrowLeft")
+    assert page.page.evaluate(style) == "solid"
+
+
+def test_fingers_turn_move_and_zoom(demo, browser):
+    page = Page(browser, demo[1].as_uri(), (480, 360)).begun()
+    touch = page.page.context.new_cdp_session(page.page)
+
+    def fingers(*paths: list[tuple[int, int]]) -> None:
+        """Put fingers down where their paths begin, move them along, and lift them."""
+        for step, places in enumerate(zip(*paths, strict=True)):
+            points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(places)]
+            kind = "touchMove" if step else "touchStart"
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+    first = page.picture()
+    seen = [first]
+    for paths in (
+        [[(100, 150), (130, 140), (160, 130)]],  # turns
+        [[(100, 150), (130, 170)], [(140, 150), (170, 170)]],  # moves
+        [[(200, 180), (150, 180), (100, 180)], [(240, 180), (290, 180), (340, 180)]],  # comes closer
+    ):
+        fingers(*paths)
+        now = page.picture()
+        assert all(different(255 * now.numpy(), 255 * before.numpy()) for before in seen)
+        seen.append(now)
+        page.page.evaluate("document.getElementById('home').click()")
+        assert not different(255 * page.picture().numpy(), 255 * first.numpy())
+    assert not page.errors
+    page.page.close()
+
+
+def test_whoever_cannot_see_the_page_is_told_what_is_there(demo, browser):
+    page = Page(browser, demo[1].as_uri(), (900, 700)).begun()
+    assert page.page.locator("html").get_attribute("lang") == "en"
+    for tab, roles in {
+        "View": {
+            "application": ["page: a scene in three dimensions"],
+            "heading": ["page"],
+            "slider": [re.compile("^Residual gain")],
+            "combobox": [re.compile("^Show"), re.compile("^Drag to")],
+            "checkbox": ["Freeze view", "Turn slowly"],
+            "button": [*TABS, "First view", "Full screen"],
+        },
+        "Photographs": {
+            "combobox": ["Photograph"],
+            "checkbox": ["Mark where taken"],
+            "button": ["Previous photograph", "Next photograph"],
+        },
+        "Share": {"button": ["Copy link to this view", "Save picture", "Embed in a page", "Add note", "Save tour"]},
+    }.items():
+        page.tab(tab)
+        assert page.page.get_by_role("region", name=tab, exact=True).count() == 1
+        for role, names in roles.items():
+            for name in names:
+                assert page.page.get_by_role(role, name=name, exact=isinstance(name, str)).count() == 1, name
+    unnamed = page.page.evaluate(
+        "[...document.querySelectorAll('button, select, input, textarea')].filter((one) => !one.labels?.length"
+        " && !one.ariaLabel && !one.textContent.trim()).map((one) => one.id)"
+    )
+    assert unnamed == []
+
+    # The keyboard alone gets everywhere, and what happens is said.
+    reached = set()
+    for tab in TABS:
+        page.tab(tab)
+        for _ in range(20):
+            page.page.keyboard.press("Tab")
+            reached.add(page.page.evaluate("document.activeElement.id"))
+    assert {
+        "scene",
+        "show",
+        "gain",
+        "freeze",
+        "drag",
+        "rotate",
+        "photograph",
+        "mark",
+        "home",
+        "embed",
+        "save",
+    } <= reached
+    page.page.focus("#scene")
+    page.page.keyboard.press("]")
+    assert page.page.get_by_role("status").filter(has_text=re.compile("^Photograph ")).count() == 1
+    for role, expanded in (("true", "Help"), ("false", "View")):
+        assert page.page.get_by_role("button", name=expanded, exact=True).get_attribute("aria-expanded") == role
+    assert not page.errors
+    page.page.close()
+
+
+def test_pictures_for_the_docs(demo, tmp_path):
+    run = subprocess.run(
+        [sys.executable, "-m", "nrfgs_lab.page_pictures", demo[1], tmp_path / "out"], capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert written == [f"{window}-{name}.jpg" for window in ("desktop", "phone") for name in ("page", "share", "view")]
+    assert all(np.asarray(Image.open(tmp_path / "out" / name)).std() > 5 for name in written)
