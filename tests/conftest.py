@@ -52,6 +52,17 @@ def pytest_unconfigure():
     let_go()
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """A headless Chromium; skips where there is none."""
+    from nrfgs_lab.pages.browser import CHROMIUM, chromium
+
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on the path: apt-get install chromium")
+    with chromium() as browser:
+        yield browser
+
+
 @pytest.fixture
 def captures() -> Path:
     """Folder of real captures (NRFGS_SCENES, else shared/scenes beside the checkout); skips where there is none."""

@@ -35,13 +35,11 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from nrfgs_ns.compact.entropy import MOST_MODEL, decode_table, encode_table
-from nrfgs_ns.files import whole
 
 MAGIC = b"\x89NRF\r\n\x1a\n"
 VERSION = 2
@@ -113,22 +111,8 @@ def container(
     return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
 
 
-def write_container(path: Path, header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> int:
-    """Write a file (`container`), whole or not at all; returns its size."""
-    data = container(header, streams)
-    with whole(path) as aside:
-        aside.write_bytes(data)
-    return len(data)
-
-
-def read_container(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The header and the streams, by name, of a file's bytes; one of BROKEN if they are damaged or of another kind."""
-    header, first = read_header(data)
-    return header, read_streams(data, header["streams"], first)
-
-
 def read_header(data: bytes) -> tuple[dict[str, Any], int]:
-    """The header of a file's bytes, and where its streams begin; errors as `read_container`."""
+    """The header of a file's bytes, and where its streams begin; one of BROKEN if it is damaged or of another kind."""
     if not data.startswith(MAGIC):
         raise ValueError(f"it begins with {data[: len(MAGIC)]!r}")
     _, version, length, total = PREAMBLE.unpack_from(data)
@@ -141,7 +125,7 @@ def read_header(data: bytes) -> tuple[dict[str, Any], int]:
 
 
 def read_streams(data: bytes, entries: list[dict[str, Any]], first: int) -> dict[str, np.ndarray]:
-    """The streams, from byte `first` on, that the header's entries describe; errors as `read_container`."""
+    """The streams, from byte `first` on, that the header's entries describe; errors as `read_header`."""
     unpacked, streams = 0, {}
     for entry in entries:
         check_keys(entry, ENTRY, named := f"the stream {ascii(entry)}")
@@ -192,8 +176,8 @@ def _unpack(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     count, size = math.prod(entry["shape"]), np.dtype(entry["dtype"]).itemsize
     unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=LARGEST_MEMORY)
     raw = unpacker.decompress(body, max_length=count * size + 1) if body else b""
-    whole = not body or unpacker.eof and not unpacker.unused_data and unpacker.check == lzma.CHECK_NONE
-    if len(raw) != count * size or not whole:
+    complete = not body or unpacker.eof and not unpacker.unused_data and unpacker.check == lzma.CHECK_NONE
+    if len(raw) != count * size or not complete:
         raise ValueError(f"it does not hold {count} numbers of {size} bytes")
     blocks = _blocks(body)
     if blocks > 1 or blocks == 1 and not body.startswith(ONE_BLOCK, 12):

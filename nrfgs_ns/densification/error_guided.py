@@ -13,7 +13,8 @@ The recipe follows brush (Arthur Brussee, Apache-2.0, `crates/brush-train`) and 
 - Opacities are never reset. Each refinement takes a little from all of them, which the loss gives back where it counts.
 
 Differences from both, because they harm captures of few views (docs/captures.md): `DEAD` is 0.1 where they have 1/255,
-wide splats are split and not replaced, and no noise moves the means.
+wide splats are split and not replaced, and no noise moves the means. The loss has a term for opacity and size
+(`shrinkage`).
 """
 
 import math
@@ -80,7 +81,7 @@ class ErrorGuided(DensificationConfig):
     """upper bound; growth usually ends below it by itself"""
     shrinkage: float = 0.2
     """weight in the loss of the splats' mean opacity and mean size, in percent, beside the model's `shrinkage`: without
-    it large faint splats, which no reset removes, double the time of a step"""
+    it there are large faint splats, which no reset removes, and twice the pairs of splats and tiles"""
     grow_until: int = 15_000
     """step after which splats are only replaced"""
     stop_at: int = 25_000

@@ -5,6 +5,7 @@ the view changed their opacity. Growth by gradients adds it up, growth by error 
 On CUDA one Triton kernel does it (`statistics_triton.py`), elsewhere and for several cameras PyTorch does.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -69,7 +70,7 @@ def take_maxima(
     change: Tensor | None,
 ) -> None:
     """Let the maxima be at least a step's radii, in shares of the longer side, the norms of its screen-space gradients,
-    in an image of [0, 1], and its changes of opacity.
+    in an image of [0, 1], and its changes of opacity. Radii and norms are never below 0.
 
     Args:
         widths, errors, changes: maxima [N], written to; None: not wanted.
@@ -100,14 +101,13 @@ def raise_in_torch(
     scales: tuple[float, float],
 ) -> None:
     """The kernel's twin: the same in PyTorch, with radii in pixels that are divided by `side`."""
-    seen = (radii > 0).nonzero()[:, 0]
-    rows = rows[seen]
-    widths.scatter_reduce_(0, rows, radii[seen] / side, "amax")
+    seen = radii > 0
+    widths.scatter_reduce_(0, rows, radii / side, "amax")
     if errors is not None:
-        x, y = gradients[seen].unbind(dim=-1)
-        errors.scatter_reduce_(0, rows, torch.hypot(x * scales[0], y * scales[1]), "amax")
+        x, y = gradients.unbind(dim=-1)
+        errors.scatter_reduce_(0, rows, torch.hypot(x * scales[0], y * scales[1]) * seen, "amax")
     if changes is not None:
-        changes.scatter_reduce_(0, rows, change[seen], "amax")
+        changes.scatter_reduce_(0, rows, change.where(seen, -math.inf), "amax")
 
 
 _GATE = Gate("What densification remembers")

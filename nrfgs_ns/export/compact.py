@@ -156,9 +156,7 @@ def encoded(
     log, size = 0.0, attempt(0.0)
     if limit is None or size <= limit:
         return found[log], 1.0
-    slope = (
-        13 * len(field.splats["means"]) + field.splats["latents"].numel()
-    ) / 8  # a bit for each number and doubling
+    slope = (13 * len(field.splats["means"]) + field.splats["latents"].numel()) / 8  # a bit a number and doubling
     while len(found) < MOST_ATTEMPTS and not ENOUGH * limit <= size <= limit:
         last = log, size
         log = min(max(log + (size - AIM * limit) / slope, 0.0), math.log2(COARSEST))

@@ -3,7 +3,6 @@
 
 import json
 import lzma
-import tempfile
 import zlib
 from functools import lru_cache, partial
 from pathlib import Path
@@ -24,17 +23,14 @@ def written() -> bytes:
     from nrfgs_ns.appearance.field import Field
     from nrfgs_ns.appearance.nrf import NrfConfig
     from nrfgs_ns.compact.encode import encode
-    from nrfgs_ns.compact.format import write_container
+    from nrfgs_ns.compact.format import container
 
     render = {"rasterize_mode": "classic", "background": [0.0, 0.0, 0.0]}
     torch.manual_seed(3)
     head = NrfConfig(latent_dim=8, hidden_width=16, output_init="default").setup().requires_grad_(False)
     columns = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "features_dc": 3, "latents": 8}
     splats = {name: torch.randn(60, count) for name, count in columns.items()}
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "field.nrf"
-        write_container(path, *encode(Field(head, splats), render))
-        return path.read_bytes()
+    return container(*encode(Field(head, splats), render))
 
 
 def read(path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import tyro
-from compact_fields import RENDER, field, matched, through_a_file
+from compact_fields import RENDER, field, matched, read_container, through_a_file, write_container
 from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.scripts.render import DatasetRender
@@ -30,7 +30,7 @@ from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode
 from nrfgs_ns.compact.entropy import encode_table
 from nrfgs_ns.compact.finetune import CodedSplats, Gated, growth_without
-from nrfgs_ns.compact.format import Table, read_container, write_container
+from nrfgs_ns.compact.format import Table
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.compact.tables import NEAR, OCTAHEDRAL, STEPS, Grid, from_morton, morton, nearest_turn
 from nrfgs_ns.errors import InputError

@@ -11,11 +11,12 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
+from compact_fields import write_container
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nrfgs_ns.compact.entropy import LOWEST, BadStream, decode_table, encode_table
-from nrfgs_ns.compact.format import Table, write_container
+from nrfgs_ns.compact.format import Table
 
 
 def laplacian(columns: int, rows: int, scale: float = 5.0, seed: int = 0) -> np.ndarray:

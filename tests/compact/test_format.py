@@ -7,10 +7,11 @@ import zlib
 
 import numpy as np
 import pytest
+from compact_fields import read_container, write_container
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.compact.format import BROKEN, DTYPES, Table, read_container, write_container
+from nrfgs_ns.compact.format import BROKEN, DTYPES, Table
 
 RANDOM = np.random.default_rng(0)
 ARRAYS = {

@@ -60,7 +60,7 @@ def written(count: int = COUNT, **options) -> bytes:
 
 
 def parts_of(header: dict, streams: dict) -> Parts:
-    """What `write_container` writes, in parts."""
+    """A file in parts."""
     entries, bodies = [], []
     for name, stream in streams.items():
         array, body = _coded(stream) if isinstance(stream, Table) else (stream, _pack(stream))

@@ -2,16 +2,7 @@
 import pytest
 from short_trainings import command_line, trained
 
-from nrfgs_lab.pages.browser import CHROMIUM, chromium
 from nrfgs_ns.export.command import Web
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on the path: apt-get install chromium")
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture(scope="session")

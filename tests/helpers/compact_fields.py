@@ -3,6 +3,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from nrfgs_ns.appearance.field import Field
@@ -10,11 +11,23 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.format import write_container
+from nrfgs_ns.compact.format import container, read_header, read_streams
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 
 RENDER = {"rasterize_mode": "classic", "background": [0.0, 0.0, 0.0]}
 """How a file says that it is rendered."""
+
+
+def write_container(path: Path, header: dict, streams: dict) -> int:
+    """Write a file; returns its size."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path.write_bytes(container(header, streams))
+
+
+def read_container(data: bytes) -> tuple[dict, dict[str, np.ndarray]]:
+    """The header and the streams, by name, of a file's bytes."""
+    header, first = read_header(data)
+    return header, read_streams(data, header["streams"], first)
 
 
 def field(count: int = 60) -> Field:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from compact_fields import write_container
 from PIL import Image
 
 from nrfgs_ns.appearance.field import Field
@@ -19,7 +20,6 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.format import write_container
 from nrfgs_ns.export.web.page import page as page_of
 from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
 from nrfgs_ns.model.renderer import composite_view, project_view, projection_options

@@ -12,7 +12,7 @@ from itertools import combinations
 
 import pytest
 
-from nrfgs_lab.pages.browser import CHROMIUM, PATIENCE, TRAIN, VIEWER, Page, Served, chromium, different
+from nrfgs_lab.pages.browser import PATIENCE, TRAIN, VIEWER, Page, Served, different
 from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, VIEW_DEPENDENCE
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
@@ -20,14 +20,6 @@ pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e '.[browser]'")
 FIELD = ["residual", "low branch", "high branch", "gate weight", "opacity residual"]
 MODES = [FULL, BASE, *FIELD, VIEW_DEPENDENCE, DEPTH]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on the path: apt-get install chromium")
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module")
