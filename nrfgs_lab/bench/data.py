@@ -6,6 +6,7 @@
   links into the work folder, beside lists of the names of each split.
 - Held out: a data set of the training views alone, at half the size, some of which are test views, in the work folder:
   for choosing settings without looking at test views.
+- Fewer views: the capture with its own test views and some of its training views.
 """
 
 import json
@@ -34,13 +35,13 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     downscaled images are missing.
     """
     folder, mirror = root / scene.path, mirrors / scene.name
-    if scene.held_out is not None:
+    scale = [] if scene.downscale is None else ["--downscale-factor", str(scene.downscale)]
+    if scene.held_out is not None or scene.views is not None:
         with FileLock(mirror.with_name(f"{mirror.name}.lock")):
             if not (mirror / "transforms.json").exists():
-                make_held_out(folder, mirror, scene.held_out, scene.views)
-        return ["nrfgs-data", "--data", str(mirror), *scene.options]
+                select_views(folder, mirror, scene)
+        return ["nrfgs-data", "--data", str(mirror), *scale, *scene.options]
     if (folder / "transforms.json").is_file():
-        scale = [] if scene.downscale is None else ["--downscale-factor", str(scene.downscale)]
         split = [] if names_its_split(folder / "transforms.json") else ["--eval-mode", "interval"]
         return ["nrfgs-data", "--data", str(folder), *split, *scale, *scene.options]
     model = find_colmap(folder)
@@ -57,42 +58,52 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     return [*parser, *scene.options]
 
 
-def held_out_views(names: list[str], first: int) -> list[str]:
-    """Views to hold out: every 8th; every 6th of fewer than 30 views if every 8th gives fewer than three."""
-    chosen = names[first::TEST_EVERY]
-    return names[first::6] if len(names) < 30 and len(chosen) < 3 else chosen
+def held_out_views(names: list[str], first: int, every: int = TEST_EVERY) -> list[str]:
+    """Views to hold out: by default every 8th, or every 6th of fewer than 30 views if every 8th gives fewer than
+    three."""
+    chosen = names[first::every]
+    return names[first::6] if every == TEST_EVERY and len(names) < 30 and len(chosen) < 3 else chosen
 
 
-def make_held_out(folder: Path, out: Path, first: int, views: int | None = None) -> None:
-    """Write a data set of a capture's training views at half the size into `out`.
-
-    `first` is the first held-out view by name; `views` of the others stay, evenly spaced. InputError if the capture
-    names no training views.
-    """
+def select_views(folder: Path, out: Path, scene: Scene) -> None:
+    """Write a data set of a capture's training views at half the size, some of them held out, or of the whole capture
+    with fewer training views, into `out`. InputError if the capture names no training views."""
     file = folder / "transforms.json"
     meta = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     if not meta.get("train_filenames"):
         raise InputError(f"{file} names no train_filenames. Give a capture that names its split (nrfgs prepare does).")
-    training = set(meta["train_filenames"])
-    frames = sorted((one for one in meta["frames"] if one["file_path"] in training), key=lambda one: one["file_path"])
+    names = sorted(meta["train_filenames"])
+    if scene.held_out is None:
+        out.mkdir(parents=True)
+        for entry in folder.iterdir():
+            if entry != file:
+                (out / entry.name).symlink_to(entry.resolve())
+    else:
+        frames = [frame for frame in meta["frames"] if frame["file_path"] in names]
+        meta |= {"frames": sorted(frames, key=lambda frame: frame["file_path"])}
+        _halve(meta, folder, out)
+        test = held_out_views(names, scene.held_out, scene.held_out_every)
+        names = [name for name in names if name not in test]
+        meta |= {"test_filenames": test, "val_filenames": test}
+    meta["train_filenames"] = [names[i] for i in evenly_spaced(len(names), scene.views or len(names))]
+    write_whole(out / "transforms.json", json.dumps(meta, indent=1))
+
+
+def _halve(meta: dict, folder: Path, out: Path) -> None:
+    """Halve the frames' images and their cameras."""
     size = meta["w"] // 2, meta["h"] // 2
-    for frame in frames:
+    for frame in meta["frames"]:
         for key in {"file_path", "mask_path"} & frame.keys():
             target = out / frame[key]
             target.parent.mkdir(parents=True, exist_ok=True)
             with Image.open(folder / frame[key]) as picture:
                 small = picture.convert("RGB" if key == "file_path" else "L").resize(size, Image.Resampling.BOX)
                 small.save(target, quality=QUALITY)
-    names = [frame["file_path"] for frame in frames]
-    test = held_out_views(names, first)
-    others = [name for name in names if name not in test]
     for keys, factor in ((("fl_x", "cx"), size[0] / meta["w"]), (("fl_y", "cy"), size[1] / meta["h"])):
         meta |= {key: meta[key] * factor for key in keys}
-    meta |= {"w": size[0], "h": size[1], "frames": frames, "test_filenames": test, "val_filenames": test}
-    meta["train_filenames"] = [others[i] for i in evenly_spaced(len(others), views or len(others))]
+    meta |= {"w": size[0], "h": size[1]}
     if "ply_file_path" in meta:
         shutil.copy(folder / meta["ply_file_path"], out / meta["ply_file_path"])
-    write_whole(out / "transforms.json", json.dumps(meta, indent=1))
 
 
 def names_its_split(transforms: Path) -> bool:

@@ -80,15 +80,19 @@ class Scene:
     steps: int | None = None
     """training steps, instead of the benchmark's"""
     views: int | None = None
-    """number of training views to keep beside held-out ones, evenly spaced"""
+    """number of training views to keep, evenly spaced"""
     held_out: int | None = None
     """first held-out view"""
+    held_out_every: int = 8
+    """from one held-out view to the next"""
 
     @property
     def name(self) -> str:
         """Name in tables and records."""
-        parts = [] if self.held_out is None else [self.held_out, self.views]
-        return "/".join(str(part) for part in [*parts, self.path] if part is not None)
+        if self.held_out is None:
+            return self.path if self.views is None else f"{self.views} views/{self.path}"
+        fold = self.held_out if self.held_out_every == 8 else f"{self.held_out} of {self.held_out_every}"
+        return "/".join(str(part) for part in (fold, self.views, self.path) if part is not None)
 
 
 @dataclass
@@ -109,6 +113,8 @@ class Spec:
     """options of ns-train for every run"""
     held_out: list[int] = field(default_factory=list)
     """first held-out view; each number makes one held-out version of each scene"""
+    held_out_every: int = 8
+    """from one held-out view to the next"""
     quick: bool = False
     """quality alone: no ns-eval, pictures or frame rates; checkpoints are removed"""
     train_views: int = 16
@@ -202,13 +208,16 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
             "options": words_of(content.get("options", ()), f"{where}: options"),
         }
     )
-    for key, least in (("steps", 1), ("jobs", 1), ("gpus", 1), ("train_views", 0), ("checkpoint_every", 1)):
+    leasts = {"steps": 1, "jobs": 1, "gpus": 1, "train_views": 0, "checkpoint_every": 1, "held_out_every": 2}
+    for key, least in leasts.items():
         _whole(getattr(spec, key), least, f"{where}: {key}")
     for key in ("seeds", "held_out"):
         for value in getattr(spec, key):
             _whole(value, 0, f"{where}: {key}")
     if spec.held_out:
-        spec.scenes = [replace(scene, held_out=first) for first in spec.held_out for scene in spec.scenes]
+        every = spec.held_out_every
+        versions = [{"held_out": first, "held_out_every": every} for first in spec.held_out]
+        spec.scenes = [replace(scene, **version) for version in versions for scene in spec.scenes]
     _require_free(spec.options, SET_HERE, f"{where}: options")
     for run in spec.runs:
         _check_run(run, spec, f"{where}: runs: {run.name}")
@@ -427,8 +436,8 @@ def _require_free(options: tuple[str, ...], given: dict[str, str], where: str) -
 
 
 def _known(value: dict[str, Any], kind: type, where: str) -> None:
-    set_here = {Method: "name", Scene: "held_out"}.get(kind)
-    known = [key.name for key in fields(kind) if key.name != set_here]
+    set_here = {Method: ["name"], Scene: ["held_out", "held_out_every"]}.get(kind, ())
+    known = [key.name for key in fields(kind) if key.name not in set_here]
     unknown = sorted(map(str, set(value) - set(known)))
     _require(not unknown, f"{where}: unknown key {', '.join(unknown)}. Known are {', '.join(known)}.")
 

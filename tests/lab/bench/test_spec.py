@@ -281,6 +281,12 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
     assert not (folder / names[0]).exists()
     left = meta["train_filenames"]
     assert thin == {**meta, "train_filenames": [left[0], left[len(left) // 2]]}
+    (fold,) = spec(scenes=["tiny"], held_out=[1], held_out_every=3).scenes
+    assert fold.name == "1 of 3/tiny"
+    assert made(fold)[1]["test_filenames"] == names[1:][1::3]
+    folder, fewer = made(Scene("tiny", views=2))
+    assert fewer == {**whole, "train_filenames": [names[1], names[1 + len(names[1:]) // 2]]}
+    assert (folder / names[0]).exists()
     (source / "transforms.json").write_text(json.dumps({**whole, "train_filenames": []}))
     with pytest.raises(InputError, match="train_filenames"):
         parser_options(source.parent, Scene("tiny", held_out=3), tmp_path / "mirrors")
