@@ -65,12 +65,12 @@ def recorded(pipeline, graphs, step: int, view: int, **more: torch.Tensor) -> tu
     """The same as a graph; None if it is not taken."""
     begin(pipeline, step)
     camera, batch = pipeline.datamanager.train_view(view)
-    done = graphs.losses(camera, batch | more, step)
-    if done is None:
+    if not graphs.prepare(camera, batch | more, step):
         return None
-    assert not sum(done[1].values()).requires_grad
-    loss = sum(done[1].values())
-    return loss.clone(), done[0]["rgb"].clone(), gradients(pipeline)
+    outputs, losses = graphs.run(batch | more)
+    loss = sum(losses.values())
+    assert not loss.requires_grad
+    return loss.clone(), outputs["rgb"].clone(), gradients(pipeline)
 
 
 def gradients(pipeline) -> dict[str, torch.Tensor]:
