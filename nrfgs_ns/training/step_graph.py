@@ -24,6 +24,7 @@ from torch.func import functional_call
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.data.checks import warn
+from nrfgs_ns.image.metrics import WINDOW_SIZE
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.model.renderer import composite_view, project_view, render_view
@@ -66,6 +67,8 @@ class StepGraphs:
                 CONSOLE.print(why, soft_wrap=True)
                 self._has_said_why = True
             return False
+        if min(batch["image"].shape[:2]) // model._get_downscale_factor() < WINDOW_SIZE:
+            return False  # pytorch_msssim, which takes small images, copies its window from the host
         return not (model.config.use_scale_regularization and step % 10 == 0)
 
     def _obstacle(self, batch: Mapping[str, Any]) -> str | None:
@@ -233,7 +236,8 @@ class _StepGraph:
                 generator.graphsafe_set_state(torch.Generator(device).graphsafe_get_state())
                 generator.set_state(state)
             raise
-        now.wait_stream(aside)
+        finally:
+            now.wait_stream(aside)
 
     def _compute(self) -> None:
         """One step's rendering, loss and gradients, from and to tensors that stay where they are.
