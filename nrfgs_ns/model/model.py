@@ -144,12 +144,6 @@ class NrfgsModel(SplatfactoModel):
         """Bytes that a renderer needs (`Field.bytes`)."""
         return self.field.bytes
 
-    @property
-    def num_diffuse(self) -> int:
-        """Number of splats without a residual."""
-        diffuse = self.densification.diffuse
-        return 0 if diffuse is None else int(diffuse.sum())
-
     # Rendering.
 
     @property

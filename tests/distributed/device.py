@@ -180,7 +180,7 @@ def work(rank: int, job: str, world: int, scene: Path, folder: Path, device_type
     import jobs
     from quick_start import keep_what_is_imported, let_go
 
-    from nrfgs_ns.distributed.launch import join_group
+    from nrfgs_lab.many_processes import join_group
 
     torch.set_num_threads(1)
     device.COMMON["--machine.device-type"] = device_type  # what `jobs` reads; this file runs as another module
