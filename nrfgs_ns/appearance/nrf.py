@@ -48,7 +48,6 @@ class NrfConfig(AppearanceHeadConfig):
     """Neural residual field. The defaults are the paper's, except for zero outputs and the straight-through bound."""
 
     _target: type = field(default_factory=lambda: NeuralResidualField)
-    """the head class that this configuration builds"""
     latent_dim: int = 32
     """D: numbers in a splat's latent"""
     num_bands: int = 3

@@ -140,11 +140,7 @@ class ShardedModel(NrfgsModel):
         if not self.training:
             return losses
         devices = comm.world()
-        over_splats = {
-            "scale_reg",
-            *self.densification.regularisation(self.gauss_params),
-            *shrinkage(self, self.gauss_params),
-        }
+        over_splats = {*self.densification.regularisation(self.gauss_params), *shrinkage(self, self.gauss_params)}
         share = self.num_points * devices / sum(self.counts)
         for name in over_splats & losses.keys():
             if self.num_points == 0:

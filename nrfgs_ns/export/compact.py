@@ -188,7 +188,6 @@ def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
     config.pipeline.compact = output
     config.pipeline.model.appearance = head
     config.pipeline.model.camera_optimizer.mode = "off"
-    config.pipeline.model.use_bilateral_grid = False
     models = config.get_checkpoint_dir()
     models.mkdir(parents=True, exist_ok=True)
     for older in models.glob("step-*.ckpt"):

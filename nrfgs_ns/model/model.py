@@ -15,7 +15,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.model_components.lib_bilagrid import BilateralGrid
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.colors import get_color
 from torch import Tensor
@@ -80,9 +79,6 @@ class NrfgsModel(SplatfactoModel):
         self._seed = torch.initial_seed()
         self.gauss_params = ParameterDict(self._initial_splats())
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
-        if config.use_bilateral_grid:
-            self.bil_grids = BilateralGrid(self.num_train_data, *config.grid_shape)
-
         self.photograph: PhotographModel | None = None  # set by the pipeline, which knows the photographs
         self.trimming = robust.Trimming(config.robust_loss) if config.robust_loss > 0.0 else None
         self.step = 0
@@ -127,12 +123,10 @@ class NrfgsModel(SplatfactoModel):
         if self.photograph is not None:
             look_asked_for(self.photograph)  # report an unknown name now, not at the first evaluation
 
-    def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
-        return {name: [parameter] for name, parameter in self.gauss_params.items()}
-
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """One group for each per-splat tensor, "field" for the head's weights, and "photograph" for exposures."""
-        groups = super().get_param_groups()
+        groups = {name: [parameter] for name, parameter in self.gauss_params.items()}
+        self.camera_optimizer.get_param_groups(groups)
         if weights := list(self.head.parameters()):
             groups["field"] = weights
         if self.photograph is not None:
@@ -178,8 +172,8 @@ class NrfgsModel(SplatfactoModel):
         """Render one camera.
 
         Returns:
-            "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1], which is
-            left out of training unless `output_depth_during_training`.
+            "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and, outside of training,
+            "depth" [H, W, 1].
         """
         field = self.field
         noise = self.view_noise.generator(self.device, self.step) if self.training else None
@@ -210,22 +204,13 @@ class NrfgsModel(SplatfactoModel):
 
     def look_of(self, index: int | None) -> Callable[[Tensor], Tensor] | None:
         """The learnt look of a photograph, for `composite_view`; None: the mean of all."""
-        if index is None:
-            return None
-
-        def look(rgb: Tensor) -> Tensor:
-            rgb = rgb.clamp(0.0, 1.0) if self.photograph is None else self.photograph(rgb, index)
-            if self.training and self.config.use_bilateral_grid:
-                rgb = self._apply_bilateral_grid(rgb[None], index, *rgb.shape[:2])[0]
-            return rgb
-
-        return look
+        return None if index is None or self.photograph is None else lambda rgb: self.photograph(rgb, index)
 
     @property
     def compositing(self) -> dict[str, bool]:
         """Options of `composite_view`."""
         return {
-            "with_depth": self.config.output_depth_during_training or not self.training,
+            "with_depth": not self.training,
             "absgrad": self.training and self.densification.needs_absgrad(self.step),
             "assume_finite": self.training,
         }
@@ -238,12 +223,11 @@ class NrfgsModel(SplatfactoModel):
         background = self._get_background_color() if background is None else background
         return composite_view(view, appearance, background, look=self.look_of(photograph), **self.compositing)
 
-    def render(self, field: Field, camera: Cameras, noisy: Field) -> tuple[dict[str, Tensor], SplatAppearance]:
+    def render(self, field: Field, camera: Cameras, noisy: Field) -> dict[str, Tensor]:
         """Render any field as `get_outputs` renders the model's own; `noisy`: as its head sees it, with or without
-        noise. Also returns the appearance of the visible splats."""
+        noise."""
         view = self.project(camera, field.splats)
-        appearance = noisy.seen_from(view)
-        return self.composite(view, appearance, photograph=self._photograph_of(camera))[0], appearance
+        return self.composite(view, noisy.seen_from(view), photograph=self._photograph_of(camera))[0]
 
     @torch.no_grad()
     def get_base_color(self, camera: Cameras) -> Tensor:

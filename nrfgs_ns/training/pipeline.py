@@ -51,7 +51,6 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
     """Nerfstudio's pipeline options."""
 
     _target: type = field(default_factory=lambda: NrfgsPipeline)
-    """target class to instantiate"""
     datamanager: NrfgsDatamanagerConfig = field(default_factory=NrfgsDatamanagerConfig)
     """specifies the datamanager config"""
     model: NrfgsModelConfig = field(default_factory=NrfgsModelConfig)

@@ -56,7 +56,7 @@ class StepGraphs:
         self._given_up = False
         self._has_said_why = False
 
-    def _takes(self, step: int, batch: Mapping[str, Any]) -> bool:
+    def _takes(self, batch: Mapping[str, Any]) -> bool:
         """Whether this step can be recorded; what prevents it is reported once."""
         model = self.model
         if self._given_up or model.device.type != "cuda" or model.num_points == 0:
@@ -67,9 +67,8 @@ class StepGraphs:
                 CONSOLE.print(why, soft_wrap=True)
                 self._has_said_why = True
             return False
-        if min(batch["image"].shape[:2]) // model._get_downscale_factor() < WINDOW_SIZE:
-            return False  # pytorch_msssim, which takes small images, copies its window from the host
-        return not (model.config.use_scale_regularization and step % 10 == 0)
+        # Smaller images go to pytorch_msssim, which copies its window from the host.
+        return min(batch["image"].shape[:2]) // model._get_downscale_factor() >= WINDOW_SIZE
 
     def _obstacle(self, batch: Mapping[str, Any]) -> str | None:
         """An option of the training, or a property of this photograph, that graphs do not support."""
@@ -80,8 +79,6 @@ class StepGraphs:
             ("exposures of transparent photographs are learnt", exposed and batch["image"].shape[-1] == 4),
             ("the robust loss chooses pixels", model.trimming is not None),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
-            ("bilateral grids are learnt", model.config.use_bilateral_grid),
-            ("depth is rendered", model.config.output_depth_during_training),
             ("some splats are diffuse", model.densification.diffuse is not None),
             (
                 f"photographs have more than {MOST_SIZES} sizes, and only those of {MOST_SIZES} have a graph",
@@ -93,7 +90,7 @@ class StepGraphs:
     def prepare(self, camera: Cameras, batch: Mapping[str, Any], step: int) -> bool:
         """Whether `run` can make this step, which it is then ready for. False where the step is the first of its kind,
         or cannot be recorded; TrainingStopped where the step before was condemned."""
-        if not self._takes(step, batch) or self._is_new():
+        if not self._takes(batch) or self._is_new():
             self.guard.settle()
             return False
         seen_from = self.model.pinholes.of_training(camera, self._how["downscale"])

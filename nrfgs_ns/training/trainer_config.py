@@ -41,7 +41,6 @@ class NrfgsTrainerConfig(TrainerConfig):
     """Nerfstudio's trainer options."""
 
     _target: type = field(default_factory=lambda: resolve_name(TRAINER))
-    """target class to instantiate"""
     max_num_iterations: int = STEPS
     """training steps. 0: 120 for each training view, from 10,000 to 30,000, with schedules stretched to them
     (docs/captures.md)"""

@@ -32,9 +32,6 @@ BY_ERROR = {"--pipeline.model.densification": "error-guided,warmup_length=2,refi
 RICH = {
     "--pipeline.model.densification": "mcmc,warmup_length=2,refine_every=4",
     "--pipeline.model.rasterize-mode": "antialiased",
-    "--pipeline.model.use-scale-regularization": True,
-    "--pipeline.model.max-gauss-ratio": 0.5,  # below every ratio: each splat has a gradient from this term
-    "--pipeline.model.use-bilateral-grid": True,
     "--pipeline.model.camera-optimizer.mode": "SO3xR3",
 }
 BUSY = {"--pipeline.model.view-noise": 0.5}

@@ -145,8 +145,6 @@ def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path, monkeypatc
     assert not any("photograph" in name for name in checkpoint["pipeline"])
     assert "photograph" not in checkpoint["optimizers"]
     on = {"--pipeline.model.photographs": "on"}
-    with pytest.raises(InputError, match="bilateral"):
-        trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 2, on, {"--pipeline.model.use-bilateral-grid": True}))
     more = {"--load-dir": models_of(config), **on}
     with pytest.raises(InputError, match="pipeline.model.photographs off"):
         trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "on", 2, QUICK, more))
