@@ -18,10 +18,10 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import train_loop
 from nerfstudio.utils import comms, profiler
 
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.distributed.launch import check_devices, explain, was_asked_to
 from nrfgs_ns.errors import ForTheUser, InputError
 from nrfgs_ns.training.stopping import StopRequest, heard_signals
-from nrfgs_ns.training.trainer_config import parse
 
 TIMEOUT = timedelta(minutes=30)
 """Longest that a device waits for another: nerfstudio's. The main device may evaluate or write for a while."""

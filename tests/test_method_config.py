@@ -68,6 +68,15 @@ def test_everything_else_is_splatfactos(name):
     assert not any(getattr(host.pipeline.model, option) for option in off)
     left_out = {"_target", "n_split_samples", "color_corrected_metrics", "sh_degree_interval", *off}
     left_out |= {"max_gauss_ratio", "grid_shape"}
+    built = Splatfacto().build(1, 1.0).strategy
+    for option, number in {
+        "densify_size_thresh": built.grow_scale3d,
+        "split_screen_size": built.grow_scale2d,
+        "cull_scale_thresh": built.prune_scale3d,
+        "cull_screen_size": built.prune_scale2d,
+    }.items():
+        assert number == getattr(host.pipeline.model, option)
+        left_out.add(option)
     for field in fields(SplatfactoModelConfig):
         own_rules = name == "nrfgs" and hasattr(Splatfacto, field.name)
         if field.name not in left_out and not own_rules:

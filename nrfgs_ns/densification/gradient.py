@@ -53,16 +53,8 @@ class Splatfacto(GradientConfig):
     """splats whose mean gradient of the loss by the screen position (normalised to [-1, 1]) is larger grow"""
     use_absgrad: bool = True
     """sum the gradients' absolute values over pixels (AbsGS)"""
-    densify_size_thresh: float = 0.01
-    """growing splats up to this size are duplicated, larger ones are split; in scene units"""
-    split_screen_size: float = 0.05
-    """splats that cover a larger share of the image are split"""
     cull_alpha_thresh: float = 0.1
     """splats of lower opacity are pruned; a reset brings opacities down to twice this"""
-    cull_scale_thresh: float = 0.5
-    """larger splats are pruned, once opacities have been reset; in scene units"""
-    cull_screen_size: float = 0.15
-    """splats that cover a larger share of the image are pruned"""
     stop_screen_size_at: int = 4000
     """step after which sizes in the image do not count"""
 
@@ -77,10 +69,10 @@ class Splatfacto(GradientConfig):
             reset_at_start=True,
             prune_opa=self.cull_alpha_thresh,
             grow_grad2d=self.densify_grad_thresh,
-            grow_scale3d=self.densify_size_thresh,
-            grow_scale2d=self.split_screen_size,
-            prune_scale3d=self.cull_scale_thresh,
-            prune_scale2d=self.cull_screen_size,
+            grow_scale3d=0.01,  # in scene units, as the next: larger ones are split, not duplicated
+            prune_scale3d=0.5,
+            grow_scale2d=0.05,  # shares of the image
+            prune_scale2d=0.15,
             refine_scale2d_stop_iter=self.stop_screen_size_at,
             pause_refine_after_reset=num_train_images + self.refine_every,
             absgrad=self.use_absgrad,

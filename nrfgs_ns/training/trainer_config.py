@@ -8,7 +8,6 @@ from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 
-import tyro
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -163,17 +162,6 @@ class NrfgsTrainerConfig(TrainerConfig):
             with suppress(FileExistsError):
                 return self.get_base_dir().mkdir(parents=True)
             self.timestamp = f"{name}_{number}"
-
-
-def parse(args: list[str]) -> TrainerConfig:
-    """The configuration that `ns-train ARGS` would run."""
-    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion  # which imports this module
-
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=args)
-    if config.data:
-        config.pipeline.datamanager.data = config.data
-    config.set_timestamp()
-    return config
 
 
 def _absolute(path: Path | None) -> Path | None:

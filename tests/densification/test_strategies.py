@@ -9,10 +9,10 @@ import yaml
 from densification_cases import REFINES, STRATEGIES, Table, strategy
 from torch.testing import assert_close
 
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.densification import Mcmc, Original, Splatfacto, strategy_from
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.host import gsplat_version
-from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

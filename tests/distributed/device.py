@@ -39,7 +39,7 @@ BUSY = {"--pipeline.model.view-noise": 0.5}
 
 def trainer_of(scene: Path, out: Path, world: int, **options):
     """A trainer, set up, on `world` devices, of which this process is one."""
-    from nrfgs_ns.training.trainer_config import parse
+    from nrfgs_lab.training_run import parse
 
     chosen = {"--data": scene, "--output-dir": out, **COMMON, **options}
     config = parse(["nrfgs", *(str(word) for option in chosen.items() for word in option)])

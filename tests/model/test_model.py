@@ -18,10 +18,10 @@ from PIL import Image
 from pytorch_msssim import SSIM
 from torch.testing import assert_close
 
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import Pinholes, pinhole, world_to_camera
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -10,12 +10,12 @@ import torch
 from PIL import ExifTags, Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.photographs import Evidence, exif_of, exposure
-from nrfgs_ns.training.trainer_config import parse
 
 NAN = math.nan
 

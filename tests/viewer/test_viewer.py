@@ -25,6 +25,7 @@ from viser.infra import _infra
 from viser.transforms import SO3
 
 import nrfgs_ns.training.trainer
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -32,7 +33,6 @@ from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
-from nrfgs_ns.training.trainer_config import parse
 from nrfgs_ns.viewer.pictures import (
     BASE,
     DEPTH,
