@@ -213,7 +213,8 @@ def fine_tune(
         camera, batch = data.next_train(step)
         tables = coded(rounded=step >= NOISY * steps)
         splats = coded.splats(tables)
-        outputs = model.render(Field(head, splats), camera, Field(head, noise.moved(splats, step)))
+        seen = noise.moved(splats, noise.generator(model.device, step))
+        outputs = model.render(Field(head, splats), camera, Field(head, seen))
         loss = photometric(model, outputs, batch)
         if step % EVERY == 0:
             bits = coded.bits(tables).sum()

@@ -12,13 +12,7 @@ from nrfgs_ns.densification.choice import STRATEGIES, DensificationChoice, strat
 from nrfgs_ns.densification.error_guided import ErrorGuided
 from nrfgs_ns.densification.gradient import Original, Splatfacto
 from nrfgs_ns.densification.mcmc import Mcmc
-from nrfgs_ns.densification.strategy import (
-    CHANGE,
-    UNSEEN,
-    Densification,
-    DensificationConfig,
-    OpacitySeen,
-)
+from nrfgs_ns.densification.strategy import CHANGE, UNSEEN, Densification, DensificationConfig
 
 __all__ = [
     "CHANGE",
@@ -29,7 +23,6 @@ __all__ = [
     "DensificationConfig",
     "ErrorGuided",
     "Mcmc",
-    "OpacitySeen",
     "Original",
     "Splatfacto",
     "strategy_from",

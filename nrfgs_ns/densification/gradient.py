@@ -32,7 +32,7 @@ class GradientConfig(DensificationConfig):
         super().check()
         self.require(self.reset_alpha_every >= 1, "reset_alpha_every", "at least 1")
 
-    def _build(self, scene_unit: float | None, reset_at_start: bool, **thresholds: Any) -> "GradientDensification":
+    def _build(self, scene_unit: float | None, **thresholds: Any) -> "GradientDensification":
         """Gsplat's strategy with these thresholds."""
         rules = PruneBySeenOpacity(
             refine_start_iter=self.warmup_length,
@@ -41,7 +41,7 @@ class GradientConfig(DensificationConfig):
             reset_every=self.reset_alpha_every * self.refine_every,
             **thresholds,
         )
-        return GradientDensification(self.name, rules, self.opacity_seen, scene_unit, reset_at_start)
+        return GradientDensification(self.name, rules, self.opacity_seen, scene_unit)
 
 
 @dataclass
@@ -66,7 +66,6 @@ class Splatfacto(GradientConfig):
     def build(self, num_train_images: int, scene_unit: float) -> "GradientDensification":
         return self._build(
             scene_unit,
-            reset_at_start=True,
             prune_opa=self.cull_alpha_thresh,
             grow_grad2d=self.densify_grad_thresh,
             grow_scale3d=0.01,  # in scene units, as the next: larger ones are split, not duplicated
@@ -88,7 +87,6 @@ class Original(GradientConfig):
     def build(self, num_train_images: int, scene_unit: float) -> "GradientDensification":
         return self._build(
             None,
-            reset_at_start=False,
             prune_opa=0.005,
             grow_grad2d=2e-4,
             grow_scale3d=0.01,  # in extents of the cameras, as the next
@@ -127,24 +125,16 @@ class GradientDensification(Densification):
         name: of the strategy.
         strategy: gsplat's own, with this one's thresholds.
         opacity_seen: which opacity pruning looks at. A reset always acts on the stored one.
-        scene_unit: world units in a scene unit, which sizes are measured in; None: in extents of the cameras.
-        reset_at_start: reset opacities at step 0, too, as gsplat 1.4 does; 3DGS counts its steps from 1.
+        scene_unit: world units in a scene unit, which sizes are measured in; None: as in 3DGS, in extents of the
+            cameras, and opacities are not reset at step 0, as gsplat 1.4 does: 3DGS counts its steps from 1.
     """
 
-    def __init__(
-        self,
-        name: str,
-        strategy: PruneBySeenOpacity,
-        opacity_seen: OpacitySeen,
-        scene_unit: float | None,
-        reset_at_start: bool,
-    ):
+    def __init__(self, name: str, strategy: PruneBySeenOpacity, opacity_seen: OpacitySeen, scene_unit: float | None):
         super().__init__(opacity_seen)
         self.name = name
         self.strategy = strategy
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
-        self.reset_at_start = reset_at_start
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
         if opacity_seen == "peak":
             strategy.seen_opacity = self.seen_opacity
@@ -173,7 +163,7 @@ class GradientDensification(Densification):
         strategy, self.shown = self.strategy, None
         if step < strategy.refine_stop_iter:
             self._take_statistics(info, len(splats["means"]))
-            if step == 0 and not self.reset_at_start:
+            if step == 0 and self.measure_by_cameras:
                 return
             if self._refines(step):
                 self._refine(step, splats, optimizers)

@@ -127,7 +127,7 @@ def render_view(
         look: as in `composite_view`.
         exchange: this device's splats in all cameras -> all devices' splats in its own camera.
     """
-    seen = field._replace(splats=model.view_noise.moved_by(field.splats, noise))
+    seen = field._replace(splats=model.view_noise.moved(field.splats, noise))
     appearance = seen.seen_from(view)
     drawn = (view, appearance) if exchange is None else exchange(view, appearance)
     outputs, info = composite_view(*drawn, model._get_background_color(), look=look, **model.compositing)

@@ -58,12 +58,8 @@ class ViewNoise:
         self.sigma, self.seed = length / math.sqrt(3.0), seed
         self._generators: dict[torch.device, torch.Generator] = {}
 
-    def moved(self, splats: Mapping[str, Tensor], step: int) -> Mapping[str, Tensor]:
-        """A table as the head sees it in a training step: with other "means" [N, 3]."""
-        return self.moved_by(splats, self.generator(splats["means"].device, step))
-
-    def moved_by(self, splats: Mapping[str, Tensor], generator: torch.Generator | None) -> Mapping[str, Tensor]:
-        """The same with a generator's numbers; None: without noise."""
+    def moved(self, splats: Mapping[str, Tensor], generator: torch.Generator | None) -> Mapping[str, Tensor]:
+        """A table as the head sees it in a training step, with other "means" [N, 3]. None: without noise."""
         if generator is None:
             return splats
         means = splats["means"]
