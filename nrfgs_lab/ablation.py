@@ -4,6 +4,7 @@
 Nothing is retrained: the loss is at least that of a model trained without the part.
 """
 
+import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -19,8 +20,8 @@ from torch.utils.benchmark import Timer
 from nrfgs_lab.residuals import THRESHOLDS, FieldViews, Residuals, dropped, look_over, slim
 from nrfgs_lab.training_run import machine
 from nrfgs_ns.appearance.field import DIFFUSE, Field
-from nrfgs_ns.appearance.nrf import NeuralResidualField
-from nrfgs_ns.appearance.reduce import LatentBasis, branches, input_columns, latent_basis, rebuilt, with_rank
+from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
+from nrfgs_ns.appearance.reduce import LatentBasis, branches, latent_basis, rebuilt, with_rank
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, write_whole
@@ -133,6 +134,22 @@ def row(part: str, group: str, field: Field, views: FieldViews, full: float | No
     loss = 0.0 if full is None else full - score
     share = diffuse_splats(field) / max(len(field.splats["means"]), 1)
     return Row(part, group, score, loss, field.bytes, head_seconds(views, field), share)
+
+
+def input_columns(config: NrfConfig, branch: str) -> dict[str, list[int]]:
+    """Columns of the first layer's inputs, of the branch "low" (or the only one) or "high", by name.
+
+    Names: latents, color, distance, opacity, direction, "band 0", "band 1", ...
+    """
+    sizes = {"latents": config.latent_dim, "color": 3}
+    if config.use_distance:
+        sizes["distance"] = 1
+    if branch == "low":
+        sizes |= {"opacity": 1, "direction": 3, "band 0": 6}
+    if branch == "high" or not config.split_bands:
+        sizes |= {f"band {k}": 6 for k in range(1, config.num_bands)}
+    ends = list(itertools.accumulate(sizes.values()))
+    return {name: list(range(end - size, end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
 
 def diffuse_splats(field: Field) -> int:

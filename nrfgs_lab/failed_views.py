@@ -57,7 +57,7 @@ def failed_views(pipeline) -> dict[str, dict[str, float]]:
         row = result[Path(name).name] = {}
         for left_out, chosen in {"nothing": torch.zeros_like(inside, dtype=torch.bool), **near, **suspects}.items():
             field = model.field._replace(splats={key: value[~chosen] for key, value in model.field.splats.items()})
-            outputs, _ = model.render(field, camera, field)
+            outputs = model.render(field, camera, field)
             row[left_out] = psnr(outputs["rgb"], model.truth_of(batch, outputs["background"]), model.mask_of(batch))
     return result
 

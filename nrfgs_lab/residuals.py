@@ -24,9 +24,9 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.head import SH_C0, SplatAppearance
-from nrfgs_ns.appearance.reduce import latent_basis, with_diffuse, with_rank
+from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.harmonics_fit import OPAQUE, look_through
 
@@ -108,6 +108,14 @@ class FieldViews:
             scores.append(psnr(outputs["rgb"], truth, mask))
         scores = [score for score in scores if score is not None]
         return sum(scores) / max(len(scores), 1)
+
+
+def with_diffuse(field: Field, diffuse: Tensor, features_dc: Tensor, opacities: Tensor) -> Field:
+    """The splats `diffuse`, bool [N], without residual, and their appearance instead: [N, 3] and logits [N, 1]."""
+    splats = {**field.splats, DIFFUSE: diffuse}
+    for name, value in (("features_dc", features_dc), ("opacities", opacities)):
+        splats[name] = torch.where(diffuse[:, None], value, field.splats[name].detach())
+    return Field(field.head, splats)
 
 
 def dropped(field: Field, seen: Residuals, threshold: float) -> Field:

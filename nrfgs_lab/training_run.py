@@ -12,14 +12,15 @@ from time import perf_counter
 from typing import Any
 
 import torch
+import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler
 from nerfstudio.utils.misc import step_check
 
 import nrfgs_ns
-from nrfgs_ns.training.trainer_config import parse
 
 
 @dataclass
@@ -41,6 +42,17 @@ class TrainRecord:
     """pairs (step, seconds until then) of the checkpoints"""
     parts: int = 1
     """number of processes: more than one if it was interrupted and went on from a checkpoint"""
+
+
+def parse(args: list[str]) -> TrainerConfig:
+    """The configuration that `ns-train ARGS` would run."""
+    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion  # after our methods
+
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=args)
+    if config.data:
+        config.pipeline.datamanager.data = config.data
+    config.set_timestamp()
+    return config
 
 
 def train(

@@ -32,7 +32,6 @@ PRIVATE = {
     "nerfstudio.data.datamanagers.full_images_datamanager:FullImageDatamanager": ("_load_images",),
     # Splatfacto's own, which the model calls or replaces.
     "nerfstudio.models.splatfacto:SplatfactoModel": (
-        "_apply_bilateral_grid",
         "_downscale_if_required",
         "_get_background_color",
         "_get_downscale_factor",

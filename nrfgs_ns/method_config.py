@@ -70,7 +70,6 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
                 "features_dc": adam(0.0025),
                 **optimizers,
                 "camera_opt": adam(1e-4, lr_final=5e-7, warmup_steps=1000, lr_pre_warmup=0),
-                "bilateral_grid": adam(2e-3, lr_final=1e-4, warmup_steps=1000, lr_pre_warmup=0),
                 "photograph": adam(5e-3, lr_final=1e-4, warmup_steps=500, lr_pre_warmup=0),
             },
             viewer=LocalViewerConfig(num_rays_per_chunk=1 << 15),

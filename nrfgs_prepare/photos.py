@@ -16,9 +16,9 @@ from PIL import ExifTags, Image, ImageOps
 
 from nrfgs_ns.data.pictures import (
     FORMATS,
+    NUMBERS,
     check_depth,
     exif_of,
-    exif_of_copy,
     naming,
     open_picture,
     read_exif,
@@ -34,6 +34,9 @@ CONVERT = "To read HEIC, run `pip install pillow-heif`, or convert it to JPEG (`
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 KEPT = (".jpg", ".jpeg", ".png")
 """Suffixes of files that are copied; others become PNG."""
+KEPT_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.DateTime)
+KEPT_DETAILS = (*NUMBERS.values(), ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DateTimeOriginal)
+"""Tags of the main and the photographic directory that hold for a turned or smaller copy, too."""
 FEWEST, FEW = 3, 15
 """Minimum number of photographs, and number below which a warning appears."""
 SHARPNESS_WIDTH = 320
@@ -139,6 +142,15 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
     if turned.mode in ("RGBA", "LA", "PA") or "transparency" in turned.info:  # put a cut-out object on white
         turned = Image.alpha_composite(Image.new("RGBA", turned.size, "white"), turned.convert("RGBA"))
     turned.convert("RGB").save(target, quality=97, subsampling=0, exif=exif_of_copy(exif))
+
+
+def exif_of_copy(exif: Image.Exif) -> bytes:
+    """The camera, exposure, date and position of a turned copy, for PIL's `exif` option."""
+    copy, details = Image.Exif(), exif.get_ifd(ExifTags.IFD.Exif)
+    copy.update({tag: exif[tag] for tag in KEPT_TAGS if tag in exif})
+    copy.get_ifd(ExifTags.IFD.Exif).update({tag: details[tag] for tag in KEPT_DETAILS if tag in details})
+    copy.get_ifd(ExifTags.IFD.GPSInfo).update(exif.get_ifd(ExifTags.IFD.GPSInfo))
+    return copy.tobytes()
 
 
 def same_camera(folder: Path, names: list[str]) -> bool:

@@ -64,7 +64,19 @@ def test_everything_else_is_splatfactos(name):
     (method, _, groups), host = METHODS[name], method_configs["splatfacto"]
     ours = method.config
     model, rules = ours.pipeline.model, ours.pipeline.model.densification
-    left_out = {"_target", "n_split_samples", "color_corrected_metrics"}
+    off = {"use_scale_regularization", "use_bilateral_grid", "output_depth_during_training"}  # and not offered here
+    assert not any(getattr(host.pipeline.model, option) for option in off)
+    left_out = {"_target", "n_split_samples", "color_corrected_metrics", "sh_degree_interval", *off}
+    left_out |= {"max_gauss_ratio", "grid_shape"}
+    built = Splatfacto().build(1, 1.0).strategy
+    for option, number in {
+        "densify_size_thresh": built.grow_scale3d,
+        "split_screen_size": built.grow_scale2d,
+        "cull_scale_thresh": built.prune_scale3d,
+        "cull_screen_size": built.prune_scale2d,
+    }.items():
+        assert number == getattr(host.pipeline.model, option)
+        left_out.add(option)
     for field in fields(SplatfactoModelConfig):
         own_rules = name == "nrfgs" and hasattr(Splatfacto, field.name)
         if field.name not in left_out and not own_rules:
@@ -74,7 +86,7 @@ def test_everything_else_is_splatfactos(name):
         if group not in {*groups, "photograph"}:
             for part in ("optimizer", "scheduler"):
                 assert parts[part] == host.optimizers[group][part], (group, part)
-    assert set(host.optimizers) - set(ours.optimizers) <= {"features_rest"}
+    assert set(host.optimizers) - set(ours.optimizers) <= {"features_rest", "bilateral_grid"}
     # nrfgs chooses by the number of views, up to splatfacto's number.
     assert ours.max_num_iterations == (0 if name == "nrfgs" else host.max_num_iterations)
     assert ours.for_views(10_000).max_num_iterations == host.max_num_iterations

@@ -58,12 +58,13 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
         result["train"] = over_views(model, zip(names, views, strict=True))
     cameras = [camera for camera, _ in test]
     large = [at_size(camera, *FULL_HD) for camera in cameras]
+    diffuse = getattr(getattr(model, "densification", None), "diffuse", None)  # nerfstudio's own have none
     return {
         **result,
         "fps": frames_per_second(model, cameras) if timed else None,
         "fps_1080p": frames_per_second(model, large) if timed and model.device.type == "cuda" else None,
         "splats": int(model.num_points),
-        "diffuse": getattr(model, "num_diffuse", 0),
+        "diffuse": 0 if diffuse is None else int(diffuse.sum()),
         "parameter_bytes": getattr(model, "parameter_bytes", None)  # nerfstudio's own have splats and no more
         or sum(parameter.numel() * parameter.element_size() for parameter in model.gauss_params.values()),
         "checkpoint_bytes": Path(checkpoint).stat().st_size,

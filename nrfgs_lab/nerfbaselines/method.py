@@ -32,6 +32,7 @@ from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
 from torch import Tensor
 
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.data.datamanager import NrfgsDatamanager, NrfgsDatamanagerConfig, NrfgsInputDataset
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.views import different_views
@@ -42,7 +43,7 @@ from nrfgs_ns.training.checkpoint_files import read_or_refuse
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.identity import leaves
 from nrfgs_ns.training.trainer import NrfgsTrainer
-from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, parse
+from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig
 
 MODELS = "nerfstudio_models"
 

@@ -22,8 +22,8 @@ import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from nrfgs_lab.bench.spec import QUIET
+from nrfgs_lab.many_processes import free_port, join_group
 from nrfgs_lab.training_run import machine, parse, synchronize
-from nrfgs_ns.distributed.launch import free_port, join_group
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import initial_splats
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 NEAREST = 0.01
-"""Smallest camera distance told apart, in scene units: the near plane, closer than which nothing is drawn."""
+"""Smallest camera distance, in scene units: the near plane, closer than which nothing is drawn."""
 FARTHEST = 1e18
 """Coordinates of v are clamped to this, without gradient beyond: their squares must stay below float32's 3e38."""
 BAND_DIM = 6
@@ -24,7 +24,7 @@ def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float
     Args:
         means: [M, 3], world units.
         camera_centers: [3] or [M, 3], world units.
-        eps: smallest distance told apart, in scene units, > 0.
+        eps: smallest distance, in scene units, > 0; shorter ones count as this.
         unit: world units in a scene unit.
 
     Returns:

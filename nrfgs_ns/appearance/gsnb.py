@@ -37,7 +37,6 @@ class GsnbConfig(ShConfig):
     """Spherical harmonics and a learnt basis. The defaults are the paper's."""
 
     _target: type = field(default_factory=lambda: NeuralBasis)
-    """the head class that this configuration builds"""
     raw_direction: bool = True
     """whether the direction itself stands beside its bands; its reference has the bands alone, 36 inputs"""
 

@@ -43,7 +43,6 @@ class AppearanceHeadConfig:
     """Base of all heads' configurations."""
 
     _target: type = field(default_factory=lambda: AppearanceHead)
-    """the head class that this configuration builds"""
 
     def setup(self, scene_unit: float = 1.0) -> "AppearanceHead":
         """Build the head, or raise InputError if a field is out of range; `scene_unit`: world units in a scene unit."""

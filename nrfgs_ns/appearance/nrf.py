@@ -48,7 +48,6 @@ class NrfConfig(AppearanceHeadConfig):
     """Neural residual field. The defaults are the paper's, except for zero outputs and the straight-through bound."""
 
     _target: type = field(default_factory=lambda: NeuralResidualField)
-    """the head class that this configuration builds"""
     latent_dim: int = 32
     """D: numbers in a splat's latent"""
     num_bands: int = 3
@@ -66,7 +65,7 @@ class NrfConfig(AppearanceHeadConfig):
     opacity_scale: float = 0.2
     """s_alpha: largest change of opacity"""
     distance_eps: float = NEAREST
-    """smallest camera distance told apart, in scene units: the near plane"""
+    """smallest camera distance, in scene units; shorter ones count as this. The near plane"""
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound | None = None

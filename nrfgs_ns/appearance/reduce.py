@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained neural residual field with shorter latents or diffuse splats; nothing here trains.
+"""A trained neural residual field with shorter latents; nothing here trains.
 
 Latents that lie in a subspace are folded into the first layer, which is exact: with z = m + B y,
 
     W z + b = (W B) y + (W m + b).
 """
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -16,22 +15,6 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
-
-
-def input_columns(config: NrfConfig, branch: str) -> dict[str, list[int]]:
-    """Columns of the first layer's inputs, of the branch "low" (or the only one) or "high", by name.
-
-    Names: latents, color, distance, opacity, direction, "band 0", "band 1", ...
-    """
-    sizes = {"latents": config.latent_dim, "color": 3}
-    if config.use_distance:
-        sizes["distance"] = 1
-    if branch == "low":
-        sizes |= {"opacity": 1, "direction": 3, "band 0": 6}
-    if branch == "high" or not config.split_bands:
-        sizes |= {f"band {k}": 6 for k in range(1, config.num_bands)}
-    ends = list(itertools.accumulate(sizes.values()))
-    return {name: list(range(end - size, end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
 
 class LatentBasis(NamedTuple):
@@ -100,14 +83,6 @@ def with_components(field: Field, columns: Tensor) -> Field:
         weights[f"{branch}.0.weight"] = torch.cat([first[:, :size][:, columns], first[:, size:]], dim=1)
     field = Field(field.head, {**field.splats, "latents": latents[:, columns]})
     return rebuilt(field, weights, latent_dim=len(columns))
-
-
-def with_diffuse(field: Field, diffuse: Tensor, features_dc: Tensor, opacities: Tensor) -> Field:
-    """The splats `diffuse`, bool [N], without residual, and their appearance instead: [N, 3] and logits [N, 1]."""
-    splats = {**field.splats, DIFFUSE: diffuse}
-    for name, value in (("features_dc", features_dc), ("opacities", opacities)):
-        splats[name] = torch.where(diffuse[:, None], value, field.splats[name].detach())
-    return Field(field.head, splats)
 
 
 def branches(weights: Mapping[str, Tensor]) -> list[str]:

@@ -36,7 +36,6 @@ class SgConfig(AppearanceHeadConfig):
     """Spherical Gaussians with free axes."""
 
     _target: type = field(default_factory=lambda: SphericalGaussians)
-    """the head class that this configuration builds"""
     lobes: int = 3
     """L: lobes of each splat, 1 to 6. They start about x, y, z, -x, -y, -z, in this order."""
 

@@ -32,7 +32,6 @@ class ShConfig(AppearanceHeadConfig):
     """Spherical harmonics, as in splatfacto."""
 
     _target: type = field(default_factory=lambda: SphericalHarmonics)
-    """the head class that this configuration builds"""
     degree: int = 3
     """highest degree, 0 to 3. 0 is a colour that does not depend on the view."""
     degree_interval: int = 1000

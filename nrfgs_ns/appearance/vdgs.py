@@ -34,7 +34,6 @@ class VdgsConfig(ShConfig):
     """Spherical harmonics and a view-dependent factor. The defaults are the paper's."""
 
     _target: type = field(default_factory=lambda: ViewDirectionFactors)
-    """the head class that this configuration builds"""
     grid_base_resolution: int = 16
     """lattice steps per scene unit on the coarsest level."""
 

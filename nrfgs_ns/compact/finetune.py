@@ -131,7 +131,7 @@ def growth_without(model, field: Field, views: Iterable[tuple[Any, dict[str, Any
     growth, error, loss = (torch.zeros(n, device=device) for n in (count, 1, 1))
     for number, (camera, batch) in enumerate(views, 1):
         gates = torch.ones(count, device=device, requires_grad=True)
-        outputs, _ = model.render(field, camera, Gated(field, gates))
+        outputs = model.render(field, camera, Gated(field, gates))
         off = outputs["rgb"] - model.truth_of(batch, outputs["background"])
         if (mask := model.mask_of(batch)) is not None:
             off = off * mask
@@ -213,7 +213,8 @@ def fine_tune(
         camera, batch = data.next_train(step)
         tables = coded(rounded=step >= NOISY * steps)
         splats = coded.splats(tables)
-        outputs, _ = model.render(Field(head, splats), camera, Field(head, noise.moved(splats, step)))
+        seen = noise.moved(splats, noise.generator(model.device, step))
+        outputs = model.render(Field(head, splats), camera, Field(head, seen))
         loss = photometric(model, outputs, batch)
         if step % EVERY == 0:
             bits = coded.bits(tables).sum()

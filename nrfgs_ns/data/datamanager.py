@@ -84,7 +84,6 @@ class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
     """nerfstudio's full-image datamanager, with images as uint8, in a quarter of the memory."""
 
     _target: type = field(default_factory=lambda: NrfgsDatamanager)
-    """target class to instantiate"""
     dataparser: AnnotatedDataParserUnion = field(default_factory=NrfgsDataParserConfig)
     """specifies the dataparser config"""
     cache_images_type: Literal["uint8", "float32"] = "uint8"

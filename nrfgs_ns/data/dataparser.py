@@ -55,7 +55,6 @@ class NrfgsDataParserConfig(NerfstudioDataParserConfig):
     """nerfstudio's transforms.json, with the defaults of comparisons in the literature."""
 
     _target: type = field(default_factory=lambda: NrfgsDataParser)
-    """target class to instantiate"""
     eval_mode: Literal["interior", "interval", "fraction", "filename", "all"] = "interior"
     """test images where the data set names none. interior: every eval_interval-th by name, from the middle of the first
     interval on. interval: from the first on. fraction: all except train_split_fraction. filename: by train or eval

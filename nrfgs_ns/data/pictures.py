@@ -128,9 +128,6 @@ NUMBERS = {
     "iso": ExifTags.Base.ISOSpeedRatings,
     "focal_length": ExifTags.Base.FocalLength,
 }
-KEPT = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.DateTime)
-KEPT_EXIF = (*NUMBERS.values(), ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DateTimeOriginal)
-"""Tags of the main and the photographic directory that hold for a turned or smaller copy, too."""
 
 
 def read_exif(path: Path) -> dict[str, float | str]:
@@ -183,15 +180,6 @@ def _number(value: Any) -> float | None:
     except (TypeError, ValueError, IndexError, ZeroDivisionError):
         return None
     return number if math.isfinite(number) and number > 0 else None
-
-
-def exif_of_copy(exif: Image.Exif) -> bytes:
-    """The camera, exposure, date and position of a turned copy, for PIL's `exif` option."""
-    copy, details = Image.Exif(), exif.get_ifd(ExifTags.IFD.Exif)
-    copy.update({tag: exif[tag] for tag in KEPT if tag in exif})
-    copy.get_ifd(ExifTags.IFD.Exif).update({tag: details[tag] for tag in KEPT_EXIF if tag in details})
-    copy.get_ifd(ExifTags.IFD.GPSInfo).update(exif.get_ifd(ExifTags.IFD.GPSInfo))
-    return copy.tobytes()
 
 
 def share_of_size(path: Path) -> float:

@@ -29,18 +29,18 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.densification.mcmc import CHANGE_BEFORE
-from nrfgs_ns.densification.relocation import Optimizers, Splats
 from nrfgs_ns.densification.statistics import take_maxima
 from nrfgs_ns.densification.strategy import (
     CHANGE,
+    CHANGE_BEFORE,
     UNSEEN,
     Densification,
     DensificationConfig,
     OpacitySeen,
+    Optimizers,
     Shown,
-    change_of,
-    seen_with,
+    Splats,
+    changes_shown,
 )
 
 ERROR = "error"
@@ -135,10 +135,7 @@ class ErrorGuidedDensification(Densification):
         rows = info["gaussian_ids"]
         self.shown = Shown(rows, opacities, info.get("n_cameras", 1))
         if self.opacity_seen == "peak":
-            # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
-            stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
-            change = change_of(stored, opacities.detach().to(stored.dtype))
-            info["change"] = torch.where(info["radii"] > 0, change, UNSEEN)
+            info["change"] = torch.where(info["radii"] > 0, changes_shown(logits, rows, opacities), UNSEEN)
         if step < self.grow_until:
             info["means2d"].retain_grad()
 
@@ -150,7 +147,9 @@ class ErrorGuidedDensification(Densification):
         self._take_statistics(step, info, len(splats["means"]))
         if step > self.start and step % self.config.refine_every == 0:
             self._refine(step, splats, optimizers)
-            self._begin_another_window()
+            self.begin_another_window()
+            self.state[ERROR].zero_()
+            self.state[WIDTH].zero_()
 
     def _take_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
         """Let the window's maxima be at least the step's."""
@@ -167,19 +166,6 @@ class ErrorGuidedDensification(Densification):
             info["means2d"].absgrad if grows else None,
             info.get("change"),
         )
-
-    def _begin_another_window(self) -> None:
-        if CHANGE in self.state:
-            self.state[CHANGE_BEFORE] = self.state[CHANGE]
-            self.state[CHANGE] = torch.full_like(self.state[CHANGE], UNSEEN)
-        self.state[ERROR].zero_()
-        self.state[WIDTH].zero_()
-
-    def seen_opacity(self, opacities: Tensor) -> Tensor:
-        """Stored opacities [N] with the largest change by a view of this window or the one before."""
-        stored = torch.sigmoid(opacities.detach().flatten())
-        changes = [self.state[name] for name in (CHANGE, CHANGE_BEFORE) if self.state.get(name) is not None]
-        return seen_with(stored, torch.stack(changes).amax(dim=0)) if changes else stored
 
     # What a refinement does.
 

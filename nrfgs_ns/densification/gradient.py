@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Growth where screen-space gradients are large: splatfacto's densification, and 3DGS's (Kerbl et al. 2023)."""
 
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -16,16 +15,6 @@ from nrfgs_ns.densification.strategy import Densification, DensificationConfig, 
 
 EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
-THRESHOLD = "log_threshold"
-"""Name in the strategy's `state`: logarithm of what the gradient's threshold is multiplied by, to meet a budget."""
-FIRST = "first_count"
-"""Name in the strategy's `state`: splats at the first refinement, where a budget's course starts."""
-RECOVERY = 3
-"""Refinements after a reset of opacities at which a training with a budget prunes nothing."""
-DEAD_BAND = 0.01
-"""Share by which the number of splats may differ from a budget's course before the threshold moves."""
-LARGEST_STEP = 0.12
-"""Largest change of the threshold's logarithm at a refinement."""
 STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop_iter")
 """What begins or ends by step number in gsplat's strategy."""
 
@@ -38,14 +27,12 @@ class GradientConfig(DensificationConfig):
     """step at which growth ends"""
     reset_alpha_every: int = 30
     """refinements between two resets of opacities"""
-    budget: int = 0
-    """number of splats to grow to: the gradient's threshold follows (arXiv 2605.16158). 0: the threshold decides"""
 
     def check(self) -> None:
         super().check()
         self.require(self.reset_alpha_every >= 1, "reset_alpha_every", "at least 1")
 
-    def _build(self, scene_unit: float | None, reset_at_start: bool, **thresholds: Any) -> "GradientDensification":
+    def _build(self, scene_unit: float | None, **thresholds: Any) -> "GradientDensification":
         """Gsplat's strategy with these thresholds."""
         rules = PruneBySeenOpacity(
             refine_start_iter=self.warmup_length,
@@ -54,10 +41,7 @@ class GradientConfig(DensificationConfig):
             reset_every=self.reset_alpha_every * self.refine_every,
             **thresholds,
         )
-        return GradientDensification(self.name, rules, self.opacity_seen, scene_unit, reset_at_start, self.budget)
-
-    def share_of(self, rank: int, devices: int) -> "GradientConfig":
-        return replace(self, budget=len(range(rank, self.budget, devices)))
+        return GradientDensification(self.name, rules, self.opacity_seen, scene_unit)
 
 
 @dataclass
@@ -69,16 +53,8 @@ class Splatfacto(GradientConfig):
     """splats whose mean gradient of the loss by the screen position (normalised to [-1, 1]) is larger grow"""
     use_absgrad: bool = True
     """sum the gradients' absolute values over pixels (AbsGS)"""
-    densify_size_thresh: float = 0.01
-    """growing splats up to this size are duplicated, larger ones are split; in scene units"""
-    split_screen_size: float = 0.05
-    """splats that cover a larger share of the image are split"""
     cull_alpha_thresh: float = 0.1
     """splats of lower opacity are pruned; a reset brings opacities down to twice this"""
-    cull_scale_thresh: float = 0.5
-    """larger splats are pruned, once opacities have been reset; in scene units"""
-    cull_screen_size: float = 0.15
-    """splats that cover a larger share of the image are pruned"""
     stop_screen_size_at: int = 4000
     """step after which sizes in the image do not count"""
 
@@ -90,13 +66,12 @@ class Splatfacto(GradientConfig):
     def build(self, num_train_images: int, scene_unit: float) -> "GradientDensification":
         return self._build(
             scene_unit,
-            reset_at_start=True,
             prune_opa=self.cull_alpha_thresh,
             grow_grad2d=self.densify_grad_thresh,
-            grow_scale3d=self.densify_size_thresh,
-            grow_scale2d=self.split_screen_size,
-            prune_scale3d=self.cull_scale_thresh,
-            prune_scale2d=self.cull_screen_size,
+            grow_scale3d=0.01,  # in scene units, as the next: larger ones are split, not duplicated
+            prune_scale3d=0.5,
+            grow_scale2d=0.05,  # shares of the image
+            prune_scale2d=0.15,
             refine_scale2d_stop_iter=self.stop_screen_size_at,
             pause_refine_after_reset=num_train_images + self.refine_every,
             absgrad=self.use_absgrad,
@@ -112,7 +87,6 @@ class Original(GradientConfig):
     def build(self, num_train_images: int, scene_unit: float) -> "GradientDensification":
         return self._build(
             None,
-            reset_at_start=False,
             prune_opa=0.005,
             grow_grad2d=2e-4,
             grow_scale3d=0.01,  # in extents of the cameras, as the next
@@ -151,29 +125,16 @@ class GradientDensification(Densification):
         name: of the strategy.
         strategy: gsplat's own, with this one's thresholds.
         opacity_seen: which opacity pruning looks at. A reset always acts on the stored one.
-        scene_unit: world units in a scene unit, which sizes are measured in; None: in extents of the cameras.
-        reset_at_start: reset opacities at step 0, too, as gsplat 1.4 does; 3DGS counts its steps from 1.
-        budget: splats to have when growth ends; 0: as many as the threshold lets grow.
+        scene_unit: world units in a scene unit, which sizes are measured in; None: as in 3DGS, in extents of the
+            cameras, and opacities are not reset at step 0, as gsplat 1.4 does: 3DGS counts its steps from 1.
     """
 
-    def __init__(
-        self,
-        name: str,
-        strategy: PruneBySeenOpacity,
-        opacity_seen: OpacitySeen,
-        scene_unit: float | None,
-        reset_at_start: bool,
-        budget: int = 0,
-    ):
+    def __init__(self, name: str, strategy: PruneBySeenOpacity, opacity_seen: OpacitySeen, scene_unit: float | None):
         super().__init__(opacity_seen)
         self.name = name
         self.strategy = strategy
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
-        self.reset_at_start = reset_at_start
-        self.budget, self.threshold = budget, strategy.grow_grad2d
-        if budget:
-            self.state |= {THRESHOLD: 0.0, FIRST: None}
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
         if opacity_seen == "peak":
             strategy.seen_opacity = self.seen_opacity
@@ -202,14 +163,14 @@ class GradientDensification(Densification):
         strategy, self.shown = self.strategy, None
         if step < strategy.refine_stop_iter:
             self._take_statistics(info, len(splats["means"]))
-            if step == 0 and not self.reset_at_start:
+            if step == 0 and self.measure_by_cameras:
                 return
             if self._refines(step):
                 self._refine(step, splats, optimizers)
             if step % strategy.reset_every == 0:
                 reset_opa(splats, optimizers, self.state, value=2.0 * strategy.prune_opa)
         if step % strategy.reset_every == 0 or self._refines(step):
-            self.forget_views()
+            self.begin_another_window()
 
     def _take_statistics(self, info: Mapping[str, Any], count: int) -> None:
         """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side."""
@@ -223,13 +184,9 @@ class GradientDensification(Densification):
     def _refine(self, step: int, splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
         strategy, state = self.strategy, self.state
-        if self.budget:
-            strategy.grow_grad2d = self._threshold_for_budget(step, len(splats["means"]))
         duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
         grown = len(splats["means"])
-        pruned = 0
-        if not self.budget or step % strategy.reset_every >= RECOVERY * strategy.refine_every:
-            pruned = strategy._prune_gs(splats, optimizers, state, step)
+        pruned = strategy._prune_gs(splats, optimizers, state, step)
         if self.verbose:
             print(f"Step {step}: {duplicated} GSs duplicated, {split} GSs split. Now having {grown} GSs.")
             print(f"Step {step}: {pruned} GSs pruned. Now having {len(splats['means'])} GSs.")
@@ -237,28 +194,6 @@ class GradientDensification(Densification):
             if name in state:
                 state[name].zero_()
         torch.cuda.empty_cache()
-
-    def _threshold_for_budget(self, step: int, count: int) -> float:
-        """The gradient above which splats grow now, for as many as the budget by the end of growth.
-
-        With x the share of growth that is over, the course of the number is N0 + (2x - x^2) (budget - N0). Where the
-        number is off it, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more splats grow than
-        bring the number to its course.
-        """
-        strategy, state = self.strategy, self.state
-        if state[FIRST] is None:
-            state[FIRST] = count
-        growth = strategy.refine_stop_iter - strategy.refine_start_iter
-        x = min((step - strategy.refine_start_iter) / max(growth - strategy.refine_every, 1), 1.0)
-        goal = state[FIRST] + (2 * x - x * x) * (self.budget - state[FIRST])
-        if abs(count - goal) > DEAD_BAND * goal:
-            move = math.log(count / goal)
-            state[THRESHOLD] += max(-LARGEST_STEP, min(move, LARGEST_STEP))
-        threshold, room = self.threshold * math.exp(state[THRESHOLD]), max(round(goal) - count, 0)
-        gradients = state["grad2d"] / state["count"].clamp_min(1)
-        if room < count:  # the threshold is exclusive
-            threshold = max(threshold, gradients.kthvalue(count - room).values.item())
-        return threshold
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         for name, step in self.bounds.items():

@@ -11,11 +11,12 @@ from torch import Tensor
 from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate
 from nrfgs_ns.densification.strategy import (
     CHANGE,
-    UNSEEN,
+    CHANGE_BEFORE,
     Densification,
     DensificationConfig,
     OpacitySeen,
-    seen_with,
+    Optimizers,
+    Splats,
 )
 
 LARGEST_BUDGET = 2**24
@@ -26,8 +27,6 @@ NOISE_LR = 5e5
 """Size of the noise on positions, times the current learning rate of the means."""
 SCALE_REGULARISATION = 0.01
 """Weight of the mean standard deviation, in scene units, in the loss."""
-CHANGE_BEFORE = CHANGE + "_before"
-"""As `CHANGE`, in the window before: `refine_every` steps until the last relocation, or what would be one."""
 
 
 @dataclass
@@ -89,33 +88,22 @@ class McmcDensification(Densification):
         if step > self.start and step % self.config.refine_every == 0:
             if step < self.stop:
                 self._relocate_and_add(splats, optimizers)
-            self._begin_another_window()
+            self.begin_another_window()  # until the training's end, as the noise acts
         lr = float(optimizers["means"].param_groups[0]["lr"])
         size = NOISE_LR * lr / self.scene_unit**2  # times a covariance; lr is a length already
-        add_noise(splats, size, self._lately_seen(splats["opacities"]))
+        # In every step: it must not take a splat for invisible because no view of this window has come by yet.
+        add_noise(splats, size, self.seen_opacity(splats["opacities"]))
 
-    def _relocate_and_add(self, splats, optimizers) -> None:
+    def _relocate_and_add(self, splats: Splats, optimizers: Optimizers) -> None:
         """Move the dead and grow by 5 %. A new row has been changed by views as the splat that it was made from: its
         stored opacity is another, but the head would answer for it much as for that one."""
-        moved = relocate(splats, optimizers, self.seen_opacity(splats["opacities"]) <= MIN_OPACITY, MIN_OPACITY)
+        dead = self.seen_opacity(splats["opacities"], before=False) <= MIN_OPACITY
+        moved = relocate(splats, optimizers, dead, MIN_OPACITY)
         count = len(splats["means"])
         goal = min(self.config.budget, int(1.05 * count))
         added = add_samples(splats, optimizers, max(0, goal - count), MIN_OPACITY)
         if self.state.get(CHANGE) is not None:
             self.state[CHANGE] = self.state[CHANGE][moved[added]]
-
-    def _begin_another_window(self) -> None:
-        """Keep the changes until now as those before, and begin anew: until the training's end, as the noise acts."""
-        if self.state.get(CHANGE) is not None:
-            self.state[CHANGE_BEFORE] = self.state[CHANGE]
-            self.state[CHANGE] = torch.full_like(self.state[CHANGE], UNSEEN)
-
-    def _lately_seen(self, opacities: Tensor) -> Tensor:
-        """As `seen_opacity`, over the views of the window before, too: the noise, which is there in every step, must
-        not take a splat for invisible because no view has come by yet."""
-        stored = torch.sigmoid(opacities.detach().flatten())
-        changes = [self.state[name] for name in (CHANGE, CHANGE_BEFORE) if self.state.get(name) is not None]
-        return seen_with(stored, torch.stack(changes).amax(dim=0)) if changes else stored
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         self.start, self.stop = step_at(self.config.warmup_length), step_at(self.config.stop_at)

@@ -12,7 +12,6 @@ device; the inner sum over i is done in closed form, sum_{i=1..n} binom(i-1, k) 
 """
 
 import math
-from collections.abc import Mapping, MutableMapping
 
 import torch
 import torch.nn.functional as F
@@ -20,7 +19,8 @@ from gsplat.strategy.ops import _update_param_with_optimizer
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import Optimizer
+
+from nrfgs_ns.densification.strategy import Optimizers, Splats
 
 MAX_COPIES = 51
 """n is cut off here, as in gsplat: the alternating sum loses its digits as n grows."""
@@ -28,9 +28,6 @@ NOISE_SHARPNESS = 100.0
 """The noise's sigmoid falls from 1 to 0 around opacity 0.005 with this slope: live splats hold still."""
 NOISE_OPACITY = 0.005
 """Opacity at which the noise is half as large as that of an invisible splat."""
-
-Splats = MutableMapping[str, Parameter]
-Optimizers = Mapping[str, Optimizer]
 
 
 def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,8 +22,15 @@ from nrfgs_ns.errors import InputError
 OpacitySeen = Literal["base", "peak"]
 """Opacity of a splat that decides what becomes of it: the stored one, or the largest that a view has shown lately."""
 
+Splats = MutableMapping[str, Parameter]
+"""A table; entries are replaced."""
+Optimizers = Mapping[str, Optimizer]
+"""One for each entry of a table, under its name, with one parameter group; others are left alone."""
+
 CHANGE = "opacity_change"
 """Name, in a strategy's `state`, of the largest change of each splat's opacity by a view, [N]: see `change_of`."""
+CHANGE_BEFORE = CHANGE + "_before"
+"""The same in the window before, for strategies that look at two (`begin_another_window`)."""
 UNSEEN = -2.0
 """Change of a splat that no view has shown: less than any change."""
 
@@ -43,6 +50,13 @@ def change_of(stored: Tensor, shown: Tensor) -> Tensor:
     """
     added = shown - stored
     return torch.where(added < 0, added / stored, added)
+
+
+def changes_shown(logits: Tensor, rows: Tensor, shown: Tensor) -> Tensor:
+    """`change_of` the rows [M] of a table with stored logits [N, 1] that a view shows at opacities [M]."""
+    # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
+    stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
+    return change_of(stored, shown.detach().to(stored.dtype))
 
 
 def seen_with(stored: Tensor, change: Tensor) -> Tensor:
@@ -170,29 +184,14 @@ class Densification(ABC):
         """
         self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
         if self.opacity_seen == "peak":
-            rows, logits = info["gaussian_ids"], logits.detach()
+            rows = info["gaussian_ids"]
             if self.state[CHANGE] is None:
                 self.state[CHANGE] = logits.new_full((len(logits),), UNSEEN)
-            # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
-            stored = torch.sigmoid(logits.index_select(0, rows)).squeeze(-1)
-            self.state[CHANGE].scatter_reduce_(0, rows, change_of(stored, opacities.detach().to(stored.dtype)), "amax")
+            self.state[CHANGE].scatter_reduce_(0, rows, changes_shown(logits, rows, opacities), "amax")
 
     @abstractmethod
-    def post_backward(
-        self,
-        step: int,
-        info: Mapping[str, Any],
-        splats: MutableMapping[str, Parameter],
-        optimizers: Mapping[str, Optimizer],
-    ) -> None:
-        """Change the table after the optimisers' step.
-
-        Args:
-            step: training step.
-            info: the rasterizer's, as in `pre_backward`, with gradients.
-            splats: the table; entries are replaced.
-            optimizers: one for each entry, under its name, each with one parameter group; others are left alone.
-        """
+    def post_backward(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
+        """Change the table after the optimisers' step, given the `info` of `pre_backward` with gradients."""
 
     def mean_opacity(self, logits: Tensor) -> Tensor:
         """The splats' mean opacity for the loss, a scalar: as the step's cameras are shown them, stored otherwise.
@@ -232,21 +231,26 @@ class Densification(ABC):
         if state.get(DIFFUSE) is not None:  # of whichever strategy
             self.state[DIFFUSE] = state[DIFFUSE].to(device)
 
-    def seen_opacity(self, opacities: Tensor) -> Tensor:
+    def seen_opacity(self, opacities: Tensor, before: bool = True) -> Tensor:
         """The opacities [N] that decide whether a splat is dead.
 
-        "base": the stored ones. "peak": the largest that a view since the last refinement or reset would show now, that
-        is the stored ones with the largest change by such a view; unchanged where no view has shown the splat. A head
-        whose opacity is the stored one changes nothing, and "peak" is then "base", bit for bit.
+        "base": the stored ones. "peak": the largest that a view since the last refinement or reset would show now, or
+        one of the window before, if the strategy keeps it: the stored ones with the largest change by such a view;
+        unchanged where no view has shown the splat. A head whose opacity is the stored one changes nothing, and "peak"
+        is then "base", bit for bit.
 
         Args:
             opacities: logits [N, 1].
+            before: look at the window before, too.
         """
         stored = torch.sigmoid(opacities.detach().flatten())
-        change = self.state.get(CHANGE)
-        return stored if change is None else seen_with(stored, change)
+        names = (CHANGE, CHANGE_BEFORE) if before else (CHANGE,)
+        changes = [self.state[name] for name in names if self.state.get(name) is not None]
+        return seen_with(stored, torch.stack(changes).amax(dim=0)) if changes else stored
 
-    def forget_views(self) -> None:
-        """Start the running maximum anew."""
+    def begin_another_window(self) -> None:
+        """Start the running maximum anew; strategies with two windows keep the last one as that before."""
         if self.state.get(CHANGE) is not None:
-            self.state[CHANGE].fill_(UNSEEN)
+            if CHANGE_BEFORE in self.state:
+                self.state[CHANGE_BEFORE] = self.state[CHANGE]
+            self.state[CHANGE] = torch.full_like(self.state[CHANGE], UNSEEN)

@@ -9,6 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import send_to_cameras
@@ -18,7 +19,7 @@ from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.pinhole import Pinhole
-from nrfgs_ns.model.renderer import View, project_splats, project_view
+from nrfgs_ns.model.renderer import View, project_splats, project_view, render_view
 from nrfgs_ns.model.view_noise import ViewNoise
 from nrfgs_ns.rasterizer import Projection
 from nrfgs_ns.training.pipeline import ShardingConfig
@@ -81,26 +82,24 @@ class ShardedModel(NrfgsModel):
         """Render this device's camera (`get_outputs`), given those of all W devices in their order."""
         pinholes = [self.pinhole(camera) for camera in cameras]
         self.sizes = [(one.width, one.height) for one in pinholes]
-        field = self.field
+        own, field = comm.rank(), self.field
         projection = self._project_everywhere(field.splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
-        appearance = self._as_learnt(field).seen_from(View(projection, centers))
 
-        absgrad = self.training and self.densification.needs_absgrad(self.step)
-        own, colored = send_to_cameras(projection, appearance, *self.sizes[comm.rank()], absgrad)
-        outputs, _ = self.picture(View(own, pinholes[comm.rank()].center), colored, cameras[comm.rank()])
-        if self.training:
-            if len(own.depths) == 0:  # all devices must go backward through the exchange, the one that sees nothing too
-                outputs["rgb"] = outputs["rgb"] + colored.colors.sum()
-            self.info = {
-                "camera_ids": projection.camera_ids,
-                "gaussian_ids": projection.gaussian_ids,
-                "radii": projection.radii,
-                "means2d": projection.means2d,
-                "depths": projection.depths,
-                "n_cameras": len(pinholes),
-            }
-            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
+        arrived: SplatAppearance | None = None
+
+        def exchange(view: View, appearance: SplatAppearance) -> tuple[View, SplatAppearance]:
+            nonlocal arrived
+            absgrad = self.compositing["absgrad"]
+            drawn, arrived = send_to_cameras(view.projection, appearance, *self.sizes[own], absgrad)
+            return View(drawn, pinholes[own].center), arrived
+
+        noise = self.view_noise.generator(self.device, self.step) if self.training else None
+        look = self.look_of(self._photograph_of(cameras[own]))
+        outputs, self.info = render_view(self, View(projection, centers), field, noise, look, exchange)
+        if self.training and len(arrived.colors) == 0:
+            # All devices must go backward through the exchange, the one that sees nothing too.
+            outputs["rgb"] = outputs["rgb"] + arrived.colors.sum()
         return outputs
 
     def _project_everywhere(self, splats: Mapping[str, Tensor], pinholes: list[Pinhole]) -> Projection:
@@ -141,11 +140,7 @@ class ShardedModel(NrfgsModel):
         if not self.training:
             return losses
         devices = comm.world()
-        over_splats = {
-            "scale_reg",
-            *self.densification.regularisation(self.gauss_params),
-            *shrinkage(self, self.gauss_params),
-        }
+        over_splats = {*self.densification.regularisation(self.gauss_params), *shrinkage(self, self.gauss_params)}
         share = self.num_points * devices / sum(self.counts)
         for name in over_splats & losses.keys():
             if self.num_points == 0:

@@ -94,7 +94,7 @@ def write_file(
                 lambda bits: advance(f"Training for the file ({bits / 8e6:.2f} MB)"),
                 None if limit is None else size_of_tables(field, render, limit, total),
             )
-    else:  # the same field in fewer bytes: components of latents that hardly matter are rounded to 0
+    else:  # latents in principal components, of which the small ones are rounded to 0 and take few bytes
         basis = latent_basis(field, torch.ones(model.num_points, device=model.device))
         field = with_rank(field, basis, field.head.config.latent_dim)
     times.append(perf_counter())
@@ -188,7 +188,6 @@ def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
     config.pipeline.compact = output
     config.pipeline.model.appearance = head
     config.pipeline.model.camera_optimizer.mode = "off"
-    config.pipeline.model.use_bilateral_grid = False
     models = config.get_checkpoint_dir()
     models.mkdir(parents=True, exist_ok=True)
     for older in models.glob("step-*.ckpt"):

@@ -56,7 +56,8 @@ class PhotographModel(nn.Module):
 
     def forward(self, image: Tensor, index: int) -> Tensor:
         """The image [H, W, 3], in the mean look and not clamped, as the photograph exposed it; in [0, 1]."""
-        return with_gain(image, (self.exponents @ self.shots[index]).exp2()).clamp(0.0, 1.0)
+        # No matrix product: a recorded step would hold cuBLAS's memory by its address, which PyTorch may give back.
+        return with_gain(image, (self.exponents * self.shots[index]).sum(dim=-1).exp2()).clamp(0.0, 1.0)
 
     @torch.no_grad()
     def center_(self) -> None:

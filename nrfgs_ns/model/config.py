@@ -31,7 +31,6 @@ class NrfgsModelConfig(ModelConfig):
     """Options of the model: this package's own, then those of splatfacto that are not the densification's."""
 
     _target: type = field(default_factory=lambda: resolve_name(MODEL))
-    """target class to instantiate"""
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
     view_noise: float = 0.0
@@ -75,30 +74,19 @@ class NrfgsModelConfig(ModelConfig):
     """side of the cube in which random points lie, in scene units"""
     ssim_lambda: float = 0.2
     """weight of SSIM in the loss; that of L1 is 1 - this"""
-    use_scale_regularization: bool = False
-    """penalise splats whose largest and smallest scales differ by more than max_gauss_ratio (PhysGaussian)"""
-    max_gauss_ratio: float = 10.0
-    """ratio of scales from which a splat is penalised"""
-    output_depth_during_training: bool = False
-    """render depth in training, too"""
     rasterize_mode: Literal["classic", "antialiased"] = "classic"
     """classic: splats are blurred by 0.3 pixels. antialiased: and dimmed for it (Mip-Splatting)"""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=lambda: CameraOptimizerConfig(mode="off"))
     """learn the cameras' poses"""
-    use_bilateral_grid: bool = False
-    """learn a bilateral grid for each photograph"""
-    grid_shape: tuple[int, int, int] = (16, 16, 8)
-    """shape of the bilateral grids (x, y, brightness)"""
-    # The head decides these two; nerfstudio's exporter and viewer read them here.
+    # The head decides this one; nerfstudio's exporter reads it here.
     sh_degree: tyro.conf.Suppress[int] = 3
-    sh_degree_interval: tyro.conf.Suppress[int] = 1000
 
     def check(self) -> None:
         """Raise InputError where a number is out of range. The head checks its own options when it is built; types and
         choices are checked where a configuration is read (`training/config_file.py`)."""
         self.densification.check()
         for names, low, high, needed in (
-            ("view_noise shrinkage warmup_steps num_downscales max_gauss_ratio", 0, math.inf, "zero or positive"),
+            ("view_noise shrinkage warmup_steps num_downscales", 0, math.inf, "zero or positive"),
             ("ssim_lambda", 0, 1 + EPSILON, "from 0 to 1"),
             ("robust_loss", 0, 1, "at least 0 and below 1"),
             ("random_scale", EPSILON, math.inf, "positive"),

@@ -5,7 +5,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-from nerfstudio.model_components.lib_bilagrid import total_variation_loss
 from torch import Tensor
 
 from nrfgs_ns.image import robust
@@ -18,21 +17,14 @@ def loss_of(model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], bat
     Terms that are zero in this step are left out. Nothing waits for the GPU.
 
     Args:
-        model: an NrfgsModel. In evaluation there are only the photometric term and scale regularisation.
+        model: an NrfgsModel. In evaluation there is only the photometric term.
         splats: the rendered table, whose tensors get gradients.
         outputs: "rgb" [H, W, 3] in [0, 1] and "background" [3], as rendered.
         batch: the datamanager's "image", and "mask" if there is one.
     """
-    config = model.config
     losses = {"main_loss": photometric(model, outputs, batch)}
-    if config.use_scale_regularization and model.step % 10 == 0:
-        scales = splats["scales"].exp()
-        ratios = scales.amax(dim=-1) / scales.amin(dim=-1)
-        losses["scale_reg"] = 0.1 * (ratios - config.max_gauss_ratio).clamp_min(0.0).mean()
     if model.training:
         model.camera_optimizer.get_loss_dict(losses)
-        if config.use_bilateral_grid:
-            losses["tv_loss"] = 10 * total_variation_loss(model.bil_grids.grids)
         losses |= model.densification.regularisation(splats) | shrinkage(model, splats)
     return losses
 

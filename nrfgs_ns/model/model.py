@@ -15,7 +15,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.model_components.lib_bilagrid import BilateralGrid
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.colors import get_color
 from torch import Tensor
@@ -28,7 +27,6 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
 from nrfgs_ns.image.metrics import image_metrics
 from nrfgs_ns.image.photograph import PhotographModel
-from nrfgs_ns.model.checkpoint import check_compatible, differences, photographs_of, reduced_config
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.harmonics_tune import fine_tune
@@ -36,7 +34,8 @@ from nrfgs_ns.model.initial_splats import initial_splats
 from nrfgs_ns.model.look import look_asked_for
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.pinhole import Pinhole, Pinholes
-from nrfgs_ns.model.renderer import View, composite_view, project_view, projection_options
+from nrfgs_ns.model.renderer import View, composite_view, project_view, projection_options, render_view
+from nrfgs_ns.model.saved_state import check_compatible, differences, photographs_of, reduced_config
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.rasterizer import ProjectionOptions
@@ -80,14 +79,11 @@ class NrfgsModel(SplatfactoModel):
         self._seed = torch.initial_seed()
         self.gauss_params = ParameterDict(self._initial_splats())
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
-        if config.use_bilateral_grid:
-            self.bil_grids = BilateralGrid(self.num_train_data, *config.grid_shape)
-
         self.photograph: PhotographModel | None = None  # set by the pipeline, which knows the photographs
         self.trimming = robust.Trimming(config.robust_loss) if config.robust_loss > 0.0 else None
         self.step = 0
         self.crop_box = None
-        self.pinholes = Pinholes()
+        self.pinholes = Pinholes(self.camera_optimizer if config.camera_optimizer.mode != "off" else None)
         is_random = config.background_color == "random"
         self.background_color = torch.tensor(VISER_BACKGROUND) if is_random else get_color(config.background_color)
         self.densification = self._strategy()
@@ -127,12 +123,10 @@ class NrfgsModel(SplatfactoModel):
         if self.photograph is not None:
             look_asked_for(self.photograph)  # report an unknown name now, not at the first evaluation
 
-    def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
-        return {name: [parameter] for name, parameter in self.gauss_params.items()}
-
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """One group for each per-splat tensor, "field" for the head's weights, and "photograph" for exposures."""
-        groups = super().get_param_groups()
+        groups = {name: [parameter] for name, parameter in self.gauss_params.items()}
+        self.camera_optimizer.get_param_groups(groups)
         if weights := list(self.head.parameters()):
             groups["field"] = weights
         if self.photograph is not None:
@@ -143,12 +137,6 @@ class NrfgsModel(SplatfactoModel):
     def parameter_bytes(self) -> int:
         """Bytes that a renderer needs (`Field.bytes`)."""
         return self.field.bytes
-
-    @property
-    def num_diffuse(self) -> int:
-        """Number of splats without a residual."""
-        diffuse = self.densification.diffuse
-        return 0 if diffuse is None else int(diffuse.sum())
 
     # Rendering.
 
@@ -169,104 +157,6 @@ class NrfgsModel(SplatfactoModel):
         # In training the guard finds numbers that are not finite.
         return projection_options(self.config.rasterize_mode, self.scene_unit, near, assume_finite=self.training)
 
-    def project(self, camera: Cameras, splats: Mapping[str, Tensor] | None = None) -> View:
-        """Project splats into a camera (`project_view`): the field's, or another table."""
-        splats = self.field.splats if splats is None else splats
-        return project_view(splats, self.pinhole(camera), self.projection_options)
-
-    def composite(
-        self,
-        view: View,
-        appearance: SplatAppearance,
-        background: Tensor | None = None,
-        photograph: int | None = None,
-    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite visible splats as this model is configured (`composite_view`).
-
-        Args:
-            background: a colour [3] instead of the configuration's.
-            photograph: the one whose exposure and colour the picture has; None: the mean.
-        """
-        return composite_view(
-            view,
-            appearance,
-            self._get_background_color() if background is None else background,
-            with_depth=self.config.output_depth_during_training or not self.training,
-            absgrad=self.training and self.densification.needs_absgrad(self.step),
-            assume_finite=self.training,
-            look=None if photograph is None else lambda rgb: self.photograph(rgb, photograph),
-        )
-
-    def pinhole(self, camera: Cameras) -> Pinhole:
-        """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
-        if not self.training:
-            return self.pinholes.fixed(camera, self.device)
-        learnt = self.camera_optimizer if self.camera_optimizer.config.mode != "off" else None
-        return self.pinholes.of_training(camera, self._get_downscale_factor(), learnt)
-
-    def _get_downscale_factor(self) -> int:
-        if not self.training:
-            return 1
-        risen = self.schedule_step // self.config.resolution_schedule
-        return 2 ** max(self.config.num_downscales - risen, 0)
-
-    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
-        """Render one camera.
-
-        Returns:
-            "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [3] in training and [H, W, 3] otherwise,
-            and "depth" [H, W, 1], which is left out of training unless `output_depth_during_training`.
-        """
-        field = self.field
-        outputs, appearance = self.render(field, camera, self._as_learnt(field))
-        if self.training:
-            self.densification.pre_backward(self.step, self.info, appearance.opacities, self.gauss_params["opacities"])
-        return outputs
-
-    def render(self, field: Field, camera: Cameras, noisy: Field) -> tuple[dict[str, Tensor], SplatAppearance]:
-        """Render any field as `get_outputs` renders the model's own.
-
-        Args:
-            field: the splats that are drawn.
-            noisy: the same as its head sees it, with or without noise.
-
-        Returns:
-            The result of `get_outputs`, and the appearance of the visible splats.
-        """
-        view = self.project(camera, field.splats)
-        appearance = noisy.seen_from(view)
-        outputs, self.info = self.picture(view, appearance, camera)
-        return outputs, appearance
-
-    def picture(
-        self, view: View, appearance: SplatAppearance, camera: Cameras, background: Tensor | None = None
-    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite a view for `get_outputs`: in training with its photograph's exposure and colour."""
-        background = self._get_background_color() if background is None else background
-        index, photograph = (camera.metadata or {}).get("cam_idx"), None
-        if self.photograph is not None:
-            photograph = index if self.training else look_asked_for(self.photograph)
-        outputs, info = self.composite(view, appearance, background, photograph)
-        if self.training:
-            outputs["background"] = background
-            if self.config.use_bilateral_grid and index is not None:
-                rgb = outputs["rgb"]
-                outputs["rgb"] = self._apply_bilateral_grid(rgb[None], index, *rgb.shape[:2])[0]
-        return outputs, info
-
-    def _as_learnt(self, field: Field) -> Field:
-        """The field as the head sees it in this step: under noise (`view_noise.py`) in training."""
-        if not self.training:
-            return field
-        return field._replace(splats=self.view_noise.moved(field.splats, self.step))
-
-    @torch.no_grad()
-    def get_base_color(self, camera: Cameras) -> Tensor:
-        """The image [H, W, 3] of the base colours and opacities alone."""
-        field = self.field
-        view = self.project(camera, field.splats)
-        return self.composite(view, field.base_of(view))[0]["rgb"]
-
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Render one camera, with splats centred in the box alone if one is given; in a viewer, as its panel says.
@@ -277,6 +167,74 @@ class NrfgsModel(SplatfactoModel):
             return self.viewer_panel.render(camera, obb_box)
         self.set_crop(obb_box)
         return self.get_outputs(camera.to(self.device) if self.training else camera)
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
+        """Render one camera.
+
+        Returns:
+            "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and, outside of training,
+            "depth" [H, W, 1].
+        """
+        field = self.field
+        noise = self.view_noise.generator(self.device, self.step) if self.training else None
+        view, look = self.project(camera, field.splats), self.look_of(self._photograph_of(camera))
+        outputs, self.info = render_view(self, view, field, noise, look)
+        return outputs
+
+    def project(self, camera: Cameras, splats: Mapping[str, Tensor] | None = None) -> View:
+        """Project splats into a camera (`project_view`): the field's, or another table."""
+        splats = self.field.splats if splats is None else splats
+        return project_view(splats, self.pinhole(camera), self.projection_options)
+
+    def pinhole(self, camera: Cameras) -> Pinhole:
+        """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
+        if not self.training:
+            return self.pinholes.fixed(camera, self.device)
+        return self.pinholes.of_training(camera, self._get_downscale_factor())
+
+    def _get_downscale_factor(self) -> int:
+        risen = self.schedule_step // self.config.resolution_schedule
+        return 2 ** max(self.config.num_downscales - risen, 0) if self.training else 1
+
+    def _photograph_of(self, camera: Cameras) -> int | None:
+        """The photograph whose look a rendering has: in training the camera's own; None: the mean of all."""
+        if self.training:
+            return (camera.metadata or {}).get("cam_idx")
+        return None if self.photograph is None else look_asked_for(self.photograph)
+
+    def look_of(self, index: int | None) -> Callable[[Tensor], Tensor] | None:
+        """The learnt look of a photograph, for `composite_view`; None: the mean of all."""
+        return None if index is None or self.photograph is None else lambda rgb: self.photograph(rgb, index)
+
+    @property
+    def compositing(self) -> dict[str, bool]:
+        """Options of `composite_view`."""
+        return {
+            "with_depth": not self.training,
+            "absgrad": self.training and self.densification.needs_absgrad(self.step),
+            "assume_finite": self.training,
+        }
+
+    def composite(
+        self, view: View, appearance: SplatAppearance, background: Tensor | None = None, photograph: int | None = None
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Composite any appearance of a view as this model is configured (`composite_view`), over a colour [3] instead
+        of the configuration's background if one is given, with the look of a photograph (`look_of`)."""
+        background = self._get_background_color() if background is None else background
+        return composite_view(view, appearance, background, look=self.look_of(photograph), **self.compositing)
+
+    def render(self, field: Field, camera: Cameras, noisy: Field) -> dict[str, Tensor]:
+        """Render any field as `get_outputs` renders the model's own; `noisy`: as its head sees it, with or without
+        noise."""
+        view = self.project(camera, field.splats)
+        return self.composite(view, noisy.seen_from(view), photograph=self._photograph_of(camera))[0]
+
+    @torch.no_grad()
+    def get_base_color(self, camera: Cameras) -> Tensor:
+        """The image [H, W, 3] of the base colours and opacities alone."""
+        field = self.field
+        view = self.project(camera, field.splats)
+        return self.composite(view, field.base_of(view))[0]["rgb"]
 
     # Training.
 
@@ -333,10 +291,14 @@ class NrfgsModel(SplatfactoModel):
         """The terms of the loss by name (`loss_of`)."""
         losses = loss_of(self, self.gauss_params, outputs, batch)
         if self.training:
-            watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
-            self.watched = {name: value.detach() for name, value in watched.items()}  # by the guard
-            self.watched_image = batch.get("image_idx")
+            self.watch(outputs, losses, batch)
         return losses
+
+    def watch(self, outputs: Mapping[str, Tensor], losses: Mapping[str, Tensor], batch: Mapping[str, Any]) -> None:
+        """Have the guard look at a step's image and losses."""
+        watched = {"the rendered image": outputs["rgb"], **{f"loss {name}": loss for name, loss in losses.items()}}
+        self.watched = {name: value.detach() for name, value in watched.items()}
+        self.watched_image = batch.get("image_idx")
 
     def truth_of(self, batch: Mapping[str, Any], background: Tensor) -> Tensor:
         """The photograph at the rendered size, over the background where it is transparent. [H, W, 3]"""

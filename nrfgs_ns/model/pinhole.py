@@ -46,24 +46,21 @@ def pinhole(camera: Cameras, camera_to_world: Tensor, downscale: int) -> Pinhole
 
 
 class Pinholes:
-    """The cameras of one model, converted once where their poses are fixed."""
+    """The cameras of one model, converted once; training cameras anew each time if an optimiser learns their poses."""
 
-    def __init__(self):
+    def __init__(self, optimizer: CameraOptimizer | None = None):
+        self._optimizer = optimizer
         self._of_training: dict[tuple[int, int], Pinhole] = {}  # by index and downscale
         # Cameras on a GPU, by the identity and version of their tensors, which stay alive.
         self._on_gpu: OrderedDict[tuple, tuple[list[Tensor], Pinhole]] = OrderedDict()
         self._has_warned = False
 
-    def of_training(self, camera: Cameras, downscale: int, optimizer: CameraOptimizer | None) -> Pinhole:
-        """A training camera at 1 / downscale of its size.
-
-        Args:
-            camera: a batch of one, [1], with its index "cam_idx" in its metadata, if it has one.
-            optimizer: has its learnt pose; None: the pose is fixed, and the camera is converted once.
-        """
+    def of_training(self, camera: Cameras, downscale: int) -> Pinhole:
+        """A training camera at 1 / downscale of its size: a batch of one, [1], with its index "cam_idx" in its
+        metadata, if it has one."""
         index = (camera.metadata or {}).get("cam_idx")
-        if optimizer is not None:
-            return pinhole(camera, optimizer.apply_to_camera(camera), downscale)
+        if self._optimizer is not None:
+            return pinhole(camera, self._optimizer.apply_to_camera(camera), downscale)
         if index is None:
             return pinhole(camera, camera.camera_to_worlds, downscale)
         if (index, downscale) not in self._of_training:

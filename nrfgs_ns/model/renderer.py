@@ -4,6 +4,8 @@
 view = project_view(field.splats, pinhole, options)            # which splats, and where
 appearance = field.seen_from(view)                             # their colours and opacities (`appearance/field.py`)
 outputs, info = composite_view(view, appearance, background)   # the image
+
+`render_view` is the last two as a model is configured.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,12 +14,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.rasterizer import Projection, ProjectionOptions, RasterizeMode, composite, project
 
 NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 """Depths between which splats are drawn, in scene units: splatfacto's."""
+ROWS = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "n_cameras"
+"""What densification reads in `info` about a view's rows."""
 
 
 def projection_options(
@@ -35,7 +40,9 @@ class View(NamedTuple):
     projection: Projection
     """the visible splats on the image plane, M of them"""
     center: Tensor
-    """camera centre in world coordinates, [3]"""
+    """camera centre in world coordinates, [3]; of several cameras, each row's, [M, 3]"""
+    every_row: bool = False
+    """invisible splats have rows, too (`ProjectionOptions.every_row`)"""
 
     @property
     def visible(self) -> Tensor:
@@ -54,7 +61,7 @@ def project_splats(
 def project_view(splats: Mapping[str, Tensor], pinhole: Pinhole, options: ProjectionOptions) -> View:
     """Project a table of splats into one camera."""
     *camera, center = pinhole
-    return View(project_splats(splats, *camera, options), center)
+    return View(project_splats(splats, *camera, options), center, options.every_row)
 
 
 def composite_view(
@@ -100,4 +107,36 @@ def composite_view(
     if with_depth:
         depth = render[..., 3:4]
         outputs["depth"] = torch.where(alpha > 0, depth, depth.detach().max())
+    return outputs, info
+
+
+def render_view(
+    model,
+    view: View,
+    field: Field,
+    noise: torch.Generator | None,
+    look: Callable[[Tensor], Tensor] | None,
+    exchange: Callable[[View, SplatAppearance], tuple[View, SplatAppearance]] | None = None,
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Render a view of a field as an NrfgsModel is configured: in evaluation, in the eager and the recorded step, and
+    on each of several devices. In training, densification looks at it. `info` is about the view's rows.
+
+    Args:
+        view: the field's splats in a camera; with `exchange`, in those of all devices.
+        noise: generator of the noise under which the head sees the splats (`view_noise.py`); None: no noise.
+        look: as in `composite_view`.
+        exchange: this device's splats in all cameras -> all devices' splats in its own camera.
+    """
+    seen = field._replace(splats=model.view_noise.moved(field.splats, noise))
+    appearance = seen.seen_from(view)
+    drawn = (view, appearance) if exchange is None else exchange(view, appearance)
+    outputs, info = composite_view(*drawn, model._get_background_color(), look=look, **model.compositing)
+    if exchange is not None:  # the image's rows are other devices' splats
+        info = {name: getattr(view.projection, name) for name in ROWS}
+    if model.training:
+        shown, stored = appearance.opacities, field.splats["opacities"]
+        if view.every_row:
+            base = torch.sigmoid(stored).flatten()  # for splats that are not visible
+            shown = torch.where(info["radii"] > 0, shown, base)
+        model.densification.pre_backward(model.step, info, shown, stored)
     return outputs, info

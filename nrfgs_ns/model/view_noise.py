@@ -58,20 +58,18 @@ class ViewNoise:
         self.sigma, self.seed = length / math.sqrt(3.0), seed
         self._generators: dict[torch.device, torch.Generator] = {}
 
-    def moved(self, splats: Mapping[str, Tensor], step: int) -> Mapping[str, Tensor]:
-        """A table as the head sees it in a training step: with other "means" [N, 3]."""
-        return self.moved_by(splats, None if self.sigma == 0.0 else self.generator(splats["means"].device, step))
-
-    def moved_by(self, splats: Mapping[str, Tensor], generator: torch.Generator | None) -> Mapping[str, Tensor]:
-        """The same with a generator's numbers; None: without noise."""
+    def moved(self, splats: Mapping[str, Tensor], generator: torch.Generator | None) -> Mapping[str, Tensor]:
+        """A table as the head sees it in a training step, with other "means" [N, 3]. None: without noise."""
         if generator is None:
             return splats
         means = splats["means"]
         noise = torch.randn(means.shape, generator=generator, device=means.device, dtype=means.dtype)
         return {**splats, "means": torch.add(means, noise, alpha=self.sigma)}
 
-    def generator(self, device: torch.device, step: int) -> torch.Generator:
-        """The generator of a step's noise on a device; the same object in each step."""
+    def generator(self, device: torch.device, step: int) -> torch.Generator | None:
+        """The generator of a step's noise on a device; the same object in each step. None: no noise."""
+        if self.sigma == 0.0:
+            return None
         if device not in self._generators:
             self._generators[device] = torch.Generator(device)
         # Two odd numbers of 64 bits, so that neighbouring steps and seeds are unrelated.

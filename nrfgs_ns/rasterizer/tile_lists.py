@@ -20,7 +20,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cache
 
 import torch
 import triton
@@ -287,7 +287,7 @@ def tile_lists(
     return begins.view(1, height + 1, width), rows.index_select(0, by_tile)
 
 
-@lru_cache(maxsize=16)
+@cache  # for good: recorded steps read it
 def _numbers(count: int, device: torch.device) -> Tensor:
     """0 to count - 1."""
     with torch.inference_mode(False):  # they outlive a rendering that records nothing

@@ -17,7 +17,6 @@ MEANING = (
     "pipeline.model.appearance",
     "pipeline.model.camera_optimizer.mode",
     "pipeline.model.rasterize_mode",
-    "pipeline.model.use_bilateral_grid",
     "pipeline.datamanager.dataparser",
     "pipeline.datamanager.camera_res_scale_factor",
 )

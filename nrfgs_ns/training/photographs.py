@@ -66,8 +66,7 @@ class Evidence(NamedTuple):
 
 
 def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | None, list[str]]:
-    """The photographs' exposure model, announced in one line; InputError where it is requested together with the
-    bilateral grid.
+    """The photographs' exposure model, announced in one line.
 
     Args:
         config: an NrfgsModelConfig.
@@ -77,11 +76,7 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
         The model, None where nothing is learnt; and the evidence in words and numbers.
     """
     choice = config.photographs
-    if choice == "on" and config.use_bilateral_grid:
-        raise InputError(
-            "pipeline.model.photographs is on and use_bilateral_grid, too: both would learn the same. Use one."
-        )
-    if choice == "off" or config.use_bilateral_grid:
+    if choice == "off":
         return None, []
     dataset, metadata = datamanager.train_dataset, datamanager.train_dataparser_outputs.metadata
     exif = torch.tensor([exposure(entry) for entry in exif_of(dataset.image_filenames, metadata.get("exif"))])

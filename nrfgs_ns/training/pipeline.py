@@ -51,7 +51,6 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
     """Nerfstudio's pipeline options."""
 
     _target: type = field(default_factory=lambda: NrfgsPipeline)
-    """target class to instantiate"""
     datamanager: NrfgsDatamanagerConfig = field(default_factory=NrfgsDatamanagerConfig)
     """specifies the datamanager config"""
     model: NrfgsModelConfig = field(default_factory=NrfgsModelConfig)
@@ -126,10 +125,12 @@ class NrfgsPipeline(VanillaPipeline):
         """Outputs, losses and metrics of a step; metrics only when they are logged. The losses of a step recorded in
         `graphs` need no gradient: the parameters have theirs."""
         camera, batch = self.datamanager.next_train(step)
-        done = None if graphs is None else graphs.losses(camera, batch, step)
-        outputs = self._model(camera) if done is None else done[0]
+        if graphs is not None and graphs.prepare(camera, batch, step):
+            outputs, losses = graphs.run(batch)
+        else:
+            outputs = self.model.get_outputs(camera)
+            losses = self.model.get_loss_dict(outputs, batch)
         metrics = self.model.get_metrics_dict(outputs, batch) if step % self.steps_per_log == 0 else {}
-        losses = self.model.get_loss_dict(outputs, batch, metrics) if done is None else done[1]
         return outputs, losses, metrics
 
     def get_average_eval_image_metrics(

@@ -33,7 +33,6 @@ class ProgressLineConfig(LocalWriterConfig):
     """The progress line's options."""
 
     _target: type = field(default_factory=lambda: ProgressLine)
-    """target class to instantiate"""
     enable: bool = True
     """say how far the training is, with the PSNR of one test view"""
     stats_to_track: Suppress[tuple[EventName, ...]] = LocalWriterConfig.stats_to_track

@@ -22,10 +22,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.func import functional_call
 
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.data.checks import warn
+from nrfgs_ns.image.metrics import WINDOW_SIZE
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.pinhole import Pinhole
-from nrfgs_ns.model.renderer import composite_view, project_view
+from nrfgs_ns.model.renderer import composite_view, project_view, render_view
 
 MORE_ROOM = 1.5
 """Room for pairs of splats and tiles, relative to the view that has most."""
@@ -41,7 +43,7 @@ class StepGraphs:
     Args:
         model: an NrfgsModel.
         datamanager: of its training.
-        guard: of its training; it settles the step before once, before each step is computed.
+        guard: of its training; its verdict on the step before is read once, before a step is computed.
     """
 
     def __init__(self, model, datamanager, guard):
@@ -54,7 +56,7 @@ class StepGraphs:
         self._given_up = False
         self._has_said_why = False
 
-    def _takes(self, step: int, batch: Mapping[str, Any]) -> bool:
+    def _takes(self, batch: Mapping[str, Any]) -> bool:
         """Whether this step can be recorded; what prevents it is reported once."""
         model = self.model
         if self._given_up or model.device.type != "cuda" or model.num_points == 0:
@@ -65,7 +67,8 @@ class StepGraphs:
                 CONSOLE.print(why, soft_wrap=True)
                 self._has_said_why = True
             return False
-        return not (model.config.use_scale_regularization and step % 10 == 0)
+        # Smaller images go to pytorch_msssim, which copies its window from the host.
+        return min(batch["image"].shape[:2]) // model._get_downscale_factor() >= WINDOW_SIZE
 
     def _obstacle(self, batch: Mapping[str, Any]) -> str | None:
         """An option of the training, or a property of this photograph, that graphs do not support."""
@@ -76,8 +79,6 @@ class StepGraphs:
             ("exposures of transparent photographs are learnt", exposed and batch["image"].shape[-1] == 4),
             ("the robust loss chooses pixels", model.trimming is not None),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
-            ("bilateral grids are learnt", model.config.use_bilateral_grid),
-            ("depth is rendered", model.config.output_depth_during_training),
             ("some splats are diffuse", model.densification.diffuse is not None),
             (
                 f"photographs have more than {MOST_SIZES} sizes, and only those of {MOST_SIZES} have a graph",
@@ -86,30 +87,28 @@ class StepGraphs:
         )
         return next((what for what, there in obstacles if there), None)
 
-    def losses(
-        self, camera: Cameras, batch: Mapping[str, Any], step: int
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]] | None:
-        """The model's outputs and losses, detached: the parameters have the gradients of the losses' sum. None where
-        the step is the first of its kind, or cannot be recorded; TrainingStopped where the step before was
-        condemned."""
-        if not self._takes(step, batch) or self._is_new():
+    def prepare(self, camera: Cameras, batch: Mapping[str, Any], step: int) -> bool:
+        """Whether `run` can make this step, which it is then ready for. False where the step is the first of its kind,
+        or cannot be recorded; TrainingStopped where the step before was condemned."""
+        if not self._takes(batch) or self._is_new():
             self.guard.settle()
-            return None
-        model, kind = self.model, _kind(batch)
-        now = model.pinhole(camera), batch, camera.metadata["cam_idx"], step
-        graph = self._graphs.get(kind)
-        if graph is not None:
+            return False
+        seen_from = self.model.pinholes.of_training(camera, self._how["downscale"])
+        now, kind = (seen_from, batch, camera.metadata["cam_idx"], step), _kind(batch)
+        if (graph := self._graphs.get(kind)) is not None:
             graph.prepare(*now)
         self.guard.settle()  # everything is ready, so that the GPU need not wait for what the host does
         if graph is None or not graph.had_room():
-            graph = self._record(kind, *now)
-        if graph is None:
-            return None
+            self._record(kind, *now)
+        return kind in self._graphs
+
+    def run(self, batch: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The outputs and losses of the step that has been prepared, detached: the parameters have the gradients of the
+        losses' sum."""
+        model, graph = self.model, self._graphs[_kind(batch)]
         losses = graph.run()
         model.info = {**graph.info, "pairs": graph.last_pairs}
-        model.watched = {"the rendered image": graph.outputs["rgb"]}
-        model.watched |= {f"loss {name}": loss for name, loss in losses.items()}
-        model.watched_image = batch.get("image_idx")
+        model.watch(graph.outputs, losses, batch)
         return dict(graph.outputs), dict(losses)
 
     def _is_new(self) -> bool:
@@ -136,10 +135,8 @@ class StepGraphs:
         self._of, self._how = now, how
         return True
 
-    def _record(
-        self, kind: tuple, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int
-    ) -> _StepGraph | None:
-        """A graph for this kind of photograph, prepared for a step. None, and no graph from now on, if that fails."""
+    def _record(self, kind: tuple, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
+        """Record a graph for this kind of photograph, prepared for a step; if that fails, there is none from now on."""
         self._see_pairs()
         self._graphs.pop(kind, None)
         try:
@@ -154,8 +151,6 @@ class StepGraphs:
             torch.cuda.empty_cache()
             reason = next(iter(str(error).splitlines()), "")
             warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
-            return None
-        return graph
 
     def _see_pairs(self) -> None:
         """Learn from the present graphs how many pairs views have."""
@@ -214,8 +209,7 @@ class _StepGraph:
         """of the step before, as far as the host knows"""
         self.shot = None if model.photograph is None else model.photograph.shots.detach()[:1].clone()
         """the step's row of a learnt exposure model, [1, R], which a graph cannot select by itself"""
-        noise = model.view_noise
-        self.noise = None if noise.sigma == 0.0 else noise.generator(device, 0)
+        self.noise = model.view_noise.generator(device, 0)
 
         generators = [torch.cuda.default_generators[device.index], *([] if self.noise is None else [self.noise])]
         states = [generator.get_state() for generator in generators]
@@ -239,7 +233,8 @@ class _StepGraph:
                 generator.graphsafe_set_state(torch.Generator(device).graphsafe_get_state())
                 generator.set_state(state)
             raise
-        now.wait_stream(aside)
+        finally:
+            now.wait_stream(aside)
 
     def _compute(self) -> None:
         """One step's rendering, loss and gradients, from and to tensors that stay where they are.
@@ -251,28 +246,14 @@ class _StepGraph:
         leaves = {name: value.detach().requires_grad_() for name, value in self.parameters.items()}
         splats = {name: leaves[f"splats.{name}"] for name in model.gauss_params}
         weights = {name: leaves[f"head.{name}"] for name, _ in model.head.named_parameters()}
+        head = lambda *view: functional_call(model.head, weights, view)  # noqa: E731
         shot = look = None
         if self.shot is not None:
             shot = self.shot.detach().requires_grad_()
             look = lambda rgb: functional_call(model.photograph, {"shots": shot}, (rgb, 0))  # noqa: E731
         with torch.enable_grad(), self.room.in_use():
             view = project_view(splats, self.seen_from, replace(model.projection_options, every_row=True))
-            asked = model.view_noise.moved_by(splats, self.noise)
-            appearance = functional_call(model.head, weights, (asked, view.visible, view.center))
-            background = model._get_background_color()
-            outputs, info = composite_view(
-                view,
-                appearance,
-                background,
-                with_depth=False,
-                absgrad=model.densification.needs_absgrad(model.step),
-                assume_finite=True,
-                look=look,
-            )
-            outputs["background"] = background
-            stored = torch.sigmoid(splats["opacities"]).flatten()  # for splats that are not visible
-            shown = torch.where(info["radii"] > 0, appearance.opacities, stored)
-            model.densification.pre_backward(model.step, info, shown, splats["opacities"])
+            outputs, info = render_view(model, view, Field(head, splats), self.noise, look)
             losses = loss_of(model, splats, outputs, self.batch)
             sum(losses.values()).backward()
         self.gradients = {name: leaf.grad for name, leaf in leaves.items()}
@@ -303,8 +284,7 @@ class _StepGraph:
         torch._foreach_copy_([mine.viewmat, mine.K, mine.center], [now.viewmat, now.K, now.center])
         for name, values in self.batch.items():
             values.copy_(batch[name], non_blocking=True)
-        if self.noise is not None:
-            self.model.view_noise.generator(self.device, step)
+        self.model.view_noise.generator(self.device, step)  # the same, with this step's seed
         if self.shot is not None:
             self.index = index
             self.shot.copy_(self.model.photograph.shots.detach()[index : index + 1])

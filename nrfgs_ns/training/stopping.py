@@ -49,11 +49,6 @@ class StopRequest:
             _say("Stopped at once; what was not saved yet is lost.")
             os._exit(128 + number)
 
-    @property
-    def exit_status(self) -> int:
-        """As a shell reports the end of a process by a signal: 130 for SIGINT, 143 for SIGTERM."""
-        return 0 if self.signal is None else 128 + self.signal
-
 
 @contextmanager
 def heard_signals(request: StopRequest) -> Iterator[None]:

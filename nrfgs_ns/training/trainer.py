@@ -28,7 +28,6 @@ from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, window
 from nrfgs_ns.training.checkpoint_files import DiskFull
 from nrfgs_ns.training.dense_start import start_with_dense_points
-from nrfgs_ns.training.evaluation import track
 from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 from nrfgs_ns.training.pace import Pace, TimedPace
@@ -222,13 +221,9 @@ class NrfgsTrainer(Trainer):
 
     @check_eval_enabled
     def eval_iteration(self, step: int) -> None:
-        """Nerfstudio's; also logs the appearance head's components when test images are evaluated."""
-        pictures = step_check(step, self.config.steps_per_eval_all_images)
-        if pictures and self.line is not None:
+        if self.line is not None and step_check(step, self.config.steps_per_eval_all_images):
             self.line.step_aside()  # the evaluation has a progress bar of its own
         super().eval_iteration(step)
-        if pictures or step_check(step, self.config.steps_per_eval_image):
-            track(self.pipeline, step, pictures)
 
     def train_iteration(self, step: int):
         """One step; TrainingStopped where it, or on a GPU the one before, met a number that is not finite."""

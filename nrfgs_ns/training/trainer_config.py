@@ -8,7 +8,6 @@ from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 
-import tyro
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -41,7 +40,6 @@ class NrfgsTrainerConfig(TrainerConfig):
     """Nerfstudio's trainer options."""
 
     _target: type = field(default_factory=lambda: resolve_name(TRAINER))
-    """target class to instantiate"""
     max_num_iterations: int = STEPS
     """training steps. 0: 120 for each training view, from 10,000 to 30,000, with schedules stretched to them
     (docs/captures.md)"""
@@ -164,17 +162,6 @@ class NrfgsTrainerConfig(TrainerConfig):
             with suppress(FileExistsError):
                 return self.get_base_dir().mkdir(parents=True)
             self.timestamp = f"{name}_{number}"
-
-
-def parse(args: list[str]) -> TrainerConfig:
-    """The configuration that `ns-train ARGS` would run."""
-    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion  # which imports this module
-
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=args)
-    if config.data:
-        config.pipeline.datamanager.data = config.data
-    config.set_timestamp()
-    return config
 
 
 def _absolute(path: Path | None) -> Path | None:

@@ -6,9 +6,11 @@ import torch
 from head_cases import awake, scene
 from torch.testing import assert_close
 
+from nrfgs_lab.ablation import input_columns
+from nrfgs_lab.residuals import with_diffuse
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.appearance.reduce import input_columns, latent_basis, with_diffuse, with_rank
+from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 
 CONFIGS = {
     "default": NrfConfig(latent_dim=8, hidden_width=16),

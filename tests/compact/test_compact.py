@@ -295,7 +295,7 @@ def test_what_a_splat_is_worth_is_what_pictures_lose_without_it(exported):
 
     @torch.no_grad()
     def error(gates):
-        outputs, _ = model.render(one, camera, Gated(one, gates))
+        outputs = model.render(one, camera, Gated(one, gates))
         return float((outputs["rgb"] - model.truth_of(batch, outputs["background"])).square().sum())
 
     ones = torch.ones(len(growth))

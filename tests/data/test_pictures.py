@@ -10,8 +10,9 @@ from small_colmap import Model
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.data.pictures import exif_of_copy, read_exif
+from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.errors import InputError
+from nrfgs_prepare.photos import exif_of_copy
 
 
 @pytest.mark.parametrize("layout", ["transforms.json", "COLMAP"])

@@ -32,9 +32,6 @@ BY_ERROR = {"--pipeline.model.densification": "error-guided,warmup_length=2,refi
 RICH = {
     "--pipeline.model.densification": "mcmc,warmup_length=2,refine_every=4",
     "--pipeline.model.rasterize-mode": "antialiased",
-    "--pipeline.model.use-scale-regularization": True,
-    "--pipeline.model.max-gauss-ratio": 0.5,  # below every ratio: each splat has a gradient from this term
-    "--pipeline.model.use-bilateral-grid": True,
     "--pipeline.model.camera-optimizer.mode": "SO3xR3",
 }
 BUSY = {"--pipeline.model.view-noise": 0.5}
@@ -42,7 +39,7 @@ BUSY = {"--pipeline.model.view-noise": 0.5}
 
 def trainer_of(scene: Path, out: Path, world: int, **options):
     """A trainer, set up, on `world` devices, of which this process is one."""
-    from nrfgs_ns.training.trainer_config import parse
+    from nrfgs_lab.training_run import parse
 
     chosen = {"--data": scene, "--output-dir": out, **COMMON, **options}
     config = parse(["nrfgs", *(str(word) for option in chosen.items() for word in option)])
@@ -180,7 +177,7 @@ def work(rank: int, job: str, world: int, scene: Path, folder: Path, device_type
     import jobs
     from quick_start import keep_what_is_imported, let_go
 
-    from nrfgs_ns.distributed.launch import join_group
+    from nrfgs_lab.many_processes import join_group
 
     torch.set_num_threads(1)
     device.COMMON["--machine.device-type"] = device_type  # what `jobs` reads; this file runs as another module

@@ -14,6 +14,7 @@ import torch
 from short_trainings import command_line
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
+from nrfgs_lab import many_processes
 from nrfgs_ns.distributed import launch
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
@@ -42,13 +43,13 @@ def test_of_a_failed_process_the_error_is_shown_without_its_traceback(config):
 
 
 def test_what_cannot_start_is_refused_before_it_does(config, monkeypatch):
-    with pytest.raises(InputError, match="nrfgs_ns.distributed.launch"):
+    with pytest.raises(InputError, match="nrfgs_lab.many_processes"):
         config.print_to_terminal()  # what ns-train does, on CPUs
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(InputError, match="num_devices is 2, but this machine shows 1"):
         launch.prepare(replace(config, machine=replace(config.machine, device_type="cuda")))
     with pytest.raises(InputError, match="num_machines is 2"):
-        launch.launch(replace(config, machine=replace(config.machine, num_machines=2)))
+        many_processes.launch(replace(config, machine=replace(config.machine, num_machines=2)))
 
 
 def test_ns_train_says_in_one_message_which_process_is_lost(config, monkeypatch, capsys):
@@ -85,9 +86,9 @@ def test_a_process_that_is_told_to_stop_once_it_has_stopped_is_not_lost(config, 
             if self.looks == 3:
                 raise ProcessExitedException("died", error_index=0, error_pid=7, exit_code=-15, signal_name="SIGTERM")
 
-    monkeypatch.setattr(launch.mp, "spawn", lambda *args, **kwargs: Processes())
-    with pytest.raises(SystemExit if asked else launch.DeviceLost) as ended:
-        launch.launch(config)
+    monkeypatch.setattr(many_processes.mp, "spawn", lambda *args, **kwargs: Processes())
+    with pytest.raises(SystemExit if asked else many_processes.DeviceLost) as ended:
+        many_processes.launch(config)
     if asked:
         assert ended.value.code == 130
 
@@ -115,7 +116,7 @@ def endless(tiny_scene, tmp_path):
     }
     words = command_line("nrfgs", tiny_scene, tmp_path, 100_000, options)
     process = subprocess.Popen(
-        [sys.executable, "-m", "nrfgs_ns.distributed.launch", *words],
+        [sys.executable, "-m", "nrfgs_lab.many_processes", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

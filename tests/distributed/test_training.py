@@ -9,7 +9,8 @@ import torch
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE
-from nrfgs_ns.densification.error_guided import CHANGE_BEFORE, ERROR, WIDTH
+from nrfgs_ns.densification.error_guided import ERROR, WIDTH
+from nrfgs_ns.densification.strategy import CHANGE_BEFORE
 from nrfgs_ns.distributed.trainer import ShardedMean
 from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.checkpoint_files import read, read_latest

@@ -17,6 +17,7 @@ from plyfile import PlyData
 from short_trainings import command_line
 from torch.testing import assert_close
 
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.sh import SphericalHarmonics, sh_bases
 from nrfgs_ns.compact.decode import decode
@@ -31,7 +32,6 @@ from nrfgs_ns.model import harmonics_fit, harmonics_tune
 from nrfgs_ns.model.harmonics_fit import STRENGTHS, Moments, Observations, PlainSplats, fit_harmonics, observe
 from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.trained.loading import load_model
-from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

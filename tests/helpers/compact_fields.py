@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from nrfgs_lab.residuals import with_diffuse
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.format import container, read_header, read_streams

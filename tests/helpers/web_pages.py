@@ -15,9 +15,9 @@ import torch
 from compact_fields import write_container
 from PIL import Image
 
+from nrfgs_lab.residuals import with_diffuse
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.appearance.reduce import with_diffuse
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.export.web.page import page as page_of

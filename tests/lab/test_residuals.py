@@ -9,11 +9,11 @@ from torch.testing import assert_close
 from nrfgs_lab import residuals
 from nrfgs_lab.failed_views import failed_views, views_that_show
 from nrfgs_lab.residuals import EIGHT_BIT_STEP, FieldViews, dropped, look_over, slim
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 from nrfgs_ns.model.harmonics_fit import observe
-from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -45,24 +45,29 @@ def test_duplicates_pairs_and_strays_do_not_decide():
     assert camera_spacing(torch.cat([cameras, torch.tensor([[0.0, 3.0, 0.0]])])) == pytest.approx(apart, rel=0.1)
 
 
+def moved_by(noise: ViewNoise, splats: dict[str, torch.Tensor], step: int):
+    """The table as the head sees it in a step."""
+    return noise.moved(splats, noise.generator(splats["means"].device, step))
+
+
 def test_noise_has_the_length_that_was_asked_for_and_moves_nothing_else():
     splats = {"means": torch.zeros(20_000, 3, requires_grad=True), "latents": torch.ones(20_000, 4)}
-    moved = ViewNoise(0.3, 42).moved(splats, 7)
+    moved = moved_by(ViewNoise(0.3, 42), splats, 7)
     assert moved["means"].square().sum(dim=-1).mean().sqrt().item() == pytest.approx(0.3, rel=0.02)
     assert moved["means"].mean(dim=0).abs().max() < 0.01
     assert moved["latents"] is splats["latents"] and not splats["means"].any()
     assert (torch.autograd.grad(moved["means"].sum(), splats["means"])[0] == 1).all()
-    assert ViewNoise(0.0, 42).moved(splats, 7) is splats
+    assert moved_by(ViewNoise(0.0, 42), splats, 7) is splats
 
 
 def test_noise_is_the_steps_and_the_seeds_alone():
     splats = {"means": torch.zeros(500, 3)}
     noise = ViewNoise(1.0, 42)
     state = torch.get_rng_state()
-    first, second = noise.moved(splats, 0)["means"], noise.moved(splats, 1)["means"]
+    first, second = moved_by(noise, splats, 0)["means"], moved_by(noise, splats, 1)["means"]
     assert torch.equal(torch.get_rng_state(), state), "another generator moved"
-    assert torch.equal(ViewNoise(1.0, 42).moved(splats, 1)["means"], second)
-    for other in (first, ViewNoise(1.0, 43).moved(splats, 1)["means"]):
+    assert torch.equal(moved_by(ViewNoise(1.0, 42), splats, 1)["means"], second)
+    for other in (first, moved_by(ViewNoise(1.0, 43), splats, 1)["means"]):
         assert abs(torch.corrcoef(torch.stack([other.flatten(), second.flatten()]))[0, 1]) < 0.1
 
 

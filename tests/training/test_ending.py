@@ -13,6 +13,7 @@ import pytest
 import torch
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
@@ -21,7 +22,6 @@ from nrfgs_ns.training.checkpoint_files import DiskFull, find
 from nrfgs_ns.training.guard import TrainingStopped
 from nrfgs_ns.training.stopping import StopRequest, heard_signals, rows_agree
 from nrfgs_ns.training.trainer import NrfgsTrainer, writer
-from nrfgs_ns.training.trainer_config import parse
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

@@ -10,12 +10,12 @@ import torch
 from PIL import ExifTags, Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
 
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.photographs import Evidence, exif_of, exposure
-from nrfgs_ns.training.trainer_config import parse
 
 NAN = math.nan
 
@@ -145,8 +145,6 @@ def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path, monkeypatc
     assert not any("photograph" in name for name in checkpoint["pipeline"])
     assert "photograph" not in checkpoint["optimizers"]
     on = {"--pipeline.model.photographs": "on"}
-    with pytest.raises(InputError, match="bilateral"):
-        trained(command_line("nrfgs-sh", tiny_scene, tmp_path, 2, on, {"--pipeline.model.use-bilateral-grid": True}))
     more = {"--load-dir": models_of(config), **on}
     with pytest.raises(InputError, match="pipeline.model.photographs off"):
         trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "on", 2, QUICK, more))

@@ -4,7 +4,7 @@ import threading
 import pytest
 from nerfstudio.viewer.viewer import Viewer
 
-from nrfgs_ns.training.trainer_config import parse
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 

@@ -24,7 +24,7 @@ from torch.testing import assert_close
 from viser.infra import _infra
 from viser.transforms import SO3
 
-import nrfgs_ns.training.trainer
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -32,7 +32,6 @@ from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
-from nrfgs_ns.training.trainer_config import parse
 from nrfgs_ns.viewer.pictures import (
     BASE,
     DEPTH,
@@ -344,12 +343,8 @@ def watched_training(scene, out, each_step) -> dict:
     }
 
 
-def test_a_training_does_not_notice_who_watches_and_tensorboard_shows_the_head(
-    tiny_scene, tmp_path, open_viewer, monkeypatch
-):
-    """To the bit: the same training logged, and with a browser that looks at something else after every second step."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
+def test_a_training_does_not_notice_who_watches(tiny_scene, tmp_path, open_viewer):
+    """To the bit: the same training with a browser that looks at something else after every second step."""
     wishes = [
         (mode, gain, frozen) for gain, frozen in ((0.0, True), (2.0, False)) for mode in [FULL, *FIELD, VIEW_DEPENDENCE]
     ]
@@ -367,30 +362,12 @@ def test_a_training_does_not_notice_who_watches_and_tensorboard_shows_the_head(
         viewers[0].control_panel.background_color = (255, 0, 0)
         seen.append(Browser.sees(viewers[0], cameras.camera_to_worlds[len(seen) % 8])["rgb"].mean().item())
 
-    tracked = watched_training(tiny_scene, tmp_path / "tracked", watch)
-    monkeypatch.setattr(nrfgs_ns.training.trainer, "track", lambda *_: None)
+    watched = watched_training(tiny_scene, tmp_path / "watched", watch)
     quiet = watched_training(tiny_scene, tmp_path / "quiet", lambda trainer: None)
     assert len(seen) == STEPS // 2 and len(set(seen)) > 1
     assert quiet["splats"] != 300, "nothing was densified: the test would prove less"
-    assert len(quiet["tensors"]) == len(tracked["tensors"]) > 20
-    assert all(torch.equal(one, other) for one, other in zip(quiet["tensors"], tracked["tensors"], strict=True))
-
-    events = EventAccumulator(str(tracked["folder"])).Reload()
-    ours = {
-        kind: {tag.removeprefix("Appearance/") for tag in events.Tags()[kind] if tag.startswith("Appearance/")}
-        for kind in ("scalars", "histograms", "images")
-    }
-    numbers = {f"{name} ({'mean' if name == 'gate weight' else 'rms'})" for name in FIELD}
-    assert ours["scalars"] == numbers | {"splats", "visible splats"}
-    assert ours["histograms"] == set(FIELD) and ours["images"] == {BASE, *FIELD}
-    assert [event.step for event in events.Images("Appearance/residual")] == [8, 16]
-    assert [event.step for event in events.Scalars("Appearance/splats")] == [4, 8, 12, 16]
-    splats = [event.value for event in events.Scalars("Appearance/splats")]
-    assert splats[0] == 300 and splats[-1] == tracked["splats"]
-    assert 0 < events.Scalars("Appearance/residual (rms)")[-1].value <= 0.2 * 3**0.5
-    histogram = events.Histograms("Appearance/gate weight")[-1].histogram_value
-    assert histogram.num == events.Scalars("Appearance/visible splats")[-1].value
-    assert 0 < histogram.min < histogram.max < 1
+    assert len(quiet["tensors"]) == len(watched["tensors"]) > 20
+    assert all(torch.equal(one, other) for one, other in zip(quiet["tensors"], watched["tensors"], strict=True))
 
 
 def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):

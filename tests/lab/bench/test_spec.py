@@ -28,9 +28,9 @@ from nrfgs_lab.bench.spec import (
 )
 from nrfgs_lab.pages.methods import HEADS, best_trial
 from nrfgs_lab.pages.options import methods
+from nrfgs_lab.training_run import parse
 from nrfgs_ns.densification import ErrorGuided, Mcmc, Original
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training.trainer_config import parse
 
 ROOT = Path(__file__).resolve().parents[3]
 SMALL = {"runs": {"SH": "nrfgs-sh", "NRF": "nrfgs"}, "scenes": ["bonsai"]}
