@@ -132,7 +132,6 @@ def test_a_preset_keeps_its_steps():
         ("own", ErrorGuided()),
         ("error-guided@77", ErrorGuided(budget=77)),
         ("original", Original()),
-        ("original@77", Original(budget=77)),
         ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9)),
     ],
 )
