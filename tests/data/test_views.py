@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from hard_trainings import rescale
+from moved_scenes import rescale
 from nerfstudio.cameras.cameras import Cameras
 from short_trainings import command_line, set_up
 

@@ -49,11 +49,9 @@ def compared(nrf, sh):
     "nrf, sh, steps, says",
     [
         ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS, "NRF is ahead of SH: +1.10 dB"),
-        ([24.0, 24.0, 24.9], [25.0, 25.2, 26.0], ENOUGH_STEPS, "NRF is behind SH: -1.10 dB"),
         ([25.0, 25.1, 25.1], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # little
         ([29.0, 21.0, 27.0], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # the views disagree
         ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS - 1, "Too short for a verdict"),
-        ([None, None, None], [None, None, None], ENOUGH_STEPS, "Nothing shines"),
     ],
 )
 def test_the_verdict_follows_the_measurement(nrf, sh, steps, says):

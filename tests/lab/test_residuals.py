@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a field can do without, and what fails a view: residuals' sizes are bounds, the smallest field is found."""
+"""What a field can do without: residuals' sizes are bounds, the smallest field is found."""
 
 import pytest
 import torch
-from short_trainings import LOUD, command_line, set_up
+from short_trainings import LOUD
 from torch.testing import assert_close
 
 from nrfgs_lab import residuals
-from nrfgs_lab.failed_views import failed_views, views_that_show
 from nrfgs_lab.residuals import EIGHT_BIT_STEP, FieldViews, dropped, look_over, slim
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 from nrfgs_ns.model.harmonics_fit import observe
@@ -102,35 +101,3 @@ def test_loss_falls_with_the_rank(loud, field, seen, monkeypatch):
         slimmed = slim(field, seen, views, wanted)
         assert views.psnr(slimmed.field) >= wanted
         assert slimmed.rank == 1 or scores[slimmed.rank - 2] < wanted
-
-
-def test_latents_of_diffuse_splats_do_not_count(field):
-    diffuse = torch.arange(len(field.splats["means"])) % 2 == 0
-    line = torch.linspace(-3.0, 3.0, len(diffuse))[:, None] * torch.ones(6)
-    latents = torch.where(diffuse[:, None], 9.0 * field.splats["latents"], line)
-    basis = latent_basis(
-        Field(field.head, {**field.splats, "latents": latents, DIFFUSE: diffuse}), torch.ones(len(line))
-    )
-    assert basis.variances[1] < 1e-9 * basis.variances[0]
-
-
-def test_a_wall_before_a_test_camera_is_what_it_costs(tiny_scene, tmp_path):
-    options = {"--pipeline.model.near-plane": "off", "--pipeline.model.num-downscales": 0}
-    pipeline = set_up(command_line("nrfgs", tiny_scene, tmp_path, 1, options)).pipeline
-    pipeline.eval()
-    model, (camera, _) = pipeline.model, pipeline.datamanager.fixed_indices_eval_dataloader[0]
-    before = failed_views(pipeline)
-    name = next(iter(before))
-    pose = camera.camera_to_worlds[0]
-    wall = pose[:, 3] - 0.05 * model.near * pose[:, 2]  # right before the camera
-    rows = torch.arange(5)
-    with torch.no_grad():
-        model.gauss_params["means"][rows] = wall + 1e-4 * torch.randn(5, 3)
-        model.gauss_params["opacities"][rows] = 9.0
-        model.gauss_params["scales"][rows] = torch.tensor(model.near).log() - 3
-        model.gauss_params["features_dc"][rows] = 5.0
-    after = failed_views(pipeline)
-    assert after[name]["nothing"] < before[name]["nothing"] - 3
-    assert after[name]["nearer than 0.5"] == pytest.approx(before[name]["nearer than 0.5"], abs=0.5)
-    shown, inside = views_that_show(pipeline)
-    assert shown.shape == inside.shape == (model.num_points,) and int(shown.max()) <= 8

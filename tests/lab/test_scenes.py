@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from plyfile import PlyData
 
-from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, project, write_scene
+from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, write_scene
 from nrfgs_lab.scenes.dataset import sparse_points, split_names
 from nrfgs_lab.scenes.geometry import CAMERA, FIRST_SOLID, GROUND, SKY, Box, Sphere, World
 
@@ -221,16 +221,6 @@ def test_points_project_onto_their_colours(matt):
         assert colour_errors(matt, MATT, shift)[0].mean() > 1.2 * errors.mean()
 
 
-def test_project_undoes_camera_rays():
-    config, camera = SceneConfig(), dome_cameras(SceneConfig())[7]
-    pixels = np.random.default_rng(0).uniform((0, 0), (config.width, config.height), size=(100, 2))
-    origins, directions = (a.astype(np.float64) for a in camera_rays(config, camera, pixels))
-    again, depth = project(config, camera, origins + 2.5 * directions)
-    # Rays are float32: 5 x 6e-8 of position, at depth 2.5 and focal length 214: 3e-5 pixels, and as much of direction.
-    np.testing.assert_allclose(again, pixels, atol=2e-4)
-    np.testing.assert_allclose(depth, 2.5, atol=1e-5)
-
-
 def test_sparse_points_come_from_training_views_alone(glossy):
     _, _, points, colours = load(glossy)
     training = np.delete(dome_cameras(GLOSSY), [0, 8], axis=0)
@@ -246,15 +236,6 @@ def test_rerun_is_identical_to_the_byte(glossy, tmp_path):
     assert first == second
     assert len(first) == GLOSSY.views + 3
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["again"]  # nothing of the staging is left
-
-
-def test_same_scene_is_reused_even_beside_other_files(glossy):
-    (glossy / "outputs").mkdir(exist_ok=True)
-    before = (glossy / "images" / "view_000.png").stat().st_mtime_ns
-    calls = []
-    assert write_scene(GLOSSY, glossy, lambda done, total: calls.append(done)) == glossy
-    assert calls == [] and (glossy / "images" / "view_000.png").stat().st_mtime_ns == before
-    (glossy / "outputs").rmdir()
 
 
 def test_other_content_is_refused(glossy, tmp_path):

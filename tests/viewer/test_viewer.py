@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer without a GPU or a browser: what each mode shows, and that a browser's wishes reach no training.
-
-`test_browser_viewer.py` clicks through the same in a real browser.
-"""
+"""The viewer without a GPU or a browser: what each mode shows, and that a browser's wishes reach no training."""
 
 from contextlib import nullcontext
 from itertools import combinations
