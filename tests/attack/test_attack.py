@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hostile inputs are refused with one clear sentence (see `attempt`), whatever is wrong with them.
 
-`python tests/attack/table.py` runs more of them and prints the table of docs/stability.md.
+Every module area_*.py beside this one is an area: AREA (its name), CASES (a list of Case), and inputs(), a hypothesis
+strategy of further ones.
 """
 
+import importlib
 import json
 import os
 import sys
@@ -13,12 +15,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))
 
 from attempt import GOOD, Case, attempts  # noqa: E402
-from table import areas  # noqa: E402
 
-AREAS = {area.AREA: area for area in areas()}
+AREAS = {area.AREA: area for area in (importlib.import_module(path.stem) for path in sorted(HERE.glob("area_*.py")))}
 
 
 @pytest.mark.parametrize("area", AREAS)

@@ -240,11 +240,6 @@ def test_images_too_small_to_begin_with_are_refused(tiny_scene, tmp_path):
         ready(tiny_scene, tmp_path, {"--pipeline.datamanager.camera-res-scale-factor": 0.01})
 
 
-def test_a_folder_that_cannot_be_written_is_refused(tiny_scene):
-    with pytest.raises(InputError, match="transforms.json.*Not a directory.* Name another --output-dir"):
-        ready(tiny_scene, tiny_scene / "transforms.json")
-
-
 def test_another_scene_and_other_options_are_refused(finished, tiny_scene, tmp_path):
     from nrfgs_lab.scenes import SceneConfig, write_scene
 
@@ -267,17 +262,6 @@ def test_trainings_of_one_name_have_a_folder_each(tiny_scene, tmp_path):
     on = replace(config, timestamp="mine", load_dir=configs[0].get_checkpoint_dir())
     on.save_config()
     assert on.timestamp == "mine"
-
-
-def test_a_configuration_leads_to_its_data_from_any_folder(tiny_scene, tmp_path, monkeypatch):
-    import yaml
-
-    monkeypatch.chdir(tiny_scene.parent)
-    config = parse(command_line("nrfgs", tiny_scene.name, "out", 1))
-    config.save_config()
-    saved = yaml.load((config.get_base_dir() / "config.yml").read_text(), Loader=yaml.Loader)
-    assert saved.pipeline.datamanager.data == tiny_scene and saved.output_dir == tiny_scene.parent / "out"
-    assert config.output_dir == Path("out"), "the configuration itself stays what it is"
 
 
 def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, capsys):
