@@ -26,7 +26,7 @@ finally:
 
 def nrfgs(*words: str, folder: Path) -> subprocess.CompletedProcess:
     """Run a command in a folder; it fails where the command imports torch."""
-    run = subprocess.run([sys.executable, "-c", RUN, *words], cwd=folder, capture_output=True, text=True)
+    run = subprocess.run([sys.executable, "-c", RUN, *words], cwd=folder, capture_output=True, text=True, timeout=300)
     assert "AssertionError" not in run.stderr, run.stderr
     return run
 

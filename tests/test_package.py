@@ -17,7 +17,7 @@ RAISE = "from nrfgs_ns.errors import InputError\nraise InputError('x.json is mis
 @pytest.mark.parametrize("debug", ["0", "1"])
 def test_it_is_the_last_line_and_the_status_1(debug):
     environment = {**os.environ, "NRFGS_DEBUG": debug}
-    run = subprocess.run([sys.executable, "-c", RAISE], capture_output=True, text=True, env=environment)
+    run = subprocess.run([sys.executable, "-c", RAISE], capture_output=True, text=True, env=environment, timeout=300)
     assert run.returncode == 1
     assert run.stderr.splitlines()[-1].endswith("x.json is missing. Make one.")
     assert ("Traceback" in run.stderr) == (debug == "1")
@@ -60,5 +60,5 @@ def test_what_cannot_be_written_is_told_beforehand(tmp_path):
 def test_open3d_is_hidden_here_and_in_processes_that_tests_start():
     with pytest.raises(ImportError, match="hidden from the tests"):
         import open3d  # noqa: F401
-    run = subprocess.run([sys.executable, "-c", "import open3d"], capture_output=True, text=True)
+    run = subprocess.run([sys.executable, "-c", "import open3d"], capture_output=True, text=True, timeout=300)
     assert run.returncode == 1 and "hidden from the tests" in run.stderr

@@ -123,7 +123,8 @@ def test_the_pages_reader_finds_the_same_numbers(tmp_path):
     write_container(tmp_path / "tables.nrf", {}, {**tables, "plain": np.arange(5, dtype=np.uint16)})
     script = (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + READ
     (tmp_path / "read.js").write_text(script, encoding="utf-8")
-    said = subprocess.run(["node", "read.js", "tables.nrf"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    words = ["node", "read.js", "tables.nrf"]
+    said = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=300)
     for name, found in json.loads(said.stdout).items():
         table, signed = TABLES[name]
         assert found == hashlib.sha256(table.astype("<i4" if signed else "<u4").tobytes()).hexdigest(), name

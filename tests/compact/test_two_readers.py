@@ -2,7 +2,7 @@
 """Python's reader and the page's refuse the same files, and read the same numbers in the others.
 
 A small file is changed in its header, its streams and its bytes, one place at a time, with lengths and checksums that
-hold again. docs/compact-format.md has the rules. pytest -m browser tests/compact: the page's reader in Chromium.
+hold again. docs/compact-format.md has the rules.
 """
 
 import base64
@@ -25,7 +25,6 @@ import torch
 from compact_fields import RENDER, field
 from torch.testing import assert_close
 
-from nrfgs_lab.pages.browser import CHROMIUM, chromium
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -481,19 +480,6 @@ def agree(cases: dict[str, bytes], found: list[dict], folder: Path) -> None:
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node: the page's reader is tried by pytest -m browser")
 def test_both_readers_refuse_the_same_files(cases, tmp_path):
     agree(cases, in_node(cases, tmp_path), tmp_path)
-
-
-@pytest.mark.browser
-def test_both_readers_refuse_the_same_files_in_a_browser(cases, tmp_path):
-    pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e '.[browser]'")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on the path: apt-get install chromium")
-    act = "(all) => all.map((text) => heard(Uint8Array.from(atob(text), (one) => one.charCodeAt(0))))"
-    with chromium() as browser:
-        page = browser.new_page()
-        page.set_default_timeout(1000 * SECONDS)
-        page.add_script_tag(content=script())
-        agree(cases, page.evaluate(act, [base64.b64encode(data).decode() for data in cases.values()]), tmp_path)
 
 
 def test_what_is_read_can_be_shown(tmp_path):

@@ -168,13 +168,13 @@ def test_the_page_names_commands():
 def test_a_command_of_the_page_works(words, tmp_path):
     original = plain_splats(500)
     write_splats(original, tmp_path / "splats.ply")
-    done = subprocess.run([TOOL, *words.split()], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run([TOOL, *words.split()], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr + done.stdout
     out = tmp_path / next(word for word in reversed(words.split()) if word.startswith("splats."))
     assert out.stat().st_size > 1000
     back = [TOOL, out.name, "back.ply"]
     if out.suffix in (".spz", ".sog", ".ply"):
-        done = subprocess.run(back, cwd=tmp_path, capture_output=True, text=True)
+        done = subprocess.run(back, cwd=tmp_path, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr + done.stdout
         vertices = PlyData.read(str(tmp_path / "back.ply"))["vertex"]
         found = torch.from_numpy(np.stack([vertices[axis] for axis in "xyz"], axis=1))

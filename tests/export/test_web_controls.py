@@ -90,16 +90,6 @@ def test_fingers_hit_every_control(window, demo, browser):
     page.page.close()
 
 
-def test_controls_stay_within_the_safe_area(demo, browser):
-    page = Page(browser, demo[1].as_uri(), (360, 640), has_touch=True).begun()
-    insets = {"top": 40, "bottom": 34, "left": 0, "right": 0}
-    page.page.context.new_cdp_session(page.page).send("Emulation.setSafeAreaInsetsOverride", {"insets": insets})
-    assert all(box["y"] + box["height"] <= 640 - 34 for box in boxes(page, "#bar button"))
-    page.tab("Share")
-    assert boxes(page, "#caption")[0]["y"] >= 40
-    page.page.close()
-
-
 def test_every_control_changes_the_picture(window, demo, browser):
     size, touch = window
     page = Page(browser, demo[1].as_uri(), size, **touch).begun()

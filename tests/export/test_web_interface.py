@@ -237,24 +237,6 @@ def test_a_recorded_path_keeps_its_time_and_lens(wall, tmp_path):
     page.until(ENDED)
 
 
-def test_an_object_turns_by_itself_until_it_is_touched(wall, browser, tmp_path):
-    scene, photographs = random_scene(tmp_path, "classic", {})
-    (tmp_path / "object.html").write_text(page_with(scene.read_bytes(), photographs, rotate=True))
-    page = Page(browser, (tmp_path / "object.html").as_uri(), (160, 120), WATCH).begun()
-    target = np.array(page.call("getCamera")["target"])
-    page.until("path.length > 8")
-    page.page.mouse.click(20, 60)
-    path = np.array(page.page.evaluate("path"))[:, 1:]
-    radii = np.linalg.norm(path - target, axis=1)
-    assert np.ptp(radii) < 1e-6 * radii.mean() and np.ptp(path[:, 2]) < 1e-6, "around the subject, at one height"
-    assert np.linalg.norm(path[-1] - path[0]) > 0.01
-    count = page.page.evaluate("path.length")
-    page.call("finished")
-    assert page.page.evaluate("path.length") - count <= 1 and not page.page.locator("#rotate").is_checked()
-    assert not page.errors
-    page.page.close()
-
-
 def test_notes_are_at_their_points_and_are_text(wall):
     camera = {"position": [3, 0, 0], "target": [0, 0, 0]}
     notes = [

@@ -252,21 +252,6 @@ def test_other_content_is_refused(glossy, tmp_path):
     assert (write_scene(tiny, tmp_path / "empty") / "scene.json").is_file()
 
 
-def test_progress_counts_and_an_interruption_leaves_nothing(tmp_path):
-    tiny = SceneConfig(views=3, width=4, height=3, samples=1, points=5)
-    calls = []
-
-    def stop_at_two(done, total):
-        calls.append((done, total))
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_scene(tiny, tmp_path / "scene", stop_at_two)
-    assert calls == [(1, 3), (2, 3)]
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_nerfstudio_reads_it_as_we_meant_it(matt):
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 

@@ -151,6 +151,8 @@ def test_a_writer_that_is_killed_at_any_operation_leaves_whole_files(tmp_path):
         child = os.fork()
         if child == 0:
             try:
+                signal.signal(signal.SIGALRM, signal.SIG_DFL)
+                signal.alarm(60)  # ends a child that hangs
                 write_until_killed(folder, count)
             finally:
                 os._exit(0)

@@ -162,14 +162,6 @@ def test_a_stopped_benchmark_takes_its_children_along(stop, status, fake, monkey
     assert [name for name, _ in ran(fake)] == ALL[:2]
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"identity": {}}'])
-def test_a_broken_record_is_named(text, fake):
-    (fake / "out" / "runs").mkdir(parents=True)
-    (fake / "out" / "runs" / "SH-own-scene-1.json").write_text(text)
-    with pytest.raises(InputError, match="SH-own-scene-1.json is no.*Remove it"):
-        bench_in(fake, seeds=(1,)).main()
-
-
 def test_records_of_other_arguments_are_refused_named_and_redone(fake, capsys):
     bench_in(fake, seeds=(1,)).main()
     with pytest.raises(
@@ -208,18 +200,6 @@ def test_more_gpus_than_there_are_are_refused(monkeypatch):
     assert gpu_names(1) == ["3"]
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert gpu_names(1) == [""], "GPUs that were hidden stay hidden"
-
-
-def test_flags_have_precedence_over_the_file(tmp_path):
-    text = "runs: {A: nrfgs, no split: {method: nrfgs, options: --x False, steps: 9}, 5: nrfgs-vdgs}\n"
-    text += "scenes: [{path: garden, downscale: 4}, other]\nsteps: 5\nseeds: [9]\njobs: 3\n"
-    plan, cells = bench_in(tmp_path, text, data=("new", "garden"), steps=7, runs=("5", "no split"), seeds=(8,)).chosen()
-    assert (plan.steps, plan.seeds, plan.jobs) == (7, [9, 8], 3) and plan.scenes[0].downscale == 4
-    assert [cell.name for cell in cells] == [
-        f"{run}-own-{scene}-8" for scene in ("garden", "new") for run in ("no_split", "5")
-    ]
-    with pytest.raises(InputError, match="'B': .*spec.yaml has no run of that name. It has 5, A, no split"):
-        bench_in(tmp_path, text, runs=("A", "B")).chosen()
 
 
 def test_a_plan_with_knobs_reports_the_trade(fake):

@@ -149,16 +149,3 @@ def test_masks_transparency_and_the_background(tiny_scene):
     assert not batch["mask"][:, :10].any() and batch["mask"][:, 10:].all()
     train(method, 0, 1)
     method.close()
-
-
-def test_the_last_steps_are_averaged(tiny_scene, monkeypatch):
-    """As `ns-train` does it, once nerfbaselines has made the last of the steps."""
-    monkeypatch.setattr("nrfgs_ns.training.averaging.LARGEST_SHARE", 1.0)
-    options = {**OPTIONS, "max_num_iterations": 6, "average_steps": 3}
-    method = Nrfgs(train_dataset=read(tiny_scene, "train"), config_overrides=options)
-    train(method, 0, 5)
-    mean = method.trainer.mean
-    assert mean.count == 2
-    train(method, 5, 6)
-    assert mean.count == 0, "the mean was not installed"
-    method.close()

@@ -109,17 +109,6 @@ def test_files_that_a_page_names_are_there(name):
     assert [path for path in paths if not any((ROOT / f"{path}{end}").exists() for end in ("", ".py"))] == []
 
 
-def test_make_targets_and_extras_that_pages_name_are_there():
-    shown = "\n".join(fence for text in PAGES.values() for fence in re.findall(r"```bash\n(.*?)```", text, re.DOTALL))
-    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    used = set(re.findall(r"^make ([\w-]+)", shown, re.MULTILINE))
-    assert used and used <= targets
-    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    extras = re.findall(r"^(\w+) = \[", project.partition("[project.optional-dependencies]")[2], re.MULTILINE)
-    named = {extra for text in PAGES.values() for extra in re.findall(r"(?:nrfgs-ns|\.)\[(\w+)\]'", text)}
-    assert named <= set(extras)
-
-
 def test_every_picture_is_shown():
     shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
     assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown
