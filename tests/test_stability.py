@@ -20,7 +20,6 @@ from nrfgs_ns.method_config import nrfgs
 
 
 def paint(folder: Path, value: int) -> None:
-    """Every image in one grey, 0 to 255."""
     for path in (folder / "images").glob("*.png"):
         Image.fromarray(np.full_like(np.array(Image.open(path)), value)).save(path)
 

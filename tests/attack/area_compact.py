@@ -22,7 +22,6 @@ AREA = "compact file"
 
 @lru_cache
 def written() -> bytes:
-    """A field of sixty splats."""
     return container(*encode(field(), RENDER))
 
 

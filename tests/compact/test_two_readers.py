@@ -51,7 +51,6 @@ Parts = tuple[dict, list[bytes]]
 
 @cache
 def written(count: int = COUNT, **options) -> bytes:
-    """A file of some splats."""
     one = field(count)
     if options:
         head = NrfConfig(**{"latent_dim": 8, "hidden_width": 16, "output_init": "default"} | options).setup()
@@ -60,7 +59,6 @@ def written(count: int = COUNT, **options) -> bytes:
 
 
 def parts_of(header: dict, streams: dict) -> Parts:
-    """A file in parts."""
     entries, bodies = [], []
     for name, stream in streams.items():
         array, body = _coded(stream) if isinstance(stream, Table) else (stream, _pack(stream))
@@ -236,39 +234,6 @@ def xz_streams() -> Iterator[tuple[str, bytes]]:
     yield "a bomb that says so", with_body(name, lambda _: packed(bytes(2**22)), shape=[2**27])
 
 
-def chunks() -> Iterator[tuple[str, bytes]]:
-    """Chunks of LZMA2, written by hand: stored bytes, with and without resets."""
-    name, raw = "head.low.2.bias", bytes(range(8))
-
-    def xz(content: bytes, claimed: int = len(raw)) -> bytes:
-        header = b"\x02\x00\x21\x01\x10\x00\x00\x00"
-        unpadded = 12 + len(content)
-        index = bytes([0, 1, unpadded, claimed])
-        foot = struct.pack("<I", (len(index) + 4) // 4 - 1) + b"\0\0"
-        return b"".join(
-            [b"\xfd7zXZ\0\0\0", struct.pack("<I", zlib.crc32(b"\0\0")), header, struct.pack("<I", zlib.crc32(header))]
-            + [content, bytes(-unpadded % 4), index, struct.pack("<I", zlib.crc32(index))]
-            + [struct.pack("<I", zlib.crc32(foot)), foot, b"YZ"]
-        )
-
-    stored = b"\x00\x07" + raw
-    lzma_chunk = lzma.compress(raw, format=lzma.FORMAT_RAW, filters=[{"id": lzma.FILTER_LZMA2}])
-    for kind, content in {
-        "stored": b"\x01" + stored + b"\0",
-        "without a reset": b"\x02" + stored + b"\0",
-        "in two": b"\x01\x00\x03" + raw[:4] + b"\x02\x00\x03" + raw[4:] + b"\0",
-        "a second reset": b"\x01\x00\x03" + raw[:4] + b"\x01\x00\x03" + raw[4:] + b"\0",
-        "an unknown control": b"\x03" + stored + b"\0",
-        "without an end": b"\x01" + stored,
-        "a byte after the end": b"\x01" + stored + b"\0\0",
-        "as it is packed": lzma_chunk,
-        "coded without properties": b"\xa0" + b"\0\x07\0\x07" + bytes(8) + b"\0",
-        "coded after stored, without properties": b"\x01\x00\x03" + raw[:4] + b"\xa0\0\x03\0\x07" + bytes(8) + b"\0",
-    }.items():
-        yield f"chunk {kind}", with_body(name, lambda _, c=content: xz(c))
-    yield "an index of another size", with_body(name, lambda _: xz(b"\x01" + stored + b"\0", 9))
-
-
 def rans_streams() -> Iterator[tuple[str, bytes]]:
     """Models and words of coded tables changed."""
     for name in ("means", "splats", "latents"):
@@ -395,7 +360,7 @@ def whole_files() -> Iterator[tuple[str, bytes]]:
             yield f"{name} {value}", joined(header, bodies)
 
 
-GROUPS = (headers, texts, containers, xz_streams, chunks, rans_streams, contents, whole_files)
+GROUPS = (headers, texts, containers, xz_streams, rans_streams, contents, whole_files)
 
 
 @pytest.fixture(scope="module", params=GROUPS, ids=lambda group: group.__name__)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Densification strategies: what they delete, copy, move and add, and by which thresholds."""
 
-import math
 from copy import deepcopy
 
 import pytest
@@ -142,27 +141,17 @@ def test_a_word_is_a_strategy_with_its_options(text, config, tmp_path):
         ("sparkle", "no strategy 'sparkle'; use one of splatfacto, original, mcmc"),
         ("mcmc,sparkle=0.5", "mcmc has no option 'sparkle'; it has opacity_seen, .*budget"),
         ("mcmc,budget=0", "budget is 0; it must be from 1 to"),
-        (f"mcmc,budget={2**24 + 1}", "budget is"),
         ("mcmc,budget=many", "budget is 'many'; it must be a whole number"),
         ("original,opacity_seen=sparkle", "'sparkle'; use one of base, peak"),
         ("splatfacto,use_absgrad=2", "use_absgrad is '2'; use one of true, false"),
         ("splatfacto,densify_grad_thresh=nan", "densify_grad_thresh is nan; it must be zero or positive"),
         ("splatfacto,cull_alpha_thresh=0.5", "cull_alpha_thresh is 0.5; it must be below 0.5"),
         ("splatfacto,refine_every=0", "refine_every is 0; it must be at least 1"),
-        ("splatfacto,reset_alpha_every=0", "reset_alpha_every is 0"),
-        ("splatfacto,warmup_length=-1", "warmup_length is -1"),
     ],
 )
 def test_options_that_cannot_work_are_refused(text, says):
     with pytest.raises(InputError, match=says):
         strategy_from(text)
-
-
-def test_what_was_set_in_code_is_checked_before_the_training(tmp_path):
-    config = parse(["nrfgs", "--output-dir", str(tmp_path)])
-    config.pipeline.model.densification = Splatfacto(refine_every=0)
-    with pytest.raises(InputError, match="refine_every is 0"):
-        config.setup(local_rank=0, world_size=1)
 
 
 @pytest.mark.skipif(gsplat_version() >= (1, 5), reason="gsplat 1.5's strategy reads two radii, and resets no opacity")
@@ -218,19 +207,6 @@ def test_growth_ends_at_the_budget(name, budget):
     assert sizes[-1] >= 0.95 * budget
     middle = sizes[len(sizes) // 2]  # three quarters of the way: 2x - x^2 at a half
     assert abs(middle - (60 + 0.75 * (max(budget, 60) - 60))) <= 0.15 * middle
-
-
-def test_the_threshold_follows_the_course():
-    rules = strategy("original", budget=1000)
-    rules.state["grad2d"], rules.state["count"] = torch.zeros(1000), torch.ones(1000)
-    base = rules.threshold
-    assert rules._threshold_for_budget(500, 100) == pytest.approx(base)  # on course
-    assert rules._threshold_for_budget(7700, 100) == pytest.approx(base * math.exp(-0.12))  # far behind
-    goal = 100 + 900 * 0.75
-    assert rules._threshold_for_budget(7700, round(1.005 * goal)) == pytest.approx(base * math.exp(-0.12))
-    assert rules._threshold_for_budget(7700, round(1.05 * goal)) == pytest.approx(
-        base * math.exp(-0.12 + math.log(1.05)), rel=1e-3
-    )
 
 
 def test_a_budget_goes_on_from_a_checkpoint():

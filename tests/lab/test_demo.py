@@ -72,13 +72,3 @@ def test_where_it_shines_is_where_gloss_changes_the_truth():
     dull = where_it_shines([SeenView(grey, grey, grey, grey)])
     assert dull == {"share": 0.0, "psnr": None, "psnr_base": None, "views": [None], "views_base": [None]}
 
-
-def test_a_folder_that_is_not_ours_is_refused_in_one_line(tmp_path, monkeypatch):
-    occupied = tmp_path / Demo(quick=True).scene_folder
-    occupied.mkdir()
-    (occupied / "precious.txt").write_text("mine")
-    monkeypatch.setattr(sys, "argv", ["nrfgs", "demo", "--quick", "--out", str(tmp_path)])
-    with pytest.raises(SystemExit) as ended:  # Python prints its message, and ends with status 1
-        entrypoint()
-    assert str(occupied) in ended.value.code and "\n" not in ended.value.code
-    assert (occupied / "precious.txt").read_text() == "mine"

@@ -129,20 +129,6 @@ def test_view_dependence_grows_with_gloss():
     assert variances[1] > 1e-5
 
 
-@pytest.mark.parametrize("studio", [False, True])
-def test_the_studio_shines_and_reflects_nothing(studio):
-    """What leaves a surface there is the same whether or not rays are followed off it, and it still shines."""
-    scene = build_scene(SceneConfig(studio=studio, **SMALL))
-    points, surfaces = surface_points(scene)
-    solid = surfaces >= FIRST_SOLID
-    points, surfaces = points[solid], surfaces[solid]
-    directions = views_above(scene, points, surfaces, 2)
-    alone, followed = (scene._outgoing(points.T, surfaces, directions[0].T, bounces) for bounces in (0, 2))
-    assert np.array_equal(alone, followed) == studio
-    other = scene._outgoing(points.T, surfaces, directions[1].T, 0)
-    assert np.abs(other - alone).mean() > 0.01
-
-
 # The data set.
 
 MATT = SceneConfig(gloss=0.0, views=10, width=96, height=72, points=1500)

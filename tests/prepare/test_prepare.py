@@ -393,14 +393,6 @@ def test_what_is_no_photograph_is_named(three, tmp_path, make, said):
         Run(Prepare(three, tmp_path / "out"), Console(quiet=True)).import_input()
 
 
-def test_photographs_of_several_sizes_have_no_single_camera(three, tmp_path):
-    photo(three / "1.png", (40, 31))
-    run = Run(Prepare(three, tmp_path / "out", camera="single"), Console(quiet=True))
-    run.import_input()
-    with pytest.raises(InputError, match="--camera is single, but .*in has photographs of 2 sizes"):
-        run.find_features()
-
-
 def test_one_camera_only_where_everything_agrees_and_damaged_exif_is_none(tmp_path):
     exif = b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + bytes(range(200))
     paths = [photo(tmp_path / "in" / f"{i}.jpg", size, exif=exif) for i, size in enumerate([(40, 30)] * 2 + [(30, 40)])]

@@ -121,7 +121,6 @@ STRETCHED = {"--schedule-steps": 40, "--steps-per-save": 3}
 
 
 def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> list[str]:
-    """A command line for ns-train."""
     return command_line(method, scene, out, steps, SCHEDULES, *more)
 
 
@@ -168,8 +167,6 @@ def test_a_stretched_training_continues_to_the_bit(stretched, tiny_scene, tmp_pa
 
 
 class SecondsAStep(TimedPace):
-    """A clock on which each step takes a second."""
-
     def __init__(self, *args):
         self.now = 0.0
         super().__init__(*args, clock=lambda: self.now)

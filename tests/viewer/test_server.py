@@ -306,12 +306,6 @@ def test_a_camera_path_is_saved_in_its_folder(to_all):
     assert handle.value == ".._.._.._a_bc"
 
 
-def test_the_page_shows_no_picture_of_another_site(open_viewer, pipeline):
-    buffer = open_viewer(pipeline).viser_server._websock_server._broadcast_buffer
-    themes = [one for one in buffer.message_from_id.values() if isinstance(one, ThemeConfigurationMessage)]
-    assert themes and all(one.titlebar_content["image"] is None for one in themes)
-
-
 def test_nrfgs_view_opens_a_compact_file_alone(config, tmp_path, monkeypatch):
     """Without config.yml and data set it draws what the file's config.yml leads to."""
     Compact(config, output=tmp_path / "with" / "it.nrf", measure=False).main()

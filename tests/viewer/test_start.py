@@ -42,7 +42,6 @@ def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_p
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    """Photographs of 640 x 400."""
     config = SceneConfig(views=3, width=640, height=400, points=50, samples=1)
     scene = write_scene(config, tmp_path_factory.mktemp("large"))
     return NrfgsInputDataset(NrfgsDataParserConfig(data=scene).setup().get_dataparser_outputs("train"))

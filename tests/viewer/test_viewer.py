@@ -74,14 +74,12 @@ def build(tiny_scene, tmp_path_factory):
 
 
 def two_cameras(pipeline):
-    """Two training cameras that see the scene from different sides."""
     cameras = pipeline.datamanager.train_dataset.cameras
     return cameras[0:1], cameras[4:5]
 
 
 @pytest.fixture(scope="module")
 def scene(build):
-    """A model, and two cameras."""
     pipeline = build()
     return pipeline.model, *two_cameras(pipeline)
 
@@ -403,21 +401,3 @@ def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):
     assert panel.count.value == f"{pipeline.model.num_points:,}"
     assert not lock.locked()
 
-
-def test_a_browser_begins_at_the_first_photograph(build):
-    """Near where it was taken, in front of it, looking where it looks; as soon as there are any."""
-    panel = build().model.viewer_panel
-    turned = SO3.from_y_radians(0.5) @ SO3.from_x_radians(-0.3)
-    looks = [turned if i == 0 else turned.inverse() for i in range(4)]
-    taken = [SimpleNamespace(position=np.full(3, 1.0 + i), wxyz=look.wxyz) for i, look in enumerate(looks)]
-    client = SimpleNamespace(camera=SimpleNamespace(position=None, wxyz=None), atomic=nullcontext)
-    panel.viewer, panel.waiting = SimpleNamespace(config=ViewerConfig(), camera_handles={}), []
-    panel._welcome(client)
-    assert client.camera.position is None and panel.waiting == [client]
-    panel.viewer.camera_handles = dict(enumerate(taken))
-    panel._welcome_waiting()
-    assert panel.waiting == []
-    np.testing.assert_array_equal(client.camera.wxyz, turned.wxyz)
-    ahead = turned.inverse() @ (client.camera.position - taken[0].position)
-    # z is forwards; the photograph's plane is at 1.9 sizes for a field of 60 degrees (viser keeps the volume).
-    np.testing.assert_allclose(ahead, [0, 0, 5 * ViewerConfig().camera_frustum_scale], atol=1e-6)

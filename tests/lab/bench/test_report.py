@@ -154,14 +154,3 @@ def test_costs_are_ratios_of_geometric_means():
     rows = [row("default", record(30.0)), row("empty", record(5.0, splats=0))]
     assert set(changes(rows, rows[0], BY_NAME["splats"], ratio=True)) == {"default"}
 
-
-def test_prices():
-    def ratio(value):
-        return Change(value, 1.05, True)
-
-    up, down, nothing = Change(0.6, 0.1), Change(-0.6, 0.1), Change(0.05, 0.1)
-    assert price(up, ratio(4.0)) == price(down, ratio(0.25)) == "0.30"
-    assert price(up, ratio(0.25), power=-1) == "0.30"  # a quarter of the frames
-    assert price(up, ratio(0.5)) == "better and cheaper" and price(down, ratio(2.0)) == "worse and more expensive"
-    assert price(up, ratio(0.97)) == "gain, cost unclear" and price(down, ratio(1.0)) == "loss, cost unclear"
-    assert price(nothing, ratio(2.0)) == "PSNR unclear" and price(nothing, ratio(1.02)) == "unclear"

@@ -134,18 +134,3 @@ def test_a_training_goes_on_as_if_it_had_not_stopped(tiny_scene, tmp_path):
     for method in (continued, unbroken):
         method.close()
 
-
-def test_masks_transparency_and_the_background(tiny_scene):
-    dataset = read(tiny_scene, "train")
-    alpha = np.full((36, 48, 1), 255, np.uint8)
-    alpha[:, :10] = 0
-    dataset["images"] = [np.concatenate([image, alpha], axis=-1) for image in dataset["images"]]
-    dataset["masks"] = [alpha[..., 0] > 0 for _ in dataset["images"]]
-    dataset["metadata"]["background_color"] = np.array([255, 255, 255], dtype=np.uint8)
-    method = Nrfgs(train_dataset=dataset, config_overrides={**OPTIONS, "pipeline.model.num_random": 10})
-    assert method.config.pipeline.model.background_color == "white"
-    _, batch = method.trainer.pipeline.datamanager.next_train(0)
-    assert batch["image"].shape == (36, 48, 4) and batch["mask"].shape == (36, 48, 1)
-    assert not batch["mask"][:, :10].any() and batch["mask"][:, 10:].all()
-    train(method, 0, 1)
-    method.close()

@@ -44,21 +44,6 @@ def my_head(tmp_path, monkeypatch):
     return module
 
 
-def test_its_colours_are_linear_in_the_direction(my_head):
-    torch.manual_seed(0)
-    head = my_head.LinearConfig().setup()
-    splats = {"means": torch.zeros(1, 3), "opacities": torch.zeros(1, 1), **head.splat_params(torch.full((1, 3), 0.5))}
-    splats["slopes"] += 0.1 * torch.randn(1, 3, 3)
-    one, two = torch.tensor([0.0, 0.0, 2.0]), torch.tensor([0.0, 3.0, 0.0])
-    rows = torch.zeros(1, dtype=torch.int64)
-    for center in (one, two):
-        expected = 0.5 - splats["slopes"][0] @ (center / center.norm())
-        assert torch.allclose(head(splats, rows, center).colors[0], expected, atol=1e-6)
-    with pytest.raises(ValueError, match="distance_eps"):
-        my_head.LinearConfig(distance_eps=0.0).setup()
-    assert list(legends(Field(head, splats))) == ["full", "base colour", "residual", "view dependence", "depth"]
-
-
 def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", "linear=my_head:linear")
     configs, descriptions = discover_methods()
