@@ -6,7 +6,6 @@ strategy of further ones.
 """
 
 import importlib
-import json
 import os
 import sys
 from pathlib import Path
@@ -63,9 +62,3 @@ def test_the_attack_tells_outcomes_apart():
         Case("", lambda folder: 1 / 0): "broken case",
     }
     assert [outcome.kind for outcome in attempts(list(cases))] == list(cases.values())
-
-
-def test_the_record_is_of_these_areas_and_nothing_got_through():
-    record = json.loads((Path(__file__).resolve().parents[2] / "results" / "attack.json").read_text())["after"]
-    assert set(record["areas"]) <= set(AREAS)
-    assert all(not area["did not hold"] for area in record["areas"].values())

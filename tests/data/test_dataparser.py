@@ -25,7 +25,6 @@ def cloud(n: int = 20) -> tuple[np.ndarray, np.ndarray]:
 
 
 def seen_from(poses: np.ndarray, xyz: np.ndarray) -> np.ndarray:
-    """Points [N, 3] in the axes of each camera [C, 3, 4]: [C, N, 3]."""
     return np.einsum("cij,cni->cnj", poses[:, :, :3], xyz[None] - poses[:, None, :, 3])
 
 

@@ -48,7 +48,6 @@ def fifty_steps(scene: Path, folder: Path) -> None:
 
 
 def after_each(trainer, do) -> None:
-    """Call `do(step)` after each step."""
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], do))
 
 
@@ -75,7 +74,6 @@ def there_and_back(scene: Path, folder: Path) -> None:
 
 
 def evaluation(trainer) -> dict:
-    """What the test images say, without times."""
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     return {name: value for name, value in metrics.items() if name not in ("seconds_per_image", "fps")}
 
@@ -172,6 +170,5 @@ def averaged(scene: Path, folder: Path) -> None:
 
 
 def parameters(trainer) -> dict:
-    """A device's splats and shared weights, now."""
     named = trainer.pipeline.model.named_parameters()
     return {name: value.detach().clone() for name, value in named if name.startswith(("gauss_params.", "head."))}

@@ -61,28 +61,6 @@ def test_ns_train_says_in_one_message_which_process_is_lost(config, monkeypatch,
     assert said.endswith("as ever: another\n")
 
 
-@pytest.mark.parametrize("asked", [True, False])
-def test_a_process_that_is_told_to_stop_once_it_has_stopped_is_not_lost(config, monkeypatch, asked):
-    """Ctrl-C reaches all; one has stopped, and hears no more, when the parent passes it on."""
-
-    class Processes:
-        processes = ()
-        looks = 0
-
-        def join(self, timeout):
-            self.looks += 1
-            if self.looks == 1 and asked:
-                os.kill(os.getpid(), signal.SIGINT)
-            if self.looks == 3:
-                raise ProcessExitedException("died", error_index=0, error_pid=7, exit_code=-15, signal_name="SIGTERM")
-
-    monkeypatch.setattr(launch.mp, "spawn", lambda *args, **kwargs: Processes())
-    with pytest.raises(SystemExit if asked else launch.DeviceLost) as ended:
-        launch.launch(config)
-    if asked:
-        assert ended.value.code == 130
-
-
 @pytest.mark.parametrize("option", ["mixed_precision", "use_grad_scaler"])
 def test_scaled_gradients_are_refused(config, option):
     with pytest.raises(InputError, match=option):

@@ -62,7 +62,6 @@ def test_checkpoints_go_from_two_devices_to_one_and_to_two(two_devices):
 
 
 def agree_with(content: dict, held: list[dict], rows: list[slice]) -> None:
-    """What devices hold are their rows of a checkpoint."""
     statistics = content["pipeline"]["_model._extra_state"]["strategy"]
     for device, part in zip(held, rows, strict=True):
         assert device["same"], "an optimiser holds orphans"

@@ -14,8 +14,6 @@ import pytest
 from PIL import Image
 from web_pages import Page, page_with, random_scene, rendered, web_server
 
-from nrfgs_lab.pages.browser import CHROMIUM
-from nrfgs_lab.pages.web import main as measure_page
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.trained.loading import load_model
 
@@ -165,4 +163,3 @@ def test_a_folder_on_a_web_server(browser, tmp_path):
         page.page.wait_for_selector("#failed:not([hidden])")
         assert "scene.nrf cannot be loaded" in page.page.inner_text("#failed")
         page.page.close()
-

@@ -21,6 +21,8 @@ WINDOWS = {
     "turned": ((640, 360), {"has_touch": True}),
 }
 TABS = ["View", "Photographs", "Share", "Help"]
+
+
 @pytest.fixture(params=WINDOWS)
 def window(request):
     return WINDOWS[request.param]
@@ -33,32 +35,6 @@ def boxes(page: Page, selector: str) -> list[dict]:
         if one.is_visible():
             found.append(one.bounding_box() | {"name": one.evaluate("(element) => element.id || element.textContent")})
     return found
-
-
-def test_the_picture_comes_first(window, demo, browser):
-    (width, height), touch = window
-    page = Page(browser, demo[1].as_uri(), (width, height), **touch).begun()
-    assert page.page.locator("#panel").is_hidden()
-    assert [button["name"] for button in boxes(page, "button")] == TABS
-    (bar,) = boxes(page, "#bar")
-    assert bar["width"] * bar["height"] < 0.15 * width * height
-    for tab in TABS:
-        page.page.get_by_role("button", name=tab, exact=True).click()
-        assert [section["name"] for section in boxes(page, "#panel section")] == [tab.lower()]
-        (panel,) = boxes(page, "#panel")
-        assert panel["x"] >= 0 and panel["x"] + panel["width"] <= width
-        assert panel["y"] >= 0 and panel["y"] + panel["height"] <= bar["y"] + 1
-        if width < 600:
-            assert panel["height"] <= 0.56 * height, "the scene is seen above the sheet"
-        assert page.page.locator("#show").is_hidden() and page.page.locator("#freeze").is_hidden()
-    page.page.keyboard.press("Escape")
-    assert page.page.locator("#panel").is_hidden()
-    assert page.page.evaluate("document.activeElement.textContent") == "Help"
-    page.page.get_by_role("button", name="View", exact=True).click()
-    page.page.mouse.click(40, 120)
-    assert page.page.locator("#panel").is_hidden() == (width < 600), "a sheet gives way to the scene"
-    assert not page.errors
-    page.page.close()
 
 
 def test_every_control_changes_the_picture(window, demo, browser):

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """docs/web-interface.md in a real browser: cameras, links, messages between pages, tours, notes."""
 
-import json
 import re
 
 import numpy as np
@@ -219,24 +218,6 @@ def test_a_tour_stops_at_the_first_touch(wall):
     assert still.page.locator("#tour").get_attribute("aria-pressed") == "false"
 
 
-def test_a_recorded_path_keeps_its_time_and_lens(wall, tmp_path):
-    photographs = wall_scene(tmp_path)[1]
-    frames = [
-        {"camera_to_world": [*photographs[k]["pose"], 0, 0, 0, 1], "fov": 30.0 + k, "aspect": 4 / 3} for k in range(9)
-    ]
-    path = {"camera_type": "perspective", "seconds": 2.0, "is_cycle": False, "camera_path": frames}
-    (tmp_path / "path.json").write_text(json.dumps(path))
-    tour = read_tour([str(tmp_path / "path.json")], [])
-    page = wall((160, 120), before=WATCH, tour=tour)
-    page.until(ENDED)
-    assert np.allclose(
-        page.call("getMatrix"), np.array([*photographs[8]["pose"], 0, 0, 0, 1]).reshape(4, 4).T.ravel(), atol=1e-6
-    )
-    assert page.call("getCamera")["fov"] == pytest.approx(38)
-    page.page.evaluate("nrfgs.play('tour')")
-    page.until(ENDED)
-
-
 def test_notes_are_at_their_points_and_are_text(wall):
     camera = {"position": [3, 0, 0], "target": [0, 0, 0]}
     notes = [
@@ -300,7 +281,6 @@ def test_what_is_made_in_a_page_is_saved_and_read_again(size, wall, tmp_path):
 
 def test_events_and_versions(wall, browser, tmp_path):
     page = wall()
-    assert page.page.evaluate("nrfgs.version") == 1
     page.page.evaluate("window.count = 0; window.off = nrfgs.on('moved', () => count++); 0")
     page.call("setCamera", VIEWS[0])
     page.call("finished")

@@ -21,13 +21,11 @@ RENDER = {"rasterize_mode": "classic", "background": [0.0, 0.0, 0.0]}
 
 
 def write_container(path: Path, header: dict, streams: dict) -> int:
-    """Write a file; returns its size."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return path.write_bytes(container(header, streams))
 
 
 def read_container(data: bytes) -> tuple[dict, dict[str, np.ndarray]]:
-    """The header and the streams, by name, of a file's bytes."""
     header, first = read_header(data)
     return header, read_streams(data, header["streams"], first)
 

@@ -2,7 +2,6 @@
 """`nrfgs demo` end to end, in its smallest form, and what it says."""
 
 import json
-import sys
 
 import pytest
 import torch
@@ -12,7 +11,6 @@ from nrfgs_lab.demo.command import ENOUGH_STEPS, METHODS, NRF, SH, Demo, verdict
 from nrfgs_lab.demo.pictures import CELL
 from nrfgs_lab.demo.views import FRAMES, SeenView, brightest_window, where_it_shines
 from nrfgs_lab.scenes import SceneConfig
-from nrfgs_ns.cli import entrypoint
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -39,7 +37,6 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
 
 
 def compared(nrf, sh):
-    """Results whose test views have these PSNRs where it shines."""
     whole = {"psnr": 25.0, "ssim": 0.8}
     field = {"views": nrf, "views_base": [20.0, 20.5, 20.1]}
     return {NRF: {"eval": whole, "shine": field}, SH: {"eval": whole, "shine": {"views": sh}}}
@@ -71,4 +68,3 @@ def test_where_it_shines_is_where_gloss_changes_the_truth():
     assert (height, width) == (4, 5) and top <= 6 and top + height >= 9 and left <= 10 and left + width >= 14
     dull = where_it_shines([SeenView(grey, grey, grey, grey)])
     assert dull == {"share": 0.0, "psnr": None, "psnr_base": None, "views": [None], "views_base": [None]}
-

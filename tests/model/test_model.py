@@ -216,7 +216,6 @@ def test_losses_are_splatfactos(build, masked, regularised):
 
 
 def residual(model, cameras) -> float:
-    """Root mean square residual over all cameras."""
     views = [model.project(cameras[index : index + 1]) for index in range(len(cameras))]
     losses = [model.head.neutral_loss(model.field.splats, view.visible, view.center) for view in views]
     return torch.stack(losses).mean().sqrt().item()

@@ -31,7 +31,6 @@ def photo(path: Path, size: tuple[int, int] = (40, 30), colour: str = "grey", **
 
 @pytest.fixture
 def three(tmp_path) -> Path:
-    """A folder of three photographs."""
     return [photo(tmp_path / "in" / f"{i}.png") for i in range(3)][0].parent
 
 
@@ -90,7 +89,6 @@ def prepared(walls, tmp_path_factory) -> Path:
 
 
 def run_quietly(source: Path, out: Path, **options) -> str:
-    """Run the command; what it says."""
     screen = Console(record=True, width=200, file=io.StringIO())
     Run(Prepare(source, out, **options), screen).all()
     return screen.export_text()
@@ -110,7 +108,6 @@ def aligned(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def frames_of(scene: Path) -> tuple[dict, np.ndarray]:
-    """The content of transforms.json, and its poses [V, 4, 4]."""
     meta = json.loads((scene / "transforms.json").read_text())
     return meta, np.array([frame["transform_matrix"] for frame in meta["frames"]])
 

@@ -19,7 +19,7 @@ from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import checkpoint_files, stopping
 from nrfgs_ns.training.checkpoint_files import DiskFull, find
 from nrfgs_ns.training.guard import TrainingStopped
-from nrfgs_ns.training.stopping import StopRequest, heard_signals, rows_agree
+from nrfgs_ns.training.stopping import StopRequest, heard_signals
 from nrfgs_ns.training.trainer import NrfgsTrainer, writer
 from nrfgs_ns.training.trainer_config import parse
 
@@ -309,4 +309,3 @@ def test_only_a_second_ctrl_c_stops_at_once(second, seconds, ends, monkeypatch):
     now[0] += seconds
     request.hear(second)
     assert ended == ([130] if ends else [])
-

@@ -15,7 +15,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import REFINING, assert_same_training, checkpoint_of, command_line, models_of, trained
 
-from nrfgs_lab.training_run import parse, train
+from nrfgs_lab.training_run import train
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import pace, trainer_config
@@ -195,12 +195,6 @@ def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
         run("b", 0.5, {"--load-dir": folder})
     record, _, last, pace = run("c", 0.6, {"--load-dir": folder})
     assert record.steps == 6 and last == 35 and pace["seconds"] == 36
-
-
-@pytest.mark.parametrize("option", ["--time-budget", "--schedule-steps"])
-def test_they_are_for_one_device(option, tiny_scene, tmp_path):
-    with pytest.raises(InputError, match="one device"):
-        parse(options(tiny_scene, tmp_path, "nrfgs", 5, {option: 5})).setup(local_rank=0, world_size=2)
 
 
 def test_what_is_left_open_is_chosen_and_what_is_given_stays():

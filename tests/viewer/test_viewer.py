@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The viewer without a GPU or a browser: what each mode shows, and that a browser's wishes reach no training."""
 
-from contextlib import nullcontext
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
-from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
@@ -19,7 +16,6 @@ from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetT
 from short_trainings import command_line, set_up
 from torch.testing import assert_close
 from viser.infra import _infra
-from viser.transforms import SO3
 
 import nrfgs_ns.training.trainer
 from nrfgs_ns.appearance.field import Field
@@ -400,4 +396,3 @@ def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):
         panel.render(camera)
     assert panel.count.value == f"{pipeline.model.num_points:,}"
     assert not lock.locked()
-

@@ -74,7 +74,6 @@ def bench_in(folder: Path, text: str = FILE, **options) -> Bench:
 
 
 def ran(folder: Path) -> list[list[str]]:
-    """Name and GPU of each child that came to its end."""
     file = folder / "ran.txt"
     return [line.split() for line in file.read_text().splitlines()] if file.exists() else []
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import t as student
 
 from nrfgs_lab.bench.table import BY_NAME, Row, markdown, ranks, with_averages
-from nrfgs_lab.bench.trade import Change, changes, noise_bound, pareto_front, pooled_deviation, price
+from nrfgs_lab.bench.trade import changes, noise_bound, pareto_front, pooled_deviation
 from nrfgs_lab.results import pack, unpack
 
 PSNR = BY_NAME["PSNR"]
@@ -82,11 +82,8 @@ def test_a_folder_comes_back(tmp_path):
     run["train"] = {"splats": [[step, 10 * step] for step in range(0, 1101, 100)] + [[1149, 7]]}
     (folder / "runs" / "one.json").write_text(json.dumps(run))
     (folder / "table.md").write_text("| a |\n|---|\n")
-    (folder / "splats.png").write_bytes(b"no text")
     pack(folder, tmp_path / "study.json")
-    assert json.loads((tmp_path / "study.json").read_text())["study"] == "study"
     unpack(tmp_path / "study.json", tmp_path / "again")
-    assert {path.name for path in (tmp_path / "again").rglob("*.*")} == {"one.json", "table.md"}
     assert (tmp_path / "again" / "table.md").read_text() == "| a |\n|---|\n"
     found = json.loads((tmp_path / "again" / "runs" / "one.json").read_text())
     assert found["train"]["splats"] == [[0, 0], [500, 5000], [1000, 10000], [1149, 7]]
@@ -153,4 +150,3 @@ def test_costs_are_ratios_of_geometric_means():
     assert result["half"].is_noise and "shared" not in result  # its time was not measured alone
     rows = [row("default", record(30.0)), row("empty", record(5.0, splats=0))]
     assert set(changes(rows, rows[0], BY_NAME["splats"], ratio=True)) == {"default"}
-

@@ -68,10 +68,3 @@ def test_checkpoints_of_other_arguments_are_cleared(tmp_path):
     assert last_checkpoint(tmp_path) is not None
     forget_other_arguments(tmp_path, {"options": ["b"]})
     assert last_checkpoint(tmp_path) is None and not (tmp_path / "train.json").exists()
-
-
-def test_a_finished_run_is_not_repeated_by_a_late_child(tmp_path, trained):
-    job = job_in(tmp_path)
-    Path(job.record).write_text("{}")
-    bench_run.run(job)
-    assert not trained and Path(job.record).read_text() == "{}"

@@ -133,4 +133,3 @@ def test_a_training_goes_on_as_if_it_had_not_stopped(tiny_scene, tmp_path):
     assert rates[0] == rates[1]
     for method in (continued, unbroken):
         method.close()
-

@@ -22,11 +22,9 @@ from smoke_runs import recorded
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
 from nrfgs_lab.pages.tables import pages
 from nrfgs_lab.training_run import evaluate, parse, train
-from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import commands
 from nrfgs_ns.densification import strategy_from
-from nrfgs_ns.viewer.pictures import legends
 
 CONTRIBUTING = Path(__file__).resolve().parents[3] / "docs" / "contributing.md"
 
