@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Densification strategies: what they delete, copy, move and add, and by which thresholds."""
 
+import math
 from copy import deepcopy
 
 import pytest
@@ -207,6 +208,13 @@ def test_growth_ends_at_the_budget(name, budget):
     assert sizes[-1] >= 0.95 * budget
     middle = sizes[len(sizes) // 2]  # three quarters of the way: 2x - x^2 at a half
     assert abs(middle - (60 + 0.75 * (max(budget, 60) - 60))) <= 0.15 * middle
+
+
+def test_the_threshold_follows_the_course_in_small_steps():
+    rules = strategy("original", budget=1000)
+    rules.state["grad2d"], rules.state["count"] = torch.zeros(1000), torch.ones(1000)
+    assert rules._threshold_for_budget(500, 100) == pytest.approx(rules.threshold)  # on course
+    assert rules._threshold_for_budget(7700, 100) == pytest.approx(rules.threshold * math.exp(-0.12))  # far behind
 
 
 def test_a_budget_goes_on_from_a_checkpoint():

@@ -2,7 +2,6 @@
 """What is loaded for an export, where its splats lie, and what other programs read of it."""
 
 import shutil
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -18,7 +17,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.ply import on_screen, render_splats
-from nrfgs_ns.trained.loading import load_model, load_training, measure_loss
+from nrfgs_ns.trained.loading import load_training, measure_loss
 from nrfgs_ns.trained.view import View
 from nrfgs_ns.training.checkpoint_files import find
 from nrfgs_ns.training.trainer import end_earlier_logs
@@ -69,13 +68,6 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_pat
         load_training(config, "test")
     with pytest.raises(InputError, match=r"its data set is not at .*/moved/data\. Put it there"):
         load_training(beside, "test")
-
-
-def test_a_model_without_splats_is_told(monkeypatch):
-    empty = SimpleNamespace(pipeline=SimpleNamespace(model=SimpleNamespace(num_points=0)))
-    monkeypatch.setattr("nrfgs_ns.trained.loading.load_training", lambda path, mode: empty)
-    with pytest.raises(InputError, match="config.yml: this training has lost all splats"):
-        load_model(Path("config.yml"), "test")
 
 
 def test_views_of_which_nothing_counts_are_told():

@@ -38,8 +38,8 @@ def test_the_command(tiny_scene, tmp_path, capsys):
     assert rows["latent rank 6"]["loss_db"] == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
     assert rows["all residuals"]["diffuse"] == 1.0
     assert rows["latent rank 1"]["bytes"] < rows["latent rank 2"]["bytes"] < rows["nothing"]["bytes"]
-    shares = [row["diffuse"] for row in result["rows"] if row["group"] == "residual"]
-    assert shares == sorted(shares), "the larger the change that may go, the more splats are diffuse"
+    below = rows["residuals below 0.5 steps"]  # what no view shows
+    assert below["diffuse"] < 0.5 and abs(below["loss_db"]) < 0.01
     assert result["together"]["loss_db"] <= 0.05 + 1e-6 and result["together"]["bytes"] <= rows["nothing"]["bytes"]
     assert "can be left out together" in capsys.readouterr().out
     with pytest.raises(InputError, match="0 of 2 test views"):

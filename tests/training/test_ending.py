@@ -19,7 +19,7 @@ from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import checkpoint_files, stopping
 from nrfgs_ns.training.checkpoint_files import DiskFull, find
 from nrfgs_ns.training.guard import TrainingStopped
-from nrfgs_ns.training.stopping import StopRequest, heard_signals
+from nrfgs_ns.training.stopping import StopRequest, heard_signals, rows_agree
 from nrfgs_ns.training.trainer import NrfgsTrainer, writer
 from nrfgs_ns.training.trainer_config import parse
 
@@ -269,7 +269,7 @@ def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, 
         assert capsys.readouterr().out.splitlines() == [f"nrfgs on {tiny_scene}"]
 
 
-# Signals, without a training.
+# Signals and states, without a training.
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -309,3 +309,23 @@ def test_only_a_second_ctrl_c_stops_at_once(second, seconds, ends, monkeypatch):
     now[0] += seconds
     request.hear(second)
     assert ended == ([130] if ends else [])
+
+
+def table(rows: int):
+    splats = {name: torch.nn.Parameter(torch.zeros(rows, 3)) for name in ("means", "scales")}
+    optimizers = {name: torch.optim.Adam([value]) for name, value in splats.items()}
+    for name, value in splats.items():
+        value.grad = torch.ones_like(value)
+        optimizers[name].step()
+    return splats, optimizers
+
+
+def test_a_table_that_is_half_changed_is_known():
+    splats, optimizers = table(5)
+    assert rows_agree(splats, optimizers, [torch.zeros(5), None, 0.5, torch.tensor(3)])
+    assert not rows_agree(splats, optimizers, [torch.zeros(6)])
+    longer = torch.nn.Parameter(torch.zeros(6, 3))
+    assert not rows_agree({**splats, "means": longer}, optimizers, [])
+    assert not rows_agree({name: torch.nn.Parameter(torch.zeros(6, 3)) for name in splats}, optimizers, [])
+    optimizers["scales"].state[splats["scales"]]["exp_avg"] = torch.zeros(4, 3)
+    assert not rows_agree(splats, optimizers, [])

@@ -188,13 +188,13 @@ def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
         state = checkpoint_of(config)
         return record, models_of(config), state["step"], state["training"]["pace"]
 
-    record, folder, last, pace = run("a", 0.5)
-    assert record.steps == 30 and last == 29 and record.saved == [[29, record.seconds]]
-    assert pace["position"] > 39 and pace["seconds"] == 30
-    with pytest.raises(InputError, match="used its time budget of 0.5 minutes. A larger --time-budget goes on"):
-        run("b", 0.5, {"--load-dir": folder})
-    record, _, last, pace = run("c", 0.6, {"--load-dir": folder})
-    assert record.steps == 6 and last == 35 and pace["seconds"] == 36
+    record, folder, last, pace = run("a", 0.2)
+    assert record.steps == 12 and last == 11 and record.saved == [[11, record.seconds]]
+    assert pace["position"] > 36 and pace["seconds"] == 12
+    with pytest.raises(InputError, match="used its time budget of 0.2 minutes. A larger --time-budget goes on"):
+        run("b", 0.2, {"--load-dir": folder})
+    record, _, last, pace = run("c", 0.3, {"--load-dir": folder})
+    assert record.steps == 6 and last == 17 and pace["seconds"] == 18
 
 
 def test_what_is_left_open_is_chosen_and_what_is_given_stays():

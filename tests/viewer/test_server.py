@@ -16,11 +16,10 @@ from short_trainings import command_line, set_up, trained
 from viser._messages import ResetGuiMessage, ViewerCameraMessage
 from websockets.asyncio.client import connect
 
-from nrfgs_ns.compact.format import MAGIC
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact
 from nrfgs_ns.trained.loading import load_model
-from nrfgs_ns.trained.view import View, view_file
+from nrfgs_ns.trained.view import view_file
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -323,11 +322,3 @@ def test_nrfgs_view_opens_a_compact_file_alone(config, tmp_path, monkeypatch):
     finally:
         viewer.viser_server.stop()
     assert os.listdir(tmp_path / "alone") == ["it.nrf"], "nothing is written beside it"
-
-
-def test_nrfgs_view_refuses_what_it_cannot_open(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        View(tmp_path / "none.nrf").main()
-    (tmp_path / "broken.nrf").write_bytes(MAGIC + b"1234")
-    with pytest.raises(InputError, match="broken.nrf"):
-        View(tmp_path / "broken.nrf").main()

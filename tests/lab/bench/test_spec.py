@@ -76,6 +76,7 @@ def test_which_trainings_a_plan_has():
     "content, says",
     [
         ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
+        ({"runs": {"NRF": {"method": "nrfgs", "colour": 3}}}, "NRF: unknown key.*colour"),
         ({"strategies": ["mcmc@many"]}, "budget is 'many'"),
         ({"seeds": ["x"]}, "seeds"),
         ({"scenes": ["a b", "a_b"]}, "twice"),

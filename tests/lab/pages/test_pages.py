@@ -24,7 +24,6 @@ from nrfgs_lab.pages.tables import pages
 from nrfgs_lab.training_run import evaluate, parse, train
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import commands
-from nrfgs_ns.densification import strategy_from
 
 CONTRIBUTING = Path(__file__).resolve().parents[3] / "docs" / "contributing.md"
 
@@ -109,14 +108,6 @@ def test_options_that_pages_name_are_there():
     }
     assert len(shown) > 15
     assert {flag.replace("_", "-") for flag in shown} <= known
-
-
-def test_strategies_that_pages_name_are_there():
-    text = "".join(path.read_text(encoding="utf-8") for path in pages())
-    words = set(re.findall(r"--pipeline\.model\.densification ([a-z][\w-]*(?:,\w+=[\w.-]*\w)*)", text))
-    assert len(words) > 4
-    for word in words:
-        strategy_from(word)
 
 
 def commands_shown() -> list[str]:
