@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is at the top of the package: messages for the user, files written whole; and that open3d is hidden here."""
+"""What is at the top of the package: messages for the user, and files written whole."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ RAISE = "from nrfgs_ns.errors import InputError\nraise InputError('x.json is mis
 @pytest.mark.parametrize("debug", ["0", "1"])
 def test_it_is_the_last_line_and_the_status_1(debug):
     environment = {**os.environ, "NRFGS_DEBUG": debug}
-    run = subprocess.run([sys.executable, "-c", RAISE], capture_output=True, text=True, env=environment)
+    run = subprocess.run([sys.executable, "-c", RAISE], capture_output=True, text=True, env=environment, timeout=300)
     assert run.returncode == 1
     assert run.stderr.splitlines()[-1].endswith("x.json is missing. Make one.")
     assert ("Traceback" in run.stderr) == (debug == "1")
@@ -55,10 +55,3 @@ def test_what_cannot_be_written_is_told_beforehand(tmp_path):
     for path in (tmp_path / "file" / "x", tmp_path / ("x" * 250)):
         with pytest.raises(InputError, match="--output .* cannot be written .*Name a file"):
             check_writable(path, "--output")
-
-
-def test_open3d_is_hidden_here_and_in_processes_that_tests_start():
-    with pytest.raises(ImportError, match="hidden from the tests"):
-        import open3d  # noqa: F401
-    run = subprocess.run([sys.executable, "-c", "import open3d"], capture_output=True, text=True)
-    assert run.returncode == 1 and "hidden from the tests" in run.stderr

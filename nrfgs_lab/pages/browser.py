@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's viewer in a headless Chromium, for the viewer's tests and the pictures in the docs.
+"""Nerfstudio's viewer in a headless Chromium, for the pictures in the docs; and the browser of the tests of pages.
 
 pip install -e '.[browser]'; apt-get install chromium
 """
@@ -14,14 +14,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-TRAIN = "nerfstudio.scripts.train:entrypoint"
-VIEWER = "nerfstudio.scripts.viewer.run_viewer:entrypoint"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 PATIENCE = 300
 """Seconds to wait for anything on a slow, busy machine."""
@@ -43,27 +41,24 @@ def chromium() -> Iterator:
 
 
 class Served:
-    """A nerfstudio command on a CPU that serves the viewer, with PNG pictures, until the block ends.
+    """ns-viewer on a CPU, with PNG pictures, until the block ends.
 
     Args:
-        entry: TRAIN or VIEWER.
         log: file for its output.
         options: words before the viewer's.
-        tail: words after the viewer's, such as the data set's.
     """
 
-    def __init__(self, entry: str, log: Path, *options, tail: Sequence = ()):
+    def __init__(self, log: Path, *options):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         viewer = {"websocket-host": "127.0.0.1", "websocket-port": self.port, "image-format": "png"}
         words = [*(word for name, value in viewer.items() for word in (f"--viewer.{name}", value))]
-        module, function = entry.split(":")
-        code = f"import sys; from {module} import {function}; sys.exit({function}())"
+        code = "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
         self.log = log
         with log.open("w") as out:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", code, *map(str, [*options, *words, *tail])],
+                [sys.executable, "-c", code, *map(str, [*options, *words])],
                 stdout=out,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "CUDA_VISIBLE_DEVICES": ""},
@@ -119,10 +114,6 @@ class Page:
         self.control(label).fill(f"{number:g}")
         self.control(label).press("Enter")
 
-    def set_gain(self, gain: float) -> None:
-        """Set the residual gain."""
-        self.enter("Residual gain", gain)
-
     def hide_cameras(self) -> None:
         """Hide the training cameras."""
         self.page.get_by_text("Hide Train Cams").click()
@@ -135,17 +126,6 @@ class Page:
     def set_resolution(self, pixels: int) -> None:
         """Set the longer side of the picture."""
         self.enter("Max res", pixels)
-
-    def step(self) -> int:
-        """Training step on the page."""
-        return int(re.search(r"Step:\s*(\d+)", self.page.inner_text("body")).group(1))
-
-    def turn(self) -> None:
-        """Drag the mouse across the scene."""
-        self.page.mouse.move(250, 450)
-        self.page.mouse.down()
-        self.page.mouse.move(400, 430, steps=8)
-        self.page.mouse.up()
 
     def shot(self) -> np.ndarray:
         """Picture of the scene now, [H, W, 3] in 0..255."""
@@ -174,13 +154,6 @@ class Page:
         """Whether the latest picture has full size."""
         sides = re.search(r"Resolution:\s*(\d+)x(\d+)px", self.page.inner_text("body"))
         return sides is not None and max(map(int, sides.groups())) == int(self.control("Max res").input_value())
-
-    def returns_to(self, picture: np.ndarray) -> None:
-        """Wait until the scene looks like a picture."""
-        deadline = time.time() + PATIENCE
-        while different(self.shot(), picture):
-            assert time.time() < deadline, "the picture did not come back"
-            time.sleep(0.3)
 
     def save(self, path: Path, quality: int = 85) -> None:
         """Write the page as a JPEG, without the logo, which comes from another site."""

@@ -12,7 +12,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image, ImageDraw
 
 from nrfgs_lab.bench.crops import GAP, TITLE
-from nrfgs_lab.pages.browser import VIEWER, Page, Served, chromium
+from nrfgs_lab.pages.browser import Page, Served, chromium
 from nrfgs_ns.viewer.pictures import PictureOptions, legends, picture
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
@@ -40,7 +40,7 @@ def sheet(config: Path, view: int = 1) -> None:
 def viewer(config: Path) -> None:
     """Write viewer.jpg, the page of ns-viewer close to the residual."""
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:
-        with Served(VIEWER, Path(folder) / "log", "--load-config", config) as served:
+        with Served(Path(folder) / "log", "--load-config", config) as served:
             page = Page(browser, served.port, 1180, 680)
             page.hide_cameras()
             page.come_closer()

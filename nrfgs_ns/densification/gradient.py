@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Growth where screen-space gradients are large: splatfacto's densification, and 3DGS's (Kerbl et al. 2023)."""
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -15,6 +16,16 @@ from nrfgs_ns.densification.strategy import Densification, DensificationConfig, 
 
 EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
+THRESHOLD = "log_threshold"
+"""Name in the strategy's `state`: logarithm of what the gradient's threshold is multiplied by, to meet a budget."""
+FIRST = "first_count"
+"""Name in the strategy's `state`: splats at the first refinement, where a budget's course starts."""
+RECOVERY = 3
+"""Refinements after a reset of opacities at which a training with a budget prunes nothing."""
+DEAD_BAND = 0.01
+"""Share by which the number of splats may differ from a budget's course before the threshold moves."""
+LARGEST_STEP = 0.12
+"""Largest change of the threshold's logarithm at a refinement."""
 STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop_iter")
 """What begins or ends by step number in gsplat's strategy."""
 
@@ -27,6 +38,8 @@ class GradientConfig(DensificationConfig):
     """step at which growth ends"""
     reset_alpha_every: int = 30
     """refinements between two resets of opacities"""
+    budget: int = 0
+    """number of splats to grow to: the gradient's threshold follows (arXiv 2605.16158). 0: the threshold decides"""
 
     def check(self) -> None:
         super().check()
@@ -41,7 +54,10 @@ class GradientConfig(DensificationConfig):
             reset_every=self.reset_alpha_every * self.refine_every,
             **thresholds,
         )
-        return GradientDensification(self.name, rules, self.opacity_seen, scene_unit)
+        return GradientDensification(self.name, rules, self.opacity_seen, scene_unit, self.budget)
+
+    def share_of(self, rank: int, devices: int) -> "GradientConfig":
+        return replace(self, budget=len(range(rank, self.budget, devices)))
 
 
 @dataclass
@@ -127,14 +143,25 @@ class GradientDensification(Densification):
         opacity_seen: which opacity pruning looks at. A reset always acts on the stored one.
         scene_unit: world units in a scene unit, which sizes are measured in; None: as in 3DGS, in extents of the
             cameras, and opacities are not reset at step 0, as gsplat 1.4 does: 3DGS counts its steps from 1.
+        budget: splats to have when growth ends; 0: as many as the threshold lets grow.
     """
 
-    def __init__(self, name: str, strategy: PruneBySeenOpacity, opacity_seen: OpacitySeen, scene_unit: float | None):
+    def __init__(
+        self,
+        name: str,
+        strategy: PruneBySeenOpacity,
+        opacity_seen: OpacitySeen,
+        scene_unit: float | None,
+        budget: int = 0,
+    ):
         super().__init__(opacity_seen)
         self.name = name
         self.strategy = strategy
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
+        self.budget, self.threshold = budget, strategy.grow_grad2d
+        if budget:
+            self.state |= {THRESHOLD: 0.0, FIRST: None}
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
         if opacity_seen == "peak":
             strategy.seen_opacity = self.seen_opacity
@@ -184,9 +211,13 @@ class GradientDensification(Densification):
     def _refine(self, step: int, splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
         strategy, state = self.strategy, self.state
+        if self.budget:
+            strategy.grow_grad2d = self._threshold_for_budget(step, len(splats["means"]))
         duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
         grown = len(splats["means"])
-        pruned = strategy._prune_gs(splats, optimizers, state, step)
+        pruned = 0
+        if not self.budget or step % strategy.reset_every >= RECOVERY * strategy.refine_every:
+            pruned = strategy._prune_gs(splats, optimizers, state, step)
         if self.verbose:
             print(f"Step {step}: {duplicated} GSs duplicated, {split} GSs split. Now having {grown} GSs.")
             print(f"Step {step}: {pruned} GSs pruned. Now having {len(splats['means'])} GSs.")
@@ -194,6 +225,28 @@ class GradientDensification(Densification):
             if name in state:
                 state[name].zero_()
         torch.cuda.empty_cache()
+
+    def _threshold_for_budget(self, step: int, count: int) -> float:
+        """The gradient above which splats grow now, for as many as the budget by the end of growth.
+
+        With x the share of growth that is over, the course of the number is N0 + (2x - x^2) (budget - N0). Where the
+        number is off it, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more splats grow than
+        bring the number to its course.
+        """
+        strategy, state = self.strategy, self.state
+        if state[FIRST] is None:
+            state[FIRST] = count
+        growth = strategy.refine_stop_iter - strategy.refine_start_iter
+        x = min((step - strategy.refine_start_iter) / max(growth - strategy.refine_every, 1), 1.0)
+        goal = state[FIRST] + (2 * x - x * x) * (self.budget - state[FIRST])
+        if abs(count - goal) > DEAD_BAND * goal:
+            move = math.log(count / goal)
+            state[THRESHOLD] += max(-LARGEST_STEP, min(move, LARGEST_STEP))
+        threshold, room = self.threshold * math.exp(state[THRESHOLD]), max(round(goal) - count, 0)
+        gradients = state["grad2d"] / state["count"].clamp_min(1)
+        if room < count:  # the threshold is exclusive
+            threshold = max(threshold, gradients.kthvalue(count - room).values.item())
+        return threshold
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         for name, step in self.bounds.items():

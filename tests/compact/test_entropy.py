@@ -4,7 +4,6 @@
 import hashlib
 import json
 import shutil
-import struct
 import subprocess
 from functools import cache
 from importlib.resources import files
@@ -15,7 +14,7 @@ from compact_fields import write_container
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.compact.entropy import LOWEST, BadStream, decode_table, encode_table
+from nrfgs_ns.compact.entropy import BadStream, decode_table, encode_table
 from nrfgs_ns.compact.format import Table
 
 
@@ -107,23 +106,14 @@ def test_another_shape_is_refused(columns, rows):
         decode_table(model, data, columns, rows)
 
 
-def test_a_stream_that_is_cut_or_longer_is_refused():
-    model, data = encode_table(laplacian(2, 200))
-    for broken in (data[:-2], data[:-1], data + b"\0\0", data[:3], b"", struct.pack("<I", LOWEST - 1) + data[4:]):
-        with pytest.raises(BadStream):
-            decode_table(model, broken, 2, 200)
-    for broken in (model[:-1], np.append(model, np.int32(0)), model[:0]):
-        with pytest.raises(BadStream):
-            decode_table(broken, data, 2, 200)
-
-
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node: the page's reader is tried by pytest -m browser")
 def test_the_pages_reader_finds_the_same_numbers(tmp_path):
     tables = {name: Table(table, signed) for name, (table, signed) in TABLES.items()}
     write_container(tmp_path / "tables.nrf", {}, {**tables, "plain": np.arange(5, dtype=np.uint16)})
     script = (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + READ
     (tmp_path / "read.js").write_text(script, encoding="utf-8")
-    said = subprocess.run(["node", "read.js", "tables.nrf"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    words = ["node", "read.js", "tables.nrf"]
+    said = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=300)
     for name, found in json.loads(said.stdout).items():
         table, signed = TABLES[name]
         assert found == hashlib.sha256(table.astype("<i4" if signed else "<u4").tobytes()).hexdigest(), name

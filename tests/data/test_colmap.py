@@ -108,17 +108,6 @@ def test_names_with_spaces_and_images_without_features(tmp_path):
     assert "a b.png" in [path.name for path in parse(scene).image_filenames]
 
 
-def test_where_the_model_is(scene, tmp_path):
-    (scene / "colmap").rename(scene / "elsewhere")
-    with pytest.raises(InputError, match="Name the folder of the COLMAP model with --colmap-path"):
-        parse(scene)
-    (scene / "elsewhere" / "sparse").rename(scene / "sparse")
-    with pytest.raises(InputError, match=r"There is a COLMAP model in .*sparse/0: give --colmap-path"):
-        parse(scene)
-    with pytest.raises(InputError, match=r"There is a COLMAP model: put `colmap --colmap-path sparse/0` at the end"):
-        NrfgsDataParserConfig(data=scene).setup().get_dataparser_outputs()
-
-
 def test_real_model(captures):
     outputs = same_as_nerfstudio(captures / "fox", colmap_path=MODEL.relative_to("colmap"))
     assert len(outputs.image_filenames) == 7 and np.isfinite(outputs.dataparser_scale)

@@ -223,13 +223,3 @@ def test_no_room_for_files_is_said(capture, tmp_path, monkeypatch):
         manager(capture, image_memory=0.0).load_all_images()
     with pytest.raises(InputError, match="image-memory is -1"):
         manager(capture, image_memory=-1.0)
-
-
-def test_the_first_broken_image_ends_the_reading(capture, monkeypatch):
-    capture.save()
-    for name in ("002", "005"):
-        (capture.folder / f"images/{name}.png").write_bytes(b"no picture")
-    monkeypatch.setattr("nrfgs_ns.data.dataparser.check_headers", lambda paths, *_: ["RGB"] * len(paths))
-    data = manager(capture, max_thread_workers=3)
-    with pytest.raises(InputError, match=r"images/002.png"):
-        data.load_all_images()

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from hard_trainings import rescale
+from moved_scenes import rescale
 from nerfstudio.cameras.cameras import Cameras
 from short_trainings import command_line, set_up
 
@@ -62,7 +62,6 @@ def test_the_nearest_depth_is_that_of_the_camera_that_comes_nearest(scale, size)
 
 
 def moved(poses, sigma):
-    """The same poses with noise on their centres."""
     noise = torch.zeros_like(poses)
     noise[:, :, 3] = sigma * torch.randn(len(poses), 3, dtype=poses.dtype, generator=torch.Generator().manual_seed(0))
     return poses + noise

@@ -66,13 +66,6 @@ def test_what_nerfstudio_writes_beside_the_checkpoints_leads_back(tmp_path):
         np.testing.assert_allclose(pose, truth[path.name][:3], atol=1e-5, rtol=0)
 
 
-def test_without_centring_coordinates_stay(tmp_path):
-    far, _ = with_points(tmp_path / "far", UTM)
-    outputs = far.parse(center_method="none", orientation_method="none", auto_scale_poses=False)
-    assert outputs.dataparser_transform.dtype == torch.float32
-    assert outputs.cameras.camera_to_worlds[:, 1, 3].min() > 5_000_000
-
-
 def test_an_applied_transform_is_part_of_the_way_back(tmp_path):
     """The capture's own world is that from before it."""
     far, xyz = with_points(tmp_path / "far", UTM)

@@ -54,12 +54,17 @@ def test_diffuse_is_gsplats_noise():
     assert_close(results[0], results[1], rtol=1e-4, atol=1e-6 * results[1].abs().max().item())
 
 
-def test_one_camera_is_the_kernels(monkeypatch):
+def one_view() -> dict:
+    """What a camera saw: 3000 of 5000 splats, some of them of no size."""
     torch.manual_seed(0)
-    info = {
-        "width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": torch.randperm(5000, device="cuda")[:3000],
-        "radii": torch.randint(1, 90, (3000,), dtype=torch.int32, device="cuda"),
-    }  # fmt: skip
+    rows = torch.randperm(5000, device="cuda")[:3000]
+    radii = torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda")
+    return {"width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": rows, "radii": radii}
+
+
+def test_one_camera_is_the_kernels(monkeypatch):
+    info = one_view()
+    info["radii"] += 1
     state = {name: torch.zeros(5000, device="cuda") for name in ("grad2d", "count", "radii")}
     gradients = torch.randn(3000, 2, device="cuda")
     twin = {name: value.clone() for name, value in state.items()}
@@ -71,16 +76,8 @@ def test_one_camera_is_the_kernels(monkeypatch):
 
 
 def test_one_cameras_maxima_are_the_kernels(monkeypatch):
-    torch.manual_seed(0)
-    info = {
-        "width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": torch.randperm(5000, device="cuda")[:3000],
-        "radii": torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda"),
-    }  # fmt: skip
-    maxima = [
-        torch.zeros(5000, device="cuda"),
-        torch.zeros(5000, device="cuda"),
-        torch.full((5000,), -2.0, device="cuda"),
-    ]
+    info = one_view()
+    maxima = [torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)]
     step = torch.randn(3000, 2, device="cuda"), torch.rand(3000, device="cuda") - 0.5
     twin = [value.clone() for value in maxima]
     statistics.raise_in_torch(*twin, info["gaussian_ids"], info["radii"], *step, 640.0, (640.0, 480.0))

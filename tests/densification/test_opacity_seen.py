@@ -55,15 +55,6 @@ def test_the_peak_is_forgotten_at_refinement(name):
     assert 7 not in table.splats["latents"][:, 0].long()
 
 
-def test_each_strategy_has_its_own_idea_of_a_dead_splat():
-    """What was measured to be better (docs/bench.md); asked for, each does the other."""
-    seen = {name: strategy(name).opacity_seen for name in STRATEGIES}
-    assert seen == {"splatfacto": "base", "original": "base", "mcmc": "peak"}
-    for name in STRATEGIES:
-        for asked in ("base", "peak"):
-            assert strategy(name, opacity_seen=asked).opacity_seen == asked
-
-
 # Heads whose opacity is the stored one.
 
 

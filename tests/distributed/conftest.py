@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
+import contextlib
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -9,22 +11,27 @@ import pytest
 from filelock import FileLock
 
 DEVICE = Path(__file__).with_name("device.py")
-TIMEOUT = 3600
-"""Seconds after which processes that wait for each other for good are ended, on however slow a machine."""
+TIMEOUT = 500
+"""Seconds after which processes that wait for each other for good are ended: before pytest ends the test."""
 
 
 def meet(job: str, scene: Path, folder: Path, world: int = 2, device_type: str = "cpu") -> Path:
     """Run a job of `jobs.py` on `world` processes; `folder`, into which they save their results."""
     folder.mkdir(parents=True, exist_ok=True)
-    run = subprocess.run(
+    process = subprocess.Popen(
         [sys.executable, str(DEVICE), job, str(world), str(scene), str(folder), device_type],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
-        timeout=TIMEOUT,
+        start_new_session=True,
     )
-    assert run.returncode == 0, run.stdout[-6000:]
+    try:
+        said, _ = process.communicate(timeout=TIMEOUT)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # its children, too
+    assert process.returncode == 0, said[-6000:]
     return folder
 
 
@@ -34,7 +41,7 @@ def two_devices(tiny_scene, tmp_path_factory) -> Path:
     want them, the first makes them."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "two-devices"
-    with FileLock(folder.with_suffix(".lock")):
+    with FileLock(folder.with_suffix(".lock"), timeout=TIMEOUT):
         if not (folder / "done").exists():
             shutil.rmtree(folder, ignore_errors=True)  # of a meeting that failed
             meet("everything", tiny_scene, folder)

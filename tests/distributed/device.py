@@ -137,7 +137,6 @@ def values_and_gradients(pipeline) -> dict:
 
 
 def statistics(model, info) -> dict:
-    """Densification's, after it has seen a step."""
     from nrfgs_ns.densification.gradient import GradientDensification
 
     rules = model.densification

@@ -33,16 +33,6 @@ def everything(scene: Path, folder: Path) -> None:
     averaged(scene, folder)
 
 
-def unbroken(scene: Path, folder: Path) -> None:
-    """24 steps at once, and 12 and 12 more from the checkpoint."""
-    world = dist.get_world_size()
-    whole = told(train(scene, folder / "whole", world, 24, **PLAIN, **MORE))
-    half = told(train(scene, folder / "half", world, 12, **PLAIN, **MORE))
-    rest = told(train(scene, folder / "rest", world, 24, load=half, **PLAIN, **MORE))
-    if dist.get_rank() == 0:
-        torch.save([str(path) for path in (whole, half, rest)], folder / "unbroken.pt")
-
-
 def fifty_steps(scene: Path, folder: Path) -> None:
     """50 steps with splits, pruning and resets; how the shards fared is saved beside the checkpoint."""
     counts = []
@@ -58,7 +48,6 @@ def fifty_steps(scene: Path, folder: Path) -> None:
 
 
 def after_each(trainer, do) -> None:
-    """Call `do(step)` after each step."""
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], do))
 
 
@@ -85,7 +74,6 @@ def there_and_back(scene: Path, folder: Path) -> None:
 
 
 def evaluation(trainer) -> dict:
-    """What the test images say, without times."""
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     return {name: value for name, value in metrics.items() if name not in ("seconds_per_image", "fps")}
 
@@ -142,9 +130,8 @@ def stops_together(scene: Path, folder: Path) -> None:
 
 def averaged(scene: Path, folder: Path) -> None:
     """12 steps with a mean over the last 10, and the last 4 of them again, from the checkpoint in between. That is
-    also looked at by one process. Then it goes on once more, until the second device has a splat that is NaN."""
+    also looked at by one process."""
     from nrfgs_ns.training import averaging
-    from nrfgs_ns.training.guard import TrainingStopped
 
     averaging.LARGEST_SHARE = 1.0
     world, main = dist.get_world_size(), dist.get_rank() == 0
@@ -166,29 +153,13 @@ def averaged(scene: Path, folder: Path) -> None:
 
         after_each(trainer, keep)
 
-    def spoil(trainer) -> None:
-        lopsided(trainer)
-
-        @torch.no_grad()
-        def break_splat(step: int) -> None:
-            if step == 9 and not main:
-                trainer.pipeline.model.means[0] = float("nan")
-
-        after_each(trainer, break_splat)
-
     options = {**PLAIN, **AVERAGED, "--pipeline.model.photographs": "on"}
     with CONSOLE.capture() as log:
         trainer = train(scene, folder / "averaged", world, 12, watch=watch, **options)
     whole, ended = told(trainer), parameters(trainer)
     from_between = {**options, "--load-step": 7}
     rest = told(train(scene, folder / "averaged-rest", world, 12, load=whole, watch=lopsided, **from_between))
-    again = {**from_between, "--steps-per-save": 9}
-    try:
-        train(scene, folder / "averaged-nan", world, 12, load=whole, watch=spoil, **again)
-        stopped = False
-    except TrainingStopped:
-        stopped = True
-    result = {"after": after, "counts": counts, "ended": ended, "said": log.get(), "stopped": stopped}
+    result = {"after": after, "counts": counts, "ended": ended, "said": log.get()}
     result["exposures"] = trainer.pipeline.model.photograph.shots.detach().clone()
     if main:
         alone = trainer_of(scene, folder / "averaged-alone", 1, **from_between, **{"--load-dir": whole})
@@ -199,6 +170,5 @@ def averaged(scene: Path, folder: Path) -> None:
 
 
 def parameters(trainer) -> dict:
-    """A device's splats and shared weights, now."""
     named = trainer.pipeline.model.named_parameters()
     return {name: value.detach().clone() for name, value in named if name.startswith(("gauss_params.", "head."))}

@@ -20,3 +20,22 @@ def demo(tiny_scene, tmp_path_factory):
     config = trained(command_line("nrfgs", tiny_scene, folder, 80, options))
     Web(config, output=folder / "page.html").main()
     return config, folder / "page.html"
+
+
+@pytest.fixture
+def wall(browser, tmp_path):
+    """Open a page of a wall; `more`: values for its scripts; `tail`: of its address."""
+    from web_pages import Page, page_with, wall_scene
+
+    opened = []
+
+    def page(size=(320, 240), before="", tail="", **more) -> Page:
+        scene, photographs = wall_scene(tmp_path)
+        (tmp_path / "page.html").write_text(page_with(scene.read_bytes(), photographs, **more))
+        opened.append(Page(browser, (tmp_path / "page.html").as_uri() + tail, size, before).begun())
+        return opened[-1]
+
+    yield page
+    for page in opened:
+        assert not page.errors
+        page.page.close()

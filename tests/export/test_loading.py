@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is loaded for an export, where its splats lie, and what other programs read of it."""
 
-import re
 import shutil
-import subprocess
-from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from compact_fields import plain_splats
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.scripts.viewer import run_viewer
-from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 from short_trainings import command_line, models_of, trained
 from torch.testing import assert_close
@@ -21,8 +16,8 @@ from torch.testing import assert_close
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
-from nrfgs_ns.export.ply import on_screen, render_splats, write_splats
-from nrfgs_ns.trained.loading import load_model, load_training, measure_loss
+from nrfgs_ns.export.ply import on_screen, render_splats
+from nrfgs_ns.trained.loading import load_training, measure_loss
 from nrfgs_ns.trained.view import View
 from nrfgs_ns.training.checkpoint_files import find
 from nrfgs_ns.training.trainer import end_earlier_logs
@@ -75,13 +70,6 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_pat
         load_training(beside, "test")
 
 
-def test_a_model_without_splats_is_told(monkeypatch):
-    empty = SimpleNamespace(pipeline=SimpleNamespace(model=SimpleNamespace(num_points=0)))
-    monkeypatch.setattr("nrfgs_ns.trained.loading.load_training", lambda path, mode: empty)
-    with pytest.raises(InputError, match="config.yml: this training has lost all splats"):
-        load_model(Path("config.yml"), "test")
-
-
 def test_views_of_which_nothing_counts_are_told():
     """Also before a page is written, which is after the measurement."""
     data = SimpleNamespace(eval_dataset=SimpleNamespace(image_filenames=[]), fixed_indices_eval_dataloader=[])
@@ -127,11 +115,6 @@ def test_the_picture_is_the_same(similarity):
         assert_close(value, getattr(original, name), rtol=1e-5, atol=2e-6, msg=name)
 
 
-def test_nowhere_is_to_the_bit():
-    original = plain_splats(40)
-    assert NOWHERE.inverse.moved(NOWHERE.moved(original)) is original
-
-
 def test_coordinates_of_the_earth_keep_their_precision():
     """Less the frame's origin, which the file's header tells."""
     rotation, center = random_rotation(3), torch.tensor([448_262.3, 5_412_345.6, 311.2], dtype=torch.float64)
@@ -152,33 +135,3 @@ def test_on_screen_is_what_sparks_shader_keeps():
     behind = torch.tensor([[0.0, 0.0, 6.0]])
     found = on_screen(torch.cat([means, behind]), camera(NOWHERE))
     assert found.tolist() == [True, True, True, False, True, False, False]
-
-
-TOOL = shutil.which("splat-transform")
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "export.md"
-COMMANDS = re.findall(r"^splat-transform (.*?)\s*(?:#.*)?$", DOCS.read_text(encoding="utf-8"), re.MULTILINE)
-
-
-def test_the_page_names_commands():
-    assert len(COMMANDS) >= 4
-
-
-@pytest.mark.skipif(TOOL is None, reason="no splat-transform: npm install -g @playcanvas/splat-transform@3.7")
-@pytest.mark.parametrize("words", COMMANDS)
-def test_a_command_of_the_page_works(words, tmp_path):
-    original = plain_splats(500)
-    write_splats(original, tmp_path / "splats.ply")
-    done = subprocess.run([TOOL, *words.split()], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr + done.stdout
-    out = tmp_path / next(word for word in reversed(words.split()) if word.startswith("splats."))
-    assert out.stat().st_size > 1000
-    back = [TOOL, out.name, "back.ply"]
-    if out.suffix in (".spz", ".sog", ".ply"):
-        done = subprocess.run(back, cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr + done.stdout
-        vertices = PlyData.read(str(tmp_path / "back.ply"))["vertex"]
-        found = torch.from_numpy(np.stack([vertices[axis] for axis in "xyz"], axis=1))
-        assert len(found) == len(original.means)
-        # Another order, and rounded: 24 bits of fixed point in .spz, 16 of a logarithm in .sog, 11 in compressed PLY.
-        expected = original.means[original.means[:, 0].argsort()]
-        assert_close(found[found[:, 0].argsort()].mean(0), expected.mean(0), rtol=0, atol=5e-3)

@@ -85,17 +85,6 @@ def test_the_code_of_a_page_is_small():
     assert not re.search(r"^(?: |// (?!SPDX))", text, re.M) and "SPDX-License-Identifier" in text
 
 
-def test_what_is_shown_where_an_address_is_shared():
-    properties = {
-        attributes["property"]: attributes["content"]
-        for _, attributes in Elements(page(ABOUT, b"", b"", 'Tea & "cake"', "Me", "https://x.org/tea.jpg")).tags
-        if "property" in attributes
-    }
-    picture = {"og:image": "https://x.org/tea.jpg"}
-    assert properties == {"og:type": "website", "og:title": 'Tea & "cake"', "og:description": "Me"} | picture
-    assert "og:image" not in page(ABOUT, b"", b"", "Tea"), "no picture is named that no crawler can fetch"
-
-
 NAMES = ["a.jpg", "b.jpg", "7.jpg"]
 POSE = [1, 0, 0, 10, 0, 1, 0, 20, 0, 0, 1, 30, 0, 0, 0, 1]
 FRAMES = [{"camera_to_world": POSE, "fov": 50 + k, "aspect": 1.5} for k in range(24)]
@@ -124,15 +113,11 @@ def test_a_tour_of_photographs_or_of_a_camera_path(tmp_path):
     [
         (None, "notes.json"),
         ("[", "JSON"),
-        ("[]", "no JSON object"),
         ({}, "camera_path"),
         ({"tour": [CAMERA]}, "two views"),
         ({"tour": [CAMERA, {}]}, r"tour\[1\].position"),
-        ({"tour": [CAMERA, None]}, r"tour\[1\]"),
         ({"tour": [CAMERA, CAMERA | {"target": [1, 2, 3]}]}, "equal"),
-        ({"tour": [CAMERA, CAMERA | {"fov": 180}]}, "fov"),
         ({"tour": [CAMERA, CAMERA | {"position": [1, 2, float("nan")]}]}, "position"),
-        (PATH | {"seconds": 0}, "seconds"),
         (PATH | {"camera_type": "fisheye"}, "fisheye"),
         (PATH | {"camera_path": [FRAMES[0], FRAMES[1] | {"camera_to_world": POSE[:12]}]}, "camera_to_world"),
         (PATH | {"camera_path": [FRAMES[0], {"camera_to_world": POSE}]}, "fov"),

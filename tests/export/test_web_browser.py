@@ -14,8 +14,6 @@ import pytest
 from PIL import Image
 from web_pages import Page, page_with, random_scene, rendered, web_server
 
-from nrfgs_lab.pages.browser import CHROMIUM
-from nrfgs_lab.pages.web import main as measure_page
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.trained.loading import load_model
 
@@ -165,19 +163,3 @@ def test_a_folder_on_a_web_server(browser, tmp_path):
         page.page.wait_for_selector("#failed:not([hidden])")
         assert "scene.nrf cannot be loaded" in page.page.inner_text("#failed")
         page.page.close()
-
-
-def test_a_page_is_measured(demo, tmp_path, monkeypatch):
-    """docs/web.md's times and figures."""
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on the path: apt-get install chromium")
-    config, path = demo
-    record = tmp_path / "record.json"
-    words = ["web", path, record, "--config", config, "--size", 320, 240, "--count", 2]
-    monkeypatch.setattr("sys.argv", list(map(str, words)))
-    measure_page()
-    found = json.loads(record.read_text())
-    assert found["size"] == [320, 240] and found["bytes"] == path.stat().st_size and found["splats"] > 0
-    assert all(found[name] > 0 for name in ("seconds_to_load", "seconds_per_picture"))
-    assert len(found["psnr"]) == 3 and min(found["psnr"]) >= ALIKE
-    assert Image.open(tmp_path / "record-2.png").size == (320, 240)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small field, a way through a compact file, and splats with harmonics."""
+"""A small field, a way through a compact file, and files taken apart; splats with harmonics."""
 
+import json
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.format import container, read_header, read_streams
+from nrfgs_ns.compact.format import CHECKSUM, MAGIC, PREAMBLE, VERSION, container, read_header, read_streams
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 
 RENDER = {"rasterize_mode": "classic", "background": [0.0, 0.0, 0.0]}
@@ -19,15 +21,30 @@ RENDER = {"rasterize_mode": "classic", "background": [0.0, 0.0, 0.0]}
 
 
 def write_container(path: Path, header: dict, streams: dict) -> int:
-    """Write a file; returns its size."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return path.write_bytes(container(header, streams))
 
 
 def read_container(data: bytes) -> tuple[dict, dict[str, np.ndarray]]:
-    """The header and the streams, by name, of a file's bytes."""
     header, first = read_header(data)
     return header, read_streams(data, header["streams"], first)
+
+
+def parts(data: bytes) -> tuple[dict, list[bytes]]:
+    """The header of a file, and its streams as they are in it."""
+    length = PREAMBLE.unpack_from(data)[2]
+    header, at, bodies = json.loads(data[PREAMBLE.size : PREAMBLE.size + length]), PREAMBLE.size + length + 4, []
+    for entry in header["streams"]:
+        bodies.append(data[at : at + entry["bytes"]])
+        at += entry["bytes"]
+    return header, bodies
+
+
+def joined(text: bytes, bodies: list[bytes]) -> bytes:
+    """A file of a header's text and streams, whose own checksum and length hold."""
+    total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
+    start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
+    return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
 
 
 def field(count: int = 60) -> Field:

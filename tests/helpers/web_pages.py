@@ -199,7 +199,6 @@ def rendered(scene: Path, photograph: dict, mode: str = "full", gain: float = 1.
 
 @contextlib.contextmanager
 def web_server(folder: Path):
-    """A static host."""
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_):

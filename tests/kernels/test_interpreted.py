@@ -20,5 +20,5 @@ def test_kernels_in_the_interpreter():
     files = sorted(set(TESTS.glob("*/*_interpreted.py")) - {Path(__file__)})
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *map(str, files)]
     environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=TESTS.parent)
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=TESTS.parent, timeout=580)
     assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-2000:]

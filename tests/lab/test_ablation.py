@@ -38,6 +38,8 @@ def test_the_command(tiny_scene, tmp_path, capsys):
     assert rows["latent rank 6"]["loss_db"] == pytest.approx(0.0, abs=1e-3)  # exact, but for float32
     assert rows["all residuals"]["diffuse"] == 1.0
     assert rows["latent rank 1"]["bytes"] < rows["latent rank 2"]["bytes"] < rows["nothing"]["bytes"]
+    below = rows["residuals below 0.5 steps"]  # what no view shows
+    assert below["diffuse"] < 0.5 and abs(below["loss_db"]) < 0.01
     assert result["together"]["loss_db"] <= 0.05 + 1e-6 and result["together"]["bytes"] <= rows["nothing"]["bytes"]
     assert "can be left out together" in capsys.readouterr().out
     with pytest.raises(InputError, match="0 of 2 test views"):
@@ -51,39 +53,29 @@ def random_field(config: NrfConfig = SPLIT):
     return Field(head, splats), visible, centers
 
 
-def assert_same(field: Field, other: Field, visible, centers, **tolerance) -> None:
-    for a, b in zip(
-        field.head(field.splats, visible, centers), other.head(other.splats, visible, centers), strict=True
-    ):
-        assert_close(a, b, **tolerance)
+def assert_same(field: Field, other: Field, visible, centers) -> None:
+    pair = (each.head(each.splats, visible, centers) for each in (field, other))
+    for a, b in zip(*pair, strict=True):
+        assert_close(a, b, **FLOAT32)
 
 
-def test_without_the_high_branch_its_gate_is_shut():
+def test_parts_left_out_are_what_their_definition_says():
     whole, visible, centers = random_field()
-    small = without_high_branch(whole)
-    shut = awake(SPLIT, torch.float32).requires_grad_(False)
+    small, shut = without_high_branch(whole), awake(SPLIT, torch.float32).requires_grad_(False)
     shut.load_state_dict(whole.head.state_dict())
     shut.high[2].weight[3], shut.high[2].bias[3] = 0.0, -1e4
     assert small.head.high is None and small.bytes < whole.bytes
-    assert_same(small, Field(shut, whole.splats), visible, centers, **FLOAT32)
+    assert_same(small, Field(shut, whole.splats), visible, centers)
 
-
-def test_without_the_low_branch_colours_are_the_high_ones():
-    whole, visible, centers = random_field()
-    head, splats = whole.head, whole.splats
+    seen = whole.head(whole.splats, visible, centers)
     small = without_low_branch(whole)
-    parts = small.head.components(splats, visible, centers)
+    parts = small.head.components(whole.splats, visible, centers)
     assert (parts["low branch"].values == 0).all() and parts["high branch"].values.abs().max() > 1e-3
-    assert (small.head(splats, visible, centers).opacities == head(splats, visible, centers).opacities).all()
+    assert (small.head(whole.splats, visible, centers).opacities == seen.opacities).all()
 
-
-def test_without_opacitys_residual_only_colours_change():
-    whole, visible, centers = random_field()
-    head, splats = whole.head, whole.splats
-    small = without_opacity_residual(whole)
-    found = small.head(splats, visible, centers)
-    assert (found.opacities == head.base_appearance(splats, visible).opacities).all()
-    assert_close(found.colors, head(splats, visible, centers).colors, **FLOAT32)
+    found = without_opacity_residual(whole).head(whole.splats, visible, centers)
+    assert (found.opacities == whole.head.base_appearance(whole.splats, visible).opacities).all()
+    assert_close(found.colors, seen.colors, **FLOAT32)
 
 
 @pytest.mark.parametrize("config", [SPLIT, NrfConfig(latent_dim=8, hidden_width=16, split_bands=False)])
@@ -96,4 +88,4 @@ def test_a_constant_distance_is_what_the_field_sees(config):
     _, log_distance = view_geometry(field.splats["means"][visible], centers, 0.01)
     small = with_constant_distance(field, float(log_distance[0]))
     assert not small.head.config.use_distance
-    assert_same(small, field, visible, centers, **FLOAT32)
+    assert_same(small, field, visible, centers)

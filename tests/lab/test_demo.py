@@ -2,7 +2,6 @@
 """`nrfgs demo` end to end, in its smallest form, and what it says."""
 
 import json
-import sys
 
 import pytest
 import torch
@@ -12,7 +11,6 @@ from nrfgs_lab.demo.command import ENOUGH_STEPS, METHODS, NRF, SH, Demo, verdict
 from nrfgs_lab.demo.pictures import CELL
 from nrfgs_lab.demo.views import FRAMES, SeenView, brightest_window, where_it_shines
 from nrfgs_lab.scenes import SceneConfig
-from nrfgs_ns.cli import entrypoint
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -39,7 +37,6 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
 
 
 def compared(nrf, sh):
-    """Results whose test views have these PSNRs where it shines."""
     whole = {"psnr": 25.0, "ssim": 0.8}
     field = {"views": nrf, "views_base": [20.0, 20.5, 20.1]}
     return {NRF: {"eval": whole, "shine": field}, SH: {"eval": whole, "shine": {"views": sh}}}
@@ -49,11 +46,9 @@ def compared(nrf, sh):
     "nrf, sh, steps, says",
     [
         ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS, "NRF is ahead of SH: +1.10 dB"),
-        ([24.0, 24.0, 24.9], [25.0, 25.2, 26.0], ENOUGH_STEPS, "NRF is behind SH: -1.10 dB"),
         ([25.0, 25.1, 25.1], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # little
         ([29.0, 21.0, 27.0], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # the views disagree
         ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS - 1, "Too short for a verdict"),
-        ([None, None, None], [None, None, None], ENOUGH_STEPS, "Nothing shines"),
     ],
 )
 def test_the_verdict_follows_the_measurement(nrf, sh, steps, says):
@@ -73,14 +68,3 @@ def test_where_it_shines_is_where_gloss_changes_the_truth():
     assert (height, width) == (4, 5) and top <= 6 and top + height >= 9 and left <= 10 and left + width >= 14
     dull = where_it_shines([SeenView(grey, grey, grey, grey)])
     assert dull == {"share": 0.0, "psnr": None, "psnr_base": None, "views": [None], "views_base": [None]}
-
-
-def test_a_folder_that_is_not_ours_is_refused_in_one_line(tmp_path, monkeypatch):
-    occupied = tmp_path / Demo(quick=True).scene_folder
-    occupied.mkdir()
-    (occupied / "precious.txt").write_text("mine")
-    monkeypatch.setattr(sys, "argv", ["nrfgs", "demo", "--quick", "--out", str(tmp_path)])
-    with pytest.raises(SystemExit) as ended:  # Python prints its message, and ends with status 1
-        entrypoint()
-    assert str(occupied) in ended.value.code and "\n" not in ended.value.code
-    assert (occupied / "precious.txt").read_text() == "mine"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from plyfile import PlyData
 
-from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, project, write_scene
+from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, write_scene
 from nrfgs_lab.scenes.dataset import sparse_points, split_names
 from nrfgs_lab.scenes.geometry import CAMERA, FIRST_SOLID, GROUND, SKY, Box, Sphere, World
 
@@ -129,20 +129,6 @@ def test_view_dependence_grows_with_gloss():
     assert variances[1] > 1e-5
 
 
-@pytest.mark.parametrize("studio", [False, True])
-def test_the_studio_shines_and_reflects_nothing(studio):
-    """What leaves a surface there is the same whether or not rays are followed off it, and it still shines."""
-    scene = build_scene(SceneConfig(studio=studio, **SMALL))
-    points, surfaces = surface_points(scene)
-    solid = surfaces >= FIRST_SOLID
-    points, surfaces = points[solid], surfaces[solid]
-    directions = views_above(scene, points, surfaces, 2)
-    alone, followed = (scene._outgoing(points.T, surfaces, directions[0].T, bounces) for bounces in (0, 2))
-    assert np.array_equal(alone, followed) == studio
-    other = scene._outgoing(points.T, surfaces, directions[1].T, 0)
-    assert np.abs(other - alone).mean() > 0.01
-
-
 # The data set.
 
 MATT = SceneConfig(gloss=0.0, views=10, width=96, height=72, points=1500)
@@ -221,16 +207,6 @@ def test_points_project_onto_their_colours(matt):
         assert colour_errors(matt, MATT, shift)[0].mean() > 1.2 * errors.mean()
 
 
-def test_project_undoes_camera_rays():
-    config, camera = SceneConfig(), dome_cameras(SceneConfig())[7]
-    pixels = np.random.default_rng(0).uniform((0, 0), (config.width, config.height), size=(100, 2))
-    origins, directions = (a.astype(np.float64) for a in camera_rays(config, camera, pixels))
-    again, depth = project(config, camera, origins + 2.5 * directions)
-    # Rays are float32: 5 x 6e-8 of position, at depth 2.5 and focal length 214: 3e-5 pixels, and as much of direction.
-    np.testing.assert_allclose(again, pixels, atol=2e-4)
-    np.testing.assert_allclose(depth, 2.5, atol=1e-5)
-
-
 def test_sparse_points_come_from_training_views_alone(glossy):
     _, _, points, colours = load(glossy)
     training = np.delete(dome_cameras(GLOSSY), [0, 8], axis=0)
@@ -248,15 +224,6 @@ def test_rerun_is_identical_to_the_byte(glossy, tmp_path):
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["again"]  # nothing of the staging is left
 
 
-def test_same_scene_is_reused_even_beside_other_files(glossy):
-    (glossy / "outputs").mkdir(exist_ok=True)
-    before = (glossy / "images" / "view_000.png").stat().st_mtime_ns
-    calls = []
-    assert write_scene(GLOSSY, glossy, lambda done, total: calls.append(done)) == glossy
-    assert calls == [] and (glossy / "images" / "view_000.png").stat().st_mtime_ns == before
-    (glossy / "outputs").rmdir()
-
-
 def test_other_content_is_refused(glossy, tmp_path):
     tiny = SceneConfig(views=2, width=4, height=3, samples=1, points=5)
     with pytest.raises(FileExistsError, match=r"glossy exists and is not this procedural scene\. Choose another"):
@@ -269,21 +236,6 @@ def test_other_content_is_refused(glossy, tmp_path):
             write_scene(tiny, place)
     (tmp_path / "empty").mkdir()
     assert (write_scene(tiny, tmp_path / "empty") / "scene.json").is_file()
-
-
-def test_progress_counts_and_an_interruption_leaves_nothing(tmp_path):
-    tiny = SceneConfig(views=3, width=4, height=3, samples=1, points=5)
-    calls = []
-
-    def stop_at_two(done, total):
-        calls.append((done, total))
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_scene(tiny, tmp_path / "scene", stop_at_two)
-    assert calls == [(1, 3), (2, 3)]
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_nerfstudio_reads_it_as_we_meant_it(matt):

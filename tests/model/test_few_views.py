@@ -15,7 +15,6 @@ from nrfgs_ns.model.loss import shrinkage
 
 
 def ready(scene, out, steps, *options):
-    """A trainer before its first step."""
     return set_up(command_line("nrfgs", scene, out, steps, REFINING, *options))
 
 

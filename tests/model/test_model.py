@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
@@ -142,16 +142,6 @@ def test_a_fixed_camera_is_what_a_camera_is(batched):
         assert torch.equal(getattr(got, name), getattr(expected, name)) and getattr(got, name).data_ptr() % 16 == 0
 
 
-def test_another_camera_than_a_pinhole_is_drawn_as_one_and_that_is_said_once(capsys):
-    """`ns-render camera-path` and the viewer's Render tab offer fisheyes and panoramas."""
-    pinholes, cpu = Pinholes(), torch.device("cpu")
-    for kind, said in (("PERSPECTIVE", ""), ("EQUIRECTANGULAR", "drawn as pinholes"), ("EQUIRECTANGULAR", "")):
-        pose = torch.eye(4)[None, :3]
-        pinholes.fixed(Cameras(pose, 50.0, 50.0, 8.0, 8.0, 16, 16, camera_type=CameraType[kind])[0:1], cpu)
-        out = capsys.readouterr().out
-        assert said in out and bool(said) == ("Warning" in out)
-
-
 @pytest.mark.gpu
 def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
     pinholes, gpu = Pinholes(), torch.device("cuda")
@@ -180,11 +170,6 @@ def test_few_or_duplicate_points_start_finite(build, count):
     model.seed_points = (torch.zeros(count, 3), torch.full((count, 3), 100, dtype=torch.uint8))
     splats = model._initial_splats()
     assert all(len(value) == count and torch.isfinite(value).all() for value in splats.values())
-
-
-def test_random_start(build):
-    pipeline = build("nrfgs", "--pipeline.model.random-init", True, "--pipeline.model.num-random", 123)
-    assert pipeline.model.num_points == 123
 
 
 @pytest.mark.parametrize("mode", ["antialiased", "classic"])
@@ -231,7 +216,6 @@ def test_losses_are_splatfactos(build, masked):
 
 
 def residual(model, cameras) -> float:
-    """Root mean square residual over all cameras."""
     views = [model.project(cameras[index : index + 1]) for index in range(len(cameras))]
     losses = [model.head.neutral_loss(model.field.splats, view.visible, view.center) for view in views]
     return torch.stack(losses).mean().sqrt().item()

@@ -7,13 +7,11 @@ import math
 import shutil
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from PIL.PngImagePlugin import PngImageFile
 from PIL.TiffImagePlugin import IFDRational
 from rich.console import Console
 
@@ -33,7 +31,6 @@ def photo(path: Path, size: tuple[int, int] = (40, 30), colour: str = "grey", **
 
 @pytest.fixture
 def three(tmp_path) -> Path:
-    """A folder of three photographs."""
     return [photo(tmp_path / "in" / f"{i}.png") for i in range(3)][0].parent
 
 
@@ -92,7 +89,6 @@ def prepared(walls, tmp_path_factory) -> Path:
 
 
 def run_quietly(source: Path, out: Path, **options) -> str:
-    """Run the command; what it says."""
     screen = Console(record=True, width=200, file=io.StringIO())
     Run(Prepare(source, out, **options), screen).all()
     return screen.export_text()
@@ -112,7 +108,6 @@ def aligned(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def frames_of(scene: Path) -> tuple[dict, np.ndarray]:
-    """The content of transforms.json, and its poses [V, 4, 4]."""
     meta = json.loads((scene / "transforms.json").read_text())
     return meta, np.array([frame["transform_matrix"] for frame in meta["frames"]])
 
@@ -393,41 +388,6 @@ def test_what_is_no_photograph_is_named(three, tmp_path, make, said):
     make(three / "1.png")
     with pytest.raises(InputError, match=f"1.png.*{said}"):
         Run(Prepare(three, tmp_path / "out"), Console(quiet=True)).import_input()
-
-
-def test_photographs_of_several_sizes_have_no_single_camera(three, tmp_path):
-    photo(three / "1.png", (40, 31))
-    run = Run(Prepare(three, tmp_path / "out", camera="single"), Console(quiet=True))
-    run.import_input()
-    with pytest.raises(InputError, match="--camera is single, but .*in has photographs of 2 sizes"):
-        run.find_features()
-
-
-def test_what_is_left_out_is_counted(three, tmp_path):
-    for name in ("a.HEIC", "b.heic", "notes", "._a.jpg"):
-        (three / name).touch()
-    photo(three / "more" / "c.jpg")
-    screen = Console(record=True, width=200, file=io.StringIO())
-    Run(Prepare(three, tmp_path / "out"), screen).import_input()
-    said = screen.export_text()
-    assert "Left out, since they are not read here: .heic, folders, no suffix. To read HEIC" in said
-    assert "Warning: 3 photographs are few" in said
-
-
-def test_heic_is_read_where_pillow_heif_is_installed(three, tmp_path, monkeypatch):
-    def register() -> None:
-        Image.register_open("HEIF", PngImageFile, lambda prefix: prefix.startswith(b"\x89PNG"))
-
-    monkeypatch.setitem(sys.modules, "pillow_heif", SimpleNamespace(register_heif_opener=register))
-    for path in list(three.iterdir()):
-        path.rename(path.with_suffix(".HEIC"))
-    try:
-        run = Run(Prepare(three, tmp_path / "out"), Console(quiet=True))
-        run.import_input()
-    finally:
-        Image.OPEN.pop("HEIF", None)
-        Image.ID.remove("HEIF")
-    assert run.names == ["0.png", "1.png", "2.png"]
 
 
 def test_one_camera_only_where_everything_agrees_and_damaged_exif_is_none(tmp_path):

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from torch.testing import assert_close
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
@@ -23,15 +22,6 @@ def content(step: int, size: int = 500) -> dict:
     torch.manual_seed(step)
     pipeline = {"_model.means": torch.randn(size, 3), "_extra_state": {"head": "nrf", "list": [1, 2.5]}}
     return {"step": step, "pipeline": pipeline, "optimizers": {"means": {"lr": 0.1, "m": torch.randn(size, 3)}}}
-
-
-def test_what_is_written_is_read(tmp_path):
-    folder = tmp_path / "models"
-    path = write(folder, 7, content(7))
-    found, state = read_latest(folder)
-    assert found == path == folder / "step-000000007.ckpt"
-    assert_close(state["pipeline"]["_model.means"], content(7)["pipeline"]["_model.means"], rtol=0, atol=0)
-    assert [file.name for file in tmp_path.iterdir()] == ["models"], "nothing is left beside the folder"
 
 
 def test_the_last_two_stay_and_strange_files_are_let_be(tmp_path):
@@ -151,6 +141,8 @@ def test_a_writer_that_is_killed_at_any_operation_leaves_whole_files(tmp_path):
         child = os.fork()
         if child == 0:
             try:
+                signal.signal(signal.SIGALRM, signal.SIG_DFL)
+                signal.alarm(60)  # ends a child that hangs
                 write_until_killed(folder, count)
             finally:
                 os._exit(0)

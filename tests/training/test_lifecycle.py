@@ -43,7 +43,6 @@ METHODS = {
 
 
 def options(scene: Path, out: Path, method: str = "nrfgs", *more: dict, steps: int = STEPS) -> list[str]:
-    """A command line for ns-train."""
     return command_line(method, scene, out, steps, BUSY, *more)
 
 

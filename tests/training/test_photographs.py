@@ -72,7 +72,6 @@ def test_exif_comes_from_the_data_set_or_else_from_the_file(tmp_path):
 
 
 def linear(values):
-    """Light of sRGB values."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 

@@ -6,14 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from short_trainings import command_line, set_up, trained
 
 from nrfgs_lab.training_run import evaluate, parse
 from nrfgs_ns.kernels.trial import Gate
 from nrfgs_ns.training import step_graph
-from nrfgs_ns.training.photographs import compare_photographs
 from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs
 
 
@@ -210,13 +208,3 @@ def test_no_kernel_is_left_to_the_first_steps(tiny_scene, tmp_path):
     trainer.train()
     assert tried(trainer.pipeline.model) == before
     assert not trainer.graphs._given_up
-
-
-@pytest.mark.gpu
-def test_photographs_are_compared_without_memory_that_stays():
-    """cuBLAS keeps 32 MiB of an H100 for each thread that multiplies matrices."""
-    cameras = Cameras(torch.eye(4)[:3].repeat(8, 1, 1), 30.0, 30.0, 16.0, 16.0, 32, 32)
-    images = [{"image": torch.zeros(32, 32, 3, dtype=torch.uint8, device="cuda")} for _ in range(8)]
-    before = torch.cuda.memory_allocated()
-    compare_photographs(torch.rand(100, 3) - torch.tensor([0.5, 0.5, 2.0]), cameras, images)
-    assert torch.cuda.memory_allocated() == before

@@ -9,7 +9,6 @@ import torch
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
-from viser import _icons
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
@@ -42,7 +41,6 @@ def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_p
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    """Photographs of 640 x 400."""
     config = SceneConfig(views=3, width=640, height=400, points=50, samples=1)
     scene = write_scene(config, tmp_path_factory.mktemp("large"))
     return NrfgsInputDataset(NrfgsDataParserConfig(data=scene).setup().get_dataparser_outputs("train"))
@@ -68,8 +66,3 @@ def test_a_photograph_of_any_mode_is_shown_in_colour(tmp_path, mode):
     dataset = type("", (), {"cameras": None, "image_filenames": [path]})()
     image = start.SmallPhotographs(dataset, None)[0]["image"]
     assert image.shape == (30, 40, 3) and (image - 153 / 255).abs().max() < 0.02
-
-
-def test_icons_are_viser_s(pipeline):
-    for name in ("door-exit", "camera", "player-play"):
-        assert start.icon(name) == _icons.svg_from_icon(name)

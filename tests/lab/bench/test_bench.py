@@ -32,7 +32,8 @@ if behaviour == "hangs":
     time.sleep(600)
 if behaviour == "meets 4":
     (here / f"{name}.there").touch()
-    while len(list(here.glob("*.there"))) < 4:
+    until = time.monotonic() + 300
+    while len(list(here.glob("*.there"))) < 4 and time.monotonic() < until:
         time.sleep(0.01)
 seed = int(job["args"][job["args"].index("--machine.seed") + 1])
 metrics = {"psnr": 20.0 + seed, "ssim": 0.9, "ms_ssim": None, "l1": 0.1, "lpips": None}
@@ -73,7 +74,6 @@ def bench_in(folder: Path, text: str = FILE, **options) -> Bench:
 
 
 def ran(folder: Path) -> list[list[str]]:
-    """Name and GPU of each child that came to its end."""
     file = folder / "ran.txt"
     return [line.split() for line in file.read_text().splitlines()] if file.exists() else []
 
@@ -100,12 +100,9 @@ def test_everything_is_run_once_and_reported(fake, capsys):
 
 
 def test_what_is_no_method_is_told_before_the_first_run(fake):
-    text = FILE.replace("NRF: nrfgs", "NRF: nrfgs-shh")
     with pytest.raises(InputError, match="runs: NRF: 'nrfgs-shh' is no method of ns-train"):
-        bench_in(fake, text).main()
+        bench_in(fake, FILE.replace("NRF: nrfgs", "NRF: nrfgs-shh")).main()
     assert not ran(fake)
-    bench_in(fake, text, runs=("SH",), seeds=(1,)).main()
-    assert len(ran(fake)) == 1
 
 
 def test_failures_are_listed_and_tried_again(fake):
@@ -164,14 +161,6 @@ def test_a_stopped_benchmark_takes_its_children_along(stop, status, fake, monkey
     assert [name for name, _ in ran(fake)] == ALL[:2]
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"identity": {}}'])
-def test_a_broken_record_is_named(text, fake):
-    (fake / "out" / "runs").mkdir(parents=True)
-    (fake / "out" / "runs" / "SH-own-scene-1.json").write_text(text)
-    with pytest.raises(InputError, match="SH-own-scene-1.json is no.*Remove it"):
-        bench_in(fake, seeds=(1,)).main()
-
-
 def test_records_of_other_arguments_are_refused_named_and_redone(fake, capsys):
     bench_in(fake, seeds=(1,)).main()
     with pytest.raises(
@@ -208,22 +197,8 @@ def test_more_gpus_than_there_are_are_refused(monkeypatch):
         gpu_names(4)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     assert gpu_names(1) == ["3"]
-    with pytest.raises(InputError, match="at most 1"):
-        gpu_names(2)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert gpu_names(1) == [""], "GPUs that were hidden stay hidden"
-
-
-def test_flags_have_precedence_over_the_file(tmp_path):
-    text = "runs: {A: nrfgs, no split: {method: nrfgs, options: --x False, steps: 9}, 5: nrfgs-vdgs}\n"
-    text += "scenes: [{path: garden, downscale: 4}, other]\nsteps: 5\nseeds: [9]\njobs: 3\n"
-    plan, cells = bench_in(tmp_path, text, data=("new", "garden"), steps=7, runs=("5", "no split"), seeds=(8,)).chosen()
-    assert (plan.steps, plan.seeds, plan.jobs) == (7, [9, 8], 3) and plan.scenes[0].downscale == 4
-    assert [cell.name for cell in cells] == [
-        f"{run}-own-{scene}-8" for scene in ("garden", "new") for run in ("no_split", "5")
-    ]
-    with pytest.raises(InputError, match="'B': .*spec.yaml has no run of that name. It has 5, A, no split"):
-        bench_in(tmp_path, text, runs=("A", "B")).chosen()
 
 
 def test_a_plan_with_knobs_reports_the_trade(fake):

@@ -4,13 +4,11 @@
 import json
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
 
 from nrfgs_lab.bench import run as bench_run
-from nrfgs_lab.bench.measure import at_size, flip, over_views
+from nrfgs_lab.bench.measure import over_views
 from nrfgs_lab.bench.spec import Job, cells_of, command, identity, make_spec
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -77,28 +75,3 @@ def test_metrics_count_inside_the_mask():
     views = [("a", (None, {"image": photograph, "mask": mask})), ("b", (None, {"image": photograph}))]
     measured = over_views(model, views)
     assert [image["l1"] for image in measured["per_image"]] == pytest.approx([0.25, (0.25 + 3 * 0.5) / 4])
-
-
-def test_at_size_keeps_the_pose_and_the_vertical_angle():
-    """The middle of the upper edge, and the image's centre, look where they looked."""
-    pose = torch.tensor([[0.0, 0.0, 1.0, 3.0], [1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 1.0]])
-    camera = Cameras(pose[None], fx=300.0, fy=320.0, cx=200.0, cy=100.0, width=400, height=200)
-    wide = at_size(camera, 1920, 1080)
-    assert (wide.width.item(), wide.height.item()) == (1920, 1080)
-    for before, after in (((100, 200), (540, 960)), ((0, 200), (0, 960))):
-        rays = [one.generate_rays(0, coords=torch.tensor(at).float()) for one, at in ((camera, before), (wide, after))]
-        torch.testing.assert_close(rays[0].directions, rays[1].directions)
-        torch.testing.assert_close(rays[0].origins, rays[1].origins)
-
-
-def test_flip_is_zero_for_equal_images_and_counts_only_inside_the_mask():
-    pytest.importorskip("flip_evaluator")
-    truth = np.random.default_rng(0).random((40, 50, 3))
-    worse = np.clip(truth + 0.2, 0, 1)
-    assert flip(truth, truth) == 0.0
-    assert 0 < flip(np.clip(truth + 0.05, 0, 1), truth) < flip(worse, truth) <= 1
-    left = np.zeros((40, 50, 1), dtype=bool)
-    left[:, :25] = True
-    half = np.where(left, truth, worse)
-    assert flip(half, truth, left) == 0.0 < flip(half, truth, ~left)
-    assert flip(half, truth, np.zeros_like(left)) is None

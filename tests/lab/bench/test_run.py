@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-import nrfgs_ns
 from nrfgs_lab.bench import run as bench_run
 from nrfgs_lab.bench.run import forget_other_arguments, last_checkpoint, record_until, train_or_continue
 from nrfgs_lab.bench.spec import Job
-from nrfgs_lab.training_run import TrainRecord, digest_of, machine
+from nrfgs_lab.training_run import TrainRecord
 from nrfgs_ns.files import write_whole
 
 
@@ -69,26 +68,3 @@ def test_checkpoints_of_other_arguments_are_cleared(tmp_path):
     assert last_checkpoint(tmp_path) is not None
     forget_other_arguments(tmp_path, {"options": ["b"]})
     assert last_checkpoint(tmp_path) is None and not (tmp_path / "train.json").exists()
-
-
-def test_a_finished_run_is_not_repeated_by_a_late_child(tmp_path, trained):
-    job = job_in(tmp_path)
-    Path(job.record).write_text("{}")
-    bench_run.run(job)
-    assert not trained and Path(job.record).read_text() == "{}"
-
-
-def test_the_digest_is_of_names_and_contents(tmp_path):
-    def digest(files: dict[str, bytes]) -> str:
-        folder = tmp_path / str(len(list(tmp_path.iterdir())))
-        for name, content in files.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(content)
-        return digest_of(folder)
-
-    files = {"a.py": b"x = 1\n", "part/b.py": b""}
-    same = {**files, "part/c.txt": b"notes"}, {**files, "a.py": b"x = 1\r\n"}
-    others = {**files, "a.py": b"x = 2\n"}, {**files, "c.py": b""}, {"a.py": b"", "part/b.py": b"x = 1\n"}
-    assert {digest(each) for each in same} == {digest(files)}
-    assert digest(files) not in [digest(each) for each in others]
-    assert machine()["source"] == digest_of(Path(nrfgs_ns.__file__).parent)

@@ -22,11 +22,8 @@ from smoke_runs import recorded
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
 from nrfgs_lab.pages.tables import pages
 from nrfgs_lab.training_run import evaluate, parse, train
-from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import commands
-from nrfgs_ns.densification import strategy_from
-from nrfgs_ns.viewer.pictures import legends
 
 CONTRIBUTING = Path(__file__).resolve().parents[3] / "docs" / "contributing.md"
 
@@ -42,21 +39,6 @@ def my_head(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "my_head", module)
     spec.loader.exec_module(module)
     return module
-
-
-def test_its_colours_are_linear_in_the_direction(my_head):
-    torch.manual_seed(0)
-    head = my_head.LinearConfig().setup()
-    splats = {"means": torch.zeros(1, 3), "opacities": torch.zeros(1, 1), **head.splat_params(torch.full((1, 3), 0.5))}
-    splats["slopes"] += 0.1 * torch.randn(1, 3, 3)
-    one, two = torch.tensor([0.0, 0.0, 2.0]), torch.tensor([0.0, 3.0, 0.0])
-    rows = torch.zeros(1, dtype=torch.int64)
-    for center in (one, two):
-        expected = 0.5 - splats["slopes"][0] @ (center / center.norm())
-        assert torch.allclose(head(splats, rows, center).colors[0], expected, atol=1e-6)
-    with pytest.raises(ValueError, match="distance_eps"):
-        my_head.LinearConfig(distance_eps=0.0).setup()
-    assert list(legends(Field(head, splats))) == ["full", "base colour", "residual", "view dependence", "depth"]
 
 
 def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tmp_path, monkeypatch):
@@ -126,14 +108,6 @@ def test_options_that_pages_name_are_there():
     }
     assert len(shown) > 15
     assert {flag.replace("_", "-") for flag in shown} <= known
-
-
-def test_strategies_that_pages_name_are_there():
-    text = "".join(path.read_text(encoding="utf-8") for path in pages())
-    words = set(re.findall(r"--pipeline\.model\.densification ([a-z][\w-]*(?:,\w+=[\w.-]*\w)*)", text))
-    assert len(words) > 4
-    for word in words:
-        strategy_from(word)
 
 
 def commands_shown() -> list[str]:

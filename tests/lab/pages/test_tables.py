@@ -7,9 +7,6 @@ from pathlib import Path
 import pytest
 
 from nrfgs_lab.pages import tables
-from nrfgs_lab.pages.few_views import runs_of
-from nrfgs_lab.pages.methods import gain, half
-from nrfgs_lab.pages.runs import VIEWS
 from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, written
 
 PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
@@ -27,33 +24,6 @@ def test_decibels_in_prose_stand_in_a_block_of_the_page(name):
     prose = re.sub(r"```.*?```|`[^`\n]*`", "", BLOCK.sub("", PAGES[name]), flags=re.DOTALL)
     loose = set(re.findall(r"(?<![\d.])(\d+(?:\.\d+)?) dB", prose))
     assert not loose - set(re.findall(r"\d+(?:\.\d+)?", inside))
-
-
-def test_verdicts_in_words_are_those_of_the_records():
-    """How many captures docs/comparison.md and README.md say that methods are ahead on."""
-
-    def ahead(runs, ours: str, theirs: str, metric: str = "psnr", scenes=tuple(VIEWS)) -> int:
-        return sum(round(gain(runs(scene, ours), runs(scene, theirs), metric), 3) > 0 for scene in scenes)
-
-    def equal(budget: int):
-        return lambda scene, run: half(scene, run, f"mcmc@{budget}")
-
-    few = [scene for scene in VIEWS if scene != "bonsai"]
-    every = len(VIEWS)
-    larger, smaller = equal(150_000), equal(75_000)
-    assert ahead(half, "NRF-GS", "3DGS", scenes=few) == ahead(half, "VDGS", "NRF-GS", scenes=few) == 5
-    assert ahead(larger, "NRF-GS", "3DGS", scenes=few) == 3 and ahead(smaller, "NRF-GS", "3DGS", scenes=few) == 2
-    assert ahead(half, "ours", "3DGS") == every and ahead(half, "ours", "3DGS", "ssim") == every - 1
-    assert ahead(larger, "ours", "3DGS") == 5 and ahead(larger, "ours", "3DGS", scenes=few) == 4
-    assert ahead(smaller, "ours", "3DGS") == ahead(smaller, "ours", "3DGS", scenes=["bonsai", "goldcape"]) == 2
-    assert ahead(smaller, "ours", "3DGS", scenes=few) == 1
-    assert sum(gain(larger(scene, "3DGS"), half(scene, "ours"), "psnr") > 0 for scene in VIEWS) == 3
-    assert ahead(runs_of, "nrfgs", "splatfacto") == ahead(runs_of, "nrfgs", "splatfacto", "ssim") == every
-    field, harmonics = "nrfgs, 150,000 splats", "harmonics, 150,000 splats"
-    assert ahead(runs_of, field, harmonics) == 4
-    by_mcmc = ["goldcape", "caliterra", "fox", "castle"]
-    for head in field, harmonics:
-        assert ahead(runs_of, head, "nrfgs", scenes=by_mcmc) == 4 and ahead(runs_of, head, "nrfgs") == 4
 
 
 def anchors(text: str) -> set[str]:
@@ -107,17 +77,6 @@ def test_files_that_a_page_names_are_there(name):
     paths = [path for path in paths if "NAME" not in path]
     paths += [module.replace(".", "/") for module in modules]
     assert [path for path in paths if not any((ROOT / f"{path}{end}").exists() for end in ("", ".py"))] == []
-
-
-def test_make_targets_and_extras_that_pages_name_are_there():
-    shown = "\n".join(fence for text in PAGES.values() for fence in re.findall(r"```bash\n(.*?)```", text, re.DOTALL))
-    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    used = set(re.findall(r"^make ([\w-]+)", shown, re.MULTILINE))
-    assert used and used <= targets
-    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    extras = re.findall(r"^(\w+) = \[", project.partition("[project.optional-dependencies]")[2], re.MULTILINE)
-    named = {extra for text in PAGES.values() for extra in re.findall(r"(?:nrfgs-ns|\.)\[(\w+)\]'", text)}
-    assert named <= set(extras)
 
 
 def test_every_picture_is_shown():
