@@ -17,7 +17,7 @@ test: $(VENV)/.installed  ## the default test suite, a process for each core
 test-slow: $(VENV)/.installed  ## real training runs
 	$(BIN)/python -m pytest -m slow
 
-test-browser: $(VENV)/.installed  ## the viewer in a headless Chromium, which must be on the path
+test-browser: $(VENV)/.installed  ## viewer and web page in Chromium, the page in Firefox too (firefox-esr, xvfb), if they are on the path
 	$(INSTALL) --editable '.[browser]'
 	$(BIN)/python -m pytest -m browser
 

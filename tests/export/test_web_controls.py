@@ -12,6 +12,7 @@ from PIL import Image
 from web_pages import Page, page_with, wall_scene
 
 from nrfgs_lab.pages.browser import different
+from nrfgs_ns.image.metrics import psnr
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 
@@ -109,10 +110,18 @@ def test_fingers_hit_every_control(window, demo, browser):
     page.page.close()
 
 
+def devtools(page: Page):
+    """Chromium's own protocol, which emulates safe areas and fingers; skips in Firefox, which has no such thing."""
+    if page.is_firefox:
+        page.page.close()
+        pytest.skip("Firefox emulates neither safe areas nor fingers")
+    return page.page.context.new_cdp_session(page.page)
+
+
 def test_controls_stay_within_the_safe_area(demo, browser):
     page = Page(browser, demo[1].as_uri(), (360, 640), has_touch=True).begun()
     insets = {"top": 40, "bottom": 34, "left": 0, "right": 0}
-    page.page.context.new_cdp_session(page.page).send("Emulation.setSafeAreaInsetsOverride", {"insets": insets})
+    devtools(page).send("Emulation.setSafeAreaInsetsOverride", {"insets": insets})
     assert all(box["y"] + box["height"] <= 640 - 34 for box in boxes(page, "#bar button"))
     page.tab("Share")
     assert boxes(page, "#caption")[0]["y"] >= 40
@@ -187,7 +196,7 @@ def test_every_control_changes_the_picture(window, demo, browser):
     for key in "wsadqe":
         changed(lambda key=key: page.page.keyboard.press(key, delay=300))
         same(press_home)
-    changed(lambda: page.page.mouse.dblclick(120, 200))
+    changed(lambda: page.double_click(120, 200))
     assert np.allclose(page.camera()[0], where), "what is double-clicked is looked at, from the same place"
     same(press_home)
 
@@ -297,7 +306,7 @@ def test_no_frame_around_what_a_mouse_drags(wall):
 
 def test_fingers_turn_move_and_zoom(demo, browser):
     page = Page(browser, demo[1].as_uri(), (480, 360)).begun()
-    touch = page.page.context.new_cdp_session(page.page)
+    touch = devtools(page)
 
     def fingers(*paths: list[tuple[int, int]]) -> None:
         """Put fingers down where their paths begin, move them along, and lift them."""
@@ -322,6 +331,48 @@ def test_fingers_turn_move_and_zoom(demo, browser):
         assert not different(255 * page.picture().numpy(), 255 * first.numpy())
     assert not page.errors
     page.page.close()
+
+
+SLOW_SORT = """
+const Quick = Worker;
+window.Worker = class extends Quick {
+  postMessage(message, ...more) {
+    setTimeout(() => super.postMessage(message, ...more), message.camera && window.nrfgs.begun ? 60000 : 0);
+  }
+};
+"""
+
+
+def test_the_picture_moves_while_splats_are_sorted(wall):
+    page = wall((240, 180), before=SLOW_SORT)
+    page.page.evaluate("nrfgs.begun = true")
+    shots = [page.page.screenshot()]
+    for _ in range(2):
+        page.page.keyboard.press("ArrowLeft")
+        page.page.wait_for_timeout(500)
+        shots.append(page.page.screenshot())
+    assert len(set(shots)) == 3
+
+
+SLOW_FRAMES = """
+window.widths = [];
+const frame = requestAnimationFrame, viewport = WebGL2RenderingContext.prototype.viewport;
+window.requestAnimationFrame = (act) => frame(() => setTimeout(() => act(performance.now()), window.late ?? 0));
+WebGL2RenderingContext.prototype.viewport = function (x, y, width, height) {
+  if (height <= this.canvas.height && width <= this.canvas.width) window.widths.push(width);  // else a table's
+  viewport.call(this, x, y, width, height);
+};
+"""
+
+
+def test_slow_frames_make_pictures_coarser_until_the_camera_rests(wall):
+    page = wall((240, 180), before=SLOW_FRAMES)
+    sharp = page.picture()
+    page.page.evaluate("late = 100; nrfgs.play('rotation')")
+    page.until("widths.some((width) => width <= 100)")
+    page.page.evaluate("nrfgs.stop(); nrfgs.visit(0)")
+    assert psnr(page.picture(), sharp) > 60
+    assert page.page.evaluate("Math.min(...widths) >= 96"), "0.4 of the whole at the coarsest"
 
 
 def test_whoever_cannot_see_the_page_is_told_what_is_there(demo, browser):
@@ -389,5 +440,6 @@ def test_pictures_for_the_docs(demo, tmp_path):
     )
     assert run.returncode == 0, run.stderr
     written = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert written == [f"{window}-{name}.jpg" for window in ("desktop", "phone") for name in ("page", "share", "view")]
+    shown = [f"{window}-{name}.jpg" for window in ("desktop", "phone") for name in ("page", "share", "view")]
+    assert written == [*shown, "web.jpg"]
     assert all(np.asarray(Image.open(tmp_path / "out" / name)).std() > 5 for name in written)
