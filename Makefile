@@ -17,7 +17,7 @@ test: $(VENV)/.installed  ## the default test suite, a process for each core
 test-slow: $(VENV)/.installed  ## real training runs
 	$(BIN)/python -m pytest -m slow
 
-test-browser: $(VENV)/.installed  ## exported pages in a headless Chromium, which must be on the path
+test-browser: $(VENV)/.installed  ## exported pages in Chromium and in Firefox (firefox-esr, xvfb), if they are on the path
 	$(INSTALL) --editable '.[browser]'
 	$(BIN)/python -m pytest -m browser
 

@@ -7,16 +7,20 @@ python -m nrfgs_lab.page_pictures PAGE.html OUT    # needs a Chromium and `pip i
 import argparse
 from pathlib import Path
 
+from PIL import Image
+
 from nrfgs_lab.pages.browser import PATIENCE, chromium
 
-WINDOWS = {"desktop": ((1280, 760), {}), "phone": ((390, 780), {"has_touch": True, "device_scale_factor": 2})}
+WINDOWS = {"desktop": ((1280, 760), {}), "phone": ((390, 844), {"has_touch": True, "device_scale_factor": 2})}
 SHOWN = {"page": None, "view": "View", "share": "Share"}
 """Pictures of each window: the part of the panel that is open."""
+HEIGHT, GAP = 600, 16
+"""Pixels of the docs' picture, and of the gap between its two halves."""
 
 
 def pictures(page: Path, folder: Path) -> list[Path]:
-    """Write WINDOW-PICTURE.jpg for each of both; return their paths. The page's tour does not run: it begins at the
-    photograph that the export chose."""
+    """Write WINDOW-PICTURE.jpg for each of both, and web.jpg, the docs' picture; return their paths. The page's tour
+    does not run: it begins at the photograph that the export chose."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     with chromium() as browser:
@@ -33,6 +37,13 @@ def pictures(page: Path, folder: Path) -> list[Path]:
                 written.append(folder / f"{window}-{name}.jpg")
                 tab.screenshot(path=written[-1], type="jpeg", quality=85)
             tab.close()
+    shown = [Image.open(folder / name) for name in ("desktop-view.jpg", "phone-page.jpg")]
+    shown = [image.resize((image.width * HEIGHT // image.height, HEIGHT)) for image in shown]
+    pair = Image.new("RGB", (sum(image.width for image in shown) + GAP, HEIGHT), "white")
+    pair.paste(shown[0])
+    pair.paste(shown[1], (shown[0].width + GAP, 0))
+    written.append(folder / "web.jpg")
+    pair.save(written[-1], quality=85)
     return written
 
 

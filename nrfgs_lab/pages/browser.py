@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's viewer in a headless Chromium, for the pictures in the docs; and the browser of the tests of pages.
+"""Browsers, and nerfstudio's viewer in one, for tests of pages and the pictures in the docs.
 
-pip install -e '.[browser]'; apt-get install chromium
+pip install -e '.[browser]'; apt-get install chromium; for Firefox: apt-get install firefox-esr xvfb
 """
 
 import contextlib
@@ -21,6 +21,7 @@ import numpy as np
 from PIL import Image
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FIREFOX = shutil.which("firefox") or shutil.which("firefox-esr")
 PATIENCE = 300
 """Seconds to wait for anything on a slow, busy machine."""
 
@@ -38,6 +39,36 @@ def chromium() -> Iterator:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
         yield browser
         browser.close()
+
+
+@contextlib.contextmanager
+def firefox() -> Iterator:
+    """A Firefox of the system's on a screen of its own, because a headless one has no WebGL without a GPU;
+    FileNotFoundError if Firefox or Xvfb is not on the path."""
+    from playwright.sync_api import sync_playwright
+
+    if FIREFOX is None or shutil.which("Xvfb") is None:
+        raise FileNotFoundError("no Firefox and Xvfb on the path: apt-get install firefox-esr xvfb")
+    ours, theirs = os.pipe()
+    command = ["Xvfb", "-displayfd", str(theirs), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"]
+    screen = subprocess.Popen(command, pass_fds=[theirs], stderr=subprocess.DEVNULL)
+    os.close(theirs)
+    try:
+        with os.fdopen(ours) as told, sync_playwright() as playwright:
+            display = f":{int(told.readline())}"
+            browser = playwright.firefox.launch(
+                channel="moz-firefox",
+                executable_path=FIREFOX,
+                headless=False,
+                # The panel of downloads would take the focus from the page.
+                firefox_user_prefs={"webgl.force-enabled": True, "browser.download.alwaysOpenPanel": False},
+                env={**os.environ, "DISPLAY": display},
+            )
+            yield browser
+            browser.close()
+    finally:
+        screen.terminate()
+        screen.wait()
 
 
 class Served:

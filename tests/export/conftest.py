@@ -2,7 +2,19 @@
 import pytest
 from short_trainings import command_line, trained
 
+from nrfgs_lab.pages import browser as browsers
 from nrfgs_ns.export.command import Web
+
+
+@pytest.fixture(scope="module", params=["chromium", "firefox"])
+def browser(request):
+    """Both browsers, one after the other; skips where there is none."""
+    pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e '.[browser]'")
+    try:
+        with getattr(browsers, request.param)() as browser:
+            yield browser
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

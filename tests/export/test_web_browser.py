@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages of `nrfgs export web` in a real browser, without a network and without a GPU.
+"""Pages of `nrfgs export web` in real browsers, without a network and without a GPU.
 
-pip install -e '.[browser]'; apt-get install chromium; pytest -m browser tests/export
+pip install -e '.[browser]'; apt-get install chromium firefox-esr xvfb; pytest -m browser tests/export
 """
 
 import base64
@@ -112,6 +112,10 @@ def test_a_page_asks_the_network_for_nothing_and_works_in_a_frame(demo, browser,
         "a letter changed": "checksum",
         "cut short": "cut short",
         "without its scene": "cut short",
+        "cut in its scripts": "incomplete",
+        "cut in its style": "incomplete",
+        "cut in its poster": "incomplete",
+        "scripts that do not parse": "cannot run this page",
         "not base64": "damaged",
         "of a later version": "version",
     }.items(),
@@ -126,6 +130,10 @@ def test_a_broken_page_says_so(fault, said, demo, browser, tmp_path):
         "a letter changed": text[:middle] + ("A" if text[middle] != "A" else "B") + text[middle + 1 :],
         "cut short": text[:middle],
         "without its scene": text[: text.rindex("<script", 0, at)],
+        "cut in its scripts": text[: text.index("async function main")],
+        "cut in its style": text[: text.index("</style>") - 9],
+        "cut in its poster": text[: text.index('src="data:image') + 400],
+        "scripts that do not parse": text.replace("async function main", "async async function main"),
         "not base64": text[:middle] + "!" + text[middle + 1 :],
         "of a later version": text[:start] + later + text[text.index("<", start) :],
     }
@@ -138,13 +146,24 @@ def test_a_broken_page_says_so(fault, said, demo, browser, tmp_path):
     page.page.close()
 
 
-def test_without_webgl_the_page_says_so(demo, browser):
-    page = browser.new_page()
-    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    page.goto(demo[1].as_uri())
-    page.wait_for_selector("#failed:not([hidden])")
-    assert "WebGL 2" in page.inner_text("#failed")
-    page.close()
+@pytest.mark.parametrize(
+    "said, before",
+    {
+        "Turn on graphics acceleration": "HTMLCanvasElement.prototype.getContext = () => null",
+        "textures are too small for": "WebGL2RenderingContext.prototype.getParameter = () => 64",
+        "graphics memory is too small": "WebGL2RenderingContext.prototype.getError = () => 0x505",
+        "graphics driver cannot": "WebGL2RenderingContext.prototype.getProgramParameter = () => false",
+        "Something went wrong": "WebGL2RenderingContext.prototype.bufferData = () => { throw Error('raw text') }",
+        "cannot be read": "Worker = null; Uint32Array.prototype.reverse = () => { throw Error('raw text') }",
+    }.items(),
+)
+def test_a_browser_that_lacks_something_says_so_in_a_sentence(said, before, demo, browser):
+    page = Page(browser, demo[1].as_uri(), before=before)
+    page.page.wait_for_selector("#failed:not([hidden])")
+    text = page.page.inner_text("#failed")
+    assert said in text and "raw text" not in text
+    assert bool(page.errors) == ("driver" in said or "raw text" in before), "the console has the details"
+    page.page.close()
 
 
 def test_a_folder_on_a_web_server(browser, tmp_path):
@@ -156,7 +175,7 @@ def test_a_folder_on_a_web_server(browser, tmp_path):
         page = Page(browser, f"{address}/").begun()
         assert psnr(page.picture(), rendered(scene, photographs[0])) >= ALIKE
         asked = {url.rsplit("/", 1)[1] for url in page.requests if url.startswith("http")}
-        assert asked <= {"", "scene.nrf", "favicon.ico"}
+        assert asked == {"", "scene.nrf"}
         page.page.close()
         scene.unlink()
         page = Page(browser, f"{address}/")

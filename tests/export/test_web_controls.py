@@ -3,13 +3,16 @@
 
 import functools
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from PIL import Image
-from web_pages import Page
+from web_pages import Page, page_with, wall_scene
 
 from nrfgs_lab.pages.browser import different
+from nrfgs_ns.image.metrics import psnr
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 
@@ -21,11 +24,33 @@ WINDOWS = {
     "turned": ((640, 360), {"has_touch": True}),
 }
 TABS = ["View", "Photographs", "Share", "Help"]
+LARGE = 44
+"""CSS pixels that a fingertip needs."""
+CONTROLS = (
+    "#bar button, #panel button, #panel select, #panel input:not([type=checkbox]), #panel label.line, #panel summary"
+)
 
 
 @pytest.fixture(params=WINDOWS)
 def window(request):
     return WINDOWS[request.param]
+
+
+@pytest.fixture
+def wall(browser, tmp_path):
+    """Open a page of a wall, with more values for its scripts."""
+    opened = []
+
+    def page(size=(480, 360), before="", **more) -> Page:
+        scene, photographs = wall_scene(tmp_path)
+        (tmp_path / "page.html").write_text(page_with(scene.read_bytes(), photographs, **more))
+        opened.append(Page(browser, (tmp_path / "page.html").as_uri(), size, before).begun())
+        return opened[-1]
+
+    yield page
+    for page in opened:
+        assert not page.errors
+        page.page.close()
 
 
 def boxes(page: Page, selector: str) -> list[dict]:
@@ -35,6 +60,72 @@ def boxes(page: Page, selector: str) -> list[dict]:
         if one.is_visible():
             found.append(one.bounding_box() | {"name": one.evaluate("(element) => element.id || element.textContent")})
     return found
+
+
+def test_the_picture_comes_first(window, demo, browser):
+    (width, height), touch = window
+    page = Page(browser, demo[1].as_uri(), (width, height), **touch).begun()
+    assert page.page.locator("#panel").is_hidden()
+    assert [button["name"] for button in boxes(page, "button")] == TABS
+    (bar,) = boxes(page, "#bar")
+    assert bar["width"] * bar["height"] < 0.15 * width * height
+    for tab in TABS:
+        page.page.get_by_role("button", name=tab, exact=True).click()
+        assert [section["name"] for section in boxes(page, "#panel section")] == [tab.lower()]
+        (panel,) = boxes(page, "#panel")
+        assert panel["x"] >= 0 and panel["x"] + panel["width"] <= width
+        assert panel["y"] >= 0 and panel["y"] + panel["height"] <= bar["y"] + 1
+        if width < 600:
+            assert panel["height"] <= 0.56 * height, "the scene is seen above the sheet"
+        assert page.page.locator("#show").is_hidden() and page.page.locator("#freeze").is_hidden()
+    page.page.keyboard.press("Escape")
+    assert page.page.locator("#panel").is_hidden()
+    assert page.page.evaluate("document.activeElement.textContent") == "Help"
+    page.page.get_by_role("button", name="View", exact=True).click()
+    page.page.mouse.click(40, 120)
+    assert page.page.locator("#panel").is_hidden() == (width < 600), "a sheet gives way to the scene"
+    assert not page.errors
+    page.page.close()
+
+
+def test_fingers_hit_every_control(window, demo, browser):
+    size, touch = window
+    page = Page(browser, demo[1].as_uri(), size, **touch).begun()
+    page.page.evaluate("nrfgs.setNotes([{ text: 'here', position: nrfgs.getCamera().target }])")
+    seen = set()
+    for tab in TABS:
+        page.tab(tab)
+        if tab == "Share":
+            page.page.click("#embed")
+            page.page.click("#copy-link")
+        for box in boxes(page, CONTROLS + ", .note button"):
+            assert box["width"] >= LARGE and box["height"] >= LARGE, box
+            seen.add(box["name"])
+        overflow = page.page.evaluate(
+            "(() => { const { scrollWidth, clientWidth } = document.getElementById('panel');"
+            " return scrollWidth - clientWidth; })()"
+        )
+        assert overflow <= 0, tab
+    assert {"home", "drag", "gain", "photograph", "copy-link", "embed", "add-note", "save-tour"} <= seen
+    page.page.close()
+
+
+def devtools(page: Page):
+    """Chromium's own protocol, which emulates safe areas and fingers; skips in Firefox, which has no such thing."""
+    if page.is_firefox:
+        page.page.close()
+        pytest.skip("Firefox emulates neither safe areas nor fingers")
+    return page.page.context.new_cdp_session(page.page)
+
+
+def test_controls_stay_within_the_safe_area(demo, browser):
+    page = Page(browser, demo[1].as_uri(), (360, 640), has_touch=True).begun()
+    insets = {"top": 40, "bottom": 34, "left": 0, "right": 0}
+    devtools(page).send("Emulation.setSafeAreaInsetsOverride", {"insets": insets})
+    assert all(box["y"] + box["height"] <= 640 - 34 for box in boxes(page, "#bar button"))
+    page.tab("Share")
+    assert boxes(page, "#caption")[0]["y"] >= 40
+    page.page.close()
 
 
 def test_every_control_changes_the_picture(window, demo, browser):
@@ -105,7 +196,7 @@ def test_every_control_changes_the_picture(window, demo, browser):
     for key in "wsadqe":
         changed(lambda key=key: page.page.keyboard.press(key, delay=300))
         same(press_home)
-    changed(lambda: page.page.mouse.dblclick(120, 200))
+    changed(lambda: page.double_click(120, 200))
     assert np.allclose(page.camera()[0], where), "what is double-clicked is looked at, from the same place"
     same(press_home)
 
@@ -126,9 +217,43 @@ def test_every_control_changes_the_picture(window, demo, browser):
     page.page.close()
 
 
+def test_marks_say_how_many_are_in_view_and_lead_there(wall):
+    page = wall((480, 480))
+    page.tab("Photographs")
+    page.page.check("#mark")
+    page.call("finished")
+    assert re.findall(r"\d+", page.page.inner_text("#mark-said")) == ["9"], "all are where the camera is, or beside it"
+    page.call("setCamera", {"position": [8, 0.1, 0.1], "target": [0, 0.1, 0.1]})
+    page.call("finished")
+    assert re.findall(r"\d+", page.page.inner_text("#mark-said")) == ["9", "9"]
+    page.page.keyboard.press("Escape")
+    camera = page.page.evaluate("nrfgs.photographs()[8].position")
+    x, y = projected(page, [camera])[0]
+    page.page.mouse.click(x, y)
+    page.call("finished")
+    assert np.allclose(page.camera()[0], camera) and page.page.locator("#photograph").input_value() == "8"
+    page.tab("Photographs")
+    page.page.uncheck("#mark")
+    assert page.page.locator("#mark-said").is_hidden()
+    page.page.keyboard.press("Escape")
+    page.call("setCamera", {"position": [8, 0.1, 0.1], "target": [0, 0.1, 0.1]})
+    page.page.mouse.click(x, y)
+    assert np.allclose(page.camera()[0], [8, 0.1, 0.1]), "what is not shown leads nowhere"
+
+
+def projected(page: Page, points: list) -> np.ndarray:
+    """Where points are seen, CSS pixels [N, 2], once the lens is in the middle, with a field of view of 50."""
+    page.call("setCamera", page.call("getCamera") | {"fov": 50})
+    matrix = np.array(page.call("getMatrix")).reshape(4, 4).T
+    x, y, z = np.linalg.inv(matrix)[:3, :3] @ np.array(points).T + np.linalg.inv(matrix)[:3, 3:]
+    size = page.page.viewport_size
+    focal = size["height"] / 2 / np.tan(np.radians(25))
+    return np.stack([size["width"] / 2 - focal * x / z, size["height"] / 2 + focal * y / z], axis=1)
+
+
 def test_the_view_never_ends_inside_or_behind_the_scene(wall):
     """The wall is at x = 0; photographs at x = 3 take its distance for 5: they turn around a point behind it."""
-    page = wall((480, 360))
+    page = wall()
     eyes = np.array([photograph["position"] for photograph in page.call("photographs")])
 
     def away(position) -> float:
@@ -166,9 +291,22 @@ def test_the_view_never_ends_inside_or_behind_the_scene(wall):
     assert page.camera()[0][0] < 19
 
 
+def test_no_frame_around_what_a_mouse_drags(wall):
+    page = wall()
+    style = "getComputedStyle(document.getElementById('scene')).outlineStyle"
+    page.page.keyboard.press("Tab")
+    page.page.focus("#scene")
+    assert page.page.evaluate(style) == "solid", "the keyboard's place is seen"
+    page.drag()
+    assert page.page.evaluate("document.activeElement.id") == "scene"
+    assert page.page.evaluate(style) == "none"
+    page.page.keyboard.press("ArrowLeft")
+    assert page.page.evaluate(style) == "solid"
+
+
 def test_fingers_turn_move_and_zoom(demo, browser):
     page = Page(browser, demo[1].as_uri(), (480, 360)).begun()
-    touch = page.page.context.new_cdp_session(page.page)
+    touch = devtools(page)
 
     def fingers(*paths: list[tuple[int, int]]) -> None:
         """Put fingers down where their paths begin, move them along, and lift them."""
@@ -195,24 +333,113 @@ def test_fingers_turn_move_and_zoom(demo, browser):
     page.page.close()
 
 
+SLOW_SORT = """
+const Quick = Worker;
+window.Worker = class extends Quick {
+  postMessage(message, ...more) {
+    setTimeout(() => super.postMessage(message, ...more), message.camera && window.nrfgs.begun ? 60000 : 0);
+  }
+};
+"""
+
+
+def test_the_picture_moves_while_splats_are_sorted(wall):
+    page = wall((240, 180), before=SLOW_SORT)
+    page.page.evaluate("nrfgs.begun = true")
+    shots = [page.page.screenshot()]
+    for _ in range(2):
+        page.page.keyboard.press("ArrowLeft")
+        page.page.wait_for_timeout(500)
+        shots.append(page.page.screenshot())
+    assert len(set(shots)) == 3
+
+
+SLOW_FRAMES = """
+window.widths = [];
+const frame = requestAnimationFrame, viewport = WebGL2RenderingContext.prototype.viewport;
+window.requestAnimationFrame = (act) => frame(() => setTimeout(() => act(performance.now()), window.late ?? 0));
+WebGL2RenderingContext.prototype.viewport = function (x, y, width, height) {
+  if (height <= this.canvas.height && width <= this.canvas.width) window.widths.push(width);  // else a table's
+  viewport.call(this, x, y, width, height);
+};
+"""
+
+
+def test_slow_frames_make_pictures_coarser_until_the_camera_rests(wall):
+    page = wall((240, 180), before=SLOW_FRAMES)
+    sharp = page.picture()
+    page.page.evaluate("late = 100; nrfgs.play('rotation')")
+    page.until("widths.some((width) => width <= 100)")
+    page.page.evaluate("nrfgs.stop(); nrfgs.visit(0)")
+    assert psnr(page.picture(), sharp) > 60
+    assert page.page.evaluate("Math.min(...widths) >= 96"), "0.4 of the whole at the coarsest"
+
+
 def test_whoever_cannot_see_the_page_is_told_what_is_there(demo, browser):
-    """The keyboard alone gets everywhere, every control has a name, and what happens is said."""
     page = Page(browser, demo[1].as_uri(), (900, 700)).begun()
+    assert page.page.locator("html").get_attribute("lang") == "en"
+    for tab, roles in {
+        "View": {
+            "application": ["page: a scene in three dimensions"],
+            "heading": ["page"],
+            "slider": [re.compile("^Residual gain")],
+            "combobox": [re.compile("^Show"), re.compile("^Drag to")],
+            "checkbox": ["Freeze view", "Turn slowly"],
+            "button": [*TABS, "First view", "Full screen"],
+        },
+        "Photographs": {
+            "combobox": ["Photograph"],
+            "checkbox": ["Mark where taken"],
+            "button": ["Previous photograph", "Next photograph"],
+        },
+        "Share": {"button": ["Copy link to this view", "Save picture", "Embed in a page", "Add note", "Save tour"]},
+    }.items():
+        page.tab(tab)
+        assert page.page.get_by_role("region", name=tab, exact=True).count() == 1
+        for role, names in roles.items():
+            for name in names:
+                assert page.page.get_by_role(role, name=name, exact=isinstance(name, str)).count() == 1, name
     unnamed = page.page.evaluate(
         "[...document.querySelectorAll('button, select, input, textarea')].filter((one) => !one.labels?.length"
         " && !one.ariaLabel && !one.textContent.trim()).map((one) => one.id)"
     )
     assert unnamed == []
+
+    # The keyboard alone gets everywhere, and what happens is said.
     reached = set()
     for tab in TABS:
         page.tab(tab)
-        assert page.page.get_by_role("region", name=tab, exact=True).count() == 1
         for _ in range(20):
             page.page.keyboard.press("Tab")
             reached.add(page.page.evaluate("document.activeElement.id"))
-    assert {"scene", "show", "gain", "freeze", "drag", "rotate", "photograph", "mark", "home", "embed"} <= reached
+    assert {
+        "scene",
+        "show",
+        "gain",
+        "freeze",
+        "drag",
+        "rotate",
+        "photograph",
+        "mark",
+        "home",
+        "embed",
+        "save",
+    } <= reached
     page.page.focus("#scene")
     page.page.keyboard.press("]")
     assert page.page.get_by_role("status").filter(has_text=re.compile("^Photograph ")).count() == 1
+    for role, expanded in (("true", "Help"), ("false", "View")):
+        assert page.page.get_by_role("button", name=expanded, exact=True).get_attribute("aria-expanded") == role
     assert not page.errors
     page.page.close()
+
+
+def test_pictures_for_the_docs(demo, tmp_path):
+    run = subprocess.run(
+        [sys.executable, "-m", "nrfgs_lab.page_pictures", demo[1], tmp_path / "out"], capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    shown = [f"{window}-{name}.jpg" for window in ("desktop", "phone") for name in ("page", "share", "view")]
+    assert written == [*shown, "web.jpg"]
+    assert all(np.asarray(Image.open(tmp_path / "out" / name)).std() > 5 for name in written)

@@ -133,8 +133,7 @@ def test_embedded_where_the_code_says(wall, browser, tmp_path):
         )
         (tmp_path / "outer" / "index.html").write_text(script + code)
         (tmp_path / "outer" / "other.html").write_text("<p>another</p>")
-        for folder in (tmp_path, tmp_path / "outer"):
-            (folder / "favicon.ico").write_bytes(b"")  # else the browser complains
+        (tmp_path / "outer" / "favicon.ico").write_bytes(b"")  # else the browser complains
         host = Page(browser, f"{outer}/", (900, 700))
 
         def answer(name: str, value) -> dict:

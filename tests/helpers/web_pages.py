@@ -34,6 +34,7 @@ class Page:
     def __init__(self, browser, address: str, size: tuple[int, int] = SIZE, before: str = "", **context):
         self.page = browser.new_page(viewport={"width": size[0], "height": size[1]}, **context)
         self.page.set_default_timeout(120_000)
+        self.is_firefox = browser.browser_type.name == "firefox"
         self.errors: list[str] = []
         self.requests: list[str] = []
         self.page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
@@ -88,6 +89,13 @@ class Page:
             " control.dispatchEvent(new Event(event)); }",
             [control, value, event],
         )
+
+    def double_click(self, x: int, y: int) -> None:
+        """Double-click on the scene. Firefox, driven from outside, counts single clicks only: it gets the event."""
+        if self.is_firefox:
+            self.page.dispatch_event("#scene", "dblclick", {"clientX": x, "clientY": y})
+        else:
+            self.page.mouse.dblclick(x, y)
 
     def drag(self, shift: bool = False) -> None:
         if shift:

@@ -7,7 +7,8 @@ const canvas = byId("scene");
 
 function fail(error) {
   const told = error instanceof BadFile || error instanceof Lacking;
-  const message = told ? error.message : `Something went wrong: ${error?.message ?? error}.`;
+  const message = told ? error.message : "Something went wrong, and the page cannot go on. Load it again; the browser's console has the details.";
+  if (!told) console.error(error);
   const hint = error instanceof BadFile ? " Load the page again, or ask for it again where it came from." : "";
   byId("loading").hidden = true;
   byId("failed").hidden = false;
@@ -397,7 +398,7 @@ function startReader() {
     const code = new Blob([byId("reader").textContent], { type: "text/javascript" });
     const worker = new Worker(URL.createObjectURL(code));
     worker.onmessage = ({ data }) => receive(data);
-    worker.onerror = (event) => fail(new BadFile(`The scene cannot be read (${event.message}).`));
+    worker.onerror = () => fail(new BadFile(UNREADABLE));  // the browser's console has the error
     post = (message, transfer) => worker.postMessage(message, transfer);
   } catch {
     const handle = answer((message) => setTimeout(() => receive(message)));

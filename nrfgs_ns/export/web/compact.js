@@ -31,6 +31,7 @@ const CHOICES = {
 // What is said to a reader: a fault of the file, or what a device lacks.
 class BadFile extends Error {}
 class Lacking extends Error {}
+const UNREADABLE = "The scene cannot be read: it is damaged, or needs more memory than this device has.";
 
 function expect(right, what) {
   if (!right) throw new BadFile(`The scene is damaged: ${what}.`);
@@ -57,7 +58,7 @@ function readScene(bytes, progress) {
     return sceneOf(header, streams);
   } catch (error) {
     if (error instanceof BadFile) throw error;
-    throw new BadFile("The scene cannot be read: it is damaged, or needs more memory than this device has.");
+    throw new BadFile(UNREADABLE);
   }
 }
 

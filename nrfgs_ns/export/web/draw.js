@@ -105,7 +105,7 @@ class Painter {
     const gl = (this.gl = canvas.getContext("webgl2", {
       alpha: false, antialias: false, depth: false, stencil: false, powerPreference: "high-performance",
     }));
-    if (!gl) throw new Lacking("This browser has no WebGL 2, which the scene is drawn with.");
+    if (!gl) throw new Lacking("The scene is drawn with WebGL 2, which this browser does not offer here. Turn on graphics acceleration in its settings, update it, or open the page in a current Chrome, Edge, Firefox or Safari.");
     this.canvas = canvas;
     const floats = gl.getExtension("EXT_color_buffer_float"), halfs = gl.getExtension("EXT_color_buffer_half_float");
     this.exact = Boolean(floats || halfs);  // else pictures are blended in 8 bits
@@ -130,6 +130,7 @@ class Painter {
     this.show = this._program(WHOLE_VERTEX, SHOW_FRAGMENT);
     this.drawn = 0;  // instances whose order is known
     this.target = null;
+    if (gl.getError() === gl.OUT_OF_MEMORY) throw new Lacking("This device's graphics memory is too small for the scene.");
   }
 
   _height(count, each) {
@@ -311,7 +312,8 @@ class Painter {
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
       const said = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader)).join("\n");
-      throw new Error(`a shader does not compile: ${said} ${gl.getProgramInfoLog(program)}`);
+      console.error(said, gl.getProgramInfoLog(program));
+      throw new Lacking("This device's graphics driver cannot run what draws the scene. Update it, or open the page in another browser.");
     }
     const places = {};
     return { program, at: (name) => (places[name] ??= gl.getUniformLocation(program, name)) };

@@ -136,7 +136,8 @@ function answer(post) {
         post({ sorted: { rows, seconds, along: order.along(camera) } }, [rows.buffer]);
       }
     } catch (error) {
-      post({ failed: error instanceof BadFile ? error.message : `The scene cannot be read (${error.message}).` });
+      if (!(error instanceof BadFile)) console.error(error);
+      post({ failed: error instanceof BadFile ? error.message : UNREADABLE });
     }
   };
 }

@@ -37,7 +37,7 @@ function drawMarks() {
     pen.stroke();
   }
   byId("mark-said").textContent = inView.length
-    ? `${inView.length} of ${photographs.length} places are in this view. Press a dot to go there.`
+    ? `${inView.length} of ${photographs.length} places ${inView.length > 1 ? "are" : "is"} in this view. Press a dot to go there.`
     : `None of the ${photographs.length} places is in this view: they are beside or behind you. Move back or turn.`;
 }
 
@@ -133,7 +133,7 @@ function save(href, download) {
 }
 
 const saveJson = (name, value) =>
-  save(URL.createObjectURL(new Blob([JSON.stringify(value, null, 1) + "\n"], { type: "application/json" })), name);
+  save(`data:application/json,${encodeURIComponent(JSON.stringify(value, null, 1) + "\n")}`, name);
 
 const legends = {
   full: "The picture as trained, with the residual times the gain.",
