@@ -18,11 +18,11 @@ from nrfgs_ns.errors import InputError
 MODEL = "nrfgs_ns.model.model:NrfgsModel"
 """The model's class, which imports this module."""
 PRIOR_VIEWS = 20
-"""Training views with which `few_views` halves the trust in the head."""
+"""Training views with which the trust in the head, by `few_views`, is one half."""
 HALVING_VIEWS = 12
 """Training views that halve `shrinkage`."""
 NEGLIGIBLE = 1e-6
-"""Weights of shrinkage below this are zero: Adam makes whole steps of any for splats that no view sees."""
+"""Smaller weights of shrinkage count as zero: Adam turns any into whole steps of splats that no view sees."""
 EPSILON = math.ulp(1.0)
 
 
