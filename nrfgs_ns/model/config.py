@@ -51,9 +51,9 @@ class NrfgsModelConfig(ModelConfig):
     """steps before training in which a head that starts with a residual unlearns it. None: one for each training
     view"""
     densification: DensificationChoice = field(default_factory=Splatfacto)
-    """how splats are added and removed: a strategy, and options of its own, as in mcmc,budget=150000
-    (docs/options.md). error-guided: growth where the error is. splatfacto: nerfstudio's rules. original: those of 3DGS.
-    mcmc: 3DGS-MCMC, up to a budget"""
+    """how splats are added and removed: a strategy, and options of its own, as in mcmc,budget=150000; those left out
+    have the strategy's defaults, not a preset's (docs/options.md). error-guided: growth where the error is. splatfacto:
+    nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to a budget"""
     photographs: Literal["auto", "on", "off"] = "auto"
     """learn each photograph's exposure and white balance. auto: if photographs or EXIF show that they vary
     (docs/exposure.md)"""
