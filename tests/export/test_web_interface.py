@@ -80,7 +80,7 @@ def test_a_camera_that_is_none_is_refused_and_changes_nothing(wall):
 def test_a_flight_arrives_or_is_stopped_by_a_touch(wall):
     page = wall()
     page.page.evaluate("window.seen = []; nrfgs.on('moved', (camera) => seen.push(camera.position)); 0")
-    assert page.call("flyTo", VIEWS[0], 0.5) is True
+    assert page.call("flyTo", VIEWS[0], 2) is True
     assert np.allclose(page.call("getCamera")["position"], VIEWS[0]["position"])
     assert len(page.page.evaluate("seen")) > 2
     page.page.evaluate("(view) => { window.flight = nrfgs.flyTo(view, 60); }", VIEWS[1])
