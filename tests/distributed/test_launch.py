@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is said when a process is lost, and that nothing else is lost with it."""
 
-import contextlib
 import os
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -12,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from sessions import session
 from short_trainings import command_line
 from torch.multiprocessing import ProcessExitedException
 
@@ -85,20 +84,11 @@ def endless(tiny_scene, tmp_path):
         "--pipeline.model.densification": "splatfacto,stop_split_at=0",
     }
     words = command_line("nrfgs", tiny_scene, tmp_path, 100_000, options)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "nrfgs_lab.many_processes", *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        start_new_session=True,
-    )
-    until = time.monotonic() + WAIT
-    while not list(tmp_path.rglob("*.ckpt")) and process.poll() is None and time.monotonic() < until:
-        time.sleep(0.1)
-    yield process
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
+    with session("-m", "nrfgs_lab.many_processes", *words) as process:
+        until = time.monotonic() + WAIT
+        while not list(tmp_path.rglob("*.ckpt")) and process.poll() is None and time.monotonic() < until:
+            time.sleep(0.1)
+        yield process
 
 
 @pytest.mark.slow

@@ -98,44 +98,38 @@ def test_a_page_asks_the_network_for_nothing_and_works_in_a_frame(demo, opened, 
     assert all(url.startswith(("file:", "blob:", "data:")) for url in page.requests)
 
 
-@pytest.mark.parametrize(
-    "fault, said",
-    {
-        "a letter changed": "checksum",
-        "cut short": "cut short",
-        "without its scene": "cut short",
-        "cut in its scripts": "incomplete",
-        "cut in its style": "incomplete",
-        "cut in its poster": "incomplete",
-        "scripts that do not parse": "cannot run this page",
-        "not base64": "damaged",
-        "of a later version": "version",
-    }.items(),
-)
-def test_a_broken_page_says_so(fault, said, demo, browser, tmp_path):
-    text = demo[1].read_text(encoding="utf-8")
+def broken_pages(text: str) -> dict[str, tuple[str, str]]:
+    """Fault -> a page with it, and what it says."""
     at = text.index('id="packed"')
     start, middle = text.index(">", at) + 1, at + (len(text) - at) // 2
     scene = base64.b64decode(text[start : text.index("<", start)])
     later = base64.b64encode(scene[:8] + (9).to_bytes(4, "little") + scene[12:]).decode()
-    broken = {
-        "a letter changed": text[:middle] + ("A" if text[middle] != "A" else "B") + text[middle + 1 :],
-        "cut short": text[:middle],
-        "without its scene": text[: text.rindex("<script", 0, at)],
-        "cut in its scripts": text[: text.index("async function main")],
-        "cut in its style": text[: text.index("</style>") - 9],
-        "cut in its poster": text[: text.index('src="data:image') + 400],
-        "scripts that do not parse": text.replace("async function main", "async async function main"),
-        "not base64": text[:middle] + "!" + text[middle + 1 :],
-        "of a later version": text[:start] + later + text[text.index("<", start) :],
+    letter = "A" if text[middle] != "A" else "B"
+    return {
+        "a letter changed": (text[:middle] + letter + text[middle + 1 :], "checksum"),
+        "cut short": (text[:middle], "cut short"),
+        "without its scene": (text[: text.rindex("<script", 0, at)], "cut short"),
+        "cut in its scripts": (text[: text.index("async function main")], "incomplete"),
+        "cut in its style": (text[: text.index("</style>") - 9], "incomplete"),
+        "cut in its poster": (text[: text.index('src="data:image') + 400], "incomplete"),
+        "scripts that do not parse": (
+            text.replace("async function", "async async function", 1),
+            "cannot run this page",
+        ),
+        "not base64": (text[:middle] + "!" + text[middle + 1 :], "damaged"),
+        "of a later version": (text[:start] + later + text[text.index("<", start) :], "version"),
     }
-    (tmp_path / "broken.html").write_text(broken[fault], encoding="utf-8")
-    page = Page(browser, (tmp_path / "broken.html").as_uri(), (400, 300))
-    page.page.wait_for_selector("#failed:not([hidden])")
-    assert said in page.page.inner_text("#failed")
-    assert page.page.locator("#loading").is_hidden()
-    assert np.asarray(Image.open(io.BytesIO(page.page.screenshot()))).std() > 5, "the poster is there"
-    page.page.close()
+
+
+def test_a_broken_page_says_so(demo, browser, tmp_path):
+    for fault, (text, said) in broken_pages(demo[1].read_text(encoding="utf-8")).items():
+        (tmp_path / "broken.html").write_text(text, encoding="utf-8")
+        page = Page(browser, (tmp_path / "broken.html").as_uri(), (400, 300))
+        page.page.wait_for_selector("#failed:not([hidden])")
+        assert said in page.page.inner_text("#failed"), fault
+        assert page.page.locator("#loading").is_hidden(), fault
+        assert np.asarray(Image.open(io.BytesIO(page.page.screenshot()))).std() > 5, "the poster is there"
+        page.page.close()
 
 
 @pytest.mark.parametrize(
