@@ -4,7 +4,6 @@
 Nothing is retrained: the loss is at least that of a model trained without the part.
 """
 
-import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -20,7 +19,7 @@ from torch.utils.benchmark import Timer
 from nrfgs_lab.residuals import THRESHOLDS, FieldViews, Residuals, dropped, look_over, slim
 from nrfgs_lab.training_run import machine
 from nrfgs_ns.appearance.field import DIFFUSE, Field
-from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
+from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.reduce import LatentBasis, branches, latent_basis, rebuilt, with_rank
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
@@ -136,22 +135,6 @@ def row(part: str, group: str, field: Field, views: FieldViews, full: float | No
     return Row(part, group, score, loss, field.bytes, head_seconds(views, field), share)
 
 
-def input_columns(config: NrfConfig, branch: str) -> dict[str, list[int]]:
-    """Columns of the first layer's inputs, of the branch "low" (or the only one) or "high", by name.
-
-    Names: latents, color, distance, opacity, direction, "band 0", "band 1", ...
-    """
-    sizes = {"latents": config.latent_dim, "color": 3}
-    if config.use_distance:
-        sizes["distance"] = 1
-    if branch == "low":
-        sizes |= {"opacity": 1, "direction": 3, "band 0": 6}
-    if branch == "high" or not config.split_bands:
-        sizes |= {f"band {k}": 6 for k in range(1, config.num_bands)}
-    ends = list(itertools.accumulate(sizes.values()))
-    return {name: list(range(end - size, end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
-
-
 def diffuse_splats(field: Field) -> int:
     """Number of splats without residual."""
     return int(field.splats[DIFFUSE].sum()) if DIFFUSE in field.splats else 0
@@ -248,9 +231,9 @@ def without_opacity_residual(field: Field) -> Field:
 def with_constant_distance(field: Field, log_distance: float) -> Field:
     """A constant log distance, folded into the biases."""
     weights = dict(field.head.state_dict())
+    column = field.head.config.latent_dim + 3  # behind latents and base colour
     for branch in branches(weights):
         first = weights[f"{branch}.0.weight"]
-        (column,) = input_columns(field.head.config, branch)["distance"]
         weights[f"{branch}.0.weight"] = torch.cat([first[:, :column], first[:, column + 1 :]], dim=1)
         weights[f"{branch}.0.bias"] = weights[f"{branch}.0.bias"] + log_distance * first[:, column]
     return rebuilt(field, weights, use_distance=False)

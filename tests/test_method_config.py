@@ -3,7 +3,7 @@
 
 import subprocess
 import sys
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from types import SimpleNamespace
 
 import pytest
@@ -18,8 +18,9 @@ from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.sg import SphericalGaussians
 from nrfgs_ns.appearance.sh import SphericalHarmonics
 from nrfgs_ns.appearance.vdgs import ViewDirectionFactors
-from nrfgs_ns.densification import DensificationConfig, Splatfacto
+from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.method_config import nrfgs, nrfgs_best, nrfgs_fast, nrfgs_gsnb, nrfgs_sg, nrfgs_sh, nrfgs_vdgs
+from nrfgs_ns.training.identity import leaves
 
 METHODS = {
     "nrfgs": (nrfgs, NeuralResidualField, {"latents", "field"}),
@@ -112,17 +113,7 @@ def test_everything_else_is_splatfactos(name):
     ],
 )
 def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):
-    def flat(config, prefix=""):
-        for field in fields(config):
-            value = getattr(config, field.name)
-            if isinstance(value, DensificationConfig):
-                yield f"{prefix}{field.name}", str(value)
-            elif is_dataclass(value) and not isinstance(value, type):
-                yield from flat(value, f"{prefix}{field.name}.")
-            else:
-                yield f"{prefix}{field.name}", value
-
-    ours, base = dict(flat(PRESETS[name].config)), dict(flat(nrfgs.config))
+    ours, base = dict(leaves(PRESETS[name].config)), dict(leaves(nrfgs.config))
     assert ours.keys() == base.keys()
     changed = {key: ours[key] for key in ours if str(ours[key]) != str(base[key])}
     assert changed == {"method_name": name, **differs}

@@ -64,13 +64,14 @@ class Demo:
         if self.steps < 1:  # ns-train nrfgs would take 0 for as many as it finds right
             raise InputError(f"--steps is {self.steps}; it must be at least 1.")
         scene = self.scene()
+        folder = f"scene-gloss{self.gloss:g}-seed{self.seed}" + ("-quick" if self.quick else "")
         check_writable(self.out / "results.json", "--out")
         steps = min(self.steps, 150) if self.quick else self.steps
         results: dict[str, dict[str, Any]] = {}
         columns = TextColumn("{task.description:<24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=screen) as progress:
             with _bar(progress, "make the scene", scene.views) as advance:
-                data = write_scene(scene, self.out / self.scene_folder, progress=lambda *_: advance())
+                data = write_scene(scene, self.out / folder, advance)
             # Heavy imports only when there is work to do: `nrfgs --help` answers at once, and so does a refusal.
             from nrfgs_lab.demo.pictures import contact_sheet, strip
             from nrfgs_lab.demo.views import Look, where_it_shines
@@ -106,11 +107,6 @@ class Demo:
         if activate := _activation():
             screen.print(f"  {activate}", highlight=False, soft_wrap=True)
         screen.print(f"  nrfgs view {results[NRF]['train']['config_path']}", highlight=False, soft_wrap=True)
-
-    @property
-    def scene_folder(self) -> str:
-        """Folder of the data set inside `out`; its name tells one demo's scene from another's."""
-        return f"scene-gloss{self.gloss:g}-seed{self.seed}" + ("-quick" if self.quick else "")
 
     def scene(self) -> SceneConfig:
         """The scene's configuration: many views, close together, as small highlights need."""

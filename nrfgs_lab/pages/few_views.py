@@ -43,12 +43,9 @@ def runs_of(scene: str, name: str) -> Trainings:
     return sorted(runs, key=lambda one: one["seed"])
 
 
-def _ahead(gains: list[float], digits: int = 1, sign: str = "") -> str:
+def _ahead(gains: list[float], digits: int = 1) -> str:
     """Gain in the median view in dB, and the number of views with a gain."""
-    if not gains:
-        return "-"
-    gain = f"{median(gains):+.{digits}f}" if sign else signed(median(gains), digits)
-    return f"{gain} ({sum(one > 0 for one in gains)}/{len(gains)})"
+    return f"{signed(median(gains), digits)} ({sum(one > 0 for one in gains)}/{len(gains)})" if gains else "-"
 
 
 def captures() -> str:
@@ -109,9 +106,9 @@ def test_views() -> str:
     for scene, views in VIEWS.items():
         field, shrunk, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, HOST))
         budget = [runs_of(scene, name) for name in BUDGET]
-        cells = [_cell(field), _cell(host), _cell(shrunk), _ahead(view_gains(field, shrunk), 2, "+")]
+        cells = [_cell(field), _cell(host), _cell(shrunk), _ahead(view_gains(field, shrunk), 2)]
         cells += [f"{_gap(field)}, {_gap(shrunk)}", ", ".join(map(_cell, budget))]
-        body.append([f"{scene}, {views}", *cells, _ahead(view_gains(*budget), 2, "+")])
+        body.append([f"{scene}, {views}", *cells, _ahead(view_gains(*budget), 2)])
     head = "`nrfgs`", "splatfacto", "harmonics", "gain", "gaps", "150k: field, harmonics", "gain there"
     return grid(["capture, training views", *head], body)
 

@@ -1,27 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of docs/viewer.md; they need a Chromium and `pip install -e '.[browser]'`.
+"""Pictures of the docs; they need a Chromium and `pip install -e '.[browser]'`.
 
-python -m nrfgs_lab.pages.pictures demo/outputs/*/nrfgs/*/config.yml
+python -m nrfgs_lab.pages.pictures demo/outputs/*/nrfgs/*/config.yml    # docs/viewer.md: the viewer, and its modes
+python -m nrfgs_lab.pages.pictures PAGE.html OUT    # a page of `nrfgs export web`, on a desktop and on a phone
 """
 
+import re
+import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
-from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image, ImageDraw
 
 from nrfgs_lab.bench.crops import GAP, TITLE
-from nrfgs_lab.pages.browser import Page, Served, chromium
-from nrfgs_ns.viewer.pictures import PictureOptions, legends, picture
+from nrfgs_lab.pages.browser import chromium
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
+PATIENCE, REST = 300_000, 60_000
+"""Milliseconds to wait for anything on a slow, busy machine, and until the viewer's picture is whole."""
+PORT = 7011
+"""Of the viewer."""
 WIDTH, COLUMNS = 300, 3
 """The sheet of modes: width of one in pixels, and number of columns."""
+WINDOWS = {"desktop": ((1280, 760), {}), "phone": ((390, 844), {"has_touch": True, "device_scale_factor": 2})}
+SHOWN = {"page": None, "view": "View", "share": "Share"}
+"""Pictures of each window: the part of the panel that is open."""
+HEIGHT, BETWEEN = 600, 16
+"""Pixels of the picture of a page, and of the gap between its two halves."""
 
 
 def sheet(config: Path, view: int = 1) -> None:
     """Write viewer-modes.jpg, every mode of the panel on one test view."""
+    from nerfstudio.utils.eval_utils import eval_setup  # takes seconds
+
+    from nrfgs_ns.viewer.pictures import PictureOptions, legends, picture
+
     _, pipeline, _, _ = eval_setup(config, test_mode="test")
     model = pipeline.model
     camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[view]
@@ -38,19 +51,65 @@ def sheet(config: Path, view: int = 1) -> None:
 
 
 def viewer(config: Path) -> None:
-    """Write viewer.jpg, the page of ns-viewer close to the residual."""
-    with tempfile.TemporaryDirectory() as folder, chromium() as browser:
-        with Served(Path(folder) / "log", "--load-config", config) as served:
-            page = Page(browser, served.port, 1180, 680)
-            page.hide_cameras()
-            page.come_closer()
-            page.set_resolution(900)
-            full = page.settled()
-            page.show("residual")
-            page.settled(unlike=full)
-            page.save(IMAGES / "viewer.jpg")
+    """Write viewer.jpg, the page of `nrfgs view` close to the residual."""
+    command = [sys.executable, "-m", "nrfgs_ns.cli", "view", str(config), "--port", str(PORT)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server, chromium() as browser:
+        try:
+            next(line for line in server.stdout if str(PORT) in line)  # it listens
+            tab = browser.new_page(viewport={"width": 1180, "height": 680})
+            tab.set_default_timeout(PATIENCE)
+            # No fonts and logos of other sites: there may be no network.
+            tab.route(re.compile(r"^https?://(?!127\.0\.0\.1)"), lambda route: route.abort())
+            tab.goto(f"http://127.0.0.1:{PORT}", wait_until="domcontentloaded")
+            tab.get_by_text("Hide Train Cams").click()
+            tab.mouse.move(410, 340)
+            tab.mouse.wheel(0, -400)
+            _control(tab, "Max res").fill("900")
+            _control(tab, "Max res").press("Enter")
+            _control(tab, "Show").click()
+            tab.get_by_role("option", name="residual", exact=True).click()
+            tab.wait_for_timeout(REST)
+            tab.add_style_tag(content="img { visibility: hidden }")  # the logo, of another site
+            tab.screenshot(path=IMAGES / "viewer.jpg", type="jpeg", quality=85)
+        finally:
+            server.terminate()
+
+
+def _control(tab, label: str):
+    """Input in the row of a label."""
+    row = tab.get_by_text(label, exact=True).first.locator("xpath=ancestor::*[.//input][1]")
+    return row.locator("input:not([type=hidden])").last
+
+
+def page(path: Path, folder: Path) -> None:
+    """Write WINDOW-PICTURE.jpg for each of both, and web.jpg, the docs' picture. The page's tour does not run: the page
+    begins at the photograph that the export chose."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with chromium() as browser:
+        for window, ((width, height), options) in WINDOWS.items():
+            viewport = {"width": width, "height": height}
+            tab = browser.new_page(viewport=viewport, reduced_motion="reduce", **options)
+            tab.set_default_timeout(PATIENCE)
+            tab.goto(path.resolve().as_uri())
+            tab.evaluate("nrfgs.ready")
+            for name, part in SHOWN.items():
+                if part:
+                    tab.get_by_role("button", name=part, exact=True).click()
+                tab.evaluate("nrfgs.finished()")
+                tab.screenshot(path=folder / f"{window}-{name}.jpg", type="jpeg", quality=85)
+            tab.close()
+    shown = [Image.open(folder / name) for name in ("desktop-view.jpg", "phone-page.jpg")]
+    shown = [image.resize((image.width * HEIGHT // image.height, HEIGHT)) for image in shown]
+    pair = Image.new("RGB", (sum(image.width for image in shown) + BETWEEN, HEIGHT), "white")
+    pair.paste(shown[0])
+    pair.paste(shown[1], (shown[0].width + BETWEEN, 0))
+    pair.save(folder / "web.jpg", quality=85)
 
 
 if __name__ == "__main__":
-    sheet(Path(sys.argv[1]))
-    viewer(Path(sys.argv[1]))
+    first, *others = map(Path, sys.argv[1:])
+    if others:
+        page(first, *others)
+    else:
+        sheet(first)
+        viewer(first)

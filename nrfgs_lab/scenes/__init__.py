@@ -14,18 +14,9 @@ written as a nerfstudio data set, or asked for its colour along any ray:
 `shading.py` has the equations, `scene.py` the layout. Only numpy is needed, and Pillow and plyfile for writing.
 """
 
-from .cameras import camera_rays, dome_cameras, project, render
+from .cameras import camera_rays, dome_cameras, render
 from .config import SceneConfig
 from .dataset import write_scene
 from .scene import build_scene
 
-__all__ = [
-    "SceneConfig",
-    "build_scene",
-    "camera_rays",
-    "dome_cameras",
-    "project",
-    "render",
-    "split_names",
-    "write_scene",
-]
+__all__ = ["SceneConfig", "build_scene", "camera_rays", "dome_cameras", "render", "write_scene"]

@@ -36,11 +36,11 @@ def split_names(config: SceneConfig) -> tuple[list[str], list[str]]:
     return [name for name in names if name not in set(test)], test
 
 
-def write_scene(config: SceneConfig, out: Path, progress: Callable[[int, int], None] | None = None) -> Path:
+def write_scene(config: SceneConfig, out: Path, advance: Callable[[], object] = lambda: None) -> Path:
     """Render a scene and write it as a nerfstudio data set; reuse `out` when it already holds exactly that.
 
     The data set is written beside `out` and moved there when it is complete: an interrupted run leaves no half of one.
-    `progress` is called after each picture with (pictures done, pictures in all).
+    `advance` is called after each picture.
 
     Raises:
         FileExistsError: when `out` holds anything else: another scene, other files.
@@ -59,7 +59,7 @@ def write_scene(config: SceneConfig, out: Path, progress: Callable[[int, int], N
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as workshop:
         staged = Path(workshop) / "scene"
-        _write_files(build_scene(config), staged, progress)
+        _write_files(build_scene(config), staged, advance)
         (staged / "scene.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         if out.is_dir():
             out.rmdir()  # it is empty; a folder cannot be moved onto another on every system
@@ -103,7 +103,7 @@ def _sees(scene: Scene, camera: Array, points: Array) -> Array:
     return inside & (np.linalg.norm(hits - points, axis=1) < SEEN_TOLERANCE)
 
 
-def _write_files(scene: Scene, folder: Path, progress: Callable[[int, int], None] | None) -> None:
+def _write_files(scene: Scene, folder: Path, advance: Callable[[], object]) -> None:
     from nrfgs_ns.data.points import write_ply  # imports nerfstudio: seconds, for work alone
 
     config = scene.config
@@ -111,11 +111,10 @@ def _write_files(scene: Scene, folder: Path, progress: Callable[[int, int], None
     train, test = split_names(config)
     names = sorted(train + test)
     (folder / "images").mkdir(parents=True)
-    for i, (name, camera) in enumerate(zip(names, cameras, strict=True), start=1):
+    for name, camera in zip(names, cameras, strict=True):
         values = np.round(255.0 * render(scene, camera)).astype(np.uint8)
         Image.fromarray(values).save(folder / name)
-        if progress is not None:
-            progress(i, config.views)
+        advance()
 
     is_train = np.isin(names, train)
     points, colours = sparse_points(scene, cameras[is_train])

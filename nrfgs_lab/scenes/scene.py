@@ -19,7 +19,6 @@ BOUNCES = 2
 class Object:
     """A solid with its paint (diffuse) and finish (specular)."""
 
-    name: str
     solid: Solid
     paint: Paint
     finish: Finish
@@ -169,38 +168,32 @@ def studio_lamps() -> tuple[Lamp, ...]:
 def build_scene(config: SceneConfig) -> Scene:
     """The shipped layout: five spheres and a box on a checkered floor, three coloured lamps, a dome of soft light."""
     objects = (
-        Object(
-            "chrome",
+        Object(  # chrome
             Sphere((0.05, 0.30, 0.66), 0.66),
             Paint((0.54, 0.56, 0.60), (0.86, 0.87, 0.88), (0.0, 0.0, 4.0)),
             Finish((0.88, 0.89, 0.91), roughness=0.16, mirror=0.9),
         ),
-        Object(
-            "gold",
+        Object(  # gold
             Sphere((-1.05, -0.50, 0.42), 0.42),
             Paint((0.66, 0.34, 0.05), (0.95, 0.66, 0.18), (3.0, 3.0, 0.0)),
             Finish((0.97, 0.58, 0.19), roughness=0.26, mirror=0.7),
         ),
-        Object(
-            "lacquer",
+        Object(  # lacquer
             Sphere((1.02, -0.42, 0.50), 0.50),
             Paint((0.42, 0.01, 0.015), (0.95, 0.13, 0.05), (0.0, 0.0, 3.0)),
             Finish((0.09, 0.09, 0.09), roughness=0.14, mirror=0.8),
         ),
-        Object(
-            "jade",
+        Object(  # jade
             Sphere((0.05, -1.00, 0.30), 0.30),
             Paint((0.01, 0.20, 0.14), (0.14, 0.58, 0.30), (2.0, 0.0, 2.0)),
             Finish((0.08, 0.08, 0.08), roughness=0.22, mirror=0.6),
         ),
-        Object(
-            "pearl",
+        Object(  # pearl
             Sphere((1.05, 0.78, 0.26), 0.26),
             Paint((0.66, 0.53, 0.70), (0.97, 0.91, 0.93), (0.0, 3.0, 0.0)),
             Finish((0.30, 0.28, 0.34), roughness=0.30, mirror=0.4),
         ),
-        Object(
-            "tiles",
+        Object(  # tiles
             Box((-0.92, 0.82, 0.48), (0.40, 0.40, 0.48), yaw=0.45),
             Paint((0.01, 0.04, 0.26), (0.06, 0.30, 0.60), (2.5, 2.5, 2.5)),
             Finish((0.14, 0.14, 0.15), roughness=0.18, mirror=0.8),

@@ -17,7 +17,7 @@ from nrfgs_ns.training.stopping import SIGNALS
 
 
 def prepare(config: TrainerConfig) -> None:
-    """Called by `ns-train` before it starts the processes, whose errors it would print with two tracebacks.
+    """Called by `ns-train` before it starts the processes.
 
     Raises:
         InputError: the devices are CPUs, or this machine has fewer GPUs than the training asks for.
@@ -27,11 +27,19 @@ def prepare(config: TrainerConfig) -> None:
             "ns-train starts several processes on GPUs only. To try it on CPUs, use python -m "
             "nrfgs_lab.many_processes with the same options."
         )
-    check_devices(config)
+    wanted, present = config.machine.num_devices, torch.cuda.device_count()
+    if present < wanted:
+        raise InputError(f"machine.num_devices is {wanted}, but this machine shows {present} GPUs.")
+    explain_losses(config)
+
+
+def explain_losses(config: TrainerConfig) -> None:
+    """Let Python say in one message that a process was lost, instead of with its traceback and the parent's. A process
+    that a signal asked to stop has said so itself (`training.stopping`)."""
     show = sys.excepthook
 
     def short(kind, error, trace):
-        if was_asked_to(error):
+        if isinstance(error, mp.ProcessExitedException) and error.exit_code in [128 + number for number in SIGNALS]:
             sys.exit(error.exit_code)
         if isinstance(error, mp.ProcessExitedException | mp.ProcessRaisedException):
             print(explain(error, config), file=sys.stderr)
@@ -39,17 +47,6 @@ def prepare(config: TrainerConfig) -> None:
             show(kind, error, trace)
 
     sys.excepthook = short
-
-
-def was_asked_to(error: BaseException) -> bool:
-    """Whether a process ended because of a signal that it heard, and said so (`training.stopping`)."""
-    return isinstance(error, mp.ProcessExitedException) and error.exit_code in [128 + number for number in SIGNALS]
-
-
-def check_devices(config: TrainerConfig) -> None:
-    wanted, present = config.machine.num_devices, torch.cuda.device_count()
-    if config.machine.device_type == "cuda" and present < wanted:
-        raise InputError(f"machine.num_devices is {wanted}, but this machine shows {present} GPUs.")
 
 
 def explain(error: mp.ProcessExitedException | mp.ProcessRaisedException, config: TrainerConfig) -> str:

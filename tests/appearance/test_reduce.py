@@ -6,7 +6,6 @@ import torch
 from head_cases import awake, scene
 from torch.testing import assert_close
 
-from nrfgs_lab.ablation import input_columns
 from nrfgs_lab.residuals import with_diffuse
 from nrfgs_ns.appearance.field import DIFFUSE, Field
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -32,14 +31,6 @@ def assert_same(field: Field, other: Field, visible, centers, **tolerance) -> No
     pair = (each.head(each.splats, visible, centers) for each in (field, other))
     for a, b in zip(*pair, strict=True):
         assert_close(a, b, **tolerance)
-
-
-def test_the_columns_are_the_heads(case):
-    field, _, _ = case
-    for name, branch in (("low", field.head.low), ("high", field.head.high)):
-        if branch is not None:
-            columns = [i for part in input_columns(field.head.config, name).values() for i in part]
-            assert columns == list(range(branch[0].in_features))
 
 
 def test_full_rank_is_the_head(case):

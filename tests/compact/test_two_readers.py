@@ -30,7 +30,7 @@ from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.format import MODEL, PREAMBLE, Table, _coded, _pack, _unpack
+from nrfgs_ns.compact.format import MODEL, PREAMBLE, Table, _pack, _unpack, container
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.trained.loading import load_file
 
@@ -55,17 +55,7 @@ def written(count: int = COUNT, **options) -> bytes:
     if options:
         head = NrfConfig(**{"latent_dim": 8, "hidden_width": 16, "output_init": "default"} | options).setup()
         one = Field(head.requires_grad_(False), one.splats)
-    return joined(*parts_of(*encode(one, dict(RENDER))))
-
-
-def parts_of(header: dict, streams: dict) -> Parts:
-    entries, bodies = [], []
-    for name, stream in streams.items():
-        array, body = _coded(stream) if isinstance(stream, Table) else (stream, _pack(stream))
-        coding = "rans" if isinstance(stream, Table) else "xz"
-        entries.append({"name": name, "coding": coding, "dtype": array.dtype.name, "shape": list(array.shape)})
-        bodies.append(body)
-    return {**header, "streams": entries}, bodies
+    return container(*encode(one, dict(RENDER)))
 
 
 def parts() -> Parts:
@@ -284,7 +274,7 @@ def with_stream(name: str, stream, **header) -> bytes:
     streams |= {name: stream} if name else {}
     for place, value in header.items():
         at_place(fields, tuple(place.split("__")), lambda node, key, v=value: node.__setitem__(key, v))
-    return joined(*parts_of(fields, streams))
+    return container(fields, streams)
 
 
 def contents() -> Iterator[tuple[str, bytes]]:
@@ -345,14 +335,14 @@ def whole_files() -> Iterator[tuple[str, bytes]]:
     header["splats"] = {"view": 0, DIFFUSE: 0}
     streams |= {"means": Table(np.zeros((2, 0)), signed=False)}
     streams |= {"splats": Table(np.zeros((11, 0))), "latents": Table(np.zeros((8, 0)))}
-    yield "no splat", joined(*parts_of(header, streams))
+    yield "no splat", container(header, streams)
     wide = NrfConfig(latent_dim=1024, hidden_width=1).setup().requires_grad_(False)
     for count in (3_000, 20_000):  # diffuse splats need latents in memory, and have none in the file
         splats = {**field(4).splats, "latents": torch.zeros(4, 1024), DIFFUSE: torch.ones(4, dtype=torch.bool)}
         header, streams = encode(Field(wide, splats), dict(RENDER))
         header["splats"][DIFFUSE] = count
         streams |= {"means": Table(np.zeros((2, count)), signed=False), "splats": Table(np.ones((11, count)))}
-        yield f"{count} diffuse splats with wide latents", joined(*parts_of(header, streams))
+        yield f"{count} diffuse splats with wide latents", container(header, streams)
     for value in ([0, 0.5, 1], [0, 0, 2], [0, 0, True], [0, 0, -0.1]):
         header, bodies = parts()
         header["render"]["background"] = value
@@ -381,14 +371,12 @@ const heard = (bytes) => {
 """
 
 
-def script() -> str:
-    return (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + READ
-
-
 def in_node(cases: dict[str, bytes], folder: Path) -> list[dict]:
     """What the page's reader says of each file, in Node."""
     (folder / "read.js").write_text(
-        script() + "const all = JSON.parse(require('fs').readFileSync('cases.json', 'utf-8'));"
+        (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8")
+        + READ
+        + "const all = JSON.parse(require('fs').readFileSync('cases.json', 'utf-8'));"
         "console.log(JSON.stringify(all.map((text) => heard(new Uint8Array(Buffer.from(text, 'base64'))))));"
     )
     (folder / "cases.json").write_text(json.dumps([base64.b64encode(data).decode() for data in cases.values()]))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from scipy.spatial.transform import Rotation
 from short_trainings import command_line, set_up
 from torch.nn import Parameter
 
@@ -54,16 +55,8 @@ class Table:
         means2d.grad = torch.tensor([gradient / 50.0, 0.0]).repeat(len(self), 1)
         means2d.absgrad = means2d.grad.clone()
         means2d.retain_grad = lambda: None
-        ids = torch.arange(len(self))
-        radii = torch.ones(len(self), dtype=torch.int32)
-        return {
-            "means2d": means2d,
-            "gaussian_ids": ids,
-            "radii": radii,
-            "width": 100,
-            "height": 100,
-            "n_cameras": 1,
-        }
+        rows = {"gaussian_ids": torch.arange(len(self)), "radii": torch.ones(len(self), dtype=torch.int32)}
+        return {"means2d": means2d, **rows, "width": 100, "height": 100, "n_cameras": 1}
 
     def step(
         self,
@@ -93,6 +86,11 @@ class Table:
         assert torch.isfinite(torch.cat([value.detach().flatten() for value in self.splats.values()])).all()
 
 
+def rotations(quats: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions w, x, y, z of any length, by SciPy."""
+    return torch.from_numpy(Rotation.from_quat(quats.detach().roll(-1, dims=-1).numpy()).as_matrix()).float()
+
+
 def strategy(name: str, images: int = 8, **options):
     return CONFIGS[name](**options).build(images, images, 1.0)
 
@@ -119,14 +117,9 @@ def trainer_of(scene: Path, out: Path, densification: str, **rules):
 def one_step(trainer, step: int) -> dict:
     """What the trainer does in a step; returns the losses."""
     trainer.pipeline.train()
-    for where in (
-        TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
-        None,
-        TrainingCallbackLocation.AFTER_TRAIN_ITERATION,
-    ):
-        if where is None:
-            losses = trainer.train_iteration(step)[1]
-        else:
-            for callback in trainer.callbacks:
-                callback.run_callback_at_location(step, where)
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+    losses = trainer.train_iteration(step)[1]
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
     return losses

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from densification_cases import Table
+from densification_cases import Table, rotations
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE, ErrorGuided
@@ -118,15 +118,7 @@ def test_halves_keep_each_axis_variance_and_the_opacity(places):
     for row, other in zip(rows.tolist(), others, strict=True):
         means = table.splats["means"].detach()
         assert_close((means[row] + means[other]) / 2, before["means"][row])
-        w, x, y, z = (before["quats"][row] / before["quats"][row].norm()).tolist()
-        axes = torch.tensor(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        offset = axes.T @ (means[row] - before["means"][row])
+        offset = rotations(before["quats"])[row].T @ (means[row] - before["means"][row])
         scales = before["scales"][row].exp()
         for axis in range(3):
             k = 1 - (1 - 1 / math.sqrt(2)) * float(scales[axis] / scales.max()) ** 2

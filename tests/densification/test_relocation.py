@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from densification_cases import Table
+from densification_cases import Table, rotations
 from torch.testing import assert_close
 
 from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate, split_evenly
@@ -56,16 +56,7 @@ def test_noise_has_the_splats_shape_and_spares_what_is_visible():
 
     torch.manual_seed(0)
     normal = torch.randn(3, 3)
-    w, x, y, z = torch.nn.functional.normalize(table.splats["quats"].detach(), dim=-1).unbind(-1)
-    rotation = torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        dim=1,
-    )
-    half = rotation * table.splats["scales"].detach().exp()[:, None, :]
+    half = rotations(table.splats["quats"]) * table.splats["scales"].detach().exp()[:, None, :]
     gate = 1 / (1 + torch.exp(100 * (torch.tensor([0.0001, 0.005, 0.5]) - 0.005)))
     expected = 0.1 * gate[:, None] * (half @ half.transpose(1, 2) @ normal[:, :, None])[..., 0]
     # float32 at values up to 10, and means of up to 2 from whose difference `moved` comes

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-import contextlib
 import os
 import shutil
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from filelock import FileLock
+from sessions import session
 
 DEVICE = Path(__file__).with_name("device.py")
 TIMEOUT = 500
@@ -18,19 +15,8 @@ TIMEOUT = 500
 def meet(job: str, scene: Path, folder: Path, world: int = 2, device_type: str = "cpu") -> Path:
     """Run a job of `jobs.py` on `world` processes; `folder`, into which they save their results."""
     folder.mkdir(parents=True, exist_ok=True)
-    process = subprocess.Popen(
-        [sys.executable, str(DEVICE), job, str(world), str(scene), str(folder), device_type],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        start_new_session=True,
-    )
-    try:
+    with session(DEVICE, job, world, scene, folder, device_type) as process:
         said, _ = process.communicate(timeout=TIMEOUT)
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)  # its children, too
     assert process.returncode == 0, said[-6000:]
     return folder
 

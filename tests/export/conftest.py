@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+import functools
+
 import pytest
 from short_trainings import command_line, trained
 
@@ -35,19 +37,37 @@ def demo(tiny_scene, tmp_path_factory):
 
 
 @pytest.fixture
-def wall(browser, tmp_path):
-    """Open a page of a wall; `more`: values for its scripts; `tail`: of its address."""
-    from web_pages import Page, page_with, wall_scene
+def opened(browser):
+    """Open an address in a window of its own, which closes at the end, without an error in its console; `begun`: wait
+    for the page's scene."""
+    from web_pages import Page
 
-    opened = []
+    pages = []
 
-    def page(size=(320, 240), before="", tail="", **more) -> Page:
-        scene, photographs = wall_scene(tmp_path)
-        (tmp_path / "page.html").write_text(page_with(scene.read_bytes(), photographs, **more))
-        opened.append(Page(browser, (tmp_path / "page.html").as_uri() + tail, size, before).begun())
-        return opened[-1]
+    def page(address, *window, begun=True, **context) -> Page:
+        pages.append(Page(browser, address, *window, **context))
+        return pages[-1].begun() if begun else pages[-1]
 
     yield page
-    for page in opened:
+    for page in pages:
         assert not page.errors
         page.page.close()
+
+
+@pytest.fixture
+def on_demo(opened, demo):
+    """Open the page of `demo`, in a window of a size."""
+    return functools.partial(opened, demo[1].as_uri())
+
+
+@pytest.fixture
+def wall(opened, tmp_path):
+    """Open a page of a wall; `more`: values for its scripts; `tail`: of its address."""
+    from web_pages import page_with, wall_scene
+
+    def page(size=(320, 240), before="", tail="", **more):
+        scene, photographs = wall_scene(tmp_path)
+        (tmp_path / "page.html").write_text(page_with(scene.read_bytes(), photographs, **more))
+        return opened((tmp_path / "page.html").as_uri() + tail, size, before)
+
+    return page

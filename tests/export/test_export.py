@@ -2,6 +2,7 @@
 """The PLY file: its layout, what the fit keeps of the head, and that nerfstudio's exporter writes the same."""
 
 import base64
+import functools
 import json
 import math
 import re
@@ -56,13 +57,10 @@ def short_fine_tune(monkeypatch):
 
 @pytest.fixture(scope="module")
 def trained(tiny_scene, tmp_path_factory):
-    done = {}
-
+    @functools.cache
     def config_of(method: str) -> Path:
-        if method not in done:
-            out = tmp_path_factory.mktemp(method)
-            done[method] = short_trainings.trained(command_line(method, tiny_scene, out, 8, METHODS[method]))
-        return done[method]
+        out = tmp_path_factory.mktemp(method)
+        return short_trainings.trained(command_line(method, tiny_scene, out, 8, METHODS[method]))
 
     return config_of
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trainings of a few steps: their command line, what they leave, and whether two are the same."""
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,10 @@ from nerfstudio.scripts.train import _set_random_seed
 from torch.testing import assert_close
 
 from nrfgs_lab.training_run import parse, train
+from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training.checkpoint_files import read_latest
 from nrfgs_ns.training.trainer import NrfgsTrainer
+from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig
 
 QUIET = {
     "--vis": "tensorboard",
@@ -50,6 +53,16 @@ def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict
     for more in options:
         chosen |= more
     return [method, *(str(word) for option in chosen.items() if option[1] is not None for word in option)]
+
+
+def config_with(name: str, value: object) -> NrfgsTrainerConfig:
+    """The configuration of `nrfgs` with one option, named with its dots, changed."""
+    part = config = deepcopy(nrfgs.config)
+    *path, last = name.split(".")
+    for step in path:
+        part = part[step] if isinstance(part, dict) else getattr(part, step)
+    setattr(part, last, value)
+    return config
 
 
 def set_up(args: list[str]) -> NrfgsTrainer:

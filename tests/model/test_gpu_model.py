@@ -4,6 +4,7 @@
 import pytest
 import torch
 from nerfstudio.engine.optimizers import Optimizers
+from short_trainings import command_line
 from smoke_runs import METHODS, PLAIN, STEPS, bound
 from torch.testing import assert_close
 
@@ -68,8 +69,6 @@ def test_one_step_is_the_same_on_both_devices(method, tiny_scene, tmp_path):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_train_and_eval_on_the_gpu(method, tiny_scene, tmp_path):
-    args = [method, "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", str(STEPS)]
-    args += ["--vis", "tensorboard", "--steps-per-eval-image", "100000", "--steps-per-eval-all-images", "100"]
-    record = train([*args, *(str(word) for option in PLAIN.items() for word in option)])
+    record = train(command_line(method, tiny_scene, tmp_path, STEPS, PLAIN, {"--steps-per-eval-all-images": 100}))
     assert record.peak_memory_bytes > 0
     assert evaluate(record.config_path, tmp_path / "eval.json")["psnr"] > bound(f"tiny/{method}")

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from short_trainings import REFINING, assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+from short_trainings import REFINING, command_line, set_up
 
 from nrfgs_ns.data.views import distinct_places
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
@@ -69,18 +69,6 @@ def test_noise_is_the_steps_and_the_seeds_alone():
     assert torch.equal(moved_by(ViewNoise(1.0, 42), splats, 1)["means"], second)
     for other in (first, moved_by(ViewNoise(1.0, 43), splats, 1)["means"]):
         assert abs(torch.corrcoef(torch.stack([other.flatten(), second.flatten()]))[0, 1]) < 0.1
-
-
-def test_training_on_is_the_unbroken_training_to_the_bit(tiny_scene, tmp_path, no_cuda):
-    def train(name, steps, *more):
-        return trained(command_line("nrfgs", tiny_scene, tmp_path / name, steps, REFINING, *more))
-
-    whole = checkpoint_of(train("whole", 8))
-    rest = checkpoint_of(train("rest", 8, {"--load-dir": models_of(train("half", 4))}))
-    assert_same_training(whole, rest, rtol=0.0, atol=0.0)
-    without = checkpoint_of(train("off", 8, {"--pipeline.model.view-noise": 0}))
-    latents = "_model.gauss_params.latents"
-    assert not torch.equal(without["pipeline"][latents], whole["pipeline"][latents]), "the noise did nothing"
 
 
 def test_evaluation_sees_no_noise(tiny_scene, tmp_path, no_cuda):

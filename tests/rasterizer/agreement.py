@@ -135,7 +135,7 @@ def judge(case: Case, grads: tuple[Tensor, Tensor], unit: float = FLOAT32, **lim
 
 
 def assert_agrees(verdict: Verdict, result: dict[str, Tensor], unit: float = FLOAT32) -> None:
-    """Check a result of `make_gsplat_fixtures.evaluate(..., packed=False)` against the twin."""
+    """Check a result of `make_gsplat_fixtures.evaluate` against the twin."""
     visible = verdict.visible
     assert torch.equal(result["radii"] > 0, visible), "visible splats differ"
     # ceil may land on either side only if three sigma is an integer up to 8 roundings of sqrt and eigenvalue, and the

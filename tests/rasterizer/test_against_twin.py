@@ -27,7 +27,7 @@ def check(case: Case, dtype: torch.dtype = torch.float32, **limits) -> None:
     unit = {torch.float32: FLOAT32, torch.float64: FLOAT64}[dtype]
     case = in_precision(case, dtype)
     grads = upstream(case, **limits)
-    ours = evaluate(rasterization, case, tuple(g.to(dtype) for g in grads), "cpu", packed=False)
+    ours = evaluate(rasterization, case, tuple(g.to(dtype) for g in grads), "cpu")
     assert_agrees(judge(case, grads, unit, **limits), ours, unit)
 
 
@@ -161,7 +161,7 @@ def test_cpu_agrees_with_gsplat(recorded, monkeypatch):
     """Both lie within the twin's tolerance, so they are within twice of each other."""
     case, grads, gsplat, verdict = recorded
     monkeypatch.setattr(projection, "MIN_DISCRIMINANT", DENSE_FLOOR)
-    ours = evaluate(rasterization, case, grads, "cpu", packed=False)
+    ours = evaluate(rasterization, case, grads, "cpu")
     assert_agrees(verdict, ours)
     for name, tolerance in verdict.tolerances.items():
         difference = (ours[name].double() - gsplat[name].double()).abs()
@@ -176,4 +176,4 @@ def test_cpu_agrees_with_gsplat(recorded, monkeypatch):
 def test_gpu_back_end_agrees_with_the_twin(name):
     case, bounds = CASES[name](), BOUNDS["cuda"]
     grads = upstream(case, bounds=bounds)
-    assert_agrees(judge(case, grads, bounds=bounds), evaluate(rasterization, case, grads, "cuda", packed=False))
+    assert_agrees(judge(case, grads, bounds=bounds), evaluate(rasterization, case, grads, "cuda"))

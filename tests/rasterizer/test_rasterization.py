@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The call: arguments, layouts, errors, and what gsplat's strategies need of `info`."""
 
+import math
 import subprocess
 import sys
 
@@ -66,6 +67,12 @@ def test_no_setting_lowers_the_precision():
         torch.set_float32_matmul_precision(usual)
 
 
+def in_a_row(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Means of splats behind each other from depth 1 to 2, and a lens in the middle of 8 x 8 pixels."""
+    means = torch.cat([torch.zeros(count, 2), torch.linspace(1, 2, count)[:, None]], 1)
+    return means, torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
+
+
 def test_one_very_long_tile():
     """Twenty thousand splats over one 8 x 8 tile, faint enough that light is left: the sum has a closed form.
 
@@ -73,14 +80,11 @@ def test_one_very_long_tile():
     2^-24 = 1e-3.
     """
     n, o = 20_000, 0.004
-    means = torch.cat([torch.zeros(n, 2), torch.linspace(1, 2, n)[:, None]], 1)
-    K = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
+    means, K = in_a_row(n)
     opacities = torch.full((n,), o, requires_grad=True)
     scales, quats = torch.full((n, 3), 1e4), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1)
     _, alphas, _ = rasterization(means, quats, scales, opacities, torch.ones(n, 1), torch.eye(4)[None], K, 8, 8)
-    drawn = int(
-        torch.floor(torch.log(torch.tensor(1e-4)) / torch.log1p(torch.tensor(-o)))
-    )  # T falls to 1e-4 after these
+    drawn = math.floor(math.log(1e-4) / math.log1p(-o))  # T falls to 1e-4 after these
     torch.testing.assert_close(1 - alphas, torch.full_like(alphas, (1 - o) ** drawn), rtol=5e-3, atol=0)
     alphas.sum().backward()
     assert (opacities.grad[:drawn] > 0).all() and (opacities.grad[drawn + 1 :] == 0).all()
@@ -92,8 +96,7 @@ def test_hidden_splats_cost_nothing(monkeypatch):
     batch = compositing.Batch
     monkeypatch.setattr(compositing, "Batch", lambda *a: looked_at.append(tuple(a[1].shape)) or batch(*a))
     n = 5020
-    means = torch.cat([torch.zeros(n, 2), torch.linspace(1, 2, n)[:, None]], 1)
-    K = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
+    means, K = in_a_row(n)
     shape = [torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1), torch.full((n, 3), 10.0)]
     rasterization(means, *shape, torch.full((n,), 0.9), torch.ones(n, 1), torch.eye(4)[None], K, 8, 8)
     assert looked_at == [(1, batches.SLAB)]  # tiles, splats

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mean over a training's last steps: of which steps it is, when it begins anew, and that it resumes to the bit."""
 
-import shutil
 from types import SimpleNamespace
 
 import pytest
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from short_trainings import assert_same_training, checkpoint_of, command_line, set_up, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import relocation
@@ -148,27 +147,21 @@ def test_the_window_of_a_training_that_goes_on(trainer):
 
 @pytest.fixture(scope="module")
 def averaged(tiny_scene, tmp_path_factory, any_share):
-    """A training of 12 steps that averages over the last 6: its parameters after each step, its output, and the
-    checkpoint of step 7."""
-    out, after = tmp_path_factory.mktemp("averaged"), {}
+    """A training of 12 steps that averages over the last 6, with the checkpoint of step 7, too: its parameters after
+    each step, and its output."""
+    after = {}
     with pytest.MonkeyPatch.context() as patch, CONSOLE.capture() as log:
-        original, average = NrfgsTrainer._write_checkpoint, NrfgsTrainer._average
-
-        def keep(trainer, step):
-            original(trainer, step)
-            if step == 7:
-                shutil.copytree(trainer.checkpoint_dir, out / "kept")
+        average = NrfgsTrainer._average
 
         def note(trainer, step):
             average(trainer, step)
             tensors = trainer.pipeline.model.state_dict().items()
             after[step] = {name: value.clone() for name, value in tensors if isinstance(value, torch.Tensor)}
 
-        patch.setattr(NrfgsTrainer, "_write_checkpoint", keep)
         patch.setattr(NrfgsTrainer, "_average", note)
         windows = {"--average-steps": 6, "--steps-per-save": 7}
-        config = trained(command_line("nrfgs", tiny_scene, out, 12, CALM, windows))
-    return SimpleNamespace(config=config, after=after, kept=out / "kept", said=log.get())
+        config = trained(command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("averaged"), 12, CALM, windows))
+    return SimpleNamespace(config=config, after=after, said=log.get())
 
 
 def test_the_trained_model_is_the_mean(averaged):
@@ -184,9 +177,9 @@ def test_the_trained_model_is_the_mean(averaged):
 
 def test_a_mean_continues_to_the_bit(averaged, tiny_scene, tmp_path):
     """From the middle of the window."""
-    _, content = read_latest(averaged.kept)
+    _, content = read_latest(models_of(averaged.config), 7)
     assert content["training"]["parameter_mean"]["count"] == 2  # steps 6 and 7
-    words = {"--average-steps": 6, "--load-dir": averaged.kept}
+    words = {"--average-steps": 6, "--load-dir": models_of(averaged.config), "--load-step": 7}
     rest = trained(command_line("nrfgs", tiny_scene, tmp_path, 12, CALM, words))
     assert_same_training(checkpoint_of(averaged.config), checkpoint_of(rest), rtol=0, atol=0)
 

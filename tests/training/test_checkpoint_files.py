@@ -5,12 +5,12 @@ import os
 import random
 import signal
 import sys
-from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from short_trainings import config_with
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
@@ -176,16 +176,6 @@ def test_another_scene_is_refused(here, message):
         check_scene(scene(), here, "data/fox")
 
 
-def options_with(name: str, value: object) -> dict:
-    """The options of `nrfgs` with one changed."""
-    part = config = deepcopy(nrfgs.config)
-    *path, last = name.split(".")
-    for step in path:
-        part = part[step] if isinstance(part, dict) else getattr(part, step)
-    setattr(part, last, value)
-    return options_of(config)
-
-
 @pytest.mark.parametrize(
     "name, value",
     [
@@ -197,7 +187,7 @@ def options_with(name: str, value: object) -> dict:
 )
 def test_an_option_that_changes_the_meaning_is_refused(name, value):
     with pytest.raises(InputError, match="--" + name.replace("_", "-") + " was .* and is "):
-        check_options(options_of(nrfgs.config), options_with(name, value))
+        check_options(options_of(nrfgs.config), options_of(config_with(name, value)))
 
 
 @pytest.mark.parametrize(
@@ -212,4 +202,4 @@ def test_an_option_that_changes_the_meaning_is_refused(name, value):
     ],
 )
 def test_options_of_learning_may_change_and_so_may_places(name, value):
-    check_options(options_of(nrfgs.config), options_with(name, value))
+    check_options(options_of(nrfgs.config), options_of(config_with(name, value)))

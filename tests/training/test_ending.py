@@ -5,18 +5,16 @@ import math
 import os
 import re
 import signal
-from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, config_with, models_of, set_up, trained
 
 from nrfgs_lab.training_run import parse
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import checkpoint_files, stopping
 from nrfgs_ns.training.checkpoint_files import DiskFull, find
 from nrfgs_ns.training.guard import TrainingStopped
@@ -210,11 +208,7 @@ def test_a_finished_training_says_so_and_how_to_extend_it(finished, tiny_scene, 
     ],
 )
 def test_options_without_sense_are_refused(option, bad, tiny_scene):
-    part = config = replace(deepcopy(nrfgs.config), data=tiny_scene)
-    *path, name = option.split(".")
-    for step in path:
-        part = part[step] if isinstance(part, dict) else getattr(part, step)
-    setattr(part, name, bad)
+    config = replace(config_with(option, bad), data=tiny_scene)
     with pytest.raises(InputError, match=re.escape(f"{option} is {bad}")):
         config.print_to_terminal()  # ns-train's first call: nothing is written before it
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train, evaluate, render, resume, refuse: nerfstudio's own commands on a tiny scene, with CUDA out of reach."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -58,13 +59,10 @@ def schedules():
 @pytest.fixture(scope="module")
 def finished(tiny_scene, tmp_path_factory):
     """config.yml of a finished training of each method, which has the checkpoint of step `HALF`, too."""
-    done = {}
 
+    @functools.cache
     def config_of(method: str) -> Path:
-        if method not in done:
-            out = tmp_path_factory.mktemp(method)
-            done[method] = trained(options(tiny_scene, out, method, {"--steps-per-save": HALF}))
-        return done[method]
+        return trained(options(tiny_scene, tmp_path_factory.mktemp(method), method, {"--steps-per-save": HALF}))
 
     return config_of
 

@@ -2,7 +2,6 @@
 """A time budget is kept whatever steps cost, stretched schedules are the plain ones elsewhere, and both continue."""
 
 import math
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,9 +18,9 @@ from nrfgs_lab.training_run import train
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import pace, trainer_config
+from nrfgs_ns.training.checkpoint_files import find, read
 from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import Pace, TimedPace, resolution_phases, steps_for
-from nrfgs_ns.training.trainer import NrfgsTrainer
 
 LENGTH = 30_000
 
@@ -126,44 +125,38 @@ def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> lis
 
 @pytest.fixture(scope="module")
 def stretched(tiny_scene, tmp_path_factory):
-    """20 steps of the 40: config.yml, a folder with the checkpoint of step 9, and numbers of splats by step."""
-    out, original, counts = tmp_path_factory.mktemp("stretched"), NrfgsTrainer._write_checkpoint, {}
-
-    def keep(trainer, step):
-        original(trainer, step)
-        counts[step] = trainer.pipeline.model.num_points
-        if step == 9:
-            shutil.copytree(trainer.checkpoint_dir, out / "kept")
-
+    """config.yml of 20 steps of the 40, with a checkpoint of every third."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch.cuda, "is_available", lambda: False)  # as where it goes on
-        patch.setattr(NrfgsTrainer, "_write_checkpoint", keep)
-        return trained(options(tiny_scene, out, "nrfgs-sh", 20, SH, STRETCHED)), out / "kept", counts
+        every = {"--save-only-latest-checkpoint": False}
+        return trained(options(tiny_scene, tmp_path_factory.mktemp("out"), "nrfgs-sh", 20, SH, STRETCHED, every))
 
 
 @pytest.mark.usefixtures("no_cuda")
 def test_a_stretched_training(stretched):
     """Degree 3 is reached at step 15, and its harmonics are there when it is evaluated; splats come only before it."""
-    config, _, counts = stretched
-    _, pipeline, _, step = eval_setup(config)
+    _, pipeline, _, step = eval_setup(stretched)
     assert step == 19 and pipeline.model.head.active_degree == 3
     assert pipeline.model.schedule_step == 40
+    saved = {
+        step: read(path)["pipeline"]["_model.gauss_params.means"] for step, path in find(models_of(stretched)).items()
+    }
+    counts = {step: len(means) for step, means in saved.items()}
     # 8 training images hold densification back for 8 + 2 steps after the reset at 0: it acts at steps 10, 12 and 14.
     assert counts[3] == counts[9] < counts[12] < counts[15] == counts[18] == pipeline.model.num_points
-    state = checkpoint_of(config)
-    assert state["training"]["pace"] == {"length": 40, "rate": 2.0, "position": 40.0}
+    assert checkpoint_of(stretched)["training"]["pace"] == {"length": 40, "rate": 2.0, "position": 40.0}
 
 
 @pytest.mark.usefixtures("no_cuda")
 def test_a_stretched_training_continues_to_the_bit(stretched, tiny_scene, tmp_path):
-    whole, kept, _ = stretched
-    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 20, SH, STRETCHED, {"--load-dir": kept}))
-    one, other = checkpoint_of(whole), checkpoint_of(rest)
+    load = {"--load-dir": models_of(stretched), "--load-step": 9}
+    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 20, SH, STRETCHED, load))
+    one, other = checkpoint_of(stretched), checkpoint_of(rest)
     assert one["step"] == 19
     assert_same_training(one, other, rtol=0, atol=0)
     assert one["schedulers"] == other["schedulers"]
     with pytest.raises(InputError, match="schedule-steps"):
-        train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 20, SH, {"--load-dir": kept}))
+        train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 20, SH, load))
 
 
 class SecondsAStep(TimedPace):

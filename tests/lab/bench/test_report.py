@@ -71,9 +71,6 @@ def test_an_average_is_of_rows_that_have_all_scenes():
     assert average["GS"].mean(PSNR) is None and ranks(list(average.values()), PSNR) == {0: 2, 1: 1}
 
 
-# Crops.
-
-
 def test_a_folder_comes_back(tmp_path):
     folder = tmp_path / "out"
     (folder / "runs").mkdir(parents=True)

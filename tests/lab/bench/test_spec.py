@@ -10,6 +10,7 @@ import pytest
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup  # noqa: F401  (registers the data parsers once, before the timing)
 from PIL import Image
+from small_colmap import Model
 
 from nrfgs_lab.bench.data import held_out_views, parser_options
 from nrfgs_lab.bench.spec import (
@@ -154,27 +155,6 @@ def test_fingerprints_ignore_paths_and_see_the_rest():
 
 # Data sets.
 
-VIEWS = 10
-FOCAL = 60.0
-
-
-def colmap_scene(folder: Path, model="sparse/0") -> Path:
-    """A COLMAP data set of 10 cameras on a line looking along z, whose numbers run against their names."""
-    rng = np.random.default_rng(0)
-    out = folder / model
-    (folder / "images").mkdir(parents=True)
-    out.mkdir(parents=True)
-    lines = []
-    for view in range(VIEWS):
-        name = f"frame_{view:02d}.png"
-        Image.fromarray(np.full((72, 96, 3), 20 * view, np.uint8)).save(folder / "images" / name)
-        lines.append(f"{VIEWS - view} 1 0 0 0 {0.1 * view} {0.05 * view} {3 + 0.02 * view**2} 1 {name}\n\n")
-    (out / "images.txt").write_text("# images\n" + "".join(lines))
-    (out / "cameras.txt").write_text(f"1 PINHOLE 96 72 {FOCAL} {FOCAL} 48 36\n")
-    points = (" ".join(map(str, [*rng.normal(size=3), *rng.integers(0, 255, size=3)])) for _ in range(20))
-    (out / "points3D.txt").write_text("".join(f"{i} {point} 0.5\n" for i, point in enumerate(points, 1)))
-    return folder
-
 
 def load(parser: list[str], method: str = "nrfgs"):
     """The data manager that ns-train would have, with all its images."""
@@ -187,33 +167,38 @@ def names_of(dataset) -> list[str]:
     return sorted(Path(name).name for name in dataset.image_filenames)
 
 
-@pytest.mark.parametrize("model", ["sparse/0", "colmap/sparse/0"])
-def test_colmap_is_read_with_every_8th_by_name(model, tmp_path):
-    colmap_scene(tmp_path / "data" / "line", model=model)
+@pytest.mark.parametrize("folder", ["sparse/0", "colmap/sparse/0"])
+def test_colmap_is_read_with_every_8th_by_name(folder, tmp_path):
+    """Also of images whose numbers run against their names."""
+    model = Model()
+    model.images = [(11 - number, *rest) for number, *rest in model.images]
+    scene = model.write(tmp_path / "data" / "ring")
+    if folder == "sparse/0":
+        (scene / "colmap" / "sparse").rename(scene / "sparse")
     before = sorted((tmp_path / "data").rglob("*"))
-    parser = parser_options(tmp_path / "data", Scene("line"), tmp_path / "mirrors")
+    parser = parser_options(tmp_path / "data", Scene("ring"), tmp_path / "mirrors")
     assert parser[0] == "colmap"
     data = load(parser)
-    assert names_of(data.eval_dataset) == ["frame_00.png", "frame_08.png"]
-    assert names_of(data.train_dataset) == [f"frame_{i:02d}.png" for i in range(10) if i not in (0, 8)]
+    assert names_of(data.eval_dataset) == ["000.png", "008.png"]
+    assert names_of(data.train_dataset) == [f"{i:03d}.png" for i in range(10) if i not in (0, 8)]
     for index, name in enumerate(data.train_dataset.image_filenames):
-        view = int(Path(name).stem[-2:])
-        assert data.cached_train[index]["image"].unique().tolist() == [20 * view], "an image and a pose are mixed up"
-    assert len(data.train_dataset.metadata["points3D_xyz"]) == 20
-    assert data.train_dataset.cameras.fx[0].item() == pytest.approx(FOCAL)
+        pixels = np.asarray(Image.open(scene / "images" / Path(name).name))
+        assert (data.cached_train[index]["image"].numpy() == pixels).all(), "an image and a pose are mixed up"
+    assert len(data.train_dataset.metadata["points3D_xyz"]) == 40
+    assert data.train_dataset.cameras.fx[0].item() == 10.0
     assert sorted((tmp_path / "data").rglob("*")) == before, "the data set was written to"
-    parser_options(tmp_path / "data", Scene("line"), tmp_path / "mirrors")  # a second time, over the first
+    parser_options(tmp_path / "data", Scene("ring"), tmp_path / "mirrors")  # a second time, over the first
 
 
 def test_a_data_set_of_the_same_name_elsewhere_is_read_there(tmp_path):
     """--scenes has changed, --work has not: a link to the first place would train on other photographs."""
     for place in ("first", "second"):
-        colmap_scene(tmp_path / place / "line")
+        Model().write(tmp_path / place / "line")
         parser = parser_options(tmp_path / place, Scene("line"), tmp_path / "mirrors")
         mirror = Path(parser[parser.index("--data") + 1])
         assert (mirror / "images").resolve() == (tmp_path / place / "line" / "images").resolve()
     assert sorted(entry.name for entry in mirror.iterdir()) == [
-        *("images", "sparse", "test_list.txt", "train_list.txt", "val_list.txt")
+        *("colmap", "images", "test_list.txt", "train_list.txt", "val_list.txt")
     ]
 
 
