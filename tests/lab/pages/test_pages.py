@@ -17,15 +17,13 @@ import tyro
 from nerfstudio.configs import method_configs
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
-from short_trainings import REFINING, command_line, trained
 from smoke_runs import recorded
 
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
 from nrfgs_lab.pages.tables import pages
-from nrfgs_lab.training_run import evaluate, parse
+from nrfgs_lab.training_run import evaluate, parse, train
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import commands
-from nrfgs_ns.training.identity import leaves
 
 CONTRIBUTING = Path(__file__).resolve().parents[3] / "docs" / "contributing.md"
 
@@ -50,10 +48,13 @@ def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tm
     # nerfstudio looks for methods when it is first imported; here it was imported long ago.
     monkeypatch.setitem(eval_utils.all_methods, "linear", configs["linear"])
     monkeypatch.setattr(method_configs, "AnnotatedBaseConfigUnion", tyro.extras.subcommand_type_from_defaults(configs))
-    config = trained(command_line("linear", tiny_scene, tmp_path, 25, REFINING))
+    args = ["linear", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "25"]
+    args += ["--vis", "tensorboard", "--pipeline.model.densification", "splatfacto,warmup_length=5,refine_every=10"]
+    args += ["--steps-per-eval-image", "1000", "--steps-per-eval-all-images", "1000"]
+    record = train([*args, "--pipeline.model.num-downscales", "0"])
     state = torch.load(next(tmp_path.rglob("*.ckpt")), weights_only=True)["pipeline"]
     assert state["_model.gauss_params.slopes"].abs().max() > 0
-    reached = evaluate(config, tmp_path / "eval.json")["psnr"]
+    reached = evaluate(record.config_path, tmp_path / "eval.json")["psnr"]
     assert reached > recorded()["tiny/nrfgs-sh"]["after_one_step"]
 
 
@@ -89,8 +90,19 @@ def test_the_page_has_the_commands_that_were_run():
         assert re.sub(r"\d{4}-\d\d-\d\d_\d{6}", "DATE", step["command"]) in shown
 
 
+def flags(config, prefix: str = "") -> set[str]:
+    """Every option of a configuration and of those inside it, and what they are inside of."""
+    found = set()
+    for field in dataclasses.fields(config):
+        name, value = prefix + field.name.replace("_", "-"), getattr(config, field.name)
+        found.add(name)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            found |= flags(value, f"{name}.")
+    return found
+
+
 def test_options_that_pages_name_are_there():
-    known = {name.replace("_", "-") for method in methods() for name, _ in leaves(method.config)}
+    known = set().union(*(flags(method.config) for method in methods()))
     shown = {
         flag for path in pages() for flag in re.findall(r"--(pipeline\.[\w.-]*\w)", path.read_text(encoding="utf-8"))
     }
@@ -98,13 +110,18 @@ def test_options_that_pages_name_are_there():
     assert {flag.replace("_", "-") for flag in shown} <= known
 
 
-def test_commands_that_pages_show_are_understood():
+def commands_shown() -> list[str]:
     """The commands of this package in the pages' shell lines, without comments and variables before them."""
-    shown = set()
+    found = []
     for path in pages():
         for fence in re.findall(r"```bash\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL):
             lines = re.sub(r"\s#.*", "", fence.replace("\\\n", " "))
-            shown |= set(re.findall(r"(?:^|&& )(?:[A-Z_]+=\S+ )?((?:nrfgs|ns-train nrfgs\S*) [^&\n]+)", lines, re.M))
+            found += re.findall(r"(?:^|&& )(?:[A-Z_]+=\S+ )?((?:nrfgs|ns-train nrfgs\S*) [^&\n]+)", lines, re.MULTILINE)
+    return sorted({" ".join(line.split()) for line in found})
+
+
+def test_commands_that_pages_show_are_understood():
+    shown = commands_shown()
     assert len(shown) > 40
     for line in shown:
         program, first, *rest = shlex.split(line)
