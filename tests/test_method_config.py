@@ -69,7 +69,7 @@ def test_everything_else_is_splatfactos(name):
     assert not any(getattr(host.pipeline.model, option) for option in off)
     left_out = {"_target", "n_split_samples", "color_corrected_metrics", "sh_degree_interval", *off}
     left_out |= {"max_gauss_ratio", "grid_shape"}
-    built = Splatfacto().build(1, 1.0).strategy
+    built = Splatfacto().build(1, 1, 1.0).strategy
     for option, number in {
         "densify_size_thresh": built.grow_scale3d,
         "split_screen_size": built.grow_scale2d,

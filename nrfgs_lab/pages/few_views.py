@@ -3,7 +3,7 @@
 
 from collections import ChainMap, defaultdict
 from collections.abc import Mapping, Sequence
-from statistics import fmean, median
+from statistics import fmean, median, stdev
 
 from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
 
@@ -210,6 +210,34 @@ def _run(one: Mapping) -> str:
     return f"{one['psnr']:.2f} dB, {one['ssim']:.3f}, {one['splats'] / 1000:.0f}k splats{seconds}"
 
 
+def one_version() -> str:
+    """Test views of `nrfgs` and of harmonics with its rules: means over seeds, and each seed's PSNR."""
+    body = []
+    for scene in ("castle", "kitchen", "fern"):
+        for name in ("nrfgs", "harmonics, same rules"):
+            runs = [one for one in records("default").values() if one["name"] == f"one version: {name}"]
+            runs = [one for one in runs if one["scene"] == scene]
+            seeds = ", ".join(f"{one['psnr']:.2f}" for one in sorted(runs, key=lambda one: one["seed"]))
+            worst = min(view[1] for one in runs for view in one["per_image"])
+            numbers = f"{mean(runs, 'ssim'):.3f}", f"{mean(runs, 'flip'):.3f}", f"{worst:.1f}"
+            body.append([f"{scene}, {VIEWS[scene]}", name, seeds, *numbers, f"{mean(runs, 'splats') / 1000:.0f}k"])
+    return grid(["capture, training views", "", "PSNR of each seed", "SSIM", "FLIP", "worst view", "splats"], body)
+
+
+def folds(trial: str) -> str:
+    """Change of PSNR by a trial of `folds`: mean and standard error over trainings, and views with a gain."""
+    gains, views = defaultdict(list), defaultdict(list)
+    for key, one in records("default").items():
+        if one["name"] == f"folds: {trial}":
+            base, scene = records("default")[key.replace(trial, "default")], one["scene"].rpartition("/")[2]
+            gains[scene].append(one["psnr"] - base["psnr"])
+            views[scene] += [a[1] > b[1] for a, b in zip(one["per_image"], base["per_image"], strict=True)]
+    errors = {scene: stdev(some) / len(some) ** 0.5 for scene, some in gains.items()}
+    ahead = {scene: f"{sum(better)}/{len(better)}" for scene, better in views.items()}
+    shown = {scene: f"{fmean(some):+.2f} +- {errors[scene]:.2f} ({ahead[scene]})" for scene, some in gains.items()}
+    return " | ".join(shown[scene] for scene in ("kitchen", "castle", "fern") if scene in shown)
+
+
 def without(trial: str) -> str:
     """Gain of a trial over the default on `bonsai` with all its views except those held out, in both ways."""
     runs = records("held-out")
@@ -256,6 +284,8 @@ BLOCKS = {
     "captures.failed": failed,
     "captures.floaters": floaters,
     "captures.run": lambda name: _run(records("default")[name]),
+    "captures.one_version": one_version,
+    "captures.folds": folds,
     "captures.without": without,
     "captures.test_views": test_views,
     "opacity.copies": lambda: gains_over("mcmc: harmonics", {name: [f"mcmc: {one}"] for name, one in COPIES.items()}),

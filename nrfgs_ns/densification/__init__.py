@@ -5,7 +5,7 @@ The splats are a table, name -> parameter [N, ...]. Whatever a strategy does to 
 table, whichever head it belongs to, and to the optimisers' moments. The model never asks which strategy it has.
 
 `strategy.py` is the interface, `choice.py` the option on the command line; `gradient.py`, `error_guided.py` and
-`mcmc.py` (with `relocation.py`) have the strategies.
+`mcmc.py` (with `relocation.py`) have the strategies, `statistics.py` and `rows.py` what they share.
 """
 
 from nrfgs_ns.densification.choice import STRATEGIES, DensificationChoice, strategy_from

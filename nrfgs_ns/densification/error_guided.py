@@ -7,9 +7,9 @@ The recipe follows brush (Arthur Brussee, Apache-2.0, `crates/brush-train`) and 
   Of the views since the last refinement the largest counts. It does not depend on the size of the images, the number of
   views or the unit of the scene.
 - Each refinement splits a share of the splats whose error is above a threshold, drawn in proportion to the error, and
-  every splat wider than three quarters of the image.
-- A splat is dead if no view of the last two windows shows it at `DEAD` or more. It is replaced by half of a live one,
-  drawn in proportion to opacity.
+  every splat whose radius, three standard deviations, exceeds three quarters of the image's longer side.
+- A splat is dead if no view of the last two windows shows it at `DEAD` or more; of one that none has seen the stored
+  opacity counts. It is replaced by half of a live one, drawn in proportion to opacity.
 - Opacities are never reset. Each refinement takes a little from all of them, which the loss gives back where it counts.
 
 Differences from both, because they harm captures of few views (docs/captures.md): `DEAD` is 0.1 where they have 1/255,
@@ -29,6 +29,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 from torch.nn import Parameter
 
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification.statistics import take_maxima
 from nrfgs_ns.densification.strategy import (
     CHANGE,
@@ -73,8 +74,8 @@ class ErrorGuided(DensificationConfig):
     refine_every: int = 200
     """steps between refinements; the views of these are a window"""
     threshold: float = 0.0025
-    """error above which a splat may be split: the smaller, the more splats and detail. V training views raise it by the
-    factor 1 + (V / 210)^2"""
+    """error above which a splat may be split: the smaller, the more splats and detail. V different training views raise
+    it by the factor 1 + (V / 210)^2"""
     budget: int = 0
     """number of splats to grow to, whatever their error (arXiv 2605.16158). 0: the threshold decides"""
     most_splats: int = 2_000_000
@@ -96,8 +97,8 @@ class ErrorGuided(DensificationConfig):
         shares = {name: len(range(rank, getattr(self, name), devices)) for name in ("budget", "most_splats")}
         return replace(self, **shares)
 
-    def build(self, num_train_images: int, scene_unit: float) -> "ErrorGuidedDensification":
-        raised = self.threshold * (1 + (num_train_images / MANY_VIEWS) ** 2)
+    def build(self, num_images: int, num_views: int, scene_unit: float) -> "ErrorGuidedDensification":
+        raised = self.threshold * (1 + (num_views / MANY_VIEWS) ** 2)
         return ErrorGuidedDensification(replace(self, threshold=raised))
 
 
@@ -121,6 +122,14 @@ class ErrorGuidedDensification(Densification):
         config = self.config
         self.start, self.grow_until = step_at(config.warmup_length), step_at(config.grow_until)
         self.stop, self.end = step_at(config.stop_at), step_at(LAYOUT)
+
+    def begin(self, centers: Tensor, num_splats: int) -> None:
+        budget = self.config.budget
+        if budget and num_splats > budget:
+            warn(
+                f"The budget of error-guided is {budget}, but the training begins with {num_splats} points, of which "
+                "none is removed. With --pipeline.model.dense-start off it begins with fewer."
+            )
 
     def needs_absgrad(self, step: int) -> bool:
         return step < self.grow_until

@@ -79,7 +79,7 @@ class Splatfacto(GradientConfig):
         opacity = self.cull_alpha_thresh
         self.require(opacity < 0.5, "cull_alpha_thresh", "below 0.5, since a reset is to twice as much")
 
-    def build(self, num_train_images: int, scene_unit: float) -> "GradientDensification":
+    def build(self, num_images: int, num_views: int, scene_unit: float) -> "GradientDensification":
         return self._build(
             scene_unit,
             prune_opa=self.cull_alpha_thresh,
@@ -89,7 +89,7 @@ class Splatfacto(GradientConfig):
             grow_scale2d=0.05,  # shares of the image
             prune_scale2d=0.15,
             refine_scale2d_stop_iter=self.stop_screen_size_at,
-            pause_refine_after_reset=num_train_images + self.refine_every,
+            pause_refine_after_reset=num_images + self.refine_every,
             absgrad=self.use_absgrad,
         )
 
@@ -100,7 +100,7 @@ class Original(GradientConfig):
 
     name: ClassVar[str] = "original"
 
-    def build(self, num_train_images: int, scene_unit: float) -> "GradientDensification":
+    def build(self, num_images: int, num_views: int, scene_unit: float) -> "GradientDensification":
         return self._build(
             None,
             prune_opa=0.005,

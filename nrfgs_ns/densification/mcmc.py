@@ -53,7 +53,7 @@ class Mcmc(DensificationConfig):
     def share_of(self, rank: int, devices: int) -> "Mcmc":
         return replace(self, budget=len(range(rank, self.budget, devices)))
 
-    def build(self, num_train_images: int, scene_unit: float) -> "McmcDensification":
+    def build(self, num_images: int, num_views: int, scene_unit: float) -> "McmcDensification":
         return McmcDensification(self, scene_unit)
 
 

@@ -8,7 +8,7 @@ each copy has (equation 9 of the paper)
     s' = s o / sum_{i=1..n} sum_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1).
 
 gsplat 1.4 has these moves too, but two of its steps exist as CUDA kernels only. Here is the same mathematics for every
-device; the inner sum over i is done in closed form, sum_{i=1..n} binom(i-1, k) = binom(n, k+1).
+device; the sum over i is done in closed form, sum_{i=1..n} binom(i-1, k) = binom(n, k+1).
 """
 
 import math

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`statistics.py` in one Triton kernel."""
+"""`statistics.py` in Triton: a kernel for sums and one for maxima."""
 
 import torch
 import triton

@@ -2,7 +2,7 @@
 """The interface of all strategies of densification: their options, and what runs in training.
 
 A strategy is a dataclass of its options (`DensificationConfig`), which builds what runs (`Densification`). What it
-wants of the head or of the loss it says itself. A new one is one file, and one line in `choice.py`.
+wants of the head or of the loss it says itself. A new one is one file, and its name in `choice.py`.
 """
 
 import math
@@ -86,11 +86,12 @@ class DensificationConfig(ABC):
     """steps between refinements"""
 
     @abstractmethod
-    def build(self, num_train_images: int, scene_unit: float) -> "Densification":
+    def build(self, num_images: int, num_views: int, scene_unit: float) -> "Densification":
         """The strategy for a training.
 
         Args:
-            num_train_images: number of training images.
+            num_images: number of training images.
+            num_views: number of different views among them.
             scene_unit: world units in a scene unit, in which sizes among the options are.
         """
 
@@ -148,8 +149,7 @@ class Densification(ABC):
 
     @property
     def diffuse(self) -> Tensor | None:
-        """Which splats have no residual, bool [N], where a checkpoint says so: a row of the table as any other, which
-        is moved with it."""
+        """Which splats have no residual, bool [N]: those of loaded compact files, which are not trained."""
         return self.state.get(DIFFUSE)
 
     def needs_absgrad(self, step: int) -> bool:

@@ -47,7 +47,7 @@ class ShardedModel(NrfgsModel):
 
     def _strategy(self) -> Densification:
         config = self.config.densification.share_of(comm.rank(), comm.world())
-        strategy = config.build(self.num_train_data, self.scene_unit)
+        strategy = config.build(self.num_train_data, self.num_views, self.scene_unit)
         strategy.verbose = comm.rank() == 0
         return strategy
 

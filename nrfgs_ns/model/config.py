@@ -18,11 +18,11 @@ from nrfgs_ns.errors import InputError
 MODEL = "nrfgs_ns.model.model:NrfgsModel"
 """The model's class, which imports this module."""
 PRIOR_VIEWS = 20
-"""Training views with which `few_views` halves the trust in the head."""
+"""Training views with which the trust in the head, by `few_views`, is one half."""
 HALVING_VIEWS = 12
 """Training views that halve `shrinkage`."""
 NEGLIGIBLE = 1e-6
-"""Weights of shrinkage below this are zero: Adam makes whole steps of any for splats that no view sees."""
+"""Smaller weights of shrinkage count as zero: Adam turns any into whole steps of splats that no view sees."""
 EPSILON = math.ulp(1.0)
 
 
@@ -51,9 +51,9 @@ class NrfgsModelConfig(ModelConfig):
     """steps before training in which a head that starts with a residual unlearns it. None: one for each training
     view"""
     densification: DensificationChoice = field(default_factory=Splatfacto)
-    """how splats are added and removed: a strategy, and options of its own, as in mcmc,budget=150000
-    (docs/options.md). error-guided: growth where the error is. splatfacto: nerfstudio's rules. original: those of 3DGS.
-    mcmc: 3DGS-MCMC, up to a budget"""
+    """how splats are added and removed: a strategy, and options of its own, as in mcmc,budget=150000; those left out
+    have the strategy's defaults, not a preset's (docs/options.md). error-guided: growth where the error is. splatfacto:
+    nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to a budget"""
     photographs: Literal["auto", "on", "off"] = "auto"
     """learn each photograph's exposure and white balance. auto: if photographs or EXIF show that they vary
     (docs/exposure.md)"""

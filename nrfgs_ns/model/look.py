@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The photograph whose exposure and colour renderings outside of training have."""
+"""Which training photograph's exposure and colour a rendering outside of training takes."""
 
 import os
 

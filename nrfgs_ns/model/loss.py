@@ -19,7 +19,7 @@ def loss_of(model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], bat
     Args:
         model: an NrfgsModel. In evaluation there is only the photometric term.
         splats: the rendered table, whose tensors get gradients.
-        outputs: "rgb" [H, W, 3] in [0, 1] and "background" [3], as rendered.
+        outputs: "rgb" [H, W, 3] in [0, 1] and "background" [H, W, 3], as rendered.
         batch: the datamanager's "image", and "mask" if there is one.
     """
     losses = {"main_loss": photometric(model, outputs, batch)}

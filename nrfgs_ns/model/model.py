@@ -115,7 +115,7 @@ class NrfgsModel(SplatfactoModel):
             self.gauss_params = ParameterDict(self._initial_splats()).to(self.device)
 
     def _strategy(self) -> Densification:
-        return self.config.densification.build(self.num_train_data, self.scene_unit)
+        return self.config.densification.build(self.num_train_data, self.num_views, self.scene_unit)
 
     def learn_photographs(self, photographs: PhotographModel | None) -> None:
         """Learn each photograph's exposure and colour; None: all are the same."""

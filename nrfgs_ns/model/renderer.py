@@ -97,7 +97,7 @@ def composite_view(
         absgrad=absgrad,
         assume_finite=assume_finite,
     )
-    render, alpha = render.squeeze(0), alpha.squeeze(0)  # a view; what [0] sends back is a copy among zeros
+    render, alpha = render.squeeze(0), alpha.squeeze(0)  # the gradient of [0] would be a copy among zeros
     rgb = render[..., :3] if with_depth else render
     outputs = {
         "rgb": torch.clamp(rgb, 0.0, 1.0) if look is None else look(rgb),

@@ -105,7 +105,6 @@ def load_file(path: Path) -> "NrfgsModel":
     model.load_state_dict(model_state(model, decoded))
     model.background_color = torch.tensor(background, dtype=torch.float32)
     model.to("cuda" if torch.cuda.is_available() else "cpu")
-    model.update_to_step(config.densification.stop_split_at)
     return model.eval()
 
 

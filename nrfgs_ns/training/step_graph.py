@@ -75,11 +75,10 @@ class StepGraphs:
         model = self.model
         exposed = model.photograph is not None
         obstacles = (
-            ("the densification looks at what views show", not model.densification.takes_all_rows),
+            ("this densification needs the visible splats alone", not model.densification.takes_all_rows),
             ("exposures of transparent photographs are learnt", exposed and batch["image"].shape[-1] == 4),
             ("the robust loss chooses pixels", model.trimming is not None),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
-            ("some splats are diffuse", model.densification.diffuse is not None),
             (
                 f"photographs have more than {MOST_SIZES} sizes, and only those of {MOST_SIZES} have a graph",
                 len(self._graphs) >= MOST_SIZES and _kind(batch) not in self._graphs,
@@ -93,7 +92,7 @@ class StepGraphs:
         if not self._takes(batch) or self._is_new():
             self.guard.settle()
             return False
-        seen_from = self.model.pinholes.of_training(camera, self._how["downscale"])
+        seen_from = self.model.pinhole(camera)
         now, kind = (seen_from, batch, camera.metadata["cam_idx"], step), _kind(batch)
         if (graph := self._graphs.get(kind)) is not None:
             graph.prepare(*now)

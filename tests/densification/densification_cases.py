@@ -92,7 +92,7 @@ def rotations(quats: torch.Tensor) -> torch.Tensor:
 
 
 def strategy(name: str, images: int = 8, **options):
-    return CONFIGS[name](**options).build(images, 1.0)
+    return CONFIGS[name](**options).build(images, images, 1.0)
 
 
 def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **rules) -> list[str]:

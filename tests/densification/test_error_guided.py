@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
 def rules(**options):
-    strategy = ErrorGuided(**options).build(0, 1.0)
+    strategy = ErrorGuided(**options).build(0, 0, 1.0)
     strategy.verbose = False
     return strategy
 
@@ -71,8 +71,8 @@ def test_the_error_is_the_largest_of_a_view_however_many_there_are():
     assert_close(errors(64, views=2, cameras_at_once=True), errors(64, views=2), rtol=1e-4, atol=1e-7)
 
 
-def test_many_views_raise_the_threshold():
-    thresholds = [ErrorGuided(threshold=0.001).build(views, 1.0).config.threshold for views in (1, 21, 210, 420)]
+def test_many_different_views_raise_the_threshold():
+    thresholds = [ErrorGuided(threshold=0.001).build(999, views, 1.0).config.threshold for views in (1, 21, 210, 420)]
     assert thresholds == pytest.approx([0.001, 0.00101, 0.002, 0.005], rel=1e-3)
 
 
@@ -201,3 +201,11 @@ def test_growth_ends_at_the_cap_and_in_time():
         table, strategy = Table(40), rules(**options)
         refine(table, strategy, step, gradient=1.0)
         assert len(table) == count
+
+
+def test_a_budget_below_the_start_is_told(capsys):
+    strategy = rules(budget=5)
+    strategy.begin(torch.zeros(3, 3), 5)
+    assert capsys.readouterr().out == ""
+    strategy.begin(torch.zeros(3, 3), 6)
+    assert "budget of error-guided is 5, but the training begins with 6" in " ".join(capsys.readouterr().out.split())

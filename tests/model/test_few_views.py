@@ -61,6 +61,8 @@ def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_c
     again = ready(twice, tmp_path / "again", 4, {"--load-dir": models_of(config)}).pipeline.model
     trust = 8 / 28
     assert again.num_views == 8 and again.trust == trust
+    by_error = ready(twice, tmp_path / "by error", 1, {"--pipeline.model.densification": "error-guided"}).pipeline.model
+    assert by_error.densification.config == ErrorGuided().build(16, 8, 1.0).config
     assert again.head.config == NrfConfig(opacity_scale=trust * 0.2) and again.noise_factor == 0.5 / trust
     assert again.view_noise.sigma == again.noise_factor * again.camera_spacing / 3**0.5
 
