@@ -17,7 +17,7 @@ import tyro
 from nerfstudio.configs import method_configs
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
-from short_trainings import REFINING, trained
+from short_trainings import trained
 from smoke_runs import recorded
 
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
@@ -51,8 +51,9 @@ def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tm
     monkeypatch.setitem(eval_utils.all_methods, "linear", configs["linear"])
     monkeypatch.setattr(method_configs, "AnnotatedBaseConfigUnion", tyro.extras.subcommand_type_from_defaults(configs))
     args = ["linear", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "25"]
-    args += ["--vis", "tensorboard", "--steps-per-eval-image", "1000", "--steps-per-eval-all-images", "1000"]
-    config = trained([*args, *(str(word) for option in REFINING.items() for word in option)])
+    args += ["--vis", "tensorboard", "--pipeline.model.densification", "splatfacto,warmup_length=5,refine_every=10"]
+    args += ["--steps-per-eval-image", "1000", "--steps-per-eval-all-images", "1000"]
+    config = trained([*args, "--pipeline.model.num-downscales", "0"])
     state = torch.load(next(tmp_path.rglob("*.ckpt")), weights_only=True)["pipeline"]
     assert state["_model.gauss_params.slopes"].abs().max() > 0
     reached = evaluate(config, tmp_path / "eval.json")["psnr"]
