@@ -5,7 +5,7 @@ Nothing is retrained: the loss is at least that of a model trained without the p
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,6 @@ from pathlib import Path
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
-from torch import Tensor
 from torch.utils.benchmark import Timer
 
 from nrfgs_lab.residuals import THRESHOLDS, FieldViews, Residuals, dropped, look_over, slim
@@ -157,12 +156,12 @@ def together(
             if full - views.psnr(smaller) <= 0.5 * budget:
                 field = smaller
                 left_out.append(part.part)
-    slimmed = slim(field, seen, views, full - budget)
-    if diffuse_splats(slimmed.field) > diffuse_splats(field):
-        left_out.append(residuals_below(slimmed.threshold))
-    if slimmed.rank < field.head.config.latent_dim and slimmed.threshold < float("inf"):
-        left_out.append(f"latents beyond rank {slimmed.rank}")
-    return row("together", "together", slimmed.field, views, full), left_out
+    slimmed, threshold, rank = slim(field, seen, views, full - budget)
+    if diffuse_splats(slimmed) > diffuse_splats(field):
+        left_out.append(residuals_below(threshold))
+    if rank < field.head.config.latent_dim and threshold < float("inf"):
+        left_out.append(f"latents beyond rank {rank}")
+    return row("together", "together", slimmed, views, full), left_out
 
 
 @torch.no_grad()
@@ -170,15 +169,12 @@ def head_seconds(views: FieldViews, field: Field) -> float:
     """Mean of the head's time over the views; diffuse splats last, as in a training and in a file."""
     seconds = []
     for view, _, _ in views.views:
-        rows = diffuse_last(field.splats, view.visible)
+        rows = view.visible
+        if DIFFUSE in field.splats:
+            rows = rows[field.splats[DIFFUSE][rows].to(torch.uint8).argsort(stable=True)]
         timer = Timer("head(splats, rows, center)", globals={**field._asdict(), "rows": rows, "center": view.center})
         seconds.append(min(timer.timeit(1).mean for _ in range(TIMED)))
     return sum(seconds) / len(seconds)
-
-
-def diffuse_last(splats: Mapping[str, Tensor], visible: Tensor) -> Tensor:
-    """Visible rows, those of diffuse splats last."""
-    return visible[splats[DIFFUSE][visible].to(torch.uint8).argsort(stable=True)] if DIFFUSE in splats else visible
 
 
 @torch.no_grad()

@@ -123,19 +123,9 @@ def dropped(field: Field, seen: Residuals, threshold: float) -> Field:
     return with_diffuse(field, seen.largest < threshold, seen.features_dc, seen.opacities)
 
 
-class Slimmed(NamedTuple):
-    """A field with fewer residuals and components."""
-
-    field: Field
-    threshold: float
-    """residuals below it are dropped, 8-bit steps; 0: none"""
-    rank: int
-    """numbers in a latent"""
-
-
-def slim(field: Field, seen: Residuals, views: FieldViews, lowest_psnr: float) -> Slimmed:
+def slim(field: Field, seen: Residuals, views: FieldViews, lowest_psnr: float) -> tuple[Field, float, int]:
     """The smallest field that keeps a PSNR on the views, dB: first the largest of THRESHOLDS within its share of the
-    allowed loss, then the lowest rank for the other splats."""
+    allowed loss, then the lowest rank for the other splats; that threshold, 0 for none, and the rank."""
     enough = lowest_psnr + (1 - SHARE_FOR_RESIDUALS) * (views.psnr(field) - lowest_psnr)
     threshold = 0.0
     for candidate in reversed(THRESHOLDS):
@@ -150,4 +140,4 @@ def slim(field: Field, seen: Residuals, views: FieldViews, lowest_psnr: float) -
         enough = views.psnr(with_rank(field, basis, middle)) >= lowest_psnr
         low, rank = (low, middle) if enough else (middle + 1, rank)
     whole = rank == field.head.config.latent_dim
-    return Slimmed(field if whole else with_rank(field, basis, rank), threshold, rank)
+    return field if whole else with_rank(field, basis, rank), threshold, rank

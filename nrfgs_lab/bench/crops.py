@@ -24,15 +24,15 @@ ACROSS = 8
 Images = npt.NDArray[np.float32]
 
 
-def crop_sheet(pictures: dict[str, Path], path: Path) -> bool:
+def crop_sheet(pictures: dict[str, Path], path: Path) -> None:
     """Write a PNG of the views where runs differ most: renderings above |error| x 4, the whole truth on the left.
 
     Args:
         pictures: label -> folder of ns-eval's pictures of a run.
-        path: where the PNG goes.
+        path: where the PNG goes, if there is a view that all runs have.
 
-    Returns:
-        Whether there is a view that all runs have. ValueError if their pictures differ in size.
+    Raises:
+        ValueError: their pictures differ in size.
     """
     files = {label: files for label, folder in pictures.items() if (files := numbered(folder))}
     places = []
@@ -41,7 +41,7 @@ def crop_sheet(pictures: dict[str, Path], path: Path) -> bool:
         side = crop_side(truth.shape[0], truth.shape[1])
         places.append((*largest_disagreement(truth, list(renders.values()), side), view))
     if not places:
-        return False
+        return
     places = sorted(places, key=lambda place: -place[0])[:VIEWS]
     parts = [_view(*read(files, view), top, left) for _, top, left, view in places]
     width, height = max(part.width for part in parts), sum(part.height + TITLE + GAP for part in parts)
@@ -53,7 +53,6 @@ def crop_sheet(pictures: dict[str, Path], path: Path) -> bool:
         y += TITLE + part.height + GAP
     with whole(path) as aside:
         sheet.save(aside, format="PNG")
-    return True
 
 
 def numbered(folder: Path) -> dict[int, Path]:

@@ -54,8 +54,9 @@ def mean_of(row: Row, column: str) -> float:
     return mean
 
 
-def trainings_of(row: Row | None) -> Trainings:
-    """The trainings of a benchmark's row; none of a missing one."""
+def trainings(study: str, scene: str, run: str, strategy: str = ORIGINAL) -> Trainings:
+    """The trainings of a run of a benchmark; none of a missing one."""
+    row = bench_rows(study).get((scene, strategy, run))
     metrics, trainings = ("psnr", "ssim", "ms_ssim"), []
     for seed, record in row.records.items() if row else ():
         test = record["measured"]["test"]
@@ -63,11 +64,6 @@ def trainings_of(row: Row | None) -> Trainings:
         values = {metric: test[metric] for metric in metrics}
         trainings.append({**values, "seed": seed, "per_image": views, "splats": record["measured"]["splats"]})
     return trainings
-
-
-def trainings(study: str, scene: str, run: str, strategy: str = ORIGINAL) -> Trainings:
-    """The trainings of a run of a benchmark."""
-    return trainings_of(bench_rows(study).get((scene, strategy, run)))
 
 
 def mean(runs: Trainings, metric: str) -> float:

@@ -21,7 +21,8 @@ from pathlib import Path
 
 SOFTWARE = "chromium --headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
 """Without a GPU."""
-PICTURES = 3
+PICTURES, PATIENCE = 3, 300
+"""Pictures that are compared, and seconds to wait for an answer."""
 
 OUTER = """<!DOCTYPE html><body style="margin:0"><script>
 const send = (answer) => fetch("done", { method: "POST", body: JSON.stringify(answer) });
@@ -48,7 +49,7 @@ document.body.append(frame);
 </script>"""
 
 
-def measured(page: Path, browser: list[str], size: tuple[int, int], count: int, patience: float) -> dict:
+def measured(page: Path, browser: list[str], size: tuple[int, int], count: int) -> dict:
     """`nrfgs.measure`'s answer, "seconds_to_load", and "pictures": PNG bytes from some photographs' cameras.
 
     Args:
@@ -56,7 +57,9 @@ def measured(page: Path, browser: list[str], size: tuple[int, int], count: int, 
         browser: command and options; a profile's folder and the address are added.
         size: of the frame, in CSS pixels.
         count: pictures over which seconds are averaged.
-        patience: seconds to wait; RuntimeError if there is no answer, or the page failed.
+
+    Raises:
+        RuntimeError: there is no answer, or the page failed.
     """
     folder, name = (page, "index.html") if page.is_dir() else (page.parent, page.name)
     outer = OUTER.replace("WIDTH", str(size[0])).replace("HEIGHT", str(size[1])).replace("COUNT", str(count))
@@ -99,19 +102,19 @@ def measured(page: Path, browser: list[str], size: tuple[int, int], count: int, 
         command = [*browser, *own, f"http://127.0.0.1:{server.server_port}/outer"]
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
         try:
-            there.wait(patience)
+            there.wait(PATIENCE)
         finally:
             os.killpg(process.pid, signal.SIGTERM)  # with the browser's children
             process.wait()
             server.shutdown()
     if not answers or "failed" in answers[0]:
-        raise RuntimeError(answers[0]["failed"] if answers else f"no answer within {patience:g} seconds")
+        raise RuntimeError(answers[0]["failed"] if answers else f"no answer within {PATIENCE} seconds")
     answer = answers[0]
     answer["pictures"] = [base64.b64decode(picture.split(",")[1]) for picture in answer["pictures"]]
     return answer
 
 
-def alike(page: Path, config: Path, browser: list[str], patience: float) -> list[float]:
+def alike(page: Path, config: Path, browser: list[str]) -> list[float]:
     """PSNR, dB, of a page's pictures against a model's, the training's or the one from `nrfgs export compact`."""
     import io
 
@@ -128,7 +131,7 @@ def alike(page: Path, config: Path, browser: list[str], patience: float) -> list
         raise RuntimeError(f"{config}: no training views")
     size = int(cameras.width[0]), int(cameras.height[0])
     scores = []
-    for k, picture in enumerate(measured(page, browser, size, 1, patience)["pictures"]):
+    for k, picture in enumerate(measured(page, browser, size, 1)["pictures"]):
         place = k * len(cameras) // PICTURES
         pixels = torch.from_numpy(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")) / np.float32(255))
         expected = pipeline.model.get_outputs_for_camera(cameras[place : place + 1])["rgb"].cpu()
@@ -144,17 +147,16 @@ def main() -> None:
     parser.add_argument("--config", type=Path, help="compare the page's pictures with those of this model")
     parser.add_argument("--size", type=int, nargs=2, default=(1920, 1080), help="width and height, pixels")
     parser.add_argument("--count", type=int, default=50, help="pictures over which seconds are averaged")
-    parser.add_argument("--patience", type=float, default=300, help="seconds")
     options = parser.parse_args()
     browser = shlex.split(options.browser)
-    record = measured(options.page, browser, options.size, options.count, options.patience)
+    record = measured(options.page, browser, options.size, options.count)
     options.record.parent.mkdir(parents=True, exist_ok=True)
     for k, picture in enumerate(record.pop("pictures")):
         options.record.with_name(f"{options.record.stem}-{k}.png").write_bytes(picture)
     files = [options.page] if options.page.is_file() else list(options.page.iterdir())
     record["bytes"] = sum(file.stat().st_size for file in files)
     if options.config:
-        record["psnr"] = alike(options.page, options.config, browser, options.patience)
+        record["psnr"] = alike(options.page, options.config, browser)
     options.record.write_text(json.dumps(record, indent=1) + "\n")
     print(json.dumps(record, indent=1))
 

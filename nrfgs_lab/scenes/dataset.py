@@ -45,7 +45,6 @@ def write_scene(config: SceneConfig, out: Path, advance: Callable[[], object] = 
     Raises:
         FileExistsError: when `out` holds anything else: another scene, other files.
     """
-    out = Path(out)
     record = {"version": SCENE_VERSION, "config": asdict(config)}
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         with contextlib.suppress(OSError, ValueError):

@@ -29,8 +29,8 @@ from nrfgs_ns.model import initial_splats
 
 EXTENT = 2.0
 """Side of the cube that the splats fill, in scene units; the cameras lie within [-1, 1]."""
-WARM = 50
-"""Steps before the clock starts."""
+WARM, STEPS = 50, 200
+"""Steps before the clock starts, and on it."""
 
 
 @dataclass
@@ -47,8 +47,6 @@ class Load:
     """more options of ns-train"""
     device_type: Literal["cuda", "cpu"] = "cuda"
     splats: int = 4_000_000
-    steps: int = 200
-    """steps on the clock"""
 
     def main(self) -> None:
         runs = []
@@ -58,8 +56,8 @@ class Load:
                 mp.spawn(one_device, args=(self, world, url, folder), nprocs=world)
                 parts = [json.loads(Path(folder, f"{rank}.json").read_text()) for rank in range(world)]
             seconds = max(part["seconds"] for part in parts)
-            run = {"options": self.options, "splats": self.splats, "devices": world, "steps": self.steps}
-            run |= {"images_per_second": world * self.steps / seconds, "step_ms": 1000 * seconds / self.steps}
+            run = {"options": self.options, "splats": self.splats, "devices": world, "steps": STEPS}
+            run |= {"images_per_second": world * STEPS / seconds, "step_ms": 1000 * seconds / STEPS}
             runs.append({**run, "peak_memory_bytes": [part["peak_memory_bytes"] for part in parts]})
             print(runs[-1], flush=True)
         content = {"machine": machine(), "scene": self.scene.name, "runs": runs}
@@ -74,7 +72,7 @@ def one_device(rank: int, load: Load, world: int, url: str, folder: str) -> None
         "--data": load.scene,
         "--output-dir": folder,
         "--machine.device-type": load.device_type,
-        "--max-num-iterations": WARM + load.steps + 1,
+        "--max-num-iterations": WARM + STEPS + 1,
         "--steps-per-save": 10**9,
         "--pipeline.model.random-init": True,
         "--pipeline.model.num-random": load.splats,
@@ -98,7 +96,7 @@ def one_device(rank: int, load: Load, world: int, url: str, folder: str) -> None
             if torch.cuda.is_available():
                 torch.cuda.reset_peak_memory_stats()
             measured["start"] = perf_counter()
-        if step == WARM + load.steps:
+        if step == WARM + STEPS:
             together(world)
             measured["seconds"] = perf_counter() - measured.pop("start")
             measured["peak_memory_bytes"] = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0

@@ -5,7 +5,7 @@
 
 Each method trains at full resolution until it has more splats, loses the surplus, and goes on with a fixed number. Then
 stretches of steps are timed: as they are, without graph, and both again at rest, when densification has ended. At last
-the trained models render the test views, at the photographs' size and at 1080p. Methods take turns, `rounds` times.
+the trained models render the test views, at the photographs' size and at 1080p. Methods take turns.
 """
 
 import contextlib
@@ -33,6 +33,10 @@ from nrfgs_ns.files import write_whole
 VARIANTS = "whole", "without graph", "at rest: whole", "at rest: without graph"
 UNTIMED = 5
 """First steps of a stretch that are not timed."""
+GROW, SETTLE, STEPS = 1500, 200, 100
+"""Steps of densification, between it and the first timed stretch, and of a stretch."""
+ROUNDS = 3
+"""Turns of each method, and of each model's frames."""
 NEVER = 10**9
 
 
@@ -48,19 +52,11 @@ class StepParts:
     """methods with splatfacto's densification"""
     splats: int = 250_000
     """largest number of splats of each method"""
-    grow: int = 1500
-    """steps of densification"""
-    settle: int = 200
-    """steps between densification and the first timed stretch"""
-    steps: int = 100
-    """steps of a timed stretch"""
-    rounds: int = 3
-    """turns of each method, and of each model's frames"""
 
     def main(self) -> None:
         rows: list[dict[str, Any]] = []
         models: dict[str, Any] = {}
-        for turn in range(self.rounds):
+        for turn in range(ROUNDS):
             for method in self.methods:
                 stretches, models[method] = self.measure(method)
                 rows += [{"method": method, "round": turn, **row} for row in stretches]
@@ -71,7 +67,7 @@ class StepParts:
                 "fps": {size: frames_per_second(model, views) for size, views in cameras.items()},
                 "splats": model.num_points,
             }
-            for turn in range(self.rounds)
+            for turn in range(ROUNDS)
             for method, (model, cameras) in models.items()
         ]
         write_whole(self.out, json.dumps({"machine": machine(), "steps": rows, "frames": frames}, indent=1) + "\n")
@@ -79,8 +75,8 @@ class StepParts:
 
     def measure(self, method: str) -> tuple[list[dict[str, Any]], tuple[Any, dict[str, list]]]:
         """Train a method and time its variants; return them, the model, and the test cameras by size."""
-        length = UNTIMED + self.steps + 1
-        begin = self.grow + self.settle
+        length = UNTIMED + STEPS + 1
+        begin = GROW + SETTLE
         folder = tempfile.mkdtemp()  # left behind: tensorboard's thread writes to it until the process ends
         args = [method, "--output-dir", folder, "--max-num-iterations", str(begin + length * len(VARIANTS) + 1), *QUIET]
         args += ["--steps-per-save", str(NEVER), "--pipeline.model.num-downscales", "0"]
@@ -98,7 +94,7 @@ class StepParts:
             def after(step: int) -> None:
                 nonlocal began
                 strategy = model.densification.strategy
-                if step == self.grow:
+                if step == GROW:
                     kept = torch.randperm(model.num_points, device=model.device)[: self.splats].sort().values
                     take_rows(model, trainer.optimizers.optimizers, kept)
                     strategy.refine_every = strategy.reset_every = NEVER
@@ -109,12 +105,12 @@ class StepParts:
                 if at == 0:
                     strategy.refine_stop_iter = 0 if "at rest" in name else NEVER
                     trainer.graphs = None if "without graph" in name else graphs
-                if at in (UNTIMED, UNTIMED + self.steps):
+                if at in (UNTIMED, UNTIMED + STEPS):
                     torch.cuda.synchronize()
                 if at == UNTIMED:
                     began = perf_counter()
-                if at == UNTIMED + self.steps:
-                    milliseconds = 1e3 * (perf_counter() - began) / self.steps
+                if at == UNTIMED + STEPS:
+                    milliseconds = 1e3 * (perf_counter() - began) / STEPS
                     rows.append({"variant": name, "splats": model.num_points, "step_ms": milliseconds})
 
             trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after))

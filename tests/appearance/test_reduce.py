@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from head_cases import awake, scene
+from head_cases import assert_same, awake, scene
 from torch.testing import assert_close
 
 from nrfgs_lab.residuals import with_diffuse
@@ -16,8 +16,6 @@ CONFIGS = {
     "one branch": NrfConfig(latent_dim=8, hidden_width=16, split_bands=False),
     "low only": NrfConfig(latent_dim=8, hidden_width=16, num_bands=1, use_distance=False, opacity_residual=False),
 }
-FLOAT32 = {"rtol": 0, "atol": 2e-5}
-"""Sums of up to 60 products of numbers of order 1 to 10, rounded at 2^-24 each, behind slopes of at most 0.2."""
 
 
 @pytest.fixture(params=CONFIGS)
@@ -27,18 +25,12 @@ def case(request):
     return Field(head, splats), visible, centers
 
 
-def assert_same(field: Field, other: Field, visible, centers, **tolerance) -> None:
-    pair = (each.head(each.splats, visible, centers) for each in (field, other))
-    for a, b in zip(*pair, strict=True):
-        assert_close(a, b, **tolerance)
-
-
 def test_full_rank_is_the_head(case):
     field, visible, centers = case
     basis = latent_basis(field, torch.rand(40))
     whole = with_rank(field, basis, 8)
     assert (whole.splats["latents"] - field.splats["latents"]).abs().max() > 0.01, "the basis must have turned"
-    assert_same(whole, field, visible, centers, **FLOAT32)
+    assert_same(whole, field, visible, centers)
 
 
 def test_components_predict_the_hidden_units_better_the_more_there_are(case):
@@ -74,7 +66,7 @@ def test_latents_in_a_subspace_need_no_more(case):
     field = Field(field.head, {**field.splats, "latents": flat})
     small = with_rank(field, latent_basis(field, torch.ones(40)), 3)
     assert small.splats["latents"].shape == (40, 3) and small.head.config.latent_dim == 3
-    assert_same(small, field, visible, centers, rtol=0, atol=1e-4)  # numbers up to 5 here, 2^-24 of them 60 times
+    assert_same(small, field, visible, centers, atol=1e-4)  # numbers up to 5 here, 2^-24 of them 60 times
     assert small.bytes < field.bytes
 
 

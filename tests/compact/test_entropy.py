@@ -2,15 +2,12 @@
 """Coded tables: what goes in comes out, in Python and in the page's JavaScript; what is damaged is refused."""
 
 import hashlib
-import json
 import shutil
-import subprocess
 from functools import cache
-from importlib.resources import files
 
 import numpy as np
 import pytest
-from compact_fields import write_container
+from compact_fields import in_node, write_container
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -110,11 +107,7 @@ def test_another_shape_is_refused(columns, rows):
 def test_the_pages_reader_finds_the_same_numbers(tmp_path):
     tables = {name: Table(table, signed) for name, (table, signed) in TABLES.items()}
     write_container(tmp_path / "tables.nrf", {}, {**tables, "plain": np.arange(5, dtype=np.uint16)})
-    script = (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + READ
-    (tmp_path / "read.js").write_text(script, encoding="utf-8")
-    words = ["node", "read.js", "tables.nrf"]
-    said = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=300)
-    for name, found in json.loads(said.stdout).items():
+    for name, found in in_node(READ, tmp_path, "tables.nrf").items():
         table, signed = TABLES[name]
         assert found == hashlib.sha256(table.astype("<i4" if signed else "<u4").tobytes()).hexdigest(), name
 

@@ -1,15 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
+import contextlib
 import os
 import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from filelock import FileLock
-from sessions import session
 
 DEVICE = Path(__file__).with_name("device.py")
 TIMEOUT = 500
 """Seconds after which processes that wait for each other for good are ended: before pytest ends the test."""
+
+
+@contextlib.contextmanager
+def session(*words: object) -> Iterator[subprocess.Popen]:
+    """Python with these words in a session of its own, which is killed at the end, with the process's children."""
+    process = subprocess.Popen(
+        [sys.executable, *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+@pytest.fixture(name="session")
+def session_of_its_own():
+    return session
 
 
 def meet(job: str, scene: Path, folder: Path, world: int = 2, device_type: str = "cpu") -> Path:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from sessions import session
 from short_trainings import command_line
 from torch.multiprocessing import ProcessExitedException
 
@@ -75,7 +74,7 @@ WAIT = 200
 
 
 @pytest.fixture
-def endless(tiny_scene, tmp_path):
+def endless(session, tiny_scene, tmp_path):
     """A training on two CPU processes that lasts longer than anybody waits, once it has written a checkpoint."""
     options = {
         "--machine.num-devices": 2,

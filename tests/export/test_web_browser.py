@@ -104,6 +104,7 @@ def broken_pages(text: str) -> dict[str, tuple[str, str]]:
     start, middle = text.index(">", at) + 1, at + (len(text) - at) // 2
     scene = base64.b64decode(text[start : text.index("<", start)])
     later = base64.b64encode(scene[:8] + (9).to_bytes(4, "little") + scene[12:]).decode()
+    unparsable = text.replace("async function", "async async function", 1)
     letter = "A" if text[middle] != "A" else "B"
     return {
         "a letter changed": (text[:middle] + letter + text[middle + 1 :], "checksum"),
@@ -112,10 +113,7 @@ def broken_pages(text: str) -> dict[str, tuple[str, str]]:
         "cut in its scripts": (text[: text.index("async function main")], "incomplete"),
         "cut in its style": (text[: text.index("</style>") - 9], "incomplete"),
         "cut in its poster": (text[: text.index('src="data:image') + 400], "incomplete"),
-        "scripts that do not parse": (
-            text.replace("async function", "async async function", 1),
-            "cannot run this page",
-        ),
+        "scripts that do not parse": (unparsable, "cannot run this page"),
         "not base64": (text[:middle] + "!" + text[middle + 1 :], "damaged"),
         "of a later version": (text[:start] + later + text[text.index("<", start) :], "version"),
     }

@@ -2,8 +2,11 @@
 """A small field, a way through a compact file, and files taken apart; splats with harmonics."""
 
 import json
+import subprocess
 import zlib
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,6 +48,14 @@ def joined(text: bytes, bodies: list[bytes]) -> bytes:
     total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
     start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
     return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
+
+
+def in_node(code: str, folder: Path, *words: str) -> Any:
+    """What the page's reader and some code after it print in Node, as JSON."""
+    script = (files("nrfgs_ns.export.web") / "compact.js").read_text(encoding="utf-8") + code
+    (folder / "read.js").write_text(script, encoding="utf-8")
+    words = ["node", "read.js", *words]
+    return json.loads(subprocess.run(words, cwd=folder, capture_output=True, check=True, timeout=300).stdout)
 
 
 def field(count: int = 60) -> Field:

@@ -6,7 +6,7 @@ import json
 import pytest
 import torch
 import tyro
-from head_cases import awake, scene
+from head_cases import assert_same, awake, scene
 from short_trainings import LOUD, command_line, trained
 from torch.testing import assert_close
 
@@ -24,8 +24,6 @@ from nrfgs_ns.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 SPLIT = NrfConfig(latent_dim=8, hidden_width=16)
-FLOAT32 = {"rtol": 0, "atol": 2e-5}
-"""Sums of up to 60 products of numbers of order 1 to 10, rounded at 2^-24 each, behind slopes of at most 0.2."""
 
 
 def test_the_command(tiny_scene, tmp_path, capsys):
@@ -53,12 +51,6 @@ def random_field(config: NrfConfig = SPLIT):
     return Field(head, splats), visible, centers
 
 
-def assert_same(field: Field, other: Field, visible, centers) -> None:
-    pair = (each.head(each.splats, visible, centers) for each in (field, other))
-    for a, b in zip(*pair, strict=True):
-        assert_close(a, b, **FLOAT32)
-
-
 def test_parts_left_out_are_what_their_definition_says():
     whole, visible, centers = random_field()
     small, shut = without_high_branch(whole), awake(SPLIT, torch.float32).requires_grad_(False)
@@ -75,7 +67,7 @@ def test_parts_left_out_are_what_their_definition_says():
 
     found = without_opacity_residual(whole).head(whole.splats, visible, centers)
     assert (found.opacities == whole.head.base_appearance(whole.splats, visible).opacities).all()
-    assert_close(found.colors, seen.colors, **FLOAT32)
+    assert_close(found.colors, seen.colors, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("config", [SPLIT, NrfConfig(latent_dim=8, hidden_width=16, split_bands=False)])

@@ -11,15 +11,7 @@ from nrfgs_ns.rasterizer import ProjectionOptions, composite, project
 
 
 def rasterization(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
+    *arguments: Any,
     packed: bool = True,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
@@ -29,13 +21,14 @@ def rasterization(
     """`project`, then `composite`.
 
     Args:
-        opacities: one per splat. [N]
-        colors: one per splat, or per camera and splat. [N, D] or [C, N, D]
+        arguments: gsplat's nine: means, quats, scales, opacities [N], colors [N, D] or, per camera, [C, N, D],
+            viewmats, Ks, width, height.
         packed: False gives `info` gsplat's dense layout: radii, means2d, depths, conics and opacities with leading
             dimensions [C, N] and zeros where a splat is not visible; camera_ids and gaussian_ids are None.
         render_mode: "RGB" or "RGB+ED".
         options: fields of `ProjectionOptions`.
     """
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height = arguments
     n, c = len(means), len(viewmats)
     projection = project(means, quats, scales, viewmats, Ks, width, height, ProjectionOptions(**options))
     cell = (projection.camera_ids, projection.gaussian_ids)

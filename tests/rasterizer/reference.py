@@ -233,16 +233,7 @@ def composite(
 
 
 def rasterization(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *,
+    *arguments: Any,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
@@ -254,6 +245,7 @@ def rasterization(
     """The twin of `gsplat_call.rasterization`, camera by camera.
 
     Args:
+        arguments: gsplat's nine, from means to height.
         perturb: applied to the projected means, depths, conics and compensations, to pixels' offsets and their products
             (`HELD`), and to the transmittance that expected depth is divided by; with noise of a few rounding units it
             shows what rounding does to the image and to its gradients.
@@ -263,6 +255,7 @@ def rasterization(
     Returns:
         render [C, H, W, X], alphas [C, H, W, 1], and the screens and images of the C cameras.
     """
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height = arguments
     renders, screens, images = [], [], []
     for camera, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
         screen = project(means, quats, scales, viewmat, K, width, height, **limits)

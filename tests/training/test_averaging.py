@@ -99,13 +99,9 @@ def test_what_gives_rows_another_meaning_begins_anew(change, anew, trainer):
 
 
 def test_rows_that_a_strategy_overwrites_in_place_begin_it_anew(trainer, monkeypatch):
-    strategy, counts = trainer.pipeline.model.densification, []
-    for step in range(6, 10):
-        if step == 8:
-            monkeypatch.setattr(strategy, "moved_at", step)
-        trainer._average(step)
-        counts.append(trainer.mean.count)
-    assert counts == [1, 2, 1, 2]
+    assert counts(trainer, range(6, 8)) == [1, 2]
+    monkeypatch.setattr(trainer.pipeline.model.densification, "moved_at", 8)
+    assert counts(trainer, range(8, 10)) == [1, 2]
 
 
 @pytest.mark.parametrize(

@@ -102,8 +102,6 @@ QUICK = {
     "--pipeline.model.warmup-steps": 0,
     "--pipeline.model.densification": "splatfacto,refine_every=1000",
 }
-
-
 TWICE = {"--steps-per-save": 2}
 
 
