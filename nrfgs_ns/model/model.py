@@ -207,9 +207,10 @@ class NrfgsModel(SplatfactoModel):
         return None if index is None or self.photograph is None else lambda rgb: self.photograph(rgb, index)
 
     @property
-    def compositing(self) -> dict[str, bool]:
+    def compositing(self) -> dict[str, Any]:
         """Options of `composite_view`."""
         return {
+            "image_of": self.head.image_of if self.head.at_pixel else None,
             "with_depth": not self.training,
             "absgrad": self.training and self.densification.needs_absgrad(self.step),
             "assume_finite": self.training,

@@ -80,6 +80,7 @@ class StepGraphs:
             ("the robust loss chooses pixels", model.trimming is not None),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
             ("some splats are diffuse", model.densification.diffuse is not None),
+            ("the head's network sees pixels", model.head.at_pixel),
             (
                 f"photographs have more than {MOST_SIZES} sizes, and only those of {MOST_SIZES} have a graph",
                 len(self._graphs) >= MOST_SIZES and _kind(batch) not in self._graphs,
