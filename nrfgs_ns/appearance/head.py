@@ -24,7 +24,7 @@ class SplatAppearance(NamedTuple):
     """Colours and opacities of M splats, from one camera position each."""
 
     colors: Tensor
-    """Linear blend colours, [M, 3], >= 0; 1 is white."""
+    """Linear blend colours, [M, 3], >= 0; 1 is white. Of a head at the pixel: any D numbers, [M, D]."""
     opacities: Tensor
     """Peak opacities, [M], in [0, 1]."""
 
@@ -88,6 +88,9 @@ class AppearanceHead(nn.Module, ABC):
     """`splat_params` that only the residual reads: a diffuse splat need not store them."""
     is_harmonics: bool = False
     """Whether colours are exactly the harmonics in `features_dc` and `features_rest`, and opacities the base's."""
+    at_pixel: bool = False
+    """Whether `colors` are features [M, D], any D, which `image_of` turns into an image once composited. Such a
+    head needs no `features_dc`, its `base_appearance` is in features, too, and rays are the camera's, without noise."""
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Initial per-splat tensors [N, ...] by name, on rgb's device, for base colours rgb [N, 3] in [0, 1].
@@ -113,12 +116,32 @@ class AppearanceHead(nn.Module, ABC):
             opacities=base_opacities(splats["opacities"].index_select(0, visible)),
         )
 
+    def image_of(self, composited: Tensor, rays: Tensor) -> Tensor:
+        """The opaque image [H, W, 3] of a head at the pixel; 1 is white. Composited colours are one already.
+
+        Args:
+            composited: its features composited over zero, [H, W, D].
+            rays: unit directions from the camera through the pixels, in world axes, [H, W, 3].
+        """
+        return composited
+
+    def require_splat_colors(self) -> None:
+        """Raise InputError for a head at the pixel, which no file of splats can hold."""
+        if self.at_pixel:
+            raise InputError(
+                f"The {self.name!r} head colours pixels, by a network that runs after splats are composited: no file "
+                "of splats can hold it. Use ns-render, ns-eval or ns-viewer."
+            )
+
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
         """Parts of the head's result, for the viewer and for logs; never called in training.
 
         Each is a mode of the viewer under its name. The names must not depend on the arguments; M = 0 must work.
-        "residual" is always there: the colours of `forward` less those of `base_appearance`.
+        "residual", the colours of `forward` less those of `base_appearance`, is always there, but for a head at the
+        pixel, which has none.
         """
+        if self.at_pixel:
+            return {}
         colors = self(splats, visible, camera_centers).colors
         return {"residual": Component(colors - self.base_appearance(splats, visible).colors, "color")}
 

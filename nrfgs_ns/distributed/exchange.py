@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projected splats travel to the device that owns the camera; gradients travel back.
 
-Each (camera, visible splat) pair is one row of eleven numbers: place, shape, depth, radius, opacity and colour.
+Each (camera, visible splat) pair is one row of numbers: place, shape, depth, radius, opacity and colour.
 Autograd carries the gradient of each number back to the row that it came from, except `absgrad`, the sum over pixels of
 |dL/dmean2d| that some densifications use. The compositor leaves it beside the gradients, on the camera's device, and it
 is sent along with them.
@@ -16,8 +16,8 @@ from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.rasterizer import Projection
 
-COLUMNS = {"means2d": 2, "conics": 3, "depths": 1, "opacities": 1, "radii": 1, "colors": 3}
-"""Columns of a row, in this order. Radii travel as floating point, exact up to 2^24 pixels."""
+COLUMNS = {"means2d": 2, "conics": 3, "depths": 1, "opacities": 1, "radii": 1}
+"""Columns of a row, in this order, before its colour. Radii travel as floating point, exact up to 2^24 pixels."""
 
 
 @dataclass
@@ -82,7 +82,7 @@ def send_to_cameras(
     ]
     post = AbsgradPost(projection.means2d) if absgrad else None
     rows = _Swap.apply(torch.cat(columns, dim=1), sent, received, post)
-    means2d, conics, depths, opacities, radii, colors = rows.split(list(COLUMNS.values()), dim=1)
+    means2d, conics, depths, opacities, radii, colors = rows.split([*COLUMNS.values(), columns[-1].shape[1]], dim=1)
     means2d = means2d.contiguous()  # the kernels would make a copy, and leave absgrad with it
     if post is not None:
         post.arrived = means2d

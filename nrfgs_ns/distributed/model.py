@@ -92,7 +92,7 @@ class ShardedModel(NrfgsModel):
             nonlocal arrived
             absgrad = self.compositing["absgrad"]
             drawn, arrived = send_to_cameras(view.projection, appearance, *self.sizes[own], absgrad)
-            return View(drawn, pinholes[own].center), arrived
+            return View(drawn, pinholes[own].center, pinhole=pinholes[own]), arrived
 
         noise = self.view_noise.generator(self.device, self.step) if self.training else None
         look = self.look_of(self._photograph_of(cameras[own]))

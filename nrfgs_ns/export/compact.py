@@ -59,6 +59,7 @@ def export_compact(
 def load_field(load_config: Path) -> NrfgsPipeline:
     """A trained pipeline; InputError if its head is not a neural residual field."""
     pipeline = load_model(load_config, "test")
+    pipeline.model.head.require_splat_colors()
     if not isinstance(pipeline.model.head, NeuralResidualField):
         raise InputError(
             f"{load_config}: compact files and pages hold a neural residual field, and this model has the "

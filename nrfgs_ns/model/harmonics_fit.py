@@ -177,6 +177,7 @@ def fit_harmonics(model, cameras: Cameras) -> Fit:
         model: an NrfgsModel in evaluation mode.
         cameras: the training cameras, [V].
     """
+    model.head.require_splat_colors()
     splats = {name: value.detach() for name, value in model.gauss_params.items()}
     plain = PlainSplats(
         means=splats["means"],

@@ -207,9 +207,10 @@ class NrfgsModel(SplatfactoModel):
         return None if index is None or self.photograph is None else lambda rgb: self.photograph(rgb, index)
 
     @property
-    def compositing(self) -> dict[str, bool]:
+    def compositing(self) -> dict[str, Any]:
         """Options of `composite_view`."""
         return {
+            "image_of": self.head.image_of if self.head.at_pixel else None,
             "with_depth": not self.training,
             "absgrad": self.training and self.densification.needs_absgrad(self.step),
             "assume_finite": self.training,
@@ -387,12 +388,18 @@ class NrfgsModel(SplatfactoModel):
 
     @property
     def shs_0(self) -> Tensor:
-        return self._exported("features_dc")
+        return self.features_dc if self.fit is None else self.fit.splats.features_dc
 
     @property
     def shs_rest(self) -> Tensor:
         """Coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any, unless they are fitted."""
         return self.features_rest if self.fit is None else self.fit.splats.features_rest
+
+    @property
+    def features_dc(self) -> Tensor:
+        """The stored coefficients of the constant harmonic [N, 3]; of a head without them zeros, mid grey."""
+        stored = self.gauss_params.get("features_dc")
+        return self.means.new_zeros(self.num_points, 3) if stored is None else stored
 
     @property
     def features_rest(self) -> Tensor:

@@ -30,6 +30,15 @@ class Pinhole(NamedTuple):
     center: Tensor
     """camera centre in world coordinates. [3]"""
 
+    def rays(self) -> Tensor:
+        """Unit directions from the centre through the pixels' centres, in world axes. [H, W, 3]"""
+        x, y, z = self.viewmat[0, :3, :3]  # the camera's axes
+        (fx, _, cx), (_, fy, cy), _ = self.K[0]
+        across = (torch.arange(self.width, device=x.device, dtype=x.dtype) + 0.5 - cx) / fx
+        down = (torch.arange(self.height, device=x.device, dtype=x.dtype) + 0.5 - cy) / fy
+        rays = across[:, None] * x + down[:, None, None] * y + z
+        return torch.nn.functional.normalize(rays, dim=-1)
+
 
 def pinhole(camera: Cameras, camera_to_world: Tensor, downscale: int) -> Pinhole:
     """One camera, at 1 / downscale of its size, rounded down as its image is.

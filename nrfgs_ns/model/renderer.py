@@ -43,6 +43,8 @@ class View(NamedTuple):
     """camera centre in world coordinates, [3]; of several cameras, each row's, [M, 3]"""
     every_row: bool = False
     """invisible splats have rows, too (`ProjectionOptions.every_row`)"""
+    pinhole: Pinhole | None = None
+    """the camera; None: the splats are those of several"""
 
     @property
     def visible(self) -> Tensor:
@@ -61,7 +63,7 @@ def project_splats(
 def project_view(splats: Mapping[str, Tensor], pinhole: Pinhole, options: ProjectionOptions) -> View:
     """Project a table of splats into one camera."""
     *camera, center = pinhole
-    return View(project_splats(splats, *camera, options), center, options.every_row)
+    return View(project_splats(splats, *camera, options), center, options.every_row, pinhole)
 
 
 def composite_view(
@@ -72,6 +74,7 @@ def composite_view(
     with_depth: bool = True,
     absgrad: bool = False,
     assume_finite: bool = False,
+    image_of: Callable[[Tensor, Tensor], Tensor] | None = None,
     look: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Composite the visible splats over a background.
@@ -82,6 +85,8 @@ def composite_view(
         background: a colour [3].
         with_depth: return depth, too.
         absgrad, assume_finite: as in `rasterizer.composite`.
+        image_of: of a head at the pixel (`AppearanceHead`). Features are composited over zero, and their image is drawn
+            over the background, as opaque as the splats are. None: colours are the image's.
         look: the photograph's exposure model, applied to the rendered image [H, W, 3]; None: clamp it to [0, 1].
 
     Returns:
@@ -92,20 +97,22 @@ def composite_view(
         view.projection,
         appearance.colors,
         appearance.opacities,
-        backgrounds=background[None],
+        backgrounds=background[None] if image_of is None else None,
         with_depth=with_depth,
         absgrad=absgrad,
         assume_finite=assume_finite,
     )
     render, alpha = render.squeeze(0), alpha.squeeze(0)  # the gradient of [0] would be a copy among zeros
-    rgb = render[..., :3] if with_depth else render
+    rgb = render[..., :-1] if with_depth else render
+    if image_of is not None:
+        rgb = alpha * image_of(rgb, view.pinhole.rays()) + (1.0 - alpha) * background
     outputs = {
         "rgb": torch.clamp(rgb, 0.0, 1.0) if look is None else look(rgb),
         "accumulation": alpha,
         "background": background.expand(*alpha.shape[:2], 3),
     }
     if with_depth:
-        depth = render[..., 3:4]
+        depth = render[..., -1:]
         outputs["depth"] = torch.where(alpha > 0, depth, depth.detach().max())
     return outputs, info
 

@@ -4,7 +4,7 @@
 Nerfstudio saves a training's configuration as YAML with Python tags, and its own commands construct whatever those
 name: `!!python/object/apply:os.system` in a shared file is run. Here a file may name
 
-    configuration classes of nerfstudio (subclasses of its PrintableConfig) and dataclasses of this package
+    configuration classes of nerfstudio (subclasses of its PrintableConfig) and dataclasses of this project
     what a configuration sets up (`_target`): its default's class or a subclass of it, or an optimiser of torch
     paths, tuples, and enums of either package
 
@@ -27,8 +27,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from nrfgs_ns.errors import InputError
 
-OURS = "nrfgs_ns."
-PACKAGES = ("nerfstudio.", OURS, "torch.optim.")
+OURS = ("nrfgs_ns.", "nrfgs_lab.")
+PACKAGES = ("nerfstudio.", *OURS, "torch.optim.")
 
 
 def read_config(path: Path) -> TrainerConfig:

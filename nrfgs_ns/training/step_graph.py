@@ -79,6 +79,7 @@ class StepGraphs:
             ("exposures of transparent photographs are learnt", exposed and batch["image"].shape[-1] == 4),
             ("the robust loss chooses pixels", model.trimming is not None),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
+            ("the head's network sees pixels", model.head.at_pixel),
             (
                 f"photographs have more than {MOST_SIZES} sizes, and only those of {MOST_SIZES} have a graph",
                 len(self._graphs) >= MOST_SIZES and _kind(batch) not in self._graphs,

@@ -42,6 +42,7 @@ FAR_QUANTILE = 0.98
 """Share of the drawn pixels that set the range of depths: one floater must not flatten all else."""
 
 LEGENDS = {
+    "pixels": "The part without view dependence, or the image if there is none: this head colours pixels, not splats.",
     FULL: "The image as trained, with the residual times the gain.",
     BASE: "Base colours and base opacities: what does not depend on the view.",
     VIEW_DEPENDENCE: f"Deviation of a splat's colour over 12 directions: dark 0, bright {FULL_DEVIATION:g} or more.",
@@ -75,6 +76,8 @@ def legends(field: Field) -> dict[str, str]:
     with torch.no_grad():
         components = field.head.components(field.splats, means.new_zeros(0, dtype=torch.int64), means.new_zeros(3))
     offered = {name: LEGENDS[component.kind] for name, component in components.items()}
+    if field.head.at_pixel:
+        return {FULL: LEGENDS[FULL], BASE: LEGENDS["pixels"], DEPTH: LEGENDS[DEPTH]}
     first, last = ({mode: LEGENDS[mode] for mode in modes} for modes in ((FULL, BASE), (VIEW_DEPENDENCE, DEPTH)))
     return first | offered | last
 
@@ -130,8 +133,9 @@ def with_gain(field: Field, view: "View", gain: float) -> SplatAppearance:
     if gain == 0.0:
         return base
     trained = field.seen_from(view)
+    colors = base.colors + gain * (trained.colors - base.colors)
     return SplatAppearance(
-        colors=(base.colors + gain * (trained.colors - base.colors)).clamp_min(0.0),
+        colors=colors if field.head.at_pixel else colors.clamp_min(0.0),
         opacities=(base.opacities + gain * (trained.opacities - base.opacities)).clamp(0.0, 1.0),
     )
 

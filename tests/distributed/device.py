@@ -20,7 +20,6 @@ COMMON = {
     "--logging.profiler": "none",
     "--pipeline.model.num-downscales": 0,
     "--pipeline.model.background-color": "black",
-    "--pipeline.model.appearance.output-init": "default",
     "--pipeline.model.few-views": "off",
     "--pipeline.model.shrinkage": 0,
     "--pipeline.model.view-noise": 0,  # one device draws other numbers than two
@@ -34,15 +33,18 @@ RICH = {
     "--pipeline.model.rasterize-mode": "antialiased",
     "--pipeline.model.camera-optimizer.mode": "SO3xR3",
 }
+PIXELS = {**PLAIN, "method": "nrfgs-latent-spec"}
 BUSY = {"--pipeline.model.view-noise": 0.5}
 
 
-def trainer_of(scene: Path, out: Path, world: int, **options):
+def trainer_of(scene: Path, out: Path, world: int, method: str = "nrfgs", **options):
     """A trainer, set up, on `world` devices, of which this process is one."""
     from nrfgs_lab.training_run import parse
 
     chosen = {"--data": scene, "--output-dir": out, **COMMON, **options}
-    config = parse(["nrfgs", *(str(word) for option in chosen.items() for word in option)])
+    if method == "nrfgs":
+        chosen["--pipeline.model.appearance.output-init"] = "default"
+    config = parse([method, *(str(word) for option in chosen.items() for word in option)])
     torch.manual_seed(config.machine.seed)
     trainer = config.setup(local_rank=dist.get_rank(), world_size=world)
     trainer.setup()
@@ -122,8 +124,11 @@ def step_alone(trainer, cameras) -> dict:
 def far_from_neutral(trainer) -> list:
     """How far the head is from neutral in the first view; the trainer's first step begins."""
     model, cameras = trainer.pipeline.model, trainer.pipeline.datamanager.train_cameras
-    visible, loss, slopes = model.far_from_neutral(cameras[0:1], list(model.head.parameters()))
+    neutral = model.far_from_neutral(cameras[0:1], list(model.head.parameters()))
     model.step_cb(trainer.optimizers, 0)
+    if neutral is None:
+        return []
+    visible, loss, slopes = neutral
     return [visible, loss, *slopes]
 
 

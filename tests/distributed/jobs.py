@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from device import BY_ERROR, PEAK, PLAIN, RICH, one_step, step_alone, step_together, told, train, trainer_of
+from device import BY_ERROR, PEAK, PIXELS, PLAIN, RICH, one_step, step_alone, step_together, told, train, trainer_of
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -27,6 +27,7 @@ def everything(scene: Path, folder: Path) -> None:
     """All that the default suite looks at, in one meeting: to meet takes longer than most of it."""
     one_step(PLAIN, scene, folder, "plain")
     one_step(RICH, scene, folder, "rich")
+    one_step(PIXELS, scene, folder, "pixels")
     fifty_steps(scene, folder)
     there_and_back(scene, folder)
     stops_together(scene, folder)

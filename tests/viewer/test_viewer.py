@@ -220,8 +220,9 @@ class Browser(RenderStateMachine):
         return thread.outputs
 
 
-def test_every_output_can_be_shown(build, open_viewer):
-    viewer = open_viewer(build())
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-deferred"])
+def test_every_output_can_be_shown(method, build, open_viewer):
+    viewer = open_viewer(build(method))
     model, pose = viewer.pipeline.model, two_cameras(viewer.pipeline)[0].camera_to_worlds[0]
     model.train()
     for mode in model.viewer_panel.legends:

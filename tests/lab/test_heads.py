@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The laboratory's heads at the pixel: gradients, nerfstudio's commands on a tiny scene, the viewer, refusals."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.scripts.render import DatasetRender
+from nerfstudio.utils.eval_utils import eval_setup
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+
+from nrfgs_lab.heads.deferred import DeferredConfig
+from nrfgs_lab.heads.latent_spec import LatentSpecConfig
+from nrfgs_lab.training_run import evaluate
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.command import Compact, Ply, Web
+from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
+from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
+from nrfgs_ns.training.checkpoint_files import read_latest
+from nrfgs_ns.training.step_graph import StepGraphs
+from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, PictureOptions, legends, picture
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+METHODS = {"nrfgs-deferred": (16, 32), "nrfgs-latent-spec": (15, 16)}
+"""Numbers that a splat stores beside its geometry, and that are composited for it."""
+BUSY = {
+    "--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4,densify_grad_thresh=2e-5",
+    "--pipeline.model.num-downscales": 1,
+    "--pipeline.model.resolution-schedule": 10,
+}
+STEPS, HALF = 20, 14
+"""8 training views: refinements at steps 12 and 16."""
+
+
+@pytest.fixture(scope="module", params=METHODS)
+def finished(request, tiny_scene, tmp_path_factory) -> tuple[str, Path]:
+    """A method and the config.yml of its training, which has the checkpoint of step `HALF`, too."""
+    words = command_line(request.param, tiny_scene, tmp_path_factory.mktemp("out"), STEPS, BUSY)
+    return request.param, trained([*words, "--steps-per-save", str(HALF)])
+
+
+SMALL = {
+    "deferred": DeferredConfig(channels=6, hidden_width=5, hidden_layers=2),
+    "deferred, features as they are": DeferredConfig(channels=4, harmonics=False, hidden_width=5, hidden_layers=1),
+    "latent-spec": LatentSpecConfig(diffuse_dim=3, specular_dim=1, hidden_width=3),
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_gradients_agree_with_finite_differences(name):
+    """From the image through the network and the rasterizer to means, opacities, features and shared weights."""
+    torch.manual_seed(0)
+    head = SMALL[name].setup().double()
+    means = torch.tensor([[0.1, 0.2, 0.0], [-0.3, 0.1, 0.4], [0.2, -0.2, -0.5]], dtype=torch.float64)
+    quats = torch.tensor([[1.0, 0.2, 0, 0], [1, 0, 0.3, 0], [1, 0, 0, 0.4]], dtype=torch.float64)
+    scales = torch.tensor([[-1.0, -0.8, -1.2]] * 3, dtype=torch.float64)
+    stored = {"means": means, "opacities": torch.tensor([[0.3], [-0.2], [0.6]], dtype=torch.float64)}
+    stored |= head.splat_params(torch.rand(3, 3, dtype=torch.float64))
+    weights = dict(head.named_parameters())
+    center = torch.tensor([0.1, -0.1, 3.0], dtype=torch.float64)
+    pose = torch.cat([torch.eye(3, dtype=torch.float64), center[:, None]], dim=1)[None]
+    K = torch.tensor([[[6.0, 0, 2.5], [0, 6.0, 2.0], [0, 0, 1]]], dtype=torch.float64)
+    camera, background = Pinhole(world_to_camera(pose), K, 5, 4, center), torch.full((3,), 0.4, dtype=torch.float64)
+
+    class Drawn(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.head = head
+
+        def forward(self, *values):
+            splats = {**dict(zip(stored, values, strict=True)), "quats": quats, "scales": scales}
+            view = project_view(splats, camera, projection_options("classic", 1.0))
+            look = lambda rgb: rgb  # noqa: E731  (not clamped)
+            seen = Field(head, splats).seen_from(view)
+            return composite_view(view, seen, background, image_of=head.image_of, look=look)[0]["rgb"]
+
+    drawn = Drawn()
+
+    def f(*inputs):
+        shared = {f"head.{key}": value for key, value in zip(weights, inputs[len(stored) :], strict=True)}
+        return torch.func.functional_call(drawn, shared, inputs[: len(stored)])
+
+    inputs = [*stored.values(), *(weight.detach().clone() for weight in weights.values())]
+    assert torch.autograd.gradcheck(f, [x.requires_grad_() for x in inputs])
+
+
+def test_train_eval_render(finished, tmp_path):
+    method, config = finished
+    stored, composited = METHODS[method]
+    results = evaluate(config, tmp_path / "eval.json")
+    assert len(results["per_image"]) == 2 and 8 < results["psnr"] < 40
+    pipeline = eval_setup(config)[1]
+    head = pipeline.model.head
+    shared = sum(weight.numel() for weight in head.parameters())
+    assert results["parameter_bytes"] == 4 * (pipeline.model.num_points * (3 + 3 + 4 + 1 + stored) + shared)
+    with torch.no_grad():
+        view = pipeline.model.project(pipeline.datamanager.train_dataset.cameras[0:1])
+        assert pipeline.model.field.seen_from(view).colors.shape == (len(view.visible), composited)
+    state = checkpoint_of(config)
+    for group in ("features", "field"):  # each learns: Adam's running means have moved
+        learning = state["optimizers"][group]["state"]
+        assert learning and all((of_one["exp_avg"] != 0).any() for of_one in learning.values()), group
+    DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
+    assert len(list((tmp_path / "renders" / "test" / "rgb").rglob("*.png"))) == 2
+
+
+def test_resumed_training_is_the_unbroken_one(finished, tiny_scene, tmp_path):
+    method, config = finished
+    folder = models_of(config)
+    load = {"--load-dir": folder, "--load-step": HALF}
+    rest = checkpoint_of(trained(command_line(method, tiny_scene, tmp_path, STEPS, BUSY, load)))
+    whole, half = (read_latest(folder, step)[1] for step in (STEPS - 1, HALF))
+    counts = [len(part["pipeline"]["_model.gauss_params.means"]) for part in (half, whole)]
+    assert counts[0] != counts[1], "nothing was densified in the second part: the test would prove nothing"
+    assert_same_training(rest, whole)
+
+
+def test_it_learns(finished, tiny_scene, tmp_path):
+    """After 60 steps test views are a decibel closer than after one."""
+    method, _ = finished
+    options = {"--pipeline.model.num-downscales": 0}
+    scores = [
+        evaluate(trained(command_line(method, tiny_scene, tmp_path / str(n), n, options)), tmp_path / "e.json")["psnr"]
+        for n in (1, 60)
+    ]
+    assert scores[1] > scores[0] + 1.0
+
+
+@pytest.mark.parametrize("command", [Ply, Compact, Web])
+def test_exports_refuse(command, finished, tmp_path):
+    with pytest.raises(InputError, match="colours pixels.*no file of splats can hold it"):
+        command(finished[1], output=tmp_path / "file").main()
+
+
+def test_recorded_steps_refuse(finished, tiny_scene, tmp_path):
+    trainer = set_up(command_line(finished[0], tiny_scene, tmp_path, 1))
+    model = trainer.pipeline.model
+    graphs = StepGraphs(model, trainer.pipeline.datamanager, None)
+    batch = {"image": torch.zeros(36, 48, 3)}
+    assert graphs._obstacle(batch) == "the head's network sees pixels"
+    model.head.at_pixel = False
+    assert graphs._obstacle(batch) is None
+
+
+def test_every_picture_of_the_viewer(finished):
+    method, config = finished
+    pipeline = eval_setup(config)[1]
+    model, camera = pipeline.model, pipeline.datamanager.train_dataset.cameras[0:1]
+    assert list(legends(model.field)) == [FULL, BASE, DEPTH]
+    images = {mode: picture(model, camera, PictureOptions(mode))["rgb"] for mode in legends(model.field)}
+    gains = [picture(model, camera, PictureOptions(gain=gain))["rgb"] for gain in (0.0, 0.5, 2.0)]
+    assert all(image.shape == (36, 48, 3) and torch.isfinite(image).all() for image in (*images.values(), *gains))
+    assert torch.equal(images[FULL], model.get_outputs_for_camera(camera)["rgb"])
+    assert torch.equal(images[BASE], gains[0]) and torch.equal(images[BASE], model.get_base_color(camera))
+    differs = (images[FULL] - images[BASE]).abs().max() > 0.01
+    assert differs == (method == "nrfgs-latent-spec")  # the diffuse image; the other head has no such part
+
+
+@pytest.mark.parametrize(
+    "config", [DeferredConfig(channels=7), DeferredConfig(channels=4), LatentSpecConfig(diffuse_dim=2)]
+)
+def test_sizes_that_cannot_work_are_named(config):
+    with pytest.raises(InputError, match="channels|diffuse_dim"):
+        config.setup()
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_methods_are_registered_by_the_laboratory_and_have_an_optimiser_for_all_that_they_learn(name):
+    config = all_methods[name]
+    head = config.pipeline.model.appearance.setup()
+    assert type(head).__module__.startswith("nrfgs_lab.heads.")
+    assert {*head.splat_params(torch.rand(1, 3)), "field"} <= set(config.optimizers)
