@@ -121,6 +121,7 @@ class NrfgsDataParser(DataParser):
             dataparser_transform=after(scene.transform, scene.to_frames),
             metadata={
                 "exif": [stored_exif(frame, scene.source) for frame in frames],
+                "factor": scene.factor,
                 "downscale": 1 if copies else scene.factor,
             },
         )

@@ -8,6 +8,7 @@ from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -196,10 +197,16 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
         count = f"{views} different training views of {given}"
     if parts:
         CONSOLE.print(f"{count}: {', '.join(parts)} (docs/captures.md).", soft_wrap=True)
+    data = pipeline.datamanager.train_dataset
+    width, height = (int(side.max()) for side in (data.cameras.width, data.cameras.height))
+    if (factor := data.metadata.get("factor", 1)) > 1 or max(width, height) > MAX_AUTO_RESOLUTION:
+        size = f"1/{factor} of their size" if factor > 1 else "full size"
+        CONSOLE.print(
+            f"Photographs are read at {size}, {width} x {height} (--downscale-factor in docs/own-data.md).", **PLAIN
+        )
     is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS
     if config.machine.device_type == "cpu" and is_long and config.pipeline.datamanager.camera_res_scale_factor == 1:
-        cameras = pipeline.datamanager.train_dataset.cameras
-        scale = min(1.0, LONGEST_SIDE / int(max(cameras.width.max(), cameras.height.max())))
+        scale = min(1.0, LONGEST_SIDE / max(width, height))
         words = f"nrfgs-fast, --time-budget 10 and --pipeline.datamanager.camera-res-scale-factor {scale:.2g}"
         CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {words}", **PLAIN)
     folder = config.get_base_dir()
