@@ -201,9 +201,7 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
     width, height = (int(side.max()) for side in (data.cameras.width, data.cameras.height))
     if (factor := data.metadata.get("factor", 1)) > 1 or max(width, height) > MAX_AUTO_RESOLUTION:
         size = f"1/{factor} of their size" if factor > 1 else "full size"
-        CONSOLE.print(
-            f"Photographs are read at {size}, {width} x {height} (--downscale-factor in docs/own-data.md).", **PLAIN
-        )
+        CONSOLE.print(f"Images are read at {size}, {width} x {height} (--downscale-factor: docs/own-data.md).", **PLAIN)
     is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS
     if config.machine.device_type == "cpu" and is_long and config.pipeline.datamanager.camera_res_scale_factor == 1:
         scale = min(1.0, LONGEST_SIDE / max(width, height))
