@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The private names of nerfstudio and gsplat that this package relies on, and their versions.
 
-`tests/test_host.py` looks up every name in the installed versions. Only `rasterizer/gsplat_cuda.py` distinguishes
-gsplat's versions, by `gsplat_version`: nerfstudio 1.1.5 pins 1.4.0, and 1.5.3 works beneath it
+`tests/test_architecture.py` looks up every name in the installed versions. Only `rasterizer/gsplat_cuda.py`
+distinguishes gsplat's versions, by `gsplat_version`: nerfstudio 1.1.5 pins 1.4.0, and 1.5.3 works beneath it
 (docs/troubleshooting.md). Nothing here imports nerfstudio or gsplat.
 """
 

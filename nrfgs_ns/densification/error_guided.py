@@ -29,7 +29,6 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification.statistics import take_maxima
 from nrfgs_ns.densification.strategy import (
     CHANGE,
@@ -115,21 +114,13 @@ class ErrorGuidedDensification(Densification):
             self.state[FIRST] = None
         if config.opacity_seen == "peak":
             self.state[CHANGE_BEFORE] = None
-        self.config = config
+        self.config, self.budget = config, config.budget
         self.reschedule(round)
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         config = self.config
         self.start, self.grow_until = step_at(config.warmup_length), step_at(config.grow_until)
         self.stop, self.end = step_at(config.stop_at), step_at(LAYOUT)
-
-    def begin(self, centers: Tensor, num_splats: int) -> None:
-        budget = self.config.budget
-        if budget and num_splats > budget:
-            warn(
-                f"The budget of error-guided is {budget}, but the training begins with {num_splats} points, of which "
-                "none is removed. With --pipeline.model.dense-start off it begins with fewer."
-            )
 
     def needs_absgrad(self, step: int) -> bool:
         return step < self.grow_until

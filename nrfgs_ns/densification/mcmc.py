@@ -72,15 +72,8 @@ class McmcDensification(Densification):
         super().__init__(config.opacity_seen)
         if config.opacity_seen == "peak":
             self.state[CHANGE_BEFORE] = None
-        self.config, self.scene_unit = config, scene_unit
+        self.config, self.budget, self.scene_unit = config, config.budget, scene_unit
         self.start, self.stop = config.warmup_length, config.stop_at
-
-    def begin(self, centers: Tensor, num_splats: int) -> None:
-        if self.verbose and num_splats > self.config.budget:
-            print(
-                f"Warning: --pipeline.model.densification mcmc: budget is {self.config.budget}, but the training "
-                f"begins with {num_splats} points, and mcmc removes none: all of them stay."
-            )
 
     @torch.no_grad()
     def post_backward(self, step, info, splats, optimizers) -> None:

@@ -17,6 +17,7 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from nrfgs_ns.appearance.field import DIFFUSE
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import InputError
 
 OpacitySeen = Literal["base", "peak"]
@@ -141,6 +142,8 @@ class Densification(ABC):
     """Numbers, tensors with a row per splat, or None for what the first step has to make."""
     verbose: bool = True
     """Whether refinements are printed."""
+    budget: int = 0
+    """Number of splats to grow to; 0: as many as the rules give."""
 
     def __init__(self, opacity_seen: OpacitySeen):
         self.opacity_seen = opacity_seen
@@ -165,13 +168,17 @@ class Densification(ABC):
         """Whether it needs no gradients of this step; splats may still be replaced."""
         return False
 
-    def begin(self, centers: Tensor, num_splats: int) -> None:  # noqa: B027
-        """Take what is known before the first step.
+    def begin(self, centers: Tensor, num_splats: int) -> None:
+        """Take what is known before the first step; warn where there are more splats than the budget of a strategy that
+        removes none.
 
         Args:
             centers: of the training cameras, [V, 3].
             num_splats: splats that the training begins with.
         """
+        if self.verbose and 0 < self.budget < num_splats:
+            fix = "With --pipeline.model.dense-start off it may begin with fewer."
+            warn(f"The budget of {self.name} is {self.budget}, but the training begins with {num_splats} points. {fix}")
 
     def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
         """Look at a training view before the loss goes backward.

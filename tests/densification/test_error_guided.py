@@ -205,6 +205,7 @@ def test_growth_ends_at_the_cap_and_in_time():
 
 def test_a_budget_below_the_start_is_told(capsys):
     strategy = rules(budget=5)
+    strategy.verbose = True
     strategy.begin(torch.zeros(3, 3), 5)
     assert capsys.readouterr().out == ""
     strategy.begin(torch.zeros(3, 3), 6)
