@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs_lab.timing.scale`: its cells are measured once, from made splats and from a training's; its table."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+import torch
+from short_trainings import LOUD, command_line, trained
+
+from nrfgs_lab import training_run
+from nrfgs_lab.timing import scale
+from nrfgs_lab.timing.scale import Bare, Scale, as_table, at_megapixels, made, resampled
+
+pytestmark = pytest.mark.usefixtures("no_cuda")
+
+
+def test_cells_are_measured_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(training_run, "WARM", 1)
+    monkeypatch.setattr(training_run, "PROFILED", 1)
+    monkeypatch.setattr(scale, "frames_per_second", lambda model, cameras: float(model.num_points * len(cameras)))
+    run = Scale(tmp_path / "scale.jsonl", splats=(300,), megapixels=(48 * 32e-6,), repeats=1, steps=1)
+    run.main()
+    lines = run.out.read_text()
+    first, second = map(json.loads, lines.splitlines())
+    assert [first["method"], second["method"]] == ["nrfgs", "nrfgs-sh"]
+    assert first["step_ms"] > 0 and first["1080p"] == first["4K"] == 300 * 16
+    assert "faster-gs is left out: it needs CUDA and FasterGSCudaBackend" in capsys.readouterr().out
+    run.main()
+    assert run.out.read_text() == lines
+    table = as_table([*map(json.loads, lines.splitlines()), {**first, "repeat": 1, "step_ms": 3 * first["step_ms"]}])
+    assert f"({first['step_ms']:.4g} to {3 * first['step_ms']:.4g})" in table and table.count("\n") == 3
+
+
+def test_a_training_is_resampled(tiny_scene, tmp_path):
+    config = trained(command_line("nrfgs", tiny_scene, tmp_path, 2, LOUD))
+    few, many = resampled(config, 20), resampled(config, 1000)
+    assert [len(some.splats["means"]) for some in (few, many)] == [20, 1000]
+    covered = [float(some.splats["scales"].double().mul(2).exp().sum()) for some in (few, many)]
+    assert covered[0] == pytest.approx(covered[1], rel=0.5)
+    assert len(few.photographs) == len(few.cameras)
+
+
+@pytest.mark.parametrize("method", ["gsplat", "faster-gs"])
+def test_a_bare_step_moves_every_tensor(method, monkeypatch):
+    """With stand-ins for kernels that need CUDA, which check what they are given."""
+    seen = []
+
+    def gsplat(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, packed):
+        seen.append((viewmats.shape, Ks.shape, colors.shape))
+        color = (colors.sum(1) + means * opacities[:, None] + scales * quats[:, :3]).sigmoid().mean(0)
+        return color.expand(1, height, width, 3), None, {}
+
+    def faster(means, scales, quats, opacities, dc, rest, info, settings):
+        seen.append((settings.w2c.shape, settings.cam_position.shape, torch.cat([dc, rest], 1).shape))
+        return gsplat(means, quats, scales, opacities[:, 0], torch.cat([dc, rest], 1), *[torch.ones(1)] * 2,
+                      settings.width, settings.height, 3, False)[0][0].permute(2, 0, 1)  # fmt: skip
+
+    names = "w2c cam_position bg active_sh_bases width height fx fy cx cy near far antialiased"
+    modules = {
+        "gsplat": SimpleNamespace(rasterization=gsplat),
+        "FasterGSCudaBackend.torch_bindings": SimpleNamespace(
+            diff_rasterize=faster, FusedAdam=torch.optim.Adam,
+            RasterizerSettings=lambda *values: SimpleNamespace(**dict(zip(names.split(), values, strict=True))),
+        ),
+    }  # fmt: skip
+    monkeypatch.setattr(scale, "import_module", modules.__getitem__)
+    capture = at_megapixels(made(50), 48 * 32e-6)
+    bare = Bare(method, capture.splats, "cpu")
+    before = {name: value.detach().clone() for name, value in bare.splats.items()}
+    bare.step(capture.cameras[:1], capture.photographs[0])
+    assert seen[0][0][-2:] == (4, 4) and seen[0][2] == (50, 16, 3)
+    assert all(not torch.equal(before[name], value) for name, value in bare.splats.items())
