@@ -48,6 +48,8 @@ def free_port() -> int:
 
 if __name__ == "__main__":
     config = parse(sys.argv[1:])
+    if config.machine.num_machines > 1:
+        sys.exit("machine.num_machines must be 1 here: only ns-train trains on several machines.")
     config.save_config()
     explain_losses(config)
     with contextlib.suppress(KeyboardInterrupt):  # the processes hear Ctrl-C, too: Python waits for their last step

@@ -19,15 +19,8 @@ from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler
 from nerfstudio.utils.misc import step_check
-from torch.autograd import DeviceType
-from torch.profiler import ProfilerActivity, profile
 
 import nrfgs_ns
-
-WARM = 50
-"""Steps before the clock starts."""
-PROFILED = 10
-"""Steps behind those on the clock, in which kernels are timed."""
 
 
 @dataclass
@@ -157,34 +150,3 @@ def synchronize() -> None:
     """Wait for the GPU, if there is one."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
-
-
-class Stopwatch:
-    """Milliseconds of a step on the clock and of the GPU's work in it, and peak memory since the first step, of a
-    training with `steps` on the clock whose devices are idle after `wait`."""
-
-    step_ms = gpu_ms = peak_bytes = 0
-
-    def __init__(self, steps: int, wait: Callable[[], None] = synchronize):
-        self.end, self.wait = WARM + steps, wait
-        self.steps = self.end + PROFILED + 1  # to be made in all
-        self.cuda = torch.cuda.is_available()
-        self.kernels = profile(activities=[ProfilerActivity.CUDA]) if self.cuda else None
-
-    def before(self, step: int) -> None:
-        """Call before each step, with its number."""
-        if step in (0, WARM, self.end, self.end + PROFILED):
-            self.wait()
-        if step == 0 and self.cuda:
-            torch.cuda.reset_peak_memory_stats()
-        if step == WARM:
-            self.start = perf_counter()
-        if step == self.end:
-            self.step_ms = 1e3 * (perf_counter() - self.start) / (self.end - WARM)
-            if self.cuda:
-                self.peak_bytes = torch.cuda.max_memory_allocated()
-                self.kernels.start()
-        if step == self.end + PROFILED and self.cuda:
-            self.kernels.stop()
-            events = [e for e in self.kernels.events() if e.device_type == DeviceType.CUDA and not e.is_user_annotation]
-            self.gpu_ms = sum(event.time_range.elapsed_us() for event in events) / 1e3 / PROFILED

@@ -21,6 +21,7 @@ from itertools import product
 from operator import itemgetter
 from pathlib import Path
 from statistics import median
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,11 +32,13 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.utils import writer
 from PIL import Image
 from torch import Tensor
+from torch.autograd import DeviceType
+from torch.profiler import ProfilerActivity, profile
 
 from nrfgs_lab.bench.measure import at_size, frames_per_second
 from nrfgs_lab.bench.run import host_without_downloads
 from nrfgs_lab.bench.spec import QUIET
-from nrfgs_lab.training_run import Stopwatch, machine, parse
+from nrfgs_lab.training_run import machine, parse, synchronize
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.image.ssim import photometric_loss
@@ -58,6 +61,41 @@ cell_of = itemgetter(*CELL)
 GEOMETRY = "means", "scales", "quats", "opacities", "features_dc"
 FRAMES = {"1080p": (1920, 1080), "4K": (3840, 2160)}
 VIEWS = 16  # at most
+WARM = 50
+"""Steps before the clock starts."""
+PROFILED = 10
+"""Steps behind those on the clock, in which kernels are timed."""
+
+
+class Stopwatch:
+    """Milliseconds of a step on the clock and of the GPU's work in it, and peak memory since the first step, of a
+    training with `steps` on the clock."""
+
+    step_ms = gpu_ms = peak_bytes = 0
+
+    def __init__(self, steps: int):
+        self.end = WARM + steps
+        self.steps = self.end + PROFILED + 1  # to be made in all
+        self.cuda = torch.cuda.is_available()
+        self.kernels = profile(activities=[ProfilerActivity.CUDA]) if self.cuda else None
+
+    def before(self, step: int) -> None:
+        """Call before each step, with its number."""
+        if step in (0, WARM, self.end, self.end + PROFILED):
+            synchronize()
+        if step == 0 and self.cuda:
+            torch.cuda.reset_peak_memory_stats()
+        if step == WARM:
+            self.start = perf_counter()
+        if step == self.end:
+            self.step_ms = 1e3 * (perf_counter() - self.start) / (self.end - WARM)
+            if self.cuda:
+                self.peak_bytes = torch.cuda.max_memory_allocated()
+                self.kernels.start()
+        if step == self.end + PROFILED and self.cuda:
+            self.kernels.stop()
+            events = [e for e in self.kernels.events() if e.device_type == DeviceType.CUDA and not e.is_user_annotation]
+            self.gpu_ms = sum(event.time_range.elapsed_us() for event in events) / 1e3 / PROFILED
 
 
 class Capture(NamedTuple):

@@ -230,8 +230,8 @@ class GradientDensification(Densification):
         """The gradient above which splats grow now, for as many as the budget by the end of growth.
 
         With x the share of growth that is over, the course of the number is N0 + (2x - x^2) (budget - N0). Where the
-        number is off it, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more splats grow than
-        bring the number to its course.
+        number is off it, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more splats grow by
+        their gradient than bring the number to its course; wide ones may be split besides.
         """
         strategy, state = self.strategy, self.state
         if state[FIRST] is None:

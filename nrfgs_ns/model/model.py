@@ -2,9 +2,9 @@
 """Splatfacto with an appearance head: nerfstudio's hooks, in the order of a training.
 
 Rendering is in `renderer.py`, the loss in `loss.py`, the initial splats in `initial_splats.py`, and strategies that add
-and remove splats in `densification/`. Unlike splatfacto's, colours and opacities come from the head, for visible splats
-only; nothing needs CUDA; metrics respect masks; and loading a checkpoint keeps the parameter objects that the
-optimisers hold, so that an interrupted training can go on.
+and remove splats in `densification/`. Unlike splatfacto's, colours and opacities come from the head, nothing needs
+CUDA, metrics respect masks, and loading a checkpoint keeps the parameter objects that the optimisers hold, so that an
+interrupted training can go on.
 """
 
 from collections.abc import Callable, Mapping
@@ -50,7 +50,7 @@ class NrfgsModel(SplatfactoModel):
     """Gaussian splatting with an appearance head. All cameras are batches of one, [1].
 
     Args:
-        config: the head, and splatfacto's options.
+        config: the head, and the options of `NrfgsModelConfig`.
         seed_points: initial points [P, 3] in world units and their colours [P, 3] in 0..255.
     """
 

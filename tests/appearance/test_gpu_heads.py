@@ -75,6 +75,18 @@ def test_sizes_and_ways(config, repeated, way, monkeypatch):
     assert_near(evaluate(head, *case), exact, rounded_limits(exact))
 
 
+@pytest.mark.parametrize("precision", ["fp32", "tf32", "bf16", "fp16"])
+def test_extremes_stay_finite(precision):
+    head, _ = heads("cuda", precision=precision, scale=100.0)
+    splats, visible, centers = scene(head, 1000, 900)
+    splats["latents"] *= 1e4
+    splats["opacities"] = 1e4 * splats["opacities"].sign()
+    centers.copy_(splats["means"][visible[0]])
+    found = evaluate(head, splats, visible, centers)
+    assert all(torch.isfinite(value).all() for value in found.values())
+    assert ((found["opacities"] >= 0) & (found["opacities"] <= 1)).all() and (found["colors"] >= 0).all()
+
+
 @pytest.mark.parametrize("repeated", [False, True])
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("share", [0.0, 0.6, 1.1])
@@ -143,6 +155,26 @@ def test_auto_takes_the_kernels_and_falls_back():
         head(*case)
 
 
+def test_rows_beyond_32_bit_offsets():
+    """The last rows of a table of more than 2^31 latents: 9 GB, and as much again for the gradient."""
+    count = 2**26 + 5
+    if torch.cuda.mem_get_info()[0] < 30 * 2**30:
+        pytest.skip("needs 30 GB of GPU memory")
+    head, _ = heads("cuda")
+    small, _, center = scene(head, 3, 3)
+    rows = torch.arange(3, device="cuda")
+    near = evaluate(head, small, rows, center)
+    large = {name: torch.zeros(count, value.shape[1], device="cuda") for name, value in small.items()}
+    for name, table in large.items():
+        table[count - 3 :] = small[name]
+        table.requires_grad_()
+    colors, opacities = head(large, rows + count - 3, center)
+    assert torch.equal(colors, near["colors"]) and torch.equal(opacities, near["opacities"])
+    (colors.sum() + opacities.sum()).backward()
+    assert all((table.grad[count - 3 :] != 0).any() for table in large.values())
+    assert all((table.grad[: count - 3] == 0).all() for table in large.values())
+
+
 # The hash grid of VDGS.
 
 PAPER = {"levels": 4, "log2_table_size": 15, "base_resolution": 16}
@@ -158,3 +190,13 @@ def interpolate(grid, x):
 @pytest.mark.parametrize("count", [0, 1, 129, 100_000])
 def test_hash_grid_values_and_gradients(count, options):
     assert_near_twin(*grids("cuda", **options), positions(count, "cuda"), interpolate)
+
+
+def test_what_is_no_lattice_coordinate():
+    grid, _ = grids("cuda", **PAPER)
+    wild = [[1e12, -1e12, 1e30], [-1e30] * 3, [0.1, torch.nan, 0.1], [0.1, 0.1, torch.inf], [0.3, -0.2, 0.1]]
+    x = torch.tensor(wild, device="cuda", requires_grad=True)
+    features = interpolate(grid, x)
+    features.sum().backward()
+    assert features[2:4].isnan().all()
+    assert torch.isfinite(features[[0, 1, 4]]).all() and torch.isfinite(x.grad[[0, 1, 4]]).all()

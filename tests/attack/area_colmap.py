@@ -62,16 +62,19 @@ CASES = [
     camera("three parameters", True, p=(10.0, 6.0, 4.5)),
     camera("words", True, p=("a", "b", "c", "d")),
     camera("of an unknown model", model=77),
+    camera("of an unknown model", True, model="PINE"),
     camera("FULL_OPENCV", model=6, p=(10.0, 11.0, 6.0, 4.5) + (0.1,) * 8),
     camera("of number 2", id=2),
     camera("strong distortion", model=4, p=(10.0, 11.0, 6.0, 4.5, 1e10, 0.0, 0.0, 0.0)),
     *(image(f"rotation {q}", q=q) for q in ((0.0,) * 4, (NAN, 0, 0, 0), (9.0, 0, 0, 0))),
+    image("rotation 0", True, q=(0.0,) * 4),
     *(image(f"position {x}", t=(x, 0.0, 0.0)) for x in (NAN, INF)),
     image("without a name", name=""),
     image("of a name that is twice", name="000.png"),
     image("of a file that is not there", name="no.png"),
     *(image(f"named {name[:20]!r}", name=name) for name in ("x" * 300, "/dev/zero", "..", "a\nb")),
     image("with words", True, t=("a", "b", "c")),
+    image("with too little", True, t=()),
     *(
         model(f"{count} {which} announced", lambda one, w=which, c=count: one.counts.update({w: c}))
         for which in FILES
@@ -84,6 +87,7 @@ CASES = [
     *(file(f"{which} missing", str(MODEL / f"{which}.bin"), Path.unlink) for which in FILES),
     *(file(f"{which} cut at {x}", str(MODEL / f"{which}.bin"), cut(x)) for which in FILES for x in (0, 0.2, 0.98)),
     file("image missing", "images/003.png", Path.unlink),
+    file("image unreadable", "images/003.png", cut(0.1)),
     file("image of another size", "images/003.png", lambda path: Image.new("RGB", (9, 9)).save(path)),
     *(model(f"{name} {value}", lambda _: None, **{name: value}) for name, value in OPTIONS),
     file("a list of strangers", "train_list.txt", lambda path: path.write_text("nobody.png\n")),

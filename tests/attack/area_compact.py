@@ -9,20 +9,34 @@ from pathlib import Path
 
 import numpy as np
 from attempt import Case
-from compact_fields import RENDER, field, joined, parts
 from hypothesis import strategies as st
 from values import DAMAGES, REPLACEMENTS, damage, put, replace_in
-
-from nrfgs_ns.compact.decode import decode
-from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.format import MODEL, Table, _coded, container
 
 AREA = "compact file"
 
 
 @lru_cache
 def written() -> bytes:
-    return container(*encode(field(), RENDER))
+    """A field of sixty splats."""
+    import torch
+
+    from nrfgs_ns.appearance.field import Field
+    from nrfgs_ns.appearance.nrf import NrfConfig
+    from nrfgs_ns.compact.encode import encode
+    from nrfgs_ns.compact.format import container
+
+    render = {"rasterize_mode": "classic", "background": [0.0, 0.0, 0.0]}
+    torch.manual_seed(3)
+    head = NrfConfig(latent_dim=8, hidden_width=16, output_init="default").setup().requires_grad_(False)
+    columns = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "features_dc": 3, "latents": 8}
+    splats = {name: torch.randn(60, count) for name, count in columns.items()}
+    return container(*encode(Field(head, splats), render))
+
+
+def read(path: Path) -> None:
+    from nrfgs_ns.compact.decode import decode
+
+    decode(path)
 
 
 def holding(name: str, content, hostile: bool = True) -> Case:
@@ -30,9 +44,31 @@ def holding(name: str, content, hostile: bool = True) -> Case:
 
     def build(folder: Path):
         (folder / "field.nrf").write_bytes(content() if callable(content) else content)
-        return partial(decode, folder / "field.nrf")
+        return partial(read, folder / "field.nrf")
 
     return Case(name, build, hostile)
+
+
+def parts(data: bytes) -> tuple[dict, list[bytes]]:
+    """The header, and the streams as they are in the file."""
+    from nrfgs_ns.compact.format import CHECKSUM, PREAMBLE
+
+    _, _, length, _ = PREAMBLE.unpack_from(data)
+    header = json.loads(data[PREAMBLE.size : PREAMBLE.size + length])
+    first, bodies = PREAMBLE.size + length + CHECKSUM.size, []
+    for entry in header["streams"]:
+        bodies.append(data[first : first + entry["bytes"]])
+        first += entry["bytes"]
+    return header, bodies
+
+
+def joined(text: bytes, bodies: list[bytes]) -> bytes:
+    """A file whose checksums and lengths hold."""
+    from nrfgs_ns.compact.format import CHECKSUM, MAGIC, PREAMBLE, VERSION
+
+    total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
+    start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
+    return b"".join([start, CHECKSUM.pack(zlib.crc32(start)), *bodies])
 
 
 def claiming(name: str, change, hostile: bool = True) -> Case:
@@ -69,12 +105,21 @@ def replaced(name: str, stream: str, count: int, body, **entry) -> Case:
     return claiming(f"{stream}: {name}", change)
 
 
+def coded(name: str, stream: str, shape: list[int], body) -> Case:
+    """A coded table of another shape and with another body."""
+    return replaced(name, stream, 60, body, shape=shape)
+
+
 def table_of_zeros(columns: int, rows: int) -> bytes:
+    from nrfgs_ns.compact.format import Table, _coded
+
     return _coded(Table(np.zeros((columns, rows), dtype=np.int64)))[1]
 
 
 def model(count: int, size: int | None = None, unpacked: int = 0) -> bytes:
     """The model of a coded table that claims `count` numbers in `size` bytes; None: the true size."""
+    from nrfgs_ns.compact.format import MODEL
+
     packed = zeros(unpacked)
     return MODEL.pack(count, len(packed) if size is None else size) + packed + bytes(400)
 
@@ -109,38 +154,48 @@ CLAIMS = {
     ("head", "config", "anything"): (1,),
 }
 """Place in the header -> values that it cannot have."""
-BOMBS = [
+TEXTS = {
+    "deep": b"[" * 200_000,
+    "no JSON": b"{",
+    "a list": b"[]",
+    "5,000 digits": b'{"streams": ' + b"9" * 5000 + b"}",
+}
+CASES = [
     replaced("bomb of bytes", "means", 2**28, lambda: zeros(2**28), dtype="uint8", coding="xz"),
     replaced("bomb of words", "latents", 2**25, lambda: zeros(2**28), dtype="uint64", coding="xz"),
-    replaced("many rows of zeros", "latents", 60, lambda: table_of_zeros(8, 10**6), shape=[8, 10**6]),
-    replaced("many columns of zeros", "latents", 60, lambda: table_of_zeros(1000, 2000), shape=[1000, 2000]),
-    replaced("more columns than rows", "splats", 60, lambda: table_of_zeros(11, 60), shape=[10**6, 1]),
-    replaced("a model of 4 GB", "splats", 60, lambda: model(2**30, unpacked=2**28)),
-    replaced("a model of 16 MB", "splats", 60, lambda: model(2**22, unpacked=2**24)),
-    replaced("a model of more than there is", "splats", 60, lambda: model(5, 2**32 - 1)),
-]
-"""Files that claim to be large. tests/compact/test_two_readers.py has what is wrong in other ways."""
-CASES = [
-    *BOMBS,
+    coded("many rows of zeros", "latents", [8, 10**6], lambda: table_of_zeros(8, 10**6)),
+    coded("many columns of zeros", "latents", [1000, 2000], lambda: table_of_zeros(1000, 2000)),
+    coded("more columns than rows", "splats", [10**6, 1], lambda: table_of_zeros(11, 60)),
+    coded("a model of 4 GB", "splats", [11, 60], lambda: model(2**30, unpacked=2**28)),
+    coded("a model of 16 MB", "splats", [11, 60], lambda: model(2**22, unpacked=2**24)),
+    *(
+        coded(f"a model of {count} numbers in {size} bytes", "splats", [11, 60], partial(model, count, size))
+        for count, size in ((2**32 - 1, 10), (5, 2**32 - 1), (0, 0), (5, 3))
+    ),
+    coded("no body", "splats", [11, 60], lambda: b""),
+    coded("a state too few", "means", [2, 60], lambda: table_of_zeros(2, 60)[:-4]),
     *(
         claiming(f"{place} {str(value)[:20]}", lambda header, _, p=place, v=value: put(header, p, v))
         for place, values in CLAIMS.items()
         for value in values
     ),
     claiming("streams of one name", lambda header, _: header["streams"][1].update(name=header["streams"][0]["name"])),
+    claiming("no format", lambda header, _: header.pop("format")),
+    claiming("no head", lambda header, _: header.pop("head")),
     claiming("a stream less", lambda header, _: header["streams"].pop()),
-    *(grid("means", "step", value) for value in (0.0, -1.0, float("nan"), 1e300, "x")),
-    *(grid("scales", "low", value) for value in (float("nan"), 1e300, [], None)),
-    holding("header deep", lambda: joined(b"[" * 200_000, parts(written())[1])),
+    *(grid(table, "step", value) for table in ("means", "latents") for value in (0.0, -1.0, float("nan"), 1e300, "x")),
+    *(grid("scales", "low", value) for value in (float("nan"), 1e300, -1e39, [], None)),
+    *(holding(f"header {name}", lambda c=c: joined(c, parts(written())[1])) for name, c in TEXTS.items()),
     holding("empty", b""),
+    holding("a PNG", b"\x89PNG\r\n\x1a\n" + bytes(100)),
     *(
         holding(f"cut at {share}", lambda s=share: written()[: int(s * len(written()))])
-        for share in (0.001, 0.3, 0.999)
+        for share in (0.001, 0.01, 0.3, 0.999)
     ),
-    Case("not there", lambda folder: partial(decode, folder / "field.nrf")),
-    Case("a folder", lambda folder: partial(decode, folder)),
-    Case("a device", lambda folder: partial(decode, Path("/dev/zero"))),
-    Case("a name too long", lambda folder: partial(decode, folder / ("x" * 300))),
+    Case("not there", lambda folder: partial(read, folder / "field.nrf")),
+    Case("a folder", lambda folder: partial(read, folder)),
+    Case("a device", lambda folder: partial(read, Path("/dev/zero"))),
+    Case("a name too long", lambda folder: partial(read, folder / ("x" * 300))),
 ]
 
 

@@ -76,6 +76,7 @@ def odd_file(name: str, make) -> Case:
 CASES = [
     *(holding(f"{file} that is EPS", EPS, file) for file in ("images/003.png", "masks/003.png")),
     holding("GIF", encoded("GIF")),
+    holding("SVG", b'<svg xmlns="http://www.w3.org/2000/svg" width="12" height="9"/>'),
     *(holding(f"{mode} of more than 8 bits", encoded("TIFF", mode=mode)) for mode in ("I", "F")),
     *(
         holding(f"{form} cut in the middle", encoded(form)[: len(encoded(form)) // 2])
@@ -95,6 +96,7 @@ CASES = [
     odd_file("a link to itself", lambda path: path.symlink_to(path)),
     odd_file("a link to /dev/zero", lambda path: path.symlink_to("/dev/zero")),
     holding("mask cut in the middle", encoded("PNG", mode="L")[:60], "masks/003.png"),
+    holding("mask empty", b"", "masks/003.png"),
     holding("mask in colours", encoded("PNG"), "masks/003.png"),
     holding("mask of another size", encoded("PNG", (6, 6), "L"), "masks/003.png"),
 ]

@@ -28,6 +28,7 @@ FINE = np.full((40, 3), 6.0)
 CASES = [
     stored("float32 in UTM", np.float32(np.random.default_rng(1).normal((5e5, 5.6e6, 100), 0.5, (40, 3)))),
     holding("empty", b""),
+    holding("no ply", b"solid\n"),
     holding("header without end", b"ply\nformat ascii 1.0\nelement vertex 9\n"),
     holding("endless header", b"ply\nformat ascii 1.0\n" + b"comment x\n" * 100_000),
     holding("no vertices", b"ply\nformat ascii 1.0\nelement face 1\nproperty float x\nend_header\n1\n"),
@@ -41,7 +42,9 @@ CASES = [
     holding("x is a list", HEAD % (b"ascii", 9, b"list uchar float") + b"1 5 6 7\n" * 9),
     holding("list of 4 billion", HEAD % (BINARY, 9, b"list uint float") + b"\xff" * 1000),
     holding("x twice", TWO % (b"x", b"x")),
+    holding("no z", TWO % (b"x", b"y")),
     holding("words", HEAD % (b"ascii", 9, b"float") + b"a b c\n" * 9),
+    holding("unknown format", HEAD % (b"base64", 9, b"float") + ROWS),
     holding("bytes", bytes(range(256)) * 9),
     *(stored(f"all {value}", np.full((40, 3), value)) for value in (np.nan, np.inf, 1e300, -1e30)),
     *(

@@ -25,12 +25,14 @@ def load(data: Path, parser=NrfgsDataParserConfig, manager: dict | None = None, 
 
 
 def add_points(capture: Capture, change=lambda xyz: xyz, text: bool = False) -> Path:
+    """Points amid the cameras."""
     rng = np.random.default_rng(1)
     xyz, rgb = rng.normal((5, 6, 7), 0.5, (40, 3)), rng.integers(0, 256, (40, 3), dtype=np.uint8)
     return capture.add_ply(change(xyz), rgb, text)
 
 
 def capture_in(folder: Path) -> Capture:
+    """A capture with masks and points."""
     capture = Capture(folder / "capture", images=10)
     capture.add_masks()
     add_points(capture)

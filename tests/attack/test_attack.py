@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hostile inputs are refused with one clear sentence (see `attempt`), whatever is wrong with them.
 
-Every module area_*.py beside this one is an area: AREA (its name), CASES (a list of Case), and inputs(), a hypothesis
-strategy of further ones.
+`python tests/attack/table.py` runs more of them and prints the table of docs/stability.md.
 """
 
-import importlib
+import json
 import os
 import sys
 from pathlib import Path
@@ -14,12 +13,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from attempt import GOOD, Case, attempts  # noqa: E402
+from table import areas  # noqa: E402
 
-AREAS = {area.AREA: area for area in (importlib.import_module(path.stem) for path in sorted(HERE.glob("area_*.py")))}
+AREAS = {area.AREA: area for area in areas()}
 
 
 @pytest.mark.parametrize("area", AREAS)
@@ -62,3 +61,9 @@ def test_the_attack_tells_outcomes_apart():
         Case("", lambda folder: 1 / 0): "broken case",
     }
     assert [outcome.kind for outcome in attempts(list(cases))] == list(cases.values())
+
+
+def test_the_record_is_of_these_areas_and_nothing_got_through():
+    record = json.loads((Path(__file__).resolve().parents[2] / "results" / "attack.json").read_text())["after"]
+    assert set(record["areas"]) <= set(AREAS)
+    assert all(not area["did not hold"] for area in record["areas"].values())

@@ -21,6 +21,7 @@ def places(tree: Any, at: tuple = ()) -> list[tuple]:
 
 
 def put(tree: Any, place: tuple, value: Any) -> None:
+    """Replace one node."""
     for key in place[:-1]:
         tree = tree[key]
     tree[place[-1]] = value
@@ -31,6 +32,7 @@ REPLACEMENTS = st.lists(st.tuples(st.floats(0, 1, exclude_max=True), ODD), min_s
 
 
 def replace_in(tree: Any, chosen: list[tuple[float, Any]]) -> None:
+    """Put them there."""
     for share, value in chosen:
         every = places(tree)
         if every:
@@ -46,6 +48,7 @@ DAMAGES = st.lists(st.tuples(HOW, st.floats(0, 1), CONTENT), min_size=1, max_siz
 
 
 def damage(data: bytes, chosen: list[tuple[str, float, bytes]]) -> bytes:
+    """Do it."""
     for how, share, content in chosen:
         at = int(share * len(data))
         rest = {"overwrite": data[at + len(content) :], "insert": data[at:], "delete": data[at + len(content) :]}

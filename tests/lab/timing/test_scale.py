@@ -8,7 +8,6 @@ import pytest
 import torch
 from short_trainings import LOUD, command_line, trained
 
-from nrfgs_lab import training_run
 from nrfgs_lab.timing import scale
 from nrfgs_lab.timing.scale import Bare, Scale, as_table, at_megapixels, made, resampled
 
@@ -16,8 +15,8 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
 def test_cells_are_measured_once(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(training_run, "WARM", 1)
-    monkeypatch.setattr(training_run, "PROFILED", 1)
+    monkeypatch.setattr(scale, "WARM", 1)
+    monkeypatch.setattr(scale, "PROFILED", 1)
     monkeypatch.setattr(scale, "frames_per_second", lambda model, cameras: float(model.num_points * len(cameras)))
     run = Scale(tmp_path / "scale.jsonl", splats=(300,), megapixels=(48 * 32e-6,), repeats=1, steps=1)
     run.main()
