@@ -13,6 +13,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 from filelock import FileLock
 from PIL import Image
 
@@ -65,6 +66,14 @@ def held_out_views(names: list[str], first: int, every: int = TEST_EVERY) -> lis
     return names[first::6] if every == TEST_EVERY and len(names) < 30 and len(chosen) < 3 else chosen
 
 
+def by_place(names: list[str], frames: list[dict]) -> list[str]:
+    """Views in the order of their cameras along the longest axis of all their places."""
+    poses = {frame["file_path"]: frame["transform_matrix"] for frame in frames}
+    places = np.array([poses[name] for name in names])[:, :3, 3]
+    places = places - places.mean(axis=0)
+    return [names[i] for i in np.argsort(places @ np.linalg.svd(places)[2][0], kind="stable")]
+
+
 def select_views(folder: Path, out: Path, scene: Scene) -> None:
     """Write a data set of a capture's training views at half the size, some of them held out, or of the whole capture
     with fewer training views, into `out`. InputError if the capture names no training views."""
@@ -82,7 +91,11 @@ def select_views(folder: Path, out: Path, scene: Scene) -> None:
         frames = [frame for frame in meta["frames"] if frame["file_path"] in names]
         meta |= {"frames": sorted(frames, key=lambda frame: frame["file_path"])}
         _halve(meta, folder, out)
-        test = held_out_views(names, scene.held_out, scene.held_out_every)
+        if scene.held_out_by == "place":
+            names = by_place(names, meta["frames"])
+            test = np.array_split(names, scene.held_out_every)[scene.held_out].tolist()
+        else:
+            test = held_out_views(names, scene.held_out, scene.held_out_every)
         names = [name for name in names if name not in test]
         meta |= {"test_filenames": test, "val_filenames": test}
     meta["train_filenames"] = [names[i] for i in evenly_spaced(len(names), scene.views or len(names))]

@@ -85,6 +85,8 @@ class Scene:
     """first held-out view"""
     held_out_every: int = 8
     """from one held-out view to the next"""
+    held_out_by: str = "name"
+    """order of the views; place: blocks along the cameras' longest axis are held out, which leaves gaps"""
 
     @property
     def name(self) -> str:
@@ -92,6 +94,7 @@ class Scene:
         if self.held_out is None:
             return self.path if self.views is None else f"{self.views} views/{self.path}"
         fold = self.held_out if self.held_out_every == 8 else f"{self.held_out} of {self.held_out_every}"
+        fold = f"place {fold}" if self.held_out_by == "place" else fold
         return "/".join(str(part) for part in (fold, self.views, self.path) if part is not None)
 
 
@@ -115,6 +118,8 @@ class Spec:
     """first held-out view; each number makes one held-out version of each scene"""
     held_out_every: int = 8
     """from one held-out view to the next"""
+    held_out_by: str = "name"
+    """order of the views (see `Scene`)"""
     quick: bool = False
     """quality alone: no ns-eval, pictures or frame rates; checkpoints are removed"""
     train_views: int = 16
@@ -215,8 +220,9 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
         for value in getattr(spec, key):
             _whole(value, 0, f"{where}: {key}")
     if spec.held_out:
-        every = spec.held_out_every
-        versions = [{"held_out": first, "held_out_every": every} for first in spec.held_out]
+        order = {"held_out_every": spec.held_out_every, "held_out_by": spec.held_out_by}
+        _require(spec.held_out_by in ("name", "place"), f"{where}: held_out_by must be name or place.")
+        versions = [{"held_out": first, **order} for first in spec.held_out]
         spec.scenes = [replace(scene, **version) for version in versions for scene in spec.scenes]
     _require_free(spec.options, SET_HERE, f"{where}: options")
     for run in spec.runs:
@@ -436,7 +442,7 @@ def _require_free(options: tuple[str, ...], given: dict[str, str], where: str) -
 
 
 def _known(value: dict[str, Any], kind: type, where: str) -> None:
-    set_here = {Method: ["name"], Scene: ["held_out", "held_out_every"]}.get(kind, ())
+    set_here = {Method: ["name"], Scene: ["held_out", "held_out_every", "held_out_by"]}.get(kind, ())
     known = [key.name for key in fields(kind) if key.name not in set_here]
     unknown = sorted(map(str, set(value) - set(known)))
     _require(not unknown, f"{where}: unknown key {', '.join(unknown)}. Known are {', '.join(known)}.")

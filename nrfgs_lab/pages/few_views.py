@@ -3,20 +3,30 @@
 
 from collections import ChainMap, defaultdict
 from collections.abc import Mapping, Sequence
-from statistics import fmean, median, stdev
+from statistics import fmean, median
+
+from scipy.stats import binomtest
 
 from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
 
-FIELD, HOST = "nrfgs", "splatfacto"
+FIELD, HOST, SAME = "nrfgs", "splatfacto", "harmonics, same rules"
 SHRUNK = "harmonics, same steps and shrinkage"
-BUDGET = "nrfgs, 150,000 splats", "harmonics, 150,000 splats"
-FEW = list(VIEWS)[1:]
-INSTEAD = {
-    "`original`": ("10,000 steps: 3DGS", "10,000 steps: field"),
-    "`peak`": ("field: peak", "field"),
-    "`mcmc`": ("mcmc: logit", "field"),
+RIVALS = {
+    "`nrfgs` with splatfacto's densification": "nrfgs",
+    "harmonics, the same": SHRUNK,
+    "field, MCMC": "nrfgs, 150,000 splats",
+    "harmonics, MCMC": "harmonics, 150,000 splats",
 }
-"""Label -> trial in results/held-out.json, and the trial of the default that it is compared with."""
+"""Label -> trainings in results/captures.json."""
+FEW = list(VIEWS)[1:]
+GAPS = {
+    "harmonics, same rules": "harmonics",
+    "field without opacity residual": "no opacity residual",
+    "field, rates a tenth (latents), a fifth (network)": "slow field",
+    "field, one band": "one band",
+    "field without distance": "no distance",
+}
+"""Label -> trial with gaps in results/default.json."""
 RULES = {
     "**by error, points from photographs, near plane**": "by error, dense start, near plane",
     "without the near plane": "by error, dense start",
@@ -43,42 +53,109 @@ def runs_of(scene: str, name: str) -> Trainings:
     return sorted(runs, key=lambda one: one["seed"])
 
 
+def today(scene: str, name: str) -> Trainings:
+    """The trainings of a capture with today's default settings in results/default.json, by seed."""
+    runs = {}
+    for sitting in ("one version", "test views"):  # the later one counts
+        for one in records("default").values():
+            if (one["scene"], one["name"]) == (scene, f"{sitting}: {name}"):
+                runs[one["seed"]] = one
+    return [runs[seed] for seed in sorted(runs)]
+
+
 def _ahead(gains: list[float], digits: int = 1) -> str:
     """Gain in the median view in dB, and the number of views with a gain."""
     return f"{signed(median(gains), digits)} ({sum(one > 0 for one in gains)}/{len(gains)})" if gains else "-"
 
 
+def verdict(gains: list[float]) -> str:
+    """Which of two is better by a two-sided sign test over views at 5 %."""
+    ahead = sum(one > 0 for one in gains)
+    if binomtest(ahead, len(gains)).pvalue >= 0.05:
+        return "no difference seen"
+    return "field" if 2 * ahead > len(gains) else "harmonics"
+
+
 def captures() -> str:
-    """`nrfgs` and splatfacto with default settings, and harmonics with the same steps, on test views."""
+    """The field, splatfacto, and harmonics with the field's rules, all with default settings, on test views."""
     body = []
     for scene, views in VIEWS.items():
-        field, harmonics, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, HOST))
-        share = f"{mean(field, 'splats') / mean(harmonics, 'splats'):.2f}"
-        cells = [*map(_cell, (field, host, harmonics)), _ahead(view_gains(field, harmonics)), share]
+        field, host, harmonics = today(scene, FIELD), runs_of(scene, HOST), today(scene, SAME)
+        gains = view_gains(field, harmonics)
+        cells = [*map(_cell, (field, host, harmonics)), f"{_ahead(gains)}: {verdict(gains)}"]
         body.append([f"{scene}, {views}", *cells])
-    head = ["capture, training views", "`nrfgs`", "splatfacto", "harmonics"]
-    return grid([*head, "gain (ahead)", "splats"], body)
+    return grid(
+        ["capture, training views", "`nrfgs`", "splatfacto", "harmonics, same rules", "field - harmonics"], body
+    )
 
 
-def gain(scene: str) -> str:
-    """Gain of the field over harmonics with the same steps in a capture's median view."""
-    gains = view_gains(runs_of(scene, FIELD), runs_of(scene, SHRUNK))
-    return f"{signed(median(gains))} dB (ahead in {sum(one > 0 for one in gains)} of {len(gains)})"
+def default() -> str:
+    """More of the same: each seed, other metrics, the worst view, splats."""
+    body = []
+    for scene, views in VIEWS.items():
+        for label, runs in (("field", today(scene, FIELD)), ("harmonics", today(scene, SAME))):
+            seeds = ", ".join(f"{one['psnr']:.2f}" for one in runs)
+            means = [f"{mean(runs, metric):.3f}" for metric in ("ssim", "ms_ssim", "flip")]
+            middle = fmean(median(view[1] for view in one["per_image"]) for one in runs)
+            worst = min(view[1] for one in runs for view in one["per_image"])
+            gap = mean(runs, "train_psnr") - mean(runs, "psnr")
+            numbers = f"{middle:.1f}", f"{worst:.1f}", f"{gap:.1f}", f"{mean(runs, 'splats') / 1000:.0f}k"
+            body.append([f"{scene}, {views}", label, seeds, *means, *numbers])
+    head = "PSNR of each seed", "SSIM", "MS-SSIM", "FLIP", "median view", "worst view", "gap", "splats"
+    return grid(["capture", "", *head], body)
 
 
-def over_host(scene: str) -> str:
-    """Gain of the field over splatfacto in a capture's median view, both with default settings."""
-    return f"{signed(median(view_gains(runs_of(scene, FIELD), runs_of(scene, HOST), all_seeds=True)))} dB"
+def rivals() -> str:
+    """Today's default beside splatfacto's densification and 150,000 splats by 3DGS-MCMC, on test views."""
+    body = [
+        [f"{scene}, {views}", _cell(today(scene, FIELD)), *(_cell(runs_of(scene, name)) for name in RIVALS.values())]
+        for scene, views in VIEWS.items()
+    ]
+    return grid(["capture, training views", "`nrfgs`", *RIVALS], body)
+
+
+def over_former(metric: str, digits: str) -> str:
+    """Mean gain of today's default over the one with splatfacto's densification, and least and most."""
+    gains = [mean(today(scene, FIELD), metric) - mean(runs_of(scene, FIELD), metric) for scene in VIEWS]
+    middle, least, most = (signed(bound(gains), int(digits)) for bound in (fmean, min, max))
+    return f"{middle} ({least} to {most})"
 
 
 def over_host_where_seen() -> str:
-    """The same on captures with 7 test views or more, least and most: in the mean, and in the median view."""
-    pairs = [(runs_of(scene, FIELD), runs_of(scene, HOST)) for scene in VIEWS]
+    """Gain of the field over splatfacto, both with default settings, on captures with 7 test views or more, least and
+    most: in the mean, and in the median view."""
+    pairs = [(today(scene, FIELD), runs_of(scene, HOST)) for scene in VIEWS]
     pairs = [pair for pair in pairs if len(pair[0][0]["per_image"]) >= 7]
     means = [mean(field, "psnr") - mean(host, "psnr") for field, host in pairs]
     medians = [median(view_gains(*pair, all_seeds=True)) for pair in pairs]
     bounds = [f"{min(gains):.1f} to {max(gains):.1f}" for gains in (means, medians)]
     return "{} dB ({} in the median view) on the {} captures with 7 test views or more".format(*bounds, len(means))
+
+
+def over_same(scene: str) -> str:
+    """Gain of the field over harmonics with the same rules: mean over test views and seeds."""
+    return f"{signed(mean(today(scene, FIELD), 'psnr') - mean(today(scene, SAME), 'psnr'))} dB"
+
+
+def gaps() -> str:
+    """Changes of PSNR and SSIM by trials with gaps between training views, against the default."""
+    runs = {capture: {} for capture in VIEWS}
+    for one in records("default").values():
+        if one["name"].startswith("gaps: "):
+            where, _, capture = one["scene"].rpartition("/")
+            runs[capture][one["name"][6:], where] = one
+    body = []
+    for label, trial in GAPS.items():
+        cells = []
+        for mine in runs.values():
+            pairs = [(one, mine["default", where]) for (name, where), one in mine.items() if name == trial]
+            gains = [
+                a[1] - b[1] for one, base in pairs for a, b in zip(one["per_image"], base["per_image"], strict=True)
+            ]
+            dB, ssim = (fmean(one[metric] - base[metric] for one, base in pairs) for metric in ("psnr", "ssim"))
+            cells.append(f"{signed(dB, 2)}/{signed(1000 * ssim, 0)} ({sum(one > 0 for one in gains)}/{len(gains)})")
+        body.append([label, *cells])
+    return grid(["", *runs], body)
 
 
 def demo(what: str) -> str:
@@ -92,25 +169,6 @@ def demo(what: str) -> str:
 
 def _cell(runs: Trainings) -> str:
     return f"{mean(runs, 'psnr'):.2f}/{mean(runs, 'ssim'):.3f}" if runs else "-"
-
-
-def _gap(runs: Trainings) -> str:
-    if not runs or any(one.get("train_psnr") is None for one in runs):
-        return "-"
-    return f"{mean(runs, 'train_psnr') - mean(runs, 'psnr'):.1f}"
-
-
-def test_views() -> str:
-    """Test views of all captures, and by how much training views are above them."""
-    body = []
-    for scene, views in VIEWS.items():
-        field, shrunk, host = (runs_of(scene, name) for name in (FIELD, SHRUNK, HOST))
-        budget = [runs_of(scene, name) for name in BUDGET]
-        cells = [_cell(field), _cell(host), _cell(shrunk), _ahead(view_gains(field, shrunk), 2)]
-        cells += [f"{_gap(field)}, {_gap(shrunk)}", ", ".join(map(_cell, budget))]
-        body.append([f"{scene}, {views}", *cells, _ahead(view_gains(*budget), 2)])
-    head = "`nrfgs`", "splatfacto", "harmonics", "gain", "gaps", "150k: field, harmonics", "gain there"
-    return grid(["capture, training views", *head], body)
 
 
 # Held-out views: (capture, which were held out, image) -> PSNR and SSIM.
@@ -172,14 +230,6 @@ def rules_gain() -> str:
     return f"{min(psnr):.1f} to {max(psnr):.1f} dB and {min(ssim):.3f} to {max(ssim):.3f} SSIM"
 
 
-def rules_over_harmonics() -> str:
-    """Gain of `nrfgs` over harmonics with the same rules on bonsai's test views."""
-    ours, theirs = (records("default")[f"test: {name}/bonsai-42"] for name in ("nrfgs", "harmonics"))
-    share = ours["splats"] / theirs["splats"]
-    gain = f"{ours['psnr'] - theirs['psnr']:.1f} dB better than harmonics with the same training"
-    return f"{gain}, at {share:.1f} times their splats"
-
-
 def failed() -> str:
     """PSNR of failed views of `kitchen`, whole and without each kind of suspects."""
     trials = {
@@ -210,51 +260,6 @@ def _run(one: Mapping) -> str:
     return f"{one['psnr']:.2f} dB, {one['ssim']:.3f}, {one['splats'] / 1000:.0f}k splats{seconds}"
 
 
-def one_version() -> str:
-    """Test views of `nrfgs` and of harmonics with its rules: means over seeds, and each seed's PSNR."""
-    body = []
-    for scene in ("castle", "kitchen", "fern"):
-        for name in ("nrfgs", "harmonics, same rules"):
-            runs = [one for one in records("default").values() if one["name"] == f"one version: {name}"]
-            runs = [one for one in runs if one["scene"] == scene]
-            seeds = ", ".join(f"{one['psnr']:.2f}" for one in sorted(runs, key=lambda one: one["seed"]))
-            worst = min(view[1] for one in runs for view in one["per_image"])
-            numbers = f"{mean(runs, 'ssim'):.3f}", f"{mean(runs, 'flip'):.3f}", f"{worst:.1f}"
-            body.append([f"{scene}, {VIEWS[scene]}", name, seeds, *numbers, f"{mean(runs, 'splats') / 1000:.0f}k"])
-    return grid(["capture, training views", "", "PSNR of each seed", "SSIM", "FLIP", "worst view", "splats"], body)
-
-
-def folds(trial: str) -> str:
-    """Change of PSNR by a trial of `folds`: mean and standard error over trainings, and views with a gain."""
-    gains, views = defaultdict(list), defaultdict(list)
-    for key, one in records("default").items():
-        if one["name"] == f"folds: {trial}":
-            base, scene = records("default")[key.replace(trial, "default")], one["scene"].rpartition("/")[2]
-            gains[scene].append(one["psnr"] - base["psnr"])
-            views[scene] += [a[1] > b[1] for a, b in zip(one["per_image"], base["per_image"], strict=True)]
-    errors = {scene: stdev(some) / len(some) ** 0.5 for scene, some in gains.items()}
-    ahead = {scene: f"{sum(better)}/{len(better)}" for scene, better in views.items()}
-    shown = {scene: f"{fmean(some):+.2f} +- {errors[scene]:.2f} ({ahead[scene]})" for scene, some in gains.items()}
-    return " | ".join(shown[scene] for scene in ("kitchen", "castle", "fern") if scene in shown)
-
-
-def without(trial: str) -> str:
-    """Gain of a trial over the default on `bonsai` with all its views except those held out, in both ways."""
-    runs = records("held-out")
-    gains, better, count, splats = [], 0, 0, []
-    for place in ("4/bonsai", "0/bonsai"):
-        base = runs[f"field/{place}-42"]
-        if (one := runs.get(f"field: {trial}/{place}-42")) is None:
-            continue
-        pairs = list(zip(one["per_image"], base["per_image"], strict=True))
-        gains.append(f"{fmean(ours[1] - theirs[1] for ours, theirs in pairs):+.2f}")
-        better += sum(ours[2] > theirs[2] for ours, theirs in pairs)
-        count += len(pairs)
-        splats.append(one["splats"] / base["splats"])
-    more = f"{100 * fmean(splats) - 100:+.0f} % splats"
-    return f"{' and '.join(gains)} dB, SSIM better in {better} of {count} views, {more}"
-
-
 def moved() -> str:
     """On how many captures MCMC is better on test views with the residual on the logit, and where not."""
     names = "nrfgs, 150,000 splats, opacity added", "nrfgs, 150,000 splats"
@@ -268,26 +273,18 @@ def moved() -> str:
 
 BLOCKS = {
     "readme.captures": captures,
-    "readme.gain": gain,
-    "readme.over_host": over_host,
     "readme.over_host_where_seen": over_host_where_seen,
+    "readme.over_same": over_same,
     "readme.demo": demo,
-    "captures.trials": lambda: str(len(records("held-out"))),
-    "captures.tried": lambda: gains_over(
-        "harmonics: shrinkage",
-        {"**u = V / (V + 20)**": ("field", "field: trust"), "u = 1": ("field: u = 1", "field: whole")},
-    ),
-    "captures.instead": lambda: gains_of("held-out", INSTEAD),
+    "captures.default": default,
+    "captures.rivals": rivals,
+    "captures.over_former": over_former,
+    "captures.gaps": gaps,
     "captures.rules": lambda: gains_of("default", {label: (one, "splatfacto's rules") for label, one in RULES.items()}),
     "captures.rules_gain": rules_gain,
-    "captures.rules_over_harmonics": rules_over_harmonics,
     "captures.failed": failed,
     "captures.floaters": floaters,
     "captures.run": lambda name: _run(records("default")[name]),
-    "captures.one_version": one_version,
-    "captures.folds": folds,
-    "captures.without": without,
-    "captures.test_views": test_views,
     "opacity.copies": lambda: gains_over("mcmc: harmonics", {name: [f"mcmc: {one}"] for name, one in COPIES.items()}),
     "opacity.moved": moved,
 }

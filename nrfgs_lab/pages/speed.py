@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blocks of docs/speed.md, docs/trade-off.md, docs/nerfstudio/nrfgs.md and README.md: what trainings cost."""
 
+from collections import defaultdict
 from datetime import datetime, timedelta
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
+import numpy as np
+
 from nrfgs_lab.bench.table import Row
-from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, signed, span, table
+from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, records, signed, span, table
 
 SITTING = timedelta(minutes=10)
 """Trainings that began within it were made on one machine, one after the other."""
@@ -67,40 +70,6 @@ def spread(*runs: str) -> str:
     return f"{100 * max(max(times) / min(times) - 1 for times in (values('time s', run) for run in runs)):.0f} %"
 
 
-def _steps(run: str, begin: int, end: int) -> float:
-    """Milliseconds of a step of whole trainings of bonsai between two checkpoints, the median over seeds."""
-    times = []
-    for record in row_of(run).records.values():
-        train = record["train"]
-        seconds = {0: 0.0, **dict(train["saved"]), train["steps"]: train["seconds"]}
-        times.append(1e3 * (seconds[end] - seconds[begin]) / (end - begin))
-    return median(times)
-
-
-PHASES = {"to step 5,000": (0, 5_000), "to 15,000": (5_000, 15_000), "to 30,000": (15_000, 30_000)}
-
-
-def steps() -> str:
-    """Milliseconds of a step of whole trainings, while splats are added and removed and later."""
-    pairs = {name: [f"{_steps(run, *phase):.2f}" for run in ("nrfgs", "nrfgs-sh")] for name, phase in PHASES.items()}
-    return ", ".join(f"{name} {'/'.join(pair)}" for name, pair in pairs.items())
-
-
-def frames() -> str:
-    """Frames per second of bonsai at 1080p, least and most."""
-    runs = {"nrfgs": "", "nrfgs-sh": "`nrfgs-sh` ", "splatfacto": "splatfacto "}
-    return ", ".join(label + span(values("FPS 1080p", run), "{:.0f}".format) for run, label in runs.items())
-
-
-def cost() -> str:
-    """Seconds of whole trainings of bonsai, least and most, and their mean PSNR."""
-    runs = {"nrfgs": "", "nrfgs-best": "`nrfgs-best` ", "nrfgs-sh": "`nrfgs-sh` ", "splatfacto": "splatfacto "}
-    return "; ".join(
-        f"{label}{span(values('time s', run), '{:.0f}'.format)} s, {mean_of(row_of(run), 'PSNR'):.2f} dB"
-        for run, label in runs.items()
-    )
-
-
 # The choice between methods and presets.
 
 CAPTURES = "bonsai", "fox"
@@ -151,14 +120,62 @@ def time(scene: str, run: str, base: str) -> str:
     return f"{ours / theirs:.2f}"
 
 
+# Steps and frames against splats and pixels (`timing/scale.py`).
+
+RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatfacto"}
+RENDERERS |= {"gsplat": "gsplat, bare", "faster-gs": "Faster-GS, bare"}
+
+
+def _scale(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
+    """(splats, megapixels) -> renderer -> a quantity in each repeat."""
+    places: dict[tuple[int, float], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for one in records("scale").values():
+        if column in one:
+            places[one["splats"], one["megapixels"]][one["method"]].append(one[column])
+    return dict(sorted(places.items()))
+
+
+def scale(column: str, factor: str, form: str) -> str:
+    """A quantity of training steps after growth, medians of repeats."""
+    body = []
+    for (count, pixels), cells in _scale(column).items():
+        values = (format(median(cells[one]) * float(factor), form) for one in RENDERERS)
+        body.append([f"{count / 1e6:g}M, {pixels:g} MP", *values])
+    return grid(["splats, image", *RENDERERS.values()], body)
+
+
+def scale_frames() -> str:
+    """Frames per second at two sizes, medians of repeats."""
+    large, body = _scale("4K"), []
+    for place, small in _scale("1080p").items():
+        rates = (f"{median(small[one]):.0f}/{median(large[place][one]):.0f}" for one in RENDERERS)
+        body.append([f"{place[0] / 1e6:g}M", *rates])
+    return grid(["splats", *RENDERERS.values()], body)
+
+
+def scale_ratio(column: str, other: str) -> str:
+    """Least and most that `nrfgs` has of another renderer's quantity over the table's cells."""
+    ratios = [median(cells["nrfgs"]) / median(cells[other]) for cells in _scale(column).values()]
+    return span(ratios, "{:.2f}".format)
+
+
+def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
+    """Least squares of a quantity by splats and pixels."""
+    cells = {place: float(factor) * median(cells[renderer]) for place, cells in _scale(column).items()}
+    parts = np.linalg.lstsq([[1, count / 1e6, pixels] for count, pixels in cells], [*cells.values()], rcond=None)[0]
+    return f"{parts[0]:.1f} {unit}, {parts[1]:.1f} for each million splats and {parts[2]:.2f} for each megapixel"
+
+
+def scale_spread() -> str:
+    """By how much a cell's slowest repeat is above its fastest, the median over cells with repeats."""
+    repeats = [values for cells in _scale("step_ms").values() for values in cells.values() if len(values) > 1]
+    return f"{100 * median(max(values) / min(values) - 1 for values in repeats):.0f} %"
+
+
 BLOCKS = {
-    **{f"speed.{block.__name__}": block for block in (trainings, spread, steps, frames)},
+    **{f"speed.{block.__name__}": block for block in (scale, scale_fit, scale_frames, scale_ratio, scale_spread)},
+    **{f"speed.{block.__name__}": block for block in (trainings, spread)},
     "speed.ratio": lambda column, run, base: f"{median(_ratios(column, run, base)):.2f}",
-    "speed.step_ratio": lambda run, base: f"{_steps(run, 15_000, 30_000) / _steps(base, 15_000, 30_000):.2f}",
-    "readme.cost": cost,
-    "readme.memory": lambda: "{:.1f} GB, splatfacto {:.1f}".format(
-        *(mean_of(row_of(run), "peak MB") / 1000 for run in ("nrfgs", "splatfacto"))
-    ),
     "trade_off.presets": presets,
     "trade_off.gain": gain,
     "trade_off.time": time,

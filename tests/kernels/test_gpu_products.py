@@ -89,7 +89,8 @@ def test_exported_files(tiny_scene, tmp_path):
     ply, compact = reports["ply"], reports["compact"]
     worth = ply["psnr_model"] - ply["psnr_base"]
     assert worth > 0.5
-    assert abs(ply["loss_db"]) < worth / 3 and abs(compact["loss_db"]) < worth / 3
+    # The PLY's fine-tuning goes on where a training of 60 steps stopped, so that it may gain; encoding alone cannot.
+    assert ply["loss_db"] < worth / 3 and abs(compact["loss_db"]) < worth / 3
     # Nearly half of so small a file is the network, which all splats share.
     assert compact["ply_ratio"] > 2
 

@@ -245,6 +245,15 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
     (fold,) = spec(scenes=["tiny"], held_out=[1], held_out_every=3).scenes
     assert fold.name == "1 of 3/tiny"
     assert made(fold)[1]["test_filenames"] == names[1:][1::3]
+    blocks = [
+        made(scene)[1] for scene in spec(scenes=["tiny"], held_out=[0, 1], held_out_every=2, held_out_by="place").scenes
+    ]
+    first, second = (set(block["test_filenames"]) for block in blocks)
+    assert first | second == set(names[1:]) and not first & second
+    places = {frame["file_path"]: np.array(frame["transform_matrix"])[:3, 3] for frame in whole["frames"]}
+    axis = np.linalg.svd(np.array(some := [places[name] for name in names[1:]]) - np.mean(some, axis=0))[2][0]
+    ends = [sorted(places[name] @ axis for name in block) for block in (first, second)]
+    assert ends[0][-1] <= ends[1][0] or ends[1][-1] <= ends[0][0]
     folder, fewer = made(Scene("tiny", views=2))
     assert fewer == {**whole, "train_filenames": [names[1], names[1 + len(names[1:]) // 2]]}
     assert (folder / names[0]).exists()
