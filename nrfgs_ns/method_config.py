@@ -3,7 +3,7 @@
 
 The methods for comparison differ from splatfacto in the appearance head alone: learning rates, schedules, densification
 and steps are splatfacto's, to the number. `nrfgs` also suits the training to the capture: steps, growth, start, near
-plane, and how far the views are trusted (docs/captures.md). Its two presets are ends of the trade in docs/trade-off.md.
+plane, and how far the views are trusted (docs/captures.md). Its two presets are ends of the trade in docs/speed.md.
 """
 
 from copy import deepcopy
@@ -106,7 +106,7 @@ nrfgs = preset(
 nrfgs_fast = preset(
     "nrfgs-fast",
     nrfgs,
-    "nrfgs in 10,000 steps, for a first result (docs/trade-off.md).",
+    "nrfgs in 10,000 steps, for a first result (docs/speed.md).",
     model={},
     max_num_iterations=FEWEST_STEPS,
     schedule_steps=STEPS,
@@ -116,7 +116,7 @@ nrfgs_fast = preset(
 nrfgs_best = preset(
     "nrfgs-best",
     nrfgs,
-    "nrfgs in 30,000 steps with a finer threshold: more splats, time and detail (docs/trade-off.md).",
+    "nrfgs in 30,000 steps with a finer threshold: more splats, time and detail (docs/speed.md).",
     model={"densification": ErrorGuided(threshold=0.0016)},
     max_num_iterations=STEPS,
     average_steps=AVERAGED,

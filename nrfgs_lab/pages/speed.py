@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of docs/speed.md, docs/trade-off.md, docs/nerfstudio/nrfgs.md and README.md: what trainings cost."""
+"""Blocks of docs/speed.md, docs/speed.md, docs/nerfstudio/nrfgs.md and README.md: what trainings cost."""
 
 from collections import defaultdict
 from datetime import datetime, timedelta
