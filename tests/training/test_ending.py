@@ -237,6 +237,13 @@ def test_another_scene_and_other_options_are_refused(finished, tiny_scene, tmp_p
         ready(tiny_scene, tmp_path / "c", resumed, {"--pipeline.model.appearance.color-scale": 0.3}, steps=STEPS + 2)
 
 
+def test_a_checkpoint_of_nerfstudios_own_method_is_refused(tiny_scene, tmp_path):
+    own = {"step": 9, "pipeline": {"_model.gauss_params.means": torch.zeros(3, 3)}, "optimizers": {}, "schedulers": {}}
+    torch.save(own, tmp_path / "step-000000009.ckpt")
+    with pytest.raises(InputError, match="another method"):
+        ready(tiny_scene, tmp_path / "a", {"--load-dir": tmp_path}, steps=STEPS)
+
+
 def test_trainings_of_one_name_have_a_folder_each(tiny_scene, tmp_path):
     """Those of one second, too; a training that goes on in its own folder stays there."""
     config = parse(command_line("nrfgs", tiny_scene, tmp_path, 1))
