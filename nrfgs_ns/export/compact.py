@@ -174,7 +174,7 @@ def encoded(
 def too_small(limit: float, smallest: int) -> InputError:
     return InputError(
         f"--size-mb is {limit / 1e6:g}, and the smallest output of this model has "
-        f"{math.ceil(smallest / 1e4) / 100:.2f} MB. Ask for more, or train with fewer splats (docs/fewer-splats.md)."
+        f"{math.ceil(smallest / 1e4) / 100:.2f} MB. Ask for more, or train with fewer splats (docs/how-many-splats.md)."
     )
 
 
