@@ -28,8 +28,9 @@ APPEARANCE = "pipeline.model.appearance."
 INTRODUCTION = """# Options
 
 What this package adds to nerfstudio's options, or sets in its own way; `ns-train nrfgs --help` lists all. Written by
-`python -m nrfgs_lab.pages.options`. Defaults are `nrfgs`'s. The other heads have no `view-noise`, `few-views` or
-`shrinkage`; they train for 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
+`python -m nrfgs_lab.pages.options`. Defaults are `nrfgs`'s. The other
+methods (`nrfgs-sh`, ...) have `view-noise`, `few-views`, `shrinkage`, `dense-start` and `near-plane` off, splatfacto's
+densification, and 30,000 steps without averaging; each can be switched on. Cameras lie within [-1, 1] scene units.
 """
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
 """Options of splatfacto's model, not explained here."""
