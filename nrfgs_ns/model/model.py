@@ -20,7 +20,7 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.errors import InputError
@@ -144,8 +144,6 @@ class NrfgsModel(SplatfactoModel):
     def field(self) -> Field:
         """The head with all splats, or, in evaluation, those in the crop box."""
         splats: dict[str, Tensor] = dict(self.gauss_params.items())
-        if (diffuse := self.densification.diffuse) is not None:
-            splats[DIFFUSE] = diffuse
         if self.crop_box is not None and not self.training:
             inside = self.crop_box.within(splats["means"]).reshape(-1)
             splats = {name: value[inside] for name, value in splats.items()}
