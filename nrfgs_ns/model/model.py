@@ -31,10 +31,16 @@ from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.model.initial_splats import initial_splats
-from nrfgs_ns.model.look import look_asked_for
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.pinhole import Pinhole, Pinholes
-from nrfgs_ns.model.renderer import View, composite_view, project_view, projection_options, render_view
+from nrfgs_ns.model.renderer import (
+    View,
+    composite_view,
+    look_asked_for,
+    project_view,
+    projection_options,
+    render_view,
+)
 from nrfgs_ns.model.saved_state import check_compatible, differences, photographs_of, reduced_config
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up

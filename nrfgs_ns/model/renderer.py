@@ -8,6 +8,7 @@ outputs, info = composite_view(view, appearance, background)   # the image
 `render_view` is the last two as a model is configured.
 """
 
+import os
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -16,6 +17,9 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.data.checks import warn
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.pinhole import Pinhole
 from nrfgs_ns.rasterizer import Projection, ProjectionOptions, RasterizeMode, composite, project
 
@@ -23,6 +27,8 @@ NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 """Depths between which splats are drawn, in scene units: splatfacto's."""
 ROWS = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "n_cameras"
 """What densification reads in `info` about a view's rows."""
+LOOK = "NRFGS_LOOK"
+"""Environment variable: a training photograph's file name; without it, renderings have the photographs' mean look."""
 
 
 def projection_options(
@@ -147,3 +153,21 @@ def render_view(
             shown = torch.where(info["radii"] > 0, shown, base)
         model.densification.pre_backward(model.step, info, shown, stored)
     return outputs, info
+
+
+def look_asked_for(photograph: PhotographModel | None) -> int | None:
+    """The index of the photograph that LOOK names, whose exposure and colour renderings outside of training take; None,
+    with a warning, if no exposures have been learnt.
+
+    Raises:
+        InputError: there is no such photograph.
+    """
+    name = os.environ.get(LOOK)
+    if not name:
+        return None
+    if photograph is None:
+        warn(f"{LOOK} is {name!r}, but this model has learnt no photograph's exposure: all renderings have one look.")
+        return None
+    if name not in photograph.names:
+        raise InputError(f"{LOOK} is {name!r}, which is not a training photograph, such as {photograph.names[0]!r}.")
+    return photograph.names.index(name)
