@@ -15,14 +15,15 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 from torch.utils.benchmark import Timer
 
-from nrfgs_lab.residuals import THRESHOLDS, FieldViews, Residuals, dropped, look_over, slim
 from nrfgs_lab.training_run import machine
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.reduce import LatentBasis, branches, latent_basis, rebuilt, with_rank
+from nrfgs_ns.compact.finetune import contributions_to
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, write_whole
+from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.harmonics_fit import look_through
 from nrfgs_ns.progress import progress
 from nrfgs_ns.trained.find import NamesTraining
@@ -56,16 +57,16 @@ class Inspect(NamesTraining):
             raise InputError(f"{config}: {self.views} of {len(images)} test views. At least one is needed.")
         images = [images[i] for i in evenly_spaced(len(images), self.views)]
         with progress(f"Looking at the splats from {len(cameras)} training views"):
-            seen, distance = look_over(model, cameras), mean_log_distance(model, cameras)
+            basis = latent_basis(model.field, contributions_to(model, cameras))
+            distance = mean_log_distance(model, cameras)
         field, views = model.field.detached(), FieldViews(model, images)
-        basis = latent_basis(field, seen.weight)
-        candidates = list(changes(field, seen, basis, distance))
+        candidates = list(changes(field, basis, distance))
         rows = [row("nothing", "full", field, views, None)]
         with progress("Leaving out", len(candidates)) as advance:
             for name, group, change in candidates:
                 rows.append(row(name, group, change(field), views, rows[0].psnr))
                 advance(name)
-        all_together, left_out = together(field, rows, candidates, seen, views, self.budget)
+        all_together, left_out = together(field, rows, candidates, basis, views, self.budget)
         result = {
             "machine": machine(),
             "splats": model.num_points,
@@ -87,7 +88,7 @@ class Row:
     part: str
     """the part left out"""
     group: str
-    """full, part, rank, residual, together"""
+    """full, part, rank, together"""
     psnr: float
     """mean over the views, dB"""
     loss_db: float
@@ -96,15 +97,13 @@ class Row:
     """of splats and head, float32"""
     head_seconds: float
     """mean over the views"""
-    diffuse: float = 0.0
-    """share of the splats without residual"""
 
 
 Candidate = tuple[str, str, Callable[[Field], Field]]
 """Name, group, and the change."""
 
 
-def changes(field: Field, seen: Residuals, basis: LatentBasis, distance: float) -> Iterator[Candidate]:
+def changes(field: Field, basis: LatentBasis, distance: float) -> Iterator[Candidate]:
     """Parts that can be left out of a field."""
     config = field.head.config
     if field.head.high is not None:
@@ -117,35 +116,58 @@ def changes(field: Field, seen: Residuals, basis: LatentBasis, distance: float) 
     ranks = range(1, config.latent_dim + 1)
     for rank in (rank for rank in ranks if rank <= 8 or rank % 8 == 0):
         yield f"latent rank {rank}", "rank", partial(with_rank, basis=basis, rank=rank)
-    for threshold in THRESHOLDS:
-        yield residuals_below(threshold), "residual", partial(dropped, seen=seen, threshold=threshold)
 
 
-def residuals_below(threshold: float) -> str:
-    """Name of residuals below a threshold in 8-bit steps."""
-    return "all residuals" if threshold == float("inf") else f"residuals below {threshold:g} steps"
+class FieldViews:
+    """Views with their photographs, projected once: no change moves a splat.
+
+    Args:
+        model: in evaluation mode.
+        views: pairs of a camera and its batch; at least one.
+    """
+
+    def __init__(self, model, views: list):
+        self.model, self.views = model, []
+        for camera, batch in views:
+            with torch.no_grad():
+                view = model.project(camera.to(model.device))
+            truth = model.truth_of(batch, model.background_color.to(model.device))
+            self.views.append((view, truth, model.mask_of(batch)))
+
+    @torch.no_grad()
+    def psnr(self, field: Field) -> float:
+        """Mean over the views, inside masks, dB; views whose mask is empty are left out."""
+        scores = []
+        for view, truth, mask in self.views:
+            outputs, _ = self.model.composite(view, field.seen_from(view))
+            scores.append(psnr(outputs["rgb"], truth, mask))
+        scores = [score for score in scores if score is not None]
+        return sum(scores) / max(len(scores), 1)
+
+    @torch.no_grad()
+    def head_seconds(self, field: Field) -> float:
+        """Mean of the head's time over the views."""
+        seconds = []
+        for view, _, _ in self.views:
+            timer = Timer("field.seen_from(view)", globals={"field": field, "view": view})
+            seconds.append(min(timer.timeit(1).mean for _ in range(TIMED)))
+        return sum(seconds) / len(seconds)
 
 
 def row(part: str, group: str, field: Field, views: FieldViews, full: float | None) -> Row:
     """Measure one field; `full` is the full field's PSNR, None for the full field."""
     score = views.psnr(field)
     loss = 0.0 if full is None else full - score
-    share = diffuse_splats(field) / max(len(field.splats["means"]), 1)
-    return Row(part, group, score, loss, field.bytes, head_seconds(views, field), share)
-
-
-def diffuse_splats(field: Field) -> int:
-    """Number of splats without residual."""
-    return int(field.splats[DIFFUSE].sum()) if DIFFUSE in field.splats else 0
+    return Row(part, group, score, loss, field.bytes, views.head_seconds(field))
 
 
 def together(
-    field: Field, rows: list[Row], candidates: list[Candidate], seen: Residuals, views: FieldViews, budget: float
+    field: Field, rows: list[Row], candidates: list[Candidate], basis: LatentBasis, views: FieldViews, budget: float
 ) -> tuple[Row, list[str]]:
     """Smallest field within `budget` dB, by leaving out the cheapest parts first, and the names of what it lacks.
 
-    Parts may take half of the budget; residuals and the latents' rank the rest (`slim`). The low branch stays: it has
-    the opacity, and without its colours nothing is saved.
+    Parts may take half of the budget; the latents' rank the rest. The low branch stays: it has the opacity, and without
+    its colours nothing is saved.
     """
     full = rows[0].psnr
     change_of = {name: change for name, _, change in candidates}
@@ -156,25 +178,15 @@ def together(
             if full - views.psnr(smaller) <= 0.5 * budget:
                 field = smaller
                 left_out.append(part.part)
-    slimmed, threshold, rank = slim(field, seen, views, full - budget)
-    if diffuse_splats(slimmed) > diffuse_splats(field):
-        left_out.append(residuals_below(threshold))
-    if rank < field.head.config.latent_dim and threshold < float("inf"):
+    low, rank = 1, field.head.config.latent_dim
+    while low < rank:  # the loss falls with the rank, except for rounding: halve the interval
+        middle = (low + rank) // 2
+        enough = full - views.psnr(with_rank(field, basis, middle)) <= budget
+        low, rank = (low, middle) if enough else (middle + 1, rank)
+    if rank < field.head.config.latent_dim:
+        field = with_rank(field, basis, rank)
         left_out.append(f"latents beyond rank {rank}")
-    return row("together", "together", slimmed, views, full), left_out
-
-
-@torch.no_grad()
-def head_seconds(views: FieldViews, field: Field) -> float:
-    """Mean of the head's time over the views; diffuse splats last, as in a training and in a file."""
-    seconds = []
-    for view, _, _ in views.views:
-        rows = view.visible
-        if DIFFUSE in field.splats:
-            rows = rows[field.splats[DIFFUSE][rows].to(torch.uint8).argsort(stable=True)]
-        timer = Timer("head(splats, rows, center)", globals={**field._asdict(), "rows": rows, "center": view.center})
-        seconds.append(min(timer.timeit(1).mean for _ in range(TIMED)))
-    return sum(seconds) / len(seconds)
+    return row("together", "together", field, views, full), left_out
 
 
 @torch.no_grad()
@@ -193,13 +205,12 @@ def mean_log_distance(model, cameras) -> float:
 def table(rows: list[Row]) -> Table:
     """Table of the rows, a section for each group."""
     printed = Table()
-    for column in ("left out", "PSNR (dB)", "loss (dB)", "MB", "head (ms)", "diffuse"):
+    for column in ("left out", "PSNR (dB)", "loss (dB)", "MB", "head (ms)"):
         printed.add_column(column, justify="left" if column == "left out" else "right")
     for entry, following in zip(rows, [*rows[1:], None], strict=True):
-        diffuse = f"{100 * entry.diffuse:.0f} %" if entry.diffuse else ""
         numbers = f"{entry.psnr:.2f}", f"{entry.loss_db:.3f}", f"{entry.bytes / 1e6:.2f}"
         last = following is not None and following.group != entry.group
-        printed.add_row(entry.part, *numbers, f"{1e3 * entry.head_seconds:.1f}", diffuse, end_section=last)
+        printed.add_row(entry.part, *numbers, f"{1e3 * entry.head_seconds:.1f}", end_section=last)
     return printed
 
 

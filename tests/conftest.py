@@ -55,7 +55,7 @@ def pytest_unconfigure():
 @pytest.fixture(scope="module")
 def browser():
     """A headless Chromium; skips where there is none."""
-    from nrfgs_lab.pages.browser import CHROMIUM, chromium
+    from nrfgs_lab.pages.pictures import CHROMIUM, chromium
 
     if CHROMIUM is None:
         pytest.skip("no Chromium on the path: apt-get install chromium")

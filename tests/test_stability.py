@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from moved_scenes import rescale
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from short_trainings import command_line, trained
+from small_capture import rescale
 from stability_catalogue import CATALOGUE
 
 from nrfgs_lab.scenes import SceneConfig, write_scene

@@ -1,20 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the docs; they need a Chromium and `pip install -e '.[browser]'`.
+"""Pictures of the docs, and browsers for them and for tests of pages.
+
+pip install -e '.[browser]'; apt-get install chromium; for Firefox: apt-get install firefox-esr xvfb
 
 python -m nrfgs_lab.pages.pictures demo/outputs/*/nrfgs/*/config.yml    # docs/viewer.md: the viewer, and its modes
 python -m nrfgs_lab.pages.pictures PAGE.html OUT    # a page of `nrfgs export web`, on a desktop and on a phone
 """
 
+import contextlib
+import os
 import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from PIL import Image, ImageDraw
 
 from nrfgs_lab.bench.crops import GAP, TITLE
-from nrfgs_lab.pages.browser import chromium
 
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FIREFOX = shutil.which("firefox") or shutil.which("firefox-esr")
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 PATIENCE, REST = 300_000, 60_000
 """Milliseconds to wait for anything on a slow, busy machine, and until the viewer's picture is whole."""
@@ -27,6 +34,51 @@ SHOWN = {"page": None, "view": "View", "share": "Share"}
 """Pictures of each window: the part of the panel that is open."""
 HEIGHT, BETWEEN = 600, 16
 """Pixels of the picture of a page, and of the gap between its two halves."""
+
+
+@contextlib.contextmanager
+def chromium() -> Iterator:
+    """A headless browser, without a GPU; FileNotFoundError if there is no Chromium on the path."""
+    from playwright.sync_api import sync_playwright
+
+    if CHROMIUM is None:
+        raise FileNotFoundError("no Chromium on the path: apt-get install chromium")
+    # Without a GPU WebGL needs Chromium's software renderer.
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+        yield browser
+        browser.close()
+
+
+@contextlib.contextmanager
+def firefox() -> Iterator:
+    """A Firefox of the system's on a screen of its own, because a headless one has no WebGL without a GPU;
+    FileNotFoundError if Firefox or Xvfb is not on the path."""
+    from playwright.sync_api import sync_playwright
+
+    if FIREFOX is None or shutil.which("Xvfb") is None:
+        raise FileNotFoundError("no Firefox and Xvfb on the path: apt-get install firefox-esr xvfb")
+    ours, theirs = os.pipe()
+    command = ["Xvfb", "-displayfd", str(theirs), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"]
+    screen = subprocess.Popen(command, pass_fds=[theirs], stderr=subprocess.DEVNULL)
+    os.close(theirs)
+    try:
+        with os.fdopen(ours) as told, sync_playwright() as playwright:
+            display = f":{int(told.readline())}"
+            browser = playwright.firefox.launch(
+                channel="moz-firefox",
+                executable_path=FIREFOX,
+                headless=False,
+                # The panel of downloads would take the focus from the page.
+                firefox_user_prefs={"webgl.force-enabled": True, "browser.download.alwaysOpenPanel": False},
+                env={**os.environ, "DISPLAY": display},
+            )
+            yield browser
+            browser.close()
+    finally:
+        screen.terminate()
+        screen.wait()
 
 
 def sheet(config: Path, view: int = 1) -> None:

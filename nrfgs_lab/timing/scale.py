@@ -43,7 +43,7 @@ from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.method_config import nrfgs_sh
-from nrfgs_ns.model.pinhole import Pinhole, Pinholes
+from nrfgs_ns.model.renderer import Pinhole, Pinholes
 from nrfgs_ns.trained.loading import load_training
 from nrfgs_ns.training.guard import TrainingStopped
 

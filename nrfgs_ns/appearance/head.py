@@ -84,8 +84,6 @@ class AppearanceHead(nn.Module, ABC):
     """Degree of the spherical harmonics among the splats' parameters; 0 if there are none."""
     scene_unit: float = 1.0
     """World units in a scene unit. A head works in scene units, so that the world's unit does not matter."""
-    residual_params: tuple[str, ...] = ()
-    """`splat_params` that only the residual reads: a diffuse splat need not store them."""
     is_harmonics: bool = False
     """Whether colours are exactly the harmonics in `features_dc` and `features_rest`, and opacities the base's."""
     at_pixel: bool = False

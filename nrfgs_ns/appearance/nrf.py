@@ -31,7 +31,6 @@ import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.encoding import BAND_DIM, NEAREST, fourier_bands, view_geometry
-from nrfgs_ns.appearance.field import DIFFUSE, view_dependent
 from nrfgs_ns.appearance.fused import FusedField
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, Component, SplatAppearance, base_colors
 
@@ -120,7 +119,6 @@ class NeuralResidualField(AppearanceHead):
     """The field, as in the module's docstring."""
 
     name = "nrf"
-    residual_params = ("latents",)
 
     def __init__(self, config: NrfConfig):
         super().__init__()
@@ -153,10 +151,6 @@ class NeuralResidualField(AppearanceHead):
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         if self.fused.takes(splats):
             return SplatAppearance(*self.fused(splats, visible, camera_centers, self.scene_unit))
-        if DIFFUSE in splats:
-            indices, others = view_dependent(splats, visible, camera_centers)
-            pairs = zip(self.base_appearance(splats, visible), self.forward(*others), strict=True)
-            return SplatAppearance(*(base.index_copy(0, indices, full.to(base.dtype)) for base, full in pairs))
         out = self._branches(splats, visible, camera_centers)
         opacities = self._opacity(out).squeeze(-1)
         return SplatAppearance((out.color + self._color_residual(out)).clamp_min(0.0), opacities)
@@ -166,12 +160,6 @@ class NeuralResidualField(AppearanceHead):
 
         "low branch" is the residual with a shut gate, s_c tanh(dc_low), and "high branch" the rest of "residual".
         """
-        if DIFFUSE in splats:
-            indices, others = view_dependent(splats, visible, camera_centers)
-            return {
-                name: Component(values.new_zeros(len(visible), values.shape[1]).index_copy(0, indices, values), kind)
-                for name, (values, kind) in self.components(*others).items()
-            }
         out = self._branches(splats, visible, camera_centers)
         residual = self._color_residual(out)
         shown = {"residual": Component(residual, "color")}

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 
 
@@ -37,11 +37,9 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     r components predict W z with the least squared error, weighted, for each r.
 
     Args:
-        weight: of each splat, >= 0; equal if their sum is 0. Diffuse splats do not count. [N]
+        weight: of each splat, >= 0; equal if their sum is 0. [N]
     """
     latents = field.splats["latents"].detach().double()
-    if DIFFUSE in field.splats:
-        weight = weight * ~field.splats[DIFFUSE]
     if not float(weight.sum()) > 0:
         weight = torch.ones_like(weight)
     weight = (weight / weight.sum()).double()[:, None]

@@ -8,18 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import build
-from nrfgs_ns.compact.encode import FORMAT, GROUPS
-from nrfgs_ns.compact.format import BROKEN, LARGEST_RATIO, SMALL, check_keys, read_header, read_streams
+from nrfgs_ns.compact.encode import FORMAT
+from nrfgs_ns.compact.format import BROKEN, check_keys, read_header, read_streams
 from nrfgs_ns.compact.tables import COLUMNS, Grid, from_morton, splats_of
 from nrfgs_ns.errors import InputError
 
 MOST_BANDS = 16
 """Most bands of a head: the sixteenth repeats every ten microradians."""
-NUMBERS = 14
-"""Numbers of a splat, except its latents."""
 LONGEST_REASON = 200
 """Characters of a message that may quote the file."""
 WIDTHS = dict(zip(COLUMNS, (1, 3, 3, 3), strict=True))
@@ -49,7 +46,7 @@ class Decoded(NamedTuple):
     weights: dict[str, Tensor]
     """the head's, float32, by their names in its `state_dict`"""
     splats: dict[str, Tensor]
-    """the table, float32, and "diffuse", bool [N]; latents of diffuse splats are 0"""
+    """the table, float32"""
     render: Render
     header: dict[str, Any]
 
@@ -62,7 +59,6 @@ def decode(path: Path) -> Decoded:
         header, first = read_header(data := path.read_bytes())
         check_keys(header, HEADER, "the header")
         check_keys(header["head"], ("name", "config", "scene_unit"), "the head")
-        check_keys(header["splats"], GROUPS, "splats")
         if header["format"] != FORMAT or header["head"]["name"] != "nrf":
             raise ValueError(f"it holds {header['format']!r} with a head named {header['head']['name']!r}")
         config, render = _config(header["head"]), _render(header["render"])
@@ -74,7 +70,6 @@ def decode(path: Path) -> Decoded:
         build(config, weights, header["head"]["scene_unit"])  # RuntimeError for weights of other names and shapes
         if not all(weight.isfinite().all() for weight in weights.values()):
             raise ValueError("the head's weights are not finite")
-        _check_size(header["splats"], config.latent_dim, sum(stream.nbytes for stream in streams.values()))
         return Decoded(config, weights, _splats(header["splats"], grids, streams), render, header)
     except BROKEN as error:
         reason = " ".join(str(error).split())[:LONGEST_REASON]
@@ -141,37 +136,24 @@ def _grids(grids: dict[str, Any], latent_dim: int) -> dict[str, Grid]:
     return read
 
 
-def _check_size(splats: dict[str, int], latent_dim: int, unpacked: int) -> None:
-    """Raise ValueError for impossible counts, and for tables much larger than the unpacked file: diffuse splats need
-    latents in memory, and have none in the file."""
-    counts = [splats[group] for group in GROUPS]
-    if not all(type(count) is int and count >= 0 for count in counts) or not any(counts):
-        raise ValueError(f"{ascii(counts)} splats")
-    if 4 * sum(counts) * (latent_dim + NUMBERS) > max(LARGEST_RATIO * unpacked, SMALL):
-        raise ValueError(f"{sum(counts)} splats with latents of {latent_dim}, unpacked from {unpacked} bytes")
-
-
-def _splats(counts: dict[str, int], grids: dict[str, Grid], streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
-    count, of_view, rank = sum(counts[group] for group in GROUPS), counts["view"], len(grids["latents"].step)
-    shapes = {"means": (2, count), "splats": (1 + sum(WIDTHS.values()), count), "latents": (rank, of_view)}
-    for name, shape in shapes.items():
-        if streams[name].shape != shape:
-            raise ValueError(f"{name} of shape {list(streams[name].shape)} instead of {list(shape)}")
+def _splats(count: Any, grids: dict[str, Grid], streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
+    if type(count) is not int or count < 1:
+        raise ValueError(f"{ascii(count)} splats")
+    rank = len(grids["latents"].step)
+    for name, columns in {"means": 2, "splats": sum(WIDTHS.values()), "latents": rank}.items():
+        if streams[name].shape != (columns, count):
+            raise ValueError(f"{name} of shape {list(streams[name].shape)} instead of {[columns, count]}")
     upper, lower = streams["means"].astype(np.uint64)
     if upper.max(initial=0) >= 2**31:
         raise ValueError("means beyond 63 bits")
     places = np.cumsum((upper << np.uint64(32)) | lower, dtype=np.uint64)
-    diffuse = streams["splats"][0] != 0
-    if int((~diffuse).sum()) != of_view:
-        raise ValueError(f"{int((~diffuse).sum())} view-dependent splats instead of {of_view}")
     codes = {"means": from_morton(places), "latents": streams["latents"].T}
     ends = np.cumsum(list(WIDTHS.values()))
-    codes |= zip(WIDTHS, np.split(streams["splats"][1:].T, ends[:-1], axis=1), strict=True)
+    codes |= zip(WIDTHS, np.split(streams["splats"].T, ends[:-1], axis=1), strict=True)
     with np.errstate(over="ignore"):  # what overflows is refused below
         values = {name: torch.from_numpy(grids[name].values(table.astype(np.float64))) for name, table in codes.items()}
     values["latents"] = values["latents"].float()  # the largest table by far, and no rotations to work out
-    splats = splats_of(values, torch.from_numpy(diffuse))
-    splats = {name: value if name == DIFFUSE else value.float() for name, value in splats.items()}
+    splats = {name: value.float() for name, value in splats_of(values).items()}
     for name, value in splats.items():
         if not torch.isfinite(value).all():
             raise ValueError(f"{name} beyond float32")
@@ -180,16 +162,14 @@ def _splats(counts: dict[str, int], grids: dict[str, Grid], streams: dict[str, n
 
 def model_state(model, decoded: Decoded) -> dict[str, Any]:
     """State dictionary of a model with a file's head and splats; its other parts do not show in an image, and stay."""
-    splats = dict(decoded.splats)
-    diffuse = splats.pop(DIFFUSE)
     return {
         **{n: v for n, v in model.state_dict().items() if not n.startswith(("gauss_params.", "head."))},
-        **{f"gauss_params.{name}": value for name, value in splats.items()},
+        **{f"gauss_params.{name}": value for name, value in decoded.splats.items()},
         **{f"head.{name}": value for name, value in decoded.weights.items()},
         "_extra_state": {
             "head": decoded.header["head"]["name"],
             "densification": model.densification.name,
-            "strategy": {DIFFUSE: diffuse} if diffuse.any() else {},
+            "strategy": {},
             "near": decoded.render.near,
         },
     }

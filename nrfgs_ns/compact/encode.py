@@ -4,7 +4,7 @@
 Keys of the header, beside "streams":
 
     format   "nrfgs-compact"
-    splats   {"view": V, "diffuse": W}: how many of each kind; N = V + W
+    splats   their number N
     head     "name" ("nrf"), "config" (the field's options, "latent_dim" the rank R), "scene_unit"
     render   "rasterize_mode", "background" (RGB), "near_plane" in world units
     grids    for "means", "turns", "scales", "opacities", "colors", "latents": "low" and "step", [columns]
@@ -14,13 +14,12 @@ An integer k in a column of a table stands for low + step k; low is 0 except in 
     means        rans   [2, N]    upper and lower 32 bits of the differences of successive Morton numbers, the first
                                   counted from 0; not signed. Bit 3 k + a of a Morton number is bit k of the code of
                                   axis a, 21 bits each
-    splats       rans   [11, N]   1 column: 0 if the splat is view-dependent, else it is diffuse; then opacities (1),
-                                  scales (3), colors (3), turns (3), as in `tables.py`
-    latents      rans   [R, V]    of the view-dependent splats, in the order of the others
+    splats       rans   [10, N]   opacities (1), scales (3), colors (3), turns (3), as in `tables.py`
+    latents      rans   [R, N]
     head.<name>  xz               the network's weights, float16; float32 where they are too large for it
 
 head.low.0.weight [H, I], head.low.0.bias, head.low.2.weight, head.low.2.bias and the same of high are the layers of
-`appearance/nrf.py`. A diffuse splat has its base colour, at least 0, and its base opacity from everywhere.
+`appearance/nrf.py`.
 
 Splats are in Morton order of their rounded means, so that a number's neighbours in its table are neighbours in space.
 A grid's step is a choice of precision, not of bits: an outlier costs a few long codes, and no other splat's precision.
@@ -34,7 +33,7 @@ import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.compact.format import Table
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, steps_of, tables_of
 from nrfgs_ns.errors import InputError
@@ -45,7 +44,6 @@ LARGEST_LOGIT = 10.0
 LARGEST_HALF = 6e4
 """Largest weight that is stored as float16."""
 LARGEST_CODE = 2**30
-GROUPS = ("view", DIFFUSE)
 
 
 def encode(
@@ -58,14 +56,13 @@ def encode(
         steps: of a fine-tuned field's tables; None: `steps_of`.
         coarser: factor of all steps.
     """
-    finite = torch.cat([value.detach().flatten(1) for value in field.splats.values() if value.dim() > 1], dim=1)
+    finite = torch.cat([value.detach().flatten(1) for value in field.splats.values()], dim=1)
     finite = finite.isfinite().all(dim=1)
     finite &= field.splats["quats"].detach().abs().amax(dim=1) > 0
     if not finite.any():
         raise InputError(f"None of the {len(finite)} splats is finite: there is nothing to write.")
-    tables, diffuse = tables_of({name: value[finite] for name, value in field.splats.items()})
+    tables = tables_of({name: value[finite] for name, value in field.splats.items()})
     tables["opacities"] = tables["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
-    tables["colors"][diffuse] = tables["colors"][diffuse].clamp_min(0.0)  # as it is drawn
     steps = {name: coarser * step for name, step in (steps_of(tables) if steps is None else steps).items()}
     needed = np.ptp(tables["means"].cpu().numpy(), axis=0) / (2**MOST_BITS - 1)
     if (needed > steps["means"]).any():
@@ -82,17 +79,14 @@ def encode(
         grids[name] = Grid(low, steps[name])
         codes[name] = grids[name].codes(values).clip(-LARGEST_CODE, LARGEST_CODE)
 
-    diffuse = diffuse.cpu().numpy()
     places = morton(codes["means"])
     order = np.argsort(places, kind="stable")
     differences = np.diff(places[order], prepend=np.uint64(0))
-    of_view = order[~diffuse[order]]
-    splats = np.concatenate([diffuse[:, None], *(codes[name] for name in COLUMNS)], axis=1)
-    latents = codes["latents"][np.cumsum(~diffuse)[of_view] - 1]
+    splats = np.concatenate([codes[name] for name in COLUMNS], axis=1)
     streams: dict[str, np.ndarray | Table] = {
         "means": Table(np.stack([differences >> np.uint64(32), differences & np.uint64(0xFFFFFFFF)]), signed=False),
         "splats": Table(splats[order].T),
-        "latents": Table(latents.T),
+        "latents": Table(codes["latents"][order].T),
     }
     for name, weight in field.head.state_dict().items():
         values = weight.detach().cpu().double().numpy()
@@ -103,7 +97,7 @@ def encode(
     config.pop("_target")
     header = {
         "format": FORMAT,
-        "splats": {"view": len(of_view), DIFFUSE: len(order) - len(of_view)},
+        "splats": len(order),
         "head": {"name": field.head.name, "config": config, "scene_unit": field.head.scene_unit},
         "render": render,
         "grids": {name: {"low": grid.low.tolist(), "step": grid.step.tolist()} for name, grid in grids.items()},

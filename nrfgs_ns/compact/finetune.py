@@ -3,8 +3,8 @@
 
 The loss is the training's, of images rendered from tables as the file would give them back, plus `rate` for each byte
 that a splat is estimated to cost on average (`rate.py`). For a given size the rate is adapted while it trains: it grows
-where the tables are estimated too large, and falls where there is room. Diffuse splats stay diffuse. A few times,
-splats are removed whose bytes cost more than images lose without them (`growth_without`).
+where the tables are estimated too large, and falls where there is room. A few times, splats are removed whose bytes
+cost more than images lose without them (`growth_without`).
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -54,15 +54,12 @@ class CodedSplats(nn.Module):
 
     def __init__(self, splats: Mapping[str, Tensor]):
         super().__init__()
-        values, diffuse = tables_of(splats)
+        values = tables_of(splats)
         steps = steps_of(values)
         grid = Grid(values["means"].amin(dim=0).cpu().numpy(), steps["means"])
         codes = grid.codes(values["means"].cpu().numpy()).clip(max=2**MOST_BITS - 1)
-        order = torch.from_numpy(np.argsort(morton(codes), kind="stable")).to(diffuse.device)
-        values["latents"] = values["latents"][(~diffuse).cumsum(0)[order[~diffuse[order]]] - 1]
-        values |= {name: values[name][order] for name in ("means", *COLUMNS)}
-        self.diffuse = diffuse[order]
-        values = {name: table.float() for name, table in values.items()}
+        order = torch.from_numpy(np.argsort(morton(codes), kind="stable")).to(values["means"].device)
+        values = {name: table[order].float() for name, table in values.items()}
         self.tables = nn.ModuleDict(
             {name: Rounded(table, torch.from_numpy(steps[name]).to(table)) for name, table in values.items()}
         )
@@ -72,26 +69,21 @@ class CodedSplats(nn.Module):
     def forward(self, rounded: bool) -> dict[str, Tensor]:
         return {name: table(rounded) for name, table in self.tables.items()}
 
-    def splats(self, tables: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return splats_of(tables, self.diffuse)
-
     def bits(self, tables: Mapping[str, Tensor]) -> Tensor:
         """Bits of each splat, [N], in tables that `forward` returned."""
         steps = {name: table.steps for name, table in self.tables.items()}
         bits = bits_of_places(tables["means"], steps["means"]) + self.density.bits(self._row(tables), self._row(steps))
-        latents = self.density_of_latents.bits(tables["latents"], steps["latents"])
-        return bits.index_add(0, (~self.diffuse).nonzero()[:, 0], latents)
+        return bits + self.density_of_latents.bits(tables["latents"], steps["latents"])
 
     @torch.no_grad()
     def keep(self, kept: Tensor, optimizer: torch.optim.Optimizer) -> None:
         """Remove the splats that are not `kept`, bool [N], and their optimizer state."""
-        of_latents, self.diffuse = kept[~self.diffuse], self.diffuse[kept]
-        for group, (name, table) in zip(optimizer.param_groups, self.tables.items(), strict=False):
-            rows, old = of_latents if name == "latents" else kept, table.values
-            table.values = nn.Parameter(old[rows])
+        for group, table in zip(optimizer.param_groups, self.tables.values(), strict=False):
+            old = table.values
+            table.values = nn.Parameter(old[kept])
             group["params"] = [table.values]
             optimizer.state[table.values] = {
-                key: value[rows] if value.shape == old.shape else value
+                key: value[kept] if value.shape == old.shape else value
                 for key, value in optimizer.state.pop(old, {}).items()
             }
 
@@ -179,7 +171,7 @@ def fine_tune(
     field = with_rank(field, basis, field.head.config.latent_dim)
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
     coded, count = CodedSplats(field.splats), len(field.splats["means"])
-    of_bits = torch.tensor(rate / (8 * count), device=coded.diffuse.device)  # loss of a bit
+    of_bits = torch.tensor(rate / (8 * count), device=model.device)  # loss of a bit
     smallest, largest = (limit / (8 * count) for limit in RATES_FOR_SIZE)
     haste = min(HASTE * EVERY / steps, HASTIEST)
     rates = RATES | {"means": RATES["means"] * model.scene_unit}
@@ -197,7 +189,7 @@ def fine_tune(
         optimizer, lambda step: LAST + (1 - LAST) * 0.5 * (1 + np.cos(np.pi * min(step / steps, 1.0)))
     )
     prunings = [round(share * steps) for share in PRUNINGS]
-    turns = torch.arange(count, device=coded.diffuse.device) % len(prunings)
+    turns = torch.arange(count, device=model.device) % len(prunings)
     model.train()
     for step in range(steps):
         if step in prunings:
@@ -205,14 +197,14 @@ def fine_tune(
                 tables = coded(rounded=True)
                 cost = coded.bits(tables) * (WORTH * of_bits)
             views = map(data.next_train, range(view_count))
-            growth, loss = growth_without(model, Field(head, coded.splats(tables)), views)
+            growth, loss = growth_without(model, Field(head, splats_of(tables)), views)
             # The training's loss is about the root of the squared error.
             kept = (turns != prunings.index(step)) | (0.5 * loss * growth > cost)
             coded.keep(kept, optimizer)
             turns = turns[kept]
         camera, batch = data.next_train(step)
         tables = coded(rounded=step >= NOISY * steps)
-        splats = coded.splats(tables)
+        splats = splats_of(tables)
         seen = noise.moved(splats, noise.generator(model.device, step))
         outputs = model.render(Field(head, splats), camera, Field(head, seen))
         loss = photometric(model, outputs, batch)
@@ -229,7 +221,7 @@ def fine_tune(
             on_report(float(bits.detach()))
     model.eval()
     with torch.no_grad():
-        splats = coded.splats(coded(rounded=True))
+        splats = splats_of(coded(rounded=True))
     grids = {name: table.steps.detach().cpu().double().numpy() for name, table in coded.tables.items()}
     field = Field(head.requires_grad_(False).eval(), splats)
     used = (splats["latents"] != 0).any(dim=0).nonzero()[:, 0]

@@ -24,7 +24,7 @@ uint32, uint64, float16 or float32) in row-major order.
            the model, int32 numbers, packed as in "xz"
            the coder's output (`entropy.py`)
 
-`encode.py` lists the streams. The version is 2.
+`encode.py` lists the streams. The version is 3.
 
 Nothing in a file is ever run. docs/compact-format.md lists what every reader refuses.
 """
@@ -42,7 +42,7 @@ import numpy as np
 from nrfgs_ns.compact.entropy import MOST_MODEL, decode_table, encode_table
 
 MAGIC = b"\x89NRF\r\n\x1a\n"
-VERSION = 2
+VERSION = 3
 PREAMBLE = struct.Struct("<8sIIQ")
 CHECKSUM = struct.Struct("<I")
 MODEL = struct.Struct("<II")

@@ -7,7 +7,7 @@ turns      [N, 3]   x, y, z of a rotation with w > 0: of the 24 that draw the sa
 scales     [N, 3]   natural logarithms of the standard deviations, along the axes that the rotation names
 opacities  [N, 1]   logits, cut off at +-10
 colors     [N, 3]   base colours, 1 is white
-latents    [V, R]   of the V splats that are not diffuse
+latents    [N, R]
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.head import SH_C0, base_colors
 
 Array = np.ndarray
@@ -97,11 +96,10 @@ def nearest_turn(quats: Array, scales: Array) -> tuple[Array, Array]:
     return turned, np.take_along_axis(scales, axes[best], axis=1)
 
 
-def tables_of(splats: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
-    """A file's tables of a field's splats, float64 without gradients, and the mask of diffuse splats, bool [N]."""
-    double = {name: value.detach().double() for name, value in splats.items() if name != DIFFUSE}
+def tables_of(splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """A file's tables of a field's splats, float64 without gradients."""
+    double = {name: value.detach().double() for name, value in splats.items()}
     like = double["means"]
-    diffuse = splats.get(DIFFUSE, torch.zeros(len(like), dtype=torch.bool, device=like.device))
     quats, scales = nearest_turn(double["quats"].cpu().numpy(), double["scales"].cpu().numpy())
     return {
         "means": like,
@@ -109,23 +107,21 @@ def tables_of(splats: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
         "scales": torch.from_numpy(scales).to(like),
         "opacities": double["opacities"],
         "colors": base_colors(double["features_dc"]),
-        "latents": double["latents"][~diffuse],
-    }, diffuse
+        "latents": double["latents"],
+    }
 
 
-def splats_of(tables: Mapping[str, Tensor], diffuse: Tensor) -> dict[str, Tensor]:
+def splats_of(tables: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """A field's splats of a file's tables, with gradients."""
-    turns, latents = tables["turns"], tables["latents"]
+    turns = tables["turns"]
     w = (1.0 - turns.square().sum(dim=1, keepdim=True)).clamp_min(SMALLEST_W2).sqrt()
-    rows = (~diffuse).nonzero()[:, 0]
     return {
         "means": tables["means"],
         "quats": torch.nn.functional.normalize(torch.cat([w, turns], dim=1), dim=1),
         "scales": tables["scales"],
         "opacities": tables["opacities"],
         "features_dc": (tables["colors"] - 0.5) / SH_C0,
-        "latents": latents.new_zeros(len(turns), latents.shape[1]).index_copy(0, rows, latents),
-        DIFFUSE: diffuse,
+        "latents": tables["latents"],
     }
 
 

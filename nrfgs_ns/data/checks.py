@@ -18,13 +18,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.errors import InputError
 
-ROTATION_TOLERANCE = 1e-2
-"""Largest entry of |R^T R - 1| of a rotation: rounding to three decimals leaves 3e-3, a scale of 1 % gives 2e-2."""
-LAST_ROW_TOLERANCE = 1e-6
-POSITION_TOLERANCE = 1e-8
-"""Relative difference of camera positions that count as one place; in UTM coordinates it is 5 cm."""
-FAR_OUTSIDE = 100.0
-"""A camera this many times as far from the middle as three in four has a wrong pose: the farthest scales the scene."""
 LONGEST_JSON = 2**26
 """Largest transforms.json, bytes: a hundred thousand frames."""
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".dng")
@@ -127,61 +120,6 @@ def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
             f"{source}: mask_path is given for some frames but not for {some(unmasked)}. Give one for every frame (an "
             "all-white mask keeps the whole image), or for none."
         )
-
-
-def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
-    """Rigid camera-to-world matrices, float64 [V, 4, 4]; with `need_spread`, not all at one place."""
-    names = np.array([frame["file_path"] for frame in frames])
-    matrices = [matrix(frame.get("transform_matrix")) for frame in frames]
-
-    def reject(bad: Any, finding: str) -> None:
-        if np.any(bad):
-            where = some(names[np.flatnonzero(bad)])
-            raise InputError(f"{source}: transform_matrix of {where} {finding}, or remove the frame.")
-
-    last_row = (0, 0, 0, 1)
-    reject(
-        [
-            pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(pose[3] - last_row).max() > LAST_ROW_TOLERANCE
-            for pose in matrices
-        ],
-        "is not a 4 x 4 matrix of finite numbers with the last row 0 0 0 1. Give the camera-to-world matrix",
-    )
-    poses = np.stack(matrices)
-    rotation = poses[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        skew = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max((1, 2))
-    reject(
-        ~(skew <= ROTATION_TOLERANCE),
-        f"is not rigid (R^T R differs from 1 by {skew.max():.2g}). Take scale and shear out of the rotation",
-    )
-    reject(np.linalg.det(rotation) < 0, "mirrors (its rotation has determinant -1). Flip one camera axis")
-
-    position = poses[:, :3, 3]
-    if need_spread and np.ptp(position, axis=0).max() <= POSITION_TOLERANCE * np.abs(position).max():
-        raise InputError(
-            f"{source}: all {len(frames)} cameras stand at the same place, so the scene has no scale and no depth. "
-            "Recompute the poses from images with parallax, or set --auto-scale-poses False."
-        )
-    distance = np.linalg.norm(position - np.median(position, axis=0), axis=1)
-    usual = np.quantile(distance, 0.75)
-    reject(
-        (distance > FAR_OUTSIDE * usual) & (usual > 0),
-        f"is more than {FAR_OUTSIDE:g} times as far from the middle of the cameras as three quarters of them, so the "
-        "scene would shrink to a speck. Correct the pose",
-    )
-    return poses
-
-
-def check_applied(meta: dict[str, Any], source: Path) -> None:
-    """If present, applied_transform is a 3 x 4 matrix and applied_scale a positive number."""
-    if "applied_transform" in meta:
-        applied = matrix(meta["applied_transform"])
-        if applied.shape != (3, 4) or not np.isfinite(applied).all():
-            raise InputError(f"{source}: applied_transform is not a 3 x 4 matrix of numbers. Correct or remove it.")
-    scale = meta.get("applied_scale", 1.0)
-    if not 0 < number(scale) < np.inf:
-        raise InputError(f"{source}: applied_scale is {shown(repr(scale))}. Give a positive number or remove it.")
 
 
 def check_unique(names: Iterable[Any], where: str) -> None:

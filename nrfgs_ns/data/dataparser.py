@@ -17,25 +17,31 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTIO
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from nrfgs_ns.data.checks import (
+from nrfgs_ns.data.cameras import (
+    SMALLEST,
+    PlacedOutputs,
+    after,
+    cameras_of,
     check_applied,
+    check_poses,
+    place,
+    read_lenses,
+)
+from nrfgs_ns.data.checks import (
     check_exist,
     check_frames,
     check_headers,
     check_options,
-    check_poses,
     check_unique,
     number,
     read_transforms,
     shown,
     warn,
 )
-from nrfgs_ns.data.lenses import SMALLEST, cameras_of, read_lenses
 from nrfgs_ns.data.pictures import read_size, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
-from nrfgs_ns.data.world import PlacedOutputs, after, place
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.start import with_data_parsers
 
@@ -75,7 +81,7 @@ class Scene(NamedTuple):
     factor: int
     """size by the intrinsics / size of the images"""
     lenses: np.ndarray
-    """`lenses.read_lenses`, float64 [V, 12]"""
+    """`cameras.read_lenses`, float64 [V, 12]"""
     cameras: Cameras
     """placed, of the size of the images"""
     transform: torch.Tensor

@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import InputError
 
@@ -150,11 +149,6 @@ class Densification(ABC):
         self.state = {CHANGE: None} if opacity_seen == "peak" else {}
         self.shown: Shown | None = None
 
-    @property
-    def diffuse(self) -> Tensor | None:
-        """Which splats have no residual, bool [N]: those of loaded compact files, which are not trained."""
-        return self.state.get(DIFFUSE)
-
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
         return False
@@ -234,9 +228,6 @@ class Densification(ABC):
         for name in self.state:
             value = state.get(name, self.state[name])
             self.state[name] = value.to(device) if isinstance(value, Tensor) else value
-        self.state.pop(DIFFUSE, None)
-        if state.get(DIFFUSE) is not None:  # of whichever strategy
-            self.state[DIFFUSE] = state[DIFFUSE].to(device)
 
     def seen_opacity(self, opacities: Tensor, before: bool = True) -> Tensor:
         """The opacities [N] that decide whether a splat is dead.

@@ -18,8 +18,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.pinhole import Pinhole
-from nrfgs_ns.model.renderer import View, project_splats, project_view, render_view
+from nrfgs_ns.model.renderer import Pinhole, View, project_splats, project_view, render_view
 from nrfgs_ns.model.view_noise import ViewNoise
 from nrfgs_ns.rasterizer import Projection
 from nrfgs_ns.training.pipeline import ShardingConfig

@@ -22,7 +22,7 @@ from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.model import ShardedModel
 from nrfgs_ns.distributed.shards import map_model_rows, map_moments
 from nrfgs_ns.training.averaging import ParameterMean
-from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched, WatchedOptimizers
+from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 from nrfgs_ns.training.pipeline import NrfgsPipeline, NrfgsPipelineConfig
 from nrfgs_ns.training.stopping import StopRequest
@@ -166,19 +166,22 @@ class ShardedGuard(Guard):
         return TrainingStopped(f"On device {device} of {comm.world()}: {message}", step, origin, savable)
 
 
-class ShardedOptimizers(WatchedOptimizers):
+class ShardedOptimizers(LeanOptimizers):
     """The optimisers of one device: gradients of what all devices have are summed before the step."""
 
+    def __init__(self, model, *args: Any):
+        super().__init__(*args)
+        self.model = model
+
     def step(self) -> None:
-        self.guard.before_optimizers(self)
-        shared = [name for name in self.optimizers if name not in self.guard.model.gauss_params]
+        shared = [name for name in self.optimizers if name not in self.model.gauss_params]
         gradients = [parameter.grad for name in shared for parameter in parameters_of(self.optimizers[name])]
         comm.sum_over_devices([gradient for gradient in gradients if gradient is not None])
-        LeanOptimizers.step(self)
+        super().step()
 
     def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
         """Load this device's rows of a whole checkpoint; the model has been loaded."""
-        model = self.guard.model
+        model = self.model
         super().load_optimizers(
             {
                 name: map_moments(state, lambda table: table[model.loaded]) if name in model.gauss_params else state
@@ -219,7 +222,7 @@ class ShardedTrainer(NrfgsTrainer):
         self.guard = ShardedGuard(self.pipeline, self.request)
         self.mean = ShardedMean() if self.config.average_steps > 0 else None
         groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
-        return ShardedOptimizers(self.guard, self.optimizer_configs(), groups, every)
+        return ShardedOptimizers(self.pipeline.model, self.optimizer_configs(), groups, every)
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
         """The whole, on the main device: what one device would write, and every device's generators and shard."""

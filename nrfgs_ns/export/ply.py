@@ -25,8 +25,7 @@ from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
-from nrfgs_ns.model.pinhole import Pinhole, pinhole
-from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
+from nrfgs_ns.model.renderer import Pinhole, composite_view, pinhole, project_view, projection_options
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import finish, load_model, lost, measure_loss
 

@@ -20,7 +20,7 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.errors import InputError
@@ -31,10 +31,17 @@ from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
 from nrfgs_ns.model.harmonics_tune import fine_tune
 from nrfgs_ns.model.initial_splats import initial_splats
-from nrfgs_ns.model.look import look_asked_for
 from nrfgs_ns.model.loss import loss_of
-from nrfgs_ns.model.pinhole import Pinhole, Pinholes
-from nrfgs_ns.model.renderer import View, composite_view, project_view, projection_options, render_view
+from nrfgs_ns.model.renderer import (
+    Pinhole,
+    Pinholes,
+    View,
+    composite_view,
+    look_asked_for,
+    project_view,
+    projection_options,
+    render_view,
+)
 from nrfgs_ns.model.saved_state import check_compatible, differences, photographs_of, reduced_config
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
@@ -144,8 +151,6 @@ class NrfgsModel(SplatfactoModel):
     def field(self) -> Field:
         """The head with all splats, or, in evaluation, those in the crop box."""
         splats: dict[str, Tensor] = dict(self.gauss_params.items())
-        if (diffuse := self.densification.diffuse) is not None:
-            splats[DIFFUSE] = diffuse
         if self.crop_box is not None and not self.training:
             inside = self.crop_box.within(splats["means"]).reshape(-1)
             splats = {name: value[inside] for name, value in splats.items()}

@@ -17,7 +17,7 @@ from torch import Tensor
 from nrfgs_ns.host import GSPLAT, gsplat_version
 from nrfgs_ns.kernels.trial import Gate
 
-from .contract import EPS2D, TILE_SIZE, Projection, ProjectionOptions
+from . import EPS2D, TILE_SIZE, Projection, ProjectionOptions
 
 if TYPE_CHECKING:  # imports Triton
     from .tile_lists import Room

@@ -9,7 +9,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 
 from nrfgs_ns.data.plane_sweep import dense_points, share_kept, small_views
-from nrfgs_ns.model.pinhole import world_to_camera
+from nrfgs_ns.model.renderer import world_to_camera
 
 
 def start_with_dense_points(model: Any, datamanager: Any) -> list[str]:

@@ -18,7 +18,7 @@ rasterizer does not draw them, so no gradient shows them) are removed before the
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -198,24 +198,6 @@ class Guard:
         else:
             message += "\nNothing has been written: the checkpoint before, if there is one, is the last good state."
         raise TrainingStopped(message, self.step, "parameter", savable=only_splats)
-
-
-class WatchedOptimizers(LeanOptimizers):
-    """The optimisers, behind the guard."""
-
-    def __init__(self, guard: Guard, *args: Any):
-        super().__init__(*args)
-        self.guard = guard
-
-    def step(self) -> None:
-        self.guard.before_optimizers(self)
-        super().step()
-
-    def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
-        """Load the moments; the checkpoint may have brought a smaller head than these were built on."""
-        if weights := list(self.guard.model.head.parameters()):
-            self.hold("field", weights)
-        super().load_optimizers(loaded_state)
 
 
 def report(pipeline, step: int, findings: Findings, limit: float) -> str:

@@ -3,10 +3,11 @@
 
 import json
 import random
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 from time import perf_counter
 from typing import Any
 
@@ -15,6 +16,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
+from rich.table import Table
 from torchvision.utils import save_image
 
 from nrfgs_ns.compact.decode import decode, model_state
@@ -22,18 +24,19 @@ from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import ssim
-from nrfgs_ns.image.metrics import METRIC_NAMES
+from nrfgs_ns.image.metrics import METRIC_NAMES, lpips_advice
 from nrfgs_ns.kernels.trial import tried_meanwhile
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.rasterizer import load_kernels
 from nrfgs_ns.training import optimizers
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.training.config_file import check_types
-from nrfgs_ns.training.evaluation import print_evaluation
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.panel import ViewerPanel
 
+SHOWN = ("psnr", "cc_psnr", "ssim", "cc_ssim", "ms_ssim", "lpips", "l1", "seconds_per_image", "splats")
+"""Columns of an evaluation's table."""
 SMALLEST_SIDE = 2
 """Fewest pixels along each side of an image at the lowest resolution: SSIM takes a side of one for none."""
 
@@ -202,3 +205,23 @@ class NrfgsPipeline(VanillaPipeline):
         version, numbers, gauss_next = json.loads(state["python_rng"])
         random.setstate((version, tuple(numbers), gauss_next))
         self.datamanager.load_sampling_state(state["sampling"])
+
+
+def print_evaluation(result: Mapping[str, Any]) -> None:
+    """Print the means over the test views, the worst view, and how to get LPIPS where it is missing."""
+    names = [name for name in SHOWN if result.get(name) is not None]
+    views = result["per_image"]
+    title = "One test view: not a mean, and no measure of the whole"
+    CONSOLE.print(title if len(views) == 1 else f"Means over {len(views)} test views", soft_wrap=True)
+    table = Table()
+    for name in names:
+        table.add_column(name, justify="right")
+    table.add_row(*(f"{result[name]:,}" if name == "splats" else f"{result[name]:.4g}" for name in names))
+    CONSOLE.print(table)
+    known = sorted((view["psnr"], view["image"]) for view in views if view.get("psnr") is not None)
+    if len(known) > 1:
+        (worst, name), middle = known[0], median(value for value, _ in known)
+        worst = f"Median view {middle:.1f} dB. Worst {worst:.1f} dB: {name}. Pictures: --render-output-path FOLDER"
+        CONSOLE.print(worst, markup=False, soft_wrap=True)
+    if result.get("lpips") is None and (advice := lpips_advice()) is not None:
+        CONSOLE.print(advice, markup=False, soft_wrap=True)

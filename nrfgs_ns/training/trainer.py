@@ -28,8 +28,9 @@ from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, window
 from nrfgs_ns.training.checkpoint_files import DiskFull
 from nrfgs_ns.training.dense_start import start_with_dense_points
-from nrfgs_ns.training.guard import Guard, TrainingStopped, WatchedOptimizers
+from nrfgs_ns.training.guard import Guard, TrainingStopped
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
+from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
 from nrfgs_ns.training.step_graph import StepGraphs
@@ -103,7 +104,7 @@ class NrfgsTrainer(Trainer):
             self.pipeline.notes = [*self.pipeline.notes, *notes]
 
     def setup_optimizers(self) -> Optimizers:
-        """The optimisers, behind a guard."""
+        """The optimisers, once what depends on the views is known: the steps, the points to start from, the pace."""
         self.steps_are_chosen = self.config.max_num_iterations == 0 and self.config.time_budget is None
         self.config = self.config.for_views(self.pipeline.model.num_views)
         self.total_steps = self.config.max_num_iterations
@@ -112,7 +113,7 @@ class NrfgsTrainer(Trainer):
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self.config.pace()
         groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
-        return WatchedOptimizers(self.guard, self.optimizer_configs(), groups, every, self.pace)
+        return LeanOptimizers(self.optimizer_configs(), groups, every, self.pace)
 
     # Resuming.
 
@@ -129,7 +130,9 @@ class NrfgsTrainer(Trainer):
         if "optimizers" not in content:
             raise InputError(f"{path} is of a compact file, which no training goes on from. Use its training's own.")
         if "training" not in content:
-            raise InputError(f"{path} was written by another method, such as splatfacto. Train anew, without --load-dir.")
+            raise InputError(
+                f"{path} was written by another method, such as splatfacto. Train anew, without --load-dir."
+            )
         self._start_step = content["step"] + 1
         training = content["training"]
         check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
@@ -139,6 +142,8 @@ class NrfgsTrainer(Trainer):
             schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
             longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
             raise InputError(f"{path} is the end of a training of {self.total_steps:,} steps: {longer}.")
+        if weights := list(self.pipeline.model.head.parameters()):  # of a smaller head, perhaps, than was built
+            self.optimizers.hold("field", weights)
         self.optimizers.load_optimizers(content["optimizers"])
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
@@ -240,6 +245,7 @@ class NrfgsTrainer(Trainer):
             loss = reduce(torch.add, losses.values())
             if loss.requires_grad:  # a recorded step has made its gradients already
                 loss.backward()
+            self.guard.before_optimizers(optimizers)
             optimizers.step()
             optimizers.scheduler_step_all(step)
         self._made = step

@@ -4,7 +4,6 @@
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.nrf import NrfConfig
 
 ULP = 2.0**-24
@@ -43,22 +42,12 @@ def scene(head, count: int, visible: int, repeated: bool = False, seed: int = 0)
     return {name: value.to(device) for name, value in splats.items()}, rows.to(device), centers.to(device)
 
 
-def some_diffuse(case, share: float, last: bool, seed: int = 5):
-    """The case with a share of its splats diffuse, visible rows in the table's order; if `last`, they come last."""
-    splats, visible, centers = case
-    generator = torch.Generator().manual_seed(seed)
-    diffuse = torch.rand(len(splats["means"]), generator=generator) < share
-    diffuse = diffuse.sort().values if last else diffuse
-    return {**splats, DIFFUSE: diffuse.to(visible.device)}, visible.sort().values, centers
-
-
 def evaluate(head, splats, visible, centers, dtype=torch.float32) -> dict[str, Tensor]:
     """Values, and the gradients of a fixed random sum of them, by name. A gradient that was not given is zero."""
-    leaves = {name: value.detach().to(dtype).requires_grad_() for name, value in splats.items() if name != DIFFUSE}
-    mask = {DIFFUSE: splats[DIFFUSE]} if DIFFUSE in splats else {}
+    leaves = {name: value.detach().to(dtype).requires_grad_() for name, value in splats.items()}
     centers = centers.detach().to(dtype).requires_grad_()
     head.zero_grad(set_to_none=True)
-    colors, opacities = head({**leaves, **mask}, visible, centers)
+    colors, opacities = head(leaves, visible, centers)
     generator = torch.Generator().manual_seed(7)
     d_colors = torch.randn(len(visible), 3, generator=generator).to(colors)
     d_opacities = torch.randn(len(visible), generator=generator).to(opacities)

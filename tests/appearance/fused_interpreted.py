@@ -19,12 +19,10 @@ from fused_cases import (
     relative_errors,
     rounding,
     scene,
-    some_diffuse,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.fused import launch
 from nrfgs_ns.appearance.fused.kernels import _waves
 
@@ -38,10 +36,9 @@ def test_values_and_gradients(opacity_bound, repeated):
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-@pytest.mark.parametrize("diffuse", [0.0, 0.5])
-def test_without_gradients_the_values_are_the_same(diffuse, mode):
+def test_without_gradients_the_values_are_the_same(mode):
     head, _ = heads()
-    case = some_diffuse(scene(head, 75, 70), diffuse, last=True)
+    case = scene(head, 75, 70)
     with mode():
         alone = head(*case)
     assert all(map(torch.equal, alone, head(*case)))
@@ -59,13 +56,11 @@ def test_without_gradients_the_values_are_the_same(diffuse, mode):
     columns=st.sampled_from([8, 16]),
     visible=st.integers(0, 70),
     repeated=st.booleans(),
-    diffuse=st.sampled_from([None, 0.0, 0.5, 1.0]),
 )
-def test_every_switch_and_size(num_bands, columns, visible, repeated, diffuse, **switches):
+def test_every_switch_and_size(num_bands, columns, visible, repeated, **switches):
     """And both ways of giving the output layer to the tensor cores."""
     head, twin = heads(num_bands=num_bands, **switches)
     case = scene(head, 75, visible, repeated)
-    case = case if diffuse is None else some_diffuse(case, diffuse, last=repeated)
     (launches,) = launch.LAUNCHES["fp32"]
     ours = launch.Launches(*(how._replace(columns=columns) for how in launches))
     with pytest.MonkeyPatch.context() as patch:
@@ -96,11 +91,11 @@ def test_the_next_way_is_taken_where_the_first_does_not_run(monkeypatch):
     first, second = launch.LAUNCHES["bf16"]
     probe, tried = launch.probe, []
 
-    def lacking(packing, launches, options, some_diffuse):
+    def lacking(packing, launches, options):
         tried.append(launches)
         if launches == first:
             raise RuntimeError("out of resource: shared memory")
-        probe(packing, launches, options, some_diffuse)
+        probe(packing, launches, options)
 
     monkeypatch.setattr(launch, "probe", lacking)
     head, twin = heads(precision="bf16")
@@ -168,75 +163,6 @@ def test_rounded_products(precision):
     with torch.no_grad():
         colors, opacities = head(*case)  # float16 saturates
     assert torch.isfinite(colors).all() and ((opacities >= 0) & (opacities <= 1)).all()
-
-
-@pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize("last", [False, True])
-@pytest.mark.parametrize("opacity_bound", ["straight-through", "logit"])
-def test_diffuse_splats(opacity_bound, last, repeated, monkeypatch):
-    """Mixed with others in every block, and last in the table, where four of seven blocks have no others."""
-    head, twin = heads(opacity_bound=opacity_bound)
-    case = some_diffuse(scene(head, 230 if not repeated else 60, 200, repeated), 0.6, last)
-    exact = evaluate(twin, *case, dtype=torch.float64)
-    monkeypatch.setattr("nrfgs_ns.appearance.nrf.view_dependent", None)
-    found = evaluate(head, *case)
-    assert_near(found, exact, float32_tolerance())
-    splats, visible, _ = case
-    diffuse, base = splats[DIFFUSE], head.base_appearance(splats, visible)
-    is_diffuse = diffuse[visible]
-    assert 0 < is_diffuse.sum() < 200
-    assert (found["d latents"][diffuse] == 0).all() and (found["d means"][diffuse] == 0).all()
-    # 0.5 + SH_C0 k rounds once here and may round twice there; the sigmoid is another library's.
-    assert (found["colors"] - base.colors)[is_diffuse].abs().max() <= 2 * ULP
-    assert (found["opacities"] - base.opacities)[is_diffuse].abs().max() <= 4 * ULP
-
-
-@pytest.mark.parametrize("precision", ["fp32", "bf16", "fp16"])
-@pytest.mark.parametrize("last", [False, True])
-def test_nothing_but_the_base_of_a_diffuse_splat_is_looked_at(last, precision):
-    head, _ = heads(precision=precision)
-    splats, visible, centers = some_diffuse(scene(head, 150, 140), 0.5, last)
-    expected = evaluate(head, splats, visible, centers)
-    for name in ("latents", "means"):
-        splats[name][splats[DIFFUSE]] = torch.nan
-    found = evaluate(head, splats, visible, centers)
-    assert all(torch.equal(found[name], value) for name, value in expected.items())
-
-
-def test_a_diffuse_splat_with_a_base_that_is_not_finite_spoils_nothing_else():
-    head, twin = heads()
-    splats, visible, centers = some_diffuse(scene(head, 150, 150), 0.5, last=False)
-    row = int(splats[DIFFUSE].nonzero()[3])
-    for name in ("features_dc", "opacities"):
-        splats[name][row] = torch.nan
-    found, exact = evaluate(head, splats, visible, centers), evaluate(twin, splats, visible, centers, torch.float64)
-    for name in ("colors", "opacities", "d features_dc", "d opacities"):
-        rows = torch.isfinite(exact[name])
-        assert torch.equal(rows, torch.isfinite(found[name])), name
-        found[name], exact[name] = found[name][rows], exact[name][rows]
-    assert_near(found, exact, float32_tolerance())
-
-
-@pytest.mark.parametrize("repeated", [False, True])
-def test_without_others_there_is_no_network(repeated, memory_begins_as_nan):
-    """All splats diffuse and visible; shared weights of NaN would show."""
-    head, _ = heads()
-    for weight in head.parameters():
-        weight.data.fill_(torch.nan)
-    splats, visible, centers = some_diffuse(scene(head, 150, 150, repeated), 1.1, last=True)
-    found = evaluate(head, splats, visible, centers)
-    assert all(torch.isfinite(value).all() for value in found.values())
-    for name, value in found.items():
-        if name.startswith("d "):
-            assert (value != 0).any() == (name in ("d features_dc", "d opacities")), name
-    # Beside others, in blocks that have a network: the same numbers.
-    sound, _ = heads()
-    mixed = some_diffuse((splats, visible, centers), 0.5, last=False)[0]
-    beside, here = evaluate(sound, mixed, visible, centers), mixed[DIFFUSE][visible]
-    for name in ("colors", "opacities"):
-        assert torch.equal(beside[name][here], found[name][here])
-    for name in ("d features_dc", "d opacities") if not repeated else ():  # those of a row's copies are added in turn
-        assert torch.equal(beside[name][mixed[DIFFUSE]], found[name][mixed[DIFFUSE]])
 
 
 def test_tiny_gradients_survive_half_precision():

@@ -3,10 +3,9 @@
 
 import pytest
 import torch
-from fused_cases import assert_near, compare, evaluate, float32_tolerance, heads, rounding, scene, some_diffuse
+from fused_cases import assert_near, compare, evaluate, float32_tolerance, heads, rounding, scene
 from hash_grid_cases import assert_near_twin, grids, positions
 
-from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.nrf import NrfConfig
 
 pytestmark = pytest.mark.gpu
@@ -85,58 +84,6 @@ def test_extremes_stay_finite(precision):
     found = evaluate(head, splats, visible, centers)
     assert all(torch.isfinite(value).all() for value in found.values())
     assert ((found["opacities"] >= 0) & (found["opacities"] <= 1)).all() and (found["colors"] >= 0).all()
-
-
-@pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize("last", [False, True])
-@pytest.mark.parametrize("share", [0.0, 0.6, 1.1])
-@pytest.mark.parametrize("opacity_bound", ["straight-through", "logit"])
-def test_diffuse_splats(opacity_bound, share, last, repeated):
-    head, twin = heads("cuda", opacity_bound=opacity_bound)
-    case = some_diffuse(scene(head, 6000, 5000, repeated), share, last)
-    compare(head, twin, case, DEVICE_FLOAT32 * float32_tolerance())
-
-
-@pytest.mark.parametrize("way", [0, -1])
-@pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize("last", [False, True])
-@pytest.mark.parametrize("precision", ["fp32", "tf32", "bf16", "fp16"])
-def test_nothing_but_the_base_of_a_diffuse_splat_is_looked_at(precision, last, repeated, way, monkeypatch):
-    """A mask and none in turn, so that the launcher has to tell the kernels apart."""
-    from nrfgs_ns.appearance.fused import launch
-
-    monkeypatch.setitem(launch.LAUNCHES, precision, launch.LAUNCHES[precision][way:])
-    head, twin = heads("cuda", precision=precision)
-    splats, visible, centers = some_diffuse(scene(head, 100_000, 90_000, repeated), 0.8, last)
-    full = {name: value for name, value in splats.items() if name != DIFFUSE}
-    first = evaluate(head, full, visible, centers)
-    sound = evaluate(head, splats, visible, centers)
-    dirty = {**splats, **{name: splats[name].clone() for name in ("latents", "means")}}
-    for name in ("latents", "means"):
-        dirty[name][splats[DIFFUSE]] = torch.nan
-    found, again = evaluate(head, dirty, visible, centers), evaluate(head, full, visible, centers)
-    sums_in_turn = ("d latents", "d means", "d features_dc", "d opacities") if repeated else ()  # by atomics
-    for name in first:
-        if name not in sums_in_turn:
-            assert torch.equal(first[name], again[name]) and torch.equal(sound[name], found[name]), name
-    assert torch.isfinite(found["d latents"]).all() and (found["d latents"][splats[DIFFUSE]] == 0).all()
-    if precision == "fp32":
-        return  # test_diffuse_splats
-    exact = evaluate(rounding(twin, launch.KINDS[precision]), dirty, visible, centers, dtype=torch.float64)
-    assert_near(found, exact, rounded_limits(exact))
-
-
-def test_diffuse_splats_are_not_waited_for():
-    head, _ = heads("cuda", precision="bf16")
-    splats, visible, center = some_diffuse(scene(head, 6000, 5000), 0.6, last=True)
-    splats = {name: value if name == DIFFUSE else value.requires_grad_() for name, value in splats.items()}
-    for mode in ("default", "error"):  # the first time, kernels are compiled
-        torch.cuda.set_sync_debug_mode(mode)
-        try:
-            colors, opacities = head(splats, visible, center)
-            (colors.sum() + opacities.sum()).backward()
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
 
 
 def test_lengths_are_in_scene_units():

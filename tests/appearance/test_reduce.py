@@ -4,10 +4,8 @@
 import pytest
 import torch
 from head_cases import assert_same, awake, scene
-from torch.testing import assert_close
 
-from nrfgs_lab.residuals import with_diffuse
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 
@@ -68,47 +66,3 @@ def test_latents_in_a_subspace_need_no_more(case):
     assert small.splats["latents"].shape == (40, 3) and small.head.config.latent_dim == 3
     assert_same(small, field, visible, centers, atol=1e-4)  # numbers up to 5 here, 2^-24 of them 60 times
     assert small.bytes < field.bytes
-
-
-def test_diffuse_splats_have_what_they_are_given(case):
-    field, visible, centers = case
-    diffuse = torch.rand(40, generator=torch.Generator().manual_seed(0)) < 0.5
-    base = {"features_dc": torch.randn(40, 3), "opacities": torch.randn(40, 1)}
-    small = with_diffuse(field, diffuse, **base)
-    found, full = small.head(small.splats, visible, centers), field.head(field.splats, visible, centers)
-    given = field.head.base_appearance({**field.splats, **base}, visible)
-    is_diffuse = diffuse[visible]
-    assert is_diffuse.any() and not is_diffuse.all()
-    for a, b, c in zip(found, full, given, strict=True):
-        assert (a[is_diffuse] == c[is_diffuse]).all()
-        assert_close(a[~is_diffuse], b[~is_diffuse], rtol=0, atol=1e-6)  # other sizes of a product, other rounding
-    saved = int(diffuse.sum()) * 8 * 4 - 40 // 8
-    assert small.bytes == field.bytes - saved
-
-
-def test_the_head_is_evaluated_for_the_others_only(case):
-    """A latent of NaN would show; and what does not count gets no gradient."""
-    field, visible, centers = case
-    diffuse = torch.arange(40) % 3 == 0
-    splats = {**field.splats, DIFFUSE: diffuse}
-    splats["latents"] = field.splats["latents"].clone()
-    splats["latents"][diffuse] = torch.nan
-    splats["latents"].requires_grad_()
-    one_center = torch.tensor([1.0, 2.0, 3.0])
-    for center in (centers, one_center):
-        found = field.head(splats, visible, center)
-        assert torch.isfinite(found.colors).all() and torch.isfinite(found.opacities).all()
-        for name, (values, _) in field.head.components(splats, visible, center).items():
-            assert len(values) == len(visible) and (values[diffuse[visible]] == 0).all(), name
-    (gradient,) = torch.autograd.grad(found.colors.sum(), splats["latents"])
-    assert (gradient[diffuse] == 0).all()
-    seen = torch.zeros(40, dtype=torch.bool).index_fill(0, visible, True)
-    assert gradient[seen & ~diffuse].abs().sum() > 0
-
-
-def test_nobody_visible_and_all_diffuse_are_fine(case):
-    field, visible, centers = case
-    for diffuse in (torch.zeros(40, dtype=torch.bool), torch.ones(40, dtype=torch.bool)):
-        splats = {**field.splats, DIFFUSE: diffuse}
-        assert field.head(splats, visible[:0], centers[:0]).colors.shape == (0, 3)
-        assert field.head(splats, visible, centers).opacities.shape == (len(visible),)

@@ -19,7 +19,7 @@ from short_trainings import command_line, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_lab.training_run import evaluate
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.decode import decode
@@ -80,8 +80,6 @@ def test_every_number_comes_back_within_half_a_step(tmp_path):
     read, truth = decoded.splats, {name: value[matched(one, decoded.splats)] for name, value in one.splats.items()}
     quats, scales = nearest_turn(truth["quats"].double().numpy(), truth["scales"].double().numpy())
     truth |= {"quats": torch.from_numpy(quats).float(), "scales": torch.from_numpy(scales).float()}
-    diffuse = read[DIFFUSE]
-    assert (diffuse == truth[DIFFUSE]).all() and 0 < diffuse.sum() < 60
     # Half a step, and float32's rounding of numbers below 16: 2^-20.
     rounding = 2.0**-20
     median = one.splats["scales"].mean(dim=1).median().exp().item()
@@ -90,12 +88,10 @@ def test_every_number_comes_back_within_half_a_step(tmp_path):
     cut = truth["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
     assert (read["opacities"] - cut).abs().max() <= STEPS["opacities"] / 2 + rounding
     drawn = base_colors(truth["features_dc"])
-    drawn[diffuse] = drawn[diffuse].clamp_min(0.0)  # as the rasterizer gets them
     assert (base_colors(read["features_dc"]) - drawn).abs().max() <= STEPS["colors"] / 2 + rounding
-    spread = one.splats["latents"][~one.splats[DIFFUSE]].double().std(dim=0, correction=0).max().item()
-    off = (read["latents"] - truth["latents"])[~diffuse].abs().max()
+    spread = one.splats["latents"].double().std(dim=0, correction=0).max().item()
+    off = (read["latents"] - truth["latents"]).abs().max()
     assert STEPS["latents"] * spread / 8 < off <= STEPS["latents"] * spread / 2 + rounding
-    assert (read["latents"][diffuse] == 0).all()
     assert (read["quats"] - truth["quats"])[:, 1:].abs().max() <= STEPS["turns"] / 2 + rounding
     assert_close(read["quats"].norm(dim=1), torch.ones(60))
     for name, weight in one.head.state_dict().items():
@@ -138,7 +134,6 @@ def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
     header, streams = encode(one, {"rasterize_mode": "classic", "background": [0, 0, 0]})
     write_container(tmp_path / "f.nrf", header, streams)
     model = load_file(tmp_path / "f.nrf")
-    assert torch.equal(model.field.splats[DIFFUSE], decode(tmp_path / "f.nrf").splats[DIFFUSE])
     rows, center = torch.arange(60), torch.tensor([40.0, 0.0, 0.0])
     expected = build(one.head.config, model.head.state_dict(), 32.0)(model.field.splats, rows, center)
     assert_close(model.field.head(model.field.splats, rows, center), expected)
@@ -241,13 +236,12 @@ def test_splats_that_go_take_what_an_optimizer_knows_of_them_along():
     (coded.bits(tables).sum() + tables["means"].sum()).backward()
     optimizer.step()
     before = {name: (table.values, optimizer.state[table.values]["exp_avg"]) for name, table in coded.tables.items()}
-    diffuse, kept = coded.diffuse, torch.arange(60) % 3 > 0
+    kept = torch.arange(60) % 3 > 0
     coded.keep(kept, optimizer)
-    assert torch.equal(coded.diffuse, diffuse[kept])
     for name, table in coded.tables.items():
-        rows, (values, moments) = kept[~diffuse] if name == "latents" else kept, before[name]
-        assert torch.equal(table.values, values[rows])
-        assert torch.equal(optimizer.state[table.values]["exp_avg"], moments[rows])
+        values, moments = before[name]
+        assert torch.equal(table.values, values[kept])
+        assert torch.equal(optimizer.state[table.values]["exp_avg"], moments[kept])
 
 
 def test_what_training_expects_is_what_a_file_has(tmp_path):
@@ -268,8 +262,8 @@ def test_what_training_expects_is_what_a_file_has(tmp_path):
     _, words = encode_table(codes.T)
     assert expected == pytest.approx(len(words), rel=0.02)
     one = field(1)
-    rows = {name: value.expand(20_000, -1) for name, value in one.splats.items() if name != DIFFUSE}
-    splats = {**rows, "means": means(rounded=True).detach(), DIFFUSE: torch.ones(20_000, dtype=torch.bool)}
+    rows = {name: value.expand(20_000, -1) for name, value in one.splats.items()}
+    splats = {**rows, "means": means(rounded=True).detach()}
     steps = {name: np.ones(n) for name, n in (("turns", 3), ("scales", 3), ("opacities", 1), ("colors", 3))}
     steps |= {"latents": np.ones(8), "means": means.steps.detach().double().numpy()}
     write_container(tmp_path / "f.nrf", *encode(Field(one.head, splats), RENDER, steps))

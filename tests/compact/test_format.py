@@ -48,7 +48,7 @@ def test_what_goes_in_comes_out(written):
 
 def test_layout_is_as_documented(written):
     magic, version, length, total = struct.unpack("<8sIIQ", written[:24])
-    assert magic == b"\x89NRF\r\n\x1a\n" and version == 2 and total == len(written)
+    assert magic == b"\x89NRF\r\n\x1a\n" and version == 3 and total == len(written)
     header = json.loads(written[24 : 24 + length])
     assert struct.unpack("<I", written[24 + length : 28 + length]) == (zlib.crc32(written[: 24 + length]),)
     first = 28 + length
@@ -81,5 +81,5 @@ def test_a_cut_or_longer_file_is_noticed(data, written):
 
 
 def test_another_version_is_told(written):
-    with pytest.raises(ValueError, match="is of version 3 of the format"):
-        read_container(written[:8] + b"\3" + written[9:])
+    with pytest.raises(ValueError, match="is of version 4 of the format"):
+        read_container(written[:8] + b"\4" + written[9:])

@@ -24,7 +24,7 @@ import torch
 from compact_fields import RENDER, field, in_node
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.field import DIFFUSE, Field
+from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.decode import Decoded, decode
@@ -245,7 +245,7 @@ def rans_streams() -> Iterator[tuple[str, bytes]]:
             yield f"{name}: {len(more)} bytes more", with_body(name, lambda body, more=more: body + more)
         for sizes in ((0, 0), (2**32 - 1, size), (count, 2**32 - 1), (2**30, 8)):
             yield f"{name}: sizes {sizes}", with_body(name, lambda b, s=sizes: MODEL.pack(*s) + b[8:])
-        rows = {"means": 2, "splats": 11, "latents": 8}[name]
+        rows = {"means": 2, "splats": 10, "latents": 8}[name]
         for shape in (
             [rows, 10**6],
             [10**6, 1],
@@ -303,10 +303,6 @@ def contents() -> Iterator[tuple[str, bytes]]:
         yield f"{name} in xz", with_stream(name, np.abs(table.numbers).astype(np.uint32))
     steps = np.full((2, COUNT), 2**31 - 1)
     yield "means beyond 64 bits", with_stream("means", Table(steps, signed=False))
-    for value in (0, 1):
-        numbers = streams["splats"].numbers.copy()
-        numbers[0] = value
-        yield f"diffuse {value}", with_stream("splats", Table(numbers))
     for name, grid in fields["grids"].items():
         for part in ("low", "step"):
             for value in (1e-320, 1e37, 1e38, 3.5e38, 1e308, -1e38, 0):
@@ -329,17 +325,13 @@ def whole_files() -> Iterator[tuple[str, bytes]]:
         yield f"with {options}", written(12, **options)
     yield "a lone splat", written(1)
     header, streams = encode(field(4), dict(RENDER))
-    header["splats"] = {"view": 0, DIFFUSE: 0}
+    header["splats"] = 0
     streams |= {"means": Table(np.zeros((2, 0)), signed=False)}
-    streams |= {"splats": Table(np.zeros((11, 0))), "latents": Table(np.zeros((8, 0)))}
+    streams |= {"splats": Table(np.zeros((10, 0))), "latents": Table(np.zeros((8, 0)))}
     yield "no splat", container(header, streams)
     wide = NrfConfig(latent_dim=1024, hidden_width=1).setup().requires_grad_(False)
-    for count in (3_000, 20_000):  # diffuse splats need latents in memory, and have none in the file
-        splats = {**field(4).splats, "latents": torch.zeros(4, 1024), DIFFUSE: torch.ones(4, dtype=torch.bool)}
-        header, streams = encode(Field(wide, splats), dict(RENDER))
-        header["splats"][DIFFUSE] = count
-        streams |= {"means": Table(np.zeros((2, count)), signed=False), "splats": Table(np.ones((11, count)))}
-        yield f"{count} diffuse splats with wide latents", container(header, streams)
+    splats = {**field(4).splats, "latents": torch.zeros(4, 1024)}
+    yield "wide latents", container(*encode(Field(wide, splats), dict(RENDER)))
     for value in ([0, 0.5, 1], [0, 0, 2], [0, 0, True], [0, 0, -0.1]):
         header, bodies = parts()
         header["render"]["background"] = value
@@ -381,11 +373,10 @@ def in_python(data: bytes, path: Path) -> Decoded | str:
 
 def same_numbers(decoded: Decoded, heard: dict) -> None:
     """The page's table and latents, of the first hundred splats, are Python's."""
-    order = decoded.splats[DIFFUSE].to(torch.uint8).argsort(stable=True)  # the page has view-dependent splats first
-    splats = {name: value[order] for name, value in decoded.splats.items()}
+    splats = decoded.splats
     table = np.frombuffer(base64.b64decode(heard["table"]), "<f4").reshape(-1, 16)
     count, rank = len(table), decoded.config.latent_dim
-    assert count == min(len(order), 100)
+    assert count == min(len(splats["means"]), 100)
     alike = {"rtol": 2**-20, "atol": 2**-22}
     for first, value in (
         (0, splats["means"]),
@@ -397,8 +388,7 @@ def same_numbers(decoded: Decoded, heard: dict) -> None:
         assert_close(torch.tensor(table[:, first : first + value.shape[1]]), value[:count], **alike)
     latents = np.frombuffer(base64.b64decode(heard["latents"]), "<f4")
     latents = latents[: len(latents) // (rank + -rank % 4) * (rank + -rank % 4)].reshape(-1, rank + -rank % 4)[:, :rank]
-    view = splats["latents"][: int((~splats[DIFFUSE]).sum())]
-    assert_close(torch.tensor(latents.copy()), view[: len(latents)], **alike)
+    assert_close(torch.tensor(latents.copy()), splats["latents"][: len(latents)], **alike)
 
 
 def agree(cases: dict[str, bytes], found: list[dict], folder: Path) -> None:

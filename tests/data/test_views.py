@@ -5,9 +5,9 @@ import math
 
 import pytest
 import torch
-from moved_scenes import rescale
 from nerfstudio.cameras.cameras import Cameras
 from short_trainings import command_line, set_up
+from small_capture import rescale
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.nrf import NrfConfig

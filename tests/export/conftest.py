@@ -4,7 +4,7 @@ import functools
 import pytest
 from short_trainings import command_line, trained
 
-from nrfgs_lab.pages import browser as browsers
+from nrfgs_lab.pages import pictures as browsers
 from nrfgs_ns.export.command import Web
 
 

@@ -326,7 +326,7 @@ def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
     from gsplat.cuda._torch_impl import _spherical_harmonics
     from gsplat_call import rasterization
 
-    from nrfgs_ns.model.pinhole import pinhole
+    from nrfgs_ns.model.renderer import pinhole
 
     config = trained("nrfgs-sh")
     words = ["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--no-measure"]

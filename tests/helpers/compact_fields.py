@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from nrfgs_lab.residuals import with_diffuse
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.decode import Decoded, decode
@@ -70,8 +69,7 @@ def field(count: int = 60) -> Field:
         "features_dc": torch.randn(count, 3),
         "latents": torch.randn(count, 8) * torch.linspace(2.0, 0.1, 8),
     }
-    diffuse = torch.rand(count) < 0.4
-    return with_diffuse(Field(head, splats), diffuse, splats["features_dc"], splats["opacities"])
+    return Field(head, splats)
 
 
 def through_a_file(one: Field, tmp_path: Path) -> Decoded:

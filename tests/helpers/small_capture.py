@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A data set of a few small images, for tests that break it."""
+"""A data set of a few small images, for tests that break it, and any data set in another unit."""
 
 import json
 from pathlib import Path
@@ -71,3 +71,17 @@ class Capture:
 
     def parse(self, split: str = "train", **options):
         return self.parser(**options).get_dataparser_outputs(split)
+
+
+def rescale(folder: Path, factor: float) -> None:
+    """Measure a scene in another unit: every length in poses and points times `factor`."""
+    path = folder / "transforms.json"
+    meta = json.loads(path.read_text())
+    for frame in meta["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= factor
+    path.write_text(json.dumps(meta))
+    points = PlyData.read(str(folder / meta["ply_file_path"]), mmap=False)
+    for axis in "xyz":
+        points["vertex"][axis] *= factor
+    points.write(str(folder / meta["ply_file_path"]))

@@ -15,14 +15,12 @@ import torch
 from compact_fields import write_container
 from PIL import Image
 
-from nrfgs_lab.residuals import with_diffuse
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.export.web.page import page as page_of
-from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
-from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
+from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, projection_options, world_to_camera
 from nrfgs_ns.viewer.pictures import AMPLIFICATION, GREY, OPACITY_AXIS, with_gain
 
 SIZE = (320, 240)
@@ -147,15 +145,14 @@ def wall_scene(folder: Path) -> tuple[Path, list[dict]]:
 
 
 def written(folder: Path, splats: dict[str, torch.Tensor], mode: str, options: dict) -> Path:
-    """A compact file of splats, a third of them diffuse, with a network that was never trained."""
+    """A compact file of splats with a network that was never trained."""
     head = NrfConfig(output_init="default", **options).setup().requires_grad_(False)
     head.scene_unit = 0.7
     for weight in head.parameters():
         weight.mul_(2.0)
     count = len(splats["means"])
     splats["latents"] = torch.randn(count, head.config.latent_dim)
-    field = with_diffuse(Field(head, splats), torch.rand(count) < 0.3, splats["features_dc"], splats["opacities"])
-    header, streams = encode(field, {"rasterize_mode": mode, "background": [0.1, 0.2, 0.3]})
+    header, streams = encode(Field(head, splats), {"rasterize_mode": mode, "background": [0.1, 0.2, 0.3]})
     write_container(folder / "scene.nrf", header, streams)
     return folder / "scene.nrf"
 

@@ -16,8 +16,7 @@ from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact, Ply, Web
-from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
-from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
+from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, projection_options, world_to_camera
 from nrfgs_ns.training.checkpoint_files import read_latest
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, PictureOptions, legends, picture

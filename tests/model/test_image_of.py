@@ -8,8 +8,7 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig
-from nrfgs_ns.model.pinhole import Pinhole, world_to_camera
-from nrfgs_ns.model.renderer import composite_view, project_view, projection_options
+from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, projection_options, world_to_camera
 from nrfgs_ns.rasterizer import composite
 
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])

@@ -20,7 +20,7 @@ from torch.testing import assert_close
 
 from nrfgs_lab.training_run import parse
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.pinhole import Pinholes, pinhole, world_to_camera
+from nrfgs_ns.model.renderer import Pinholes, pinhole, world_to_camera
 from nrfgs_ns.model.warmup import warm_up
 
 pytestmark = pytest.mark.usefixtures("no_cuda")

@@ -8,8 +8,8 @@ import torch
 from gsplat_call import rasterization
 from make_gsplat_fixtures import CASES
 
+from nrfgs_ns.rasterizer import TILE_SIZE as TILE
 from nrfgs_ns.rasterizer import project
-from nrfgs_ns.rasterizer.contract import TILE_SIZE as TILE
 from nrfgs_ns.rasterizer.torch_cpu import compositing
 from nrfgs_ns.rasterizer.torch_cpu.tiles import MIN_ALPHA, SUB_TILE, footprints, list_tiles
 

@@ -95,14 +95,14 @@ def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fuse
     trainer = start(fused=fused)
     poison(trainer, at=3, name=name, value=value)
     before = {}
-    original = trainer.optimizers.step
+    original = trainer.guard.before_optimizers
 
     def remember(*args):
         if trainer.step == 3:
             before.update({path: tensor.clone() for path, tensor in numbers(state_of(trainer)).items()})
         original(*args)
 
-    trainer.optimizers.step = remember
+    trainer.guard.before_optimizers = remember
     with pytest.raises(TrainingStopped, match="stopped at step 3") as stopped:
         trainer.train()
     assert stopped.value.step == 3

@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.field import DIFFUSE
 from nrfgs_ns.appearance.fused.packing import Packing, pack
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.kernels.trial import Gate
@@ -60,7 +59,7 @@ class FusedField:
             return f"the splats are on {device.type}, and the kernels run on CUDA"
         if any(splats[name].dtype != torch.float32 for name in TABLES):
             return "the splats are not float32"
-        ready = self._ready_on(device, DIFFUSE in splats)
+        ready = self._ready_on(device)
         return ready if isinstance(ready, str) else None
 
     def try_on(self, device: torch.device) -> None:
@@ -75,17 +74,16 @@ class FusedField:
         from nrfgs_ns.appearance.fused.launch import FieldOptions, FusedFunction
 
         weights = [weight for layer in self.layers for weight in (layer.weight, layer.bias)]
-        tables, diffuse = [splats[name] for name in TABLES], splats.get(DIFFUSE)
-        ready, options = self._ready_on(visible.device, diffuse is not None), FieldOptions.of(self.config, scene_unit)
-        return FusedFunction.apply(*ready, options, *tables, diffuse, visible, camera_centers, *weights)
+        tables = [splats[name] for name in TABLES]
+        ready, options = self._ready_on(visible.device), FieldOptions.of(self.config, scene_unit)
+        return FusedFunction.apply(*ready, options, *tables, visible, camera_centers, *weights)
 
-    def _ready_on(self, device: torch.device, some_diffuse: bool = False) -> tuple[Packing, Any] | str:
+    def _ready_on(self, device: torch.device) -> tuple[Packing, Any] | str:
         """Index maps and launches on `device`, or why there are none: tried and reported once."""
-        key = device, self.config.precision, some_diffuse
         quiet = self.config.implementation != "auto"
-        return self.ready.find(key, device, lambda: self._prepare(device, some_diffuse), quiet)
+        return self.ready.find((device, self.config.precision), device, lambda: self._prepare(device), quiet)
 
-    def _prepare(self, device: torch.device, some_diffuse: bool) -> tuple[Packing, Any] | str:
+    def _prepare(self, device: torch.device) -> tuple[Packing, Any] | str:
         width, hidden = self.on_cpu.width, self.on_cpu.hidden
         if width > MAX_WIDTH or 2 * width * hidden > MAX_WEIGHTS:
             return (
@@ -95,4 +93,4 @@ class FusedField:
         from nrfgs_ns.appearance.fused.launch import FieldOptions, first_that_runs
 
         packing = self.on_cpu.to(device)
-        return packing, first_that_runs(packing, FieldOptions.of(self.config), some_diffuse)
+        return packing, first_that_runs(packing, FieldOptions.of(self.config))

@@ -26,12 +26,10 @@ from nrfgs_ns.appearance.fused.tiles import (
     give,
     give_latents,
     last,
-    load_flags,
     load_four,
     load_latents,
     load_three,
     operand,
-    read_four,
     sigmoid,
     sin_half_turns,
     stack,
@@ -154,91 +152,20 @@ def _inputs(Z, F, B: tl.constexpr, P: tl.constexpr, KIND: tl.constexpr):
 
 
 @triton.jit
-def _silenced(X, is_diffuse, B: tl.constexpr, P: tl.constexpr):
-    """X with zeros for diffuse splats: 0 times NaN would be NaN in the weights' gradients."""
-    lanes = tl.reshape(X, (B, P // 4, 4, 2))
-    return tl.reshape(tl.where(is_diffuse[:, None, :, None], 0.0, lanes), (B, 2 * P))
-
-
-# Blocks whose splats are all diffuse: a program walks backwards over its last ones, as long as they need no network.
-# Diffuse splats come last in the table, so at most one other block has some. A branch in the main loop would serve a
-# table in any order, but it keeps the compiler from loading the next blocks while one is computed.
-
-
-@triton.jit
 def base_of(stored, lanes, sh_c0):
     """(c, alpha) from features_dc, and the logit in lane 3."""
     return tl.where(lanes < 3, 0.5 + sh_c0 * stored, sigmoid(stored))
 
 
-@triton.jit
-def _last_block(count, B: tl.constexpr):
-    """The last block that this program walks over."""
-    first = tl.program_id(0)
-    return first + (tl.cdiv(count, B) - 1 - first) // tl.num_programs(0) * tl.num_programs(0)
-
-
-@triton.jit
-def _all_diffuse(diffuse, visible, block, count, B: tl.constexpr):
-    """Whether every splat of a block is diffuse; no for negative blocks, which do not exist."""
-    items = tl.minimum(block * B + tl.arange(0, B), count - 1).to(tl.int64)
-    rows = tl.load(visible + items, mask=items >= 0, other=0)
-    return tl.min(tl.load(diffuse + rows, mask=items >= 0, other=0), axis=0) > 0
-
-
-@triton.jit
-def forward_base(
-    features_dc, opacities, diffuse, visible, colors_out, opacities_out, count, sh_c0, lanes, B: tl.constexpr
-):  # fmt: skip
-    """Do this program's last blocks that need no network; return the end of the others."""
-    block = _last_block(count, B)
-    done = _all_diffuse(diffuse, visible, block, count, B)
-    while done:
-        items = block * B + tl.arange(0, B)[:, None]
-        valid = items < count
-        items = tl.minimum(items, count - 1).to(tl.int64)
-        base = base_of(read_four(features_dc, opacities, tl.load(visible + items), valid, lanes), lanes, sh_c0)
-        out = tl.maximum(base, 0.0, propagate_nan=tl.PropagateNan.ALL)
-        tl.store(colors_out + items * 3 + lanes, out, mask=valid & (lanes < 3))
-        tl.store(opacities_out + items + (lanes - 3), out, mask=valid & (lanes == 3))
-        block -= tl.num_programs(0)
-        done = _all_diffuse(diffuse, visible, block, count, B)
-    return block + 1
-
-
-@triton.jit
-def backward_base(
-    features_dc, opacities, diffuse, visible, d_colors, d_opacities, d_features_dc, d_logits, count, sh_c0, lanes,
-    B: tl.constexpr, UNIQUE: tl.constexpr,
-):  # fmt: skip
-    """The same for gradients; those by latents, means and centres are 0 already."""
-    block = _last_block(count, B)
-    done = _all_diffuse(diffuse, visible, block, count, B)
-    while done:
-        items = block * B + tl.arange(0, B)[:, None]
-        valid = items < count
-        items = tl.minimum(items, count - 1).to(tl.int64)
-        rows = tl.load(visible + items)
-        base = base_of(read_four(features_dc, opacities, rows, valid, lanes), lanes, sh_c0)
-        d_out = read_four(d_colors, d_opacities, items, valid, lanes)
-        d_color = tl.where(base >= 0.0, d_out, 0.0)
-        d_stored = tl.where(lanes < 3, sh_c0 * d_color, d_out * (base * (1.0 - base)))
-        give(d_features_dc + rows * 3 + lanes, d_stored, valid & (lanes < 3), UNIQUE)
-        give(d_logits + rows + (lanes - 3), d_stored, valid & (lanes == 3), UNIQUE)
-        block -= tl.num_programs(0)
-        done = _all_diffuse(diffuse, visible, block, count, B)
-    return block + 1
-
-
 @triton.jit(do_not_specialize=["count"])
 def forward_kernel(
-    means, latents, features_dc, opacities, diffuse, visible, centers, packed,
+    means, latents, features_dc, opacities, visible, centers, packed,
     colors_out, opacities_out,
     count, eps_squared, log_unit, color_scale, opacity_scale, sh_c0,
     D: tl.constexpr, P: tl.constexpr, H: tl.constexpr, BANDS: tl.constexpr, B: tl.constexpr, COLUMNS: tl.constexpr,
-    ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, KIND: tl.constexpr, DIFFUSE: tl.constexpr,
+    ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, KIND: tl.constexpr,
 ):  # fmt: skip
-    """Colours [count, 3] and opacities [count] of the splats in rows `visible`; `diffuse` is read if DIFFUSE."""
+    """Colours [count, 3] and opacities [count] of the splats in rows `visible`."""
     lanes = tl.arange(0, 4)[None, :]
     outputs = tl.arange(0, COLUMNS)
     units = tl.arange(0, H)
@@ -250,14 +177,8 @@ def forward_kernel(
     W2 = operand(W2, KIND)
     b2 = tl.load(second + H * OUTPUTS + outputs, mask=real, other=0.0)
 
-    blocks = tl.cdiv(count, B)
-    if DIFFUSE:
-        blocks = forward_base(
-            features_dc, opacities, diffuse, visible, colors_out, opacities_out, count, sh_c0, lanes, B
-        )  # fmt: skip
-
     # Values hoisted out of the loop would take registers that its inside needs.
-    for block in tl.range(tl.program_id(0), blocks, tl.num_programs(0), disable_licm=True):
+    for block in tl.range(tl.program_id(0), tl.cdiv(count, B), tl.num_programs(0), disable_licm=True):
         items = block * B + tl.arange(0, B)[:, None]
         valid = items < count
         items = tl.minimum(items, count - 1).to(tl.int64)  # the last block repeats the last splat, and keeps it back
@@ -273,14 +194,9 @@ def forward_kernel(
         Y = dot(hidden, W2, tl.zeros((B, COLUMNS), tl.float32), KIND) + b2[None, :]
         _, _, seen = _outputs(Y, lanes, B, COLUMNS)
         t = tanh(seen)
-        if DIFFUSE:
-            is_diffuse = load_flags(diffuse, rows, B)
-            t = tl.where(is_diffuse, 0.0, t)
 
         color = tl.maximum(base + color_scale * t, 0.0, propagate_nan=tl.PropagateNan.ALL)
         opacity, _, _ = _bounded_opacity(stored, base, t, opacity_scale, BOUND)
-        if DIFFUSE:
-            opacity = tl.where(is_diffuse, base, opacity)  # the logit bound rounds another way
         out = deal(tl.where(lanes < 3, color, opacity), B)
         tl.store(colors_out + items * 3 + lanes, out, mask=valid & (lanes < 3))
         tl.store(opacities_out + items + (lanes - 3), out, mask=valid & (lanes == 3))
@@ -288,19 +204,19 @@ def forward_kernel(
 
 @triton.jit(do_not_specialize=["count"])
 def backward_kernel(
-    means, latents, features_dc, opacities, diffuse, visible, centers, packed,
+    means, latents, features_dc, opacities, visible, centers, packed,
     d_colors, d_opacities,
     d_means, d_latents, d_features_dc, d_logits, d_centers, partials,
     count, eps_squared, log_unit, color_scale, opacity_scale, sh_c0,
     D: tl.constexpr, P: tl.constexpr, H: tl.constexpr, BANDS: tl.constexpr, B: tl.constexpr, COLUMNS: tl.constexpr,
     SLOTS: tl.constexpr, ONE_CENTER: tl.constexpr, BOUND: tl.constexpr, CENTER: tl.constexpr,
-    KIND: tl.constexpr, GRADIENT_KIND: tl.constexpr, DIFFUSE: tl.constexpr,
+    KIND: tl.constexpr, GRADIENT_KIND: tl.constexpr,
 ):  # fmt: skip
     """Gradients of everything, from those of colours and opacities; d_x is the loss's derivative by x.
 
-    Rows of the tables' gradients that no block visits are not written; with DIFFUSE, zeros may not be either. Each
-    program writes its sum of the packed weights' gradients, and of one shared camera centre's, to its row of `partials`
-    [programs, SLOTS]: no atomics, so the result is the same every time.
+    Rows of the tables' gradients that no block visits are not written. Each program writes its sum of the packed
+    weights' gradients, and of one shared camera centre's, to its row of `partials` [programs, SLOTS]: no atomics, so
+    the result is the same every time.
     """
     lanes = tl.arange(0, 4)[None, :]
     outputs = tl.arange(0, COLUMNS)
@@ -324,14 +240,8 @@ def backward_kernel(
     d_W2 = tl.zeros((H, COLUMNS), tl.float32)
     d_b2_low, d_b2_high = tl.zeros((B, 4), tl.float32), tl.zeros((B, 4), tl.float32)
     d_center = tl.zeros((B, 4), tl.float32)
-    blocks = tl.cdiv(count, B)
-    if DIFFUSE:
-        blocks = backward_base(
-            features_dc, opacities, diffuse, visible, d_colors, d_opacities, d_features_dc, d_logits, count, sh_c0,
-            lanes, B, ONE_CENTER,
-        )  # fmt: skip
 
-    for block in tl.range(tl.program_id(0), blocks, tl.num_programs(0), disable_licm=True):
+    for block in tl.range(tl.program_id(0), tl.cdiv(count, B), tl.num_programs(0), disable_licm=True):
         items = block * B + tl.arange(0, B)[:, None]
         valid = items < count
         items = tl.minimum(items, count - 1).to(tl.int64)  # the last block repeats the last splat, and keeps it back
@@ -346,29 +256,19 @@ def backward_kernel(
         waves = _waves(d, BANDS)
         F = _features(d, base, log_r, waves, lanes, B, P // 4, BANDS)
         X = _inputs(Z, F, B, P, KIND)
-        if DIFFUSE:
-            is_diffuse = load_flags(diffuse, rows, B)
-            X = _silenced(X, is_diffuse, B, P)
         pre = tl.maximum(dot(X, W1, tl.zeros((B, H), tl.float32), KIND), 0.0, propagate_nan=tl.PropagateNan.ALL)
         hidden = operand(pre, KIND)
         Y = dot(hidden, W2, tl.zeros((B, COLUMNS), tl.float32), KIND) + b2[None, :]
         if KIND != GRADIENT_KIND:
             X = _inputs(Z, F, B, P, GRADIENT_KIND)
-            if DIFFUSE:
-                X = _silenced(X, is_diffuse, B, P)
             hidden = operand(pre, GRADIENT_KIND)
         high, gate, seen = _outputs(Y, lanes, B, COLUMNS)
         t = tanh(seen)
-        if DIFFUSE:
-            t = tl.where(is_diffuse, 0.0, t)
 
         # Outputs.
         d_color = tl.where(base + color_scale * t >= 0.0, d_out, 0.0)
         _, logit_slope, t_slope = _bounded_opacity(stored, base, t, opacity_scale, BOUND)
         d_low = tl.where(lanes < 3, color_scale * d_color, d_out * t_slope) * (1.0 - t * t)
-        if DIFFUSE:
-            logit_slope = tl.where(is_diffuse, base * (1.0 - base), logit_slope)
-            d_low = tl.where(is_diffuse, 0.0, d_low)
         d_gate = gate * (1.0 - gate) * tl.sum(tl.where(lanes < 3, d_low * high, 0.0), axis=1)[:, None]
         d_high = tl.where(lanes < 3, gate * d_low, d_gate)
         d_b2_low += d_low
@@ -400,8 +300,6 @@ def backward_kernel(
         radial = tl.sum(tl.where(lanes < 3, -d_view * d, d_view), axis=1)[:, None]
         radial = tl.where(above, radial, 0.0)
         d_v = inverse * (d_view + radial * d)
-        if DIFFUSE:
-            d_v = tl.where(is_diffuse, 0.0, d_v)
         mask = valid & (lanes < 3)
         give(d_means + rows * 3 + lanes, deal(-d_v, B), mask, ONE_CENTER)
         if CENTER and ONE_CENTER:

@@ -2,8 +2,7 @@
 """The kernels as one differentiable function of tables, camera centres and shared weights.
 
 A training step of a small scene is bound by the host, hence few launches: two to pack the weights, one forward, one to
-zero the tables' gradients unless every splat is visible and none diffuse, one backward, two to sum and unpack the
-weights' gradients; one for a 32-bit mask of diffuse splats.
+zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the weights' gradients.
 """
 
 import functools
@@ -122,27 +121,22 @@ class FieldOptions(NamedTuple):
 class FusedFunction(torch.autograd.Function):
     """(tables, visible rows, camera centres, shared weights) -> colours [M, 3], opacities [M].
 
-    Camera centres [3] promise that no row of `visible` repeats. All tensors are float32 on one device, `visible` int64,
-    `diffuse` bool [N], or None where no splat is diffuse: that compiles other kernels.
+    Camera centres [3] promise that no row of `visible` repeats. All tensors are float32 on one device, `visible` int64.
     """
 
     @staticmethod
     def forward(ctx, packing: Packing, launches: Launches, options: FieldOptions, means, latents, features_dc,
-                opacities, diffuse, visible, centers, *weights):  # fmt: skip
+                opacities, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
         visible, centers, packed = _contiguous(visible), _contiguous(centers), _packed(packing, weights)
-        # Triton lays out a product's factors by the narrowest number that they are computed from: for bytes, it took
-        # more columns to a thread than d_Y has, and float32's d_hidden was wrong.
-        flags = None if diffuse is None else diffuse.to(torch.int32)
         count, how = len(visible), launches.forward
         colors, seen = packed.new_empty(count, 3), packed.new_empty(count)
         if count > 0:
             launch_forward(
-                (_programs(how, count, visible.device), 1, 1), *tables, visible if flags is None else flags, visible,
-                centers, packed, colors, seen, count, *options.scalars,
-                **_constants(packing, how, options, centers.dim() == 1, flags),
+                (_programs(how, count, visible.device), 1, 1), *tables, visible, centers, packed, colors, seen,
+                count, *options.scalars, **_constants(packing, how, options, centers.dim() == 1),
             )  # fmt: skip
-        ctx.save_for_backward(*tables, flags, visible, centers, packed)
+        ctx.save_for_backward(*tables, visible, centers, packed)
         ctx.packing, ctx.how, ctx.options = packing, launches.backward, options
         return colors, seen
 
@@ -150,23 +144,20 @@ class FusedFunction(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, d_colors, d_opacities):
         packing, how, options = ctx.packing, ctx.how, ctx.options
-        *tables, flags, visible, centers, packed = ctx.saved_tensors
+        *tables, visible, centers, packed = ctx.saved_tensors
         count, rows, device = len(visible), len(tables[0]), visible.device
-        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[9]
+        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[8]
         # Without zeros only where the kernel writes each row, once.
-        zero = not one_center or count < rows or flags is not None
-        d_tables = _tables(rows, packing.latent_dim, device, zero)
+        d_tables = _tables(rows, packing.latent_dim, device, zero=not one_center or count < rows)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
-        if flags is not None and wants_center and not one_center:
-            d_centers.zero_()
         if count > 0:
             programs = _programs(how, count, device)
             partials = tables[0].new_empty(programs, len(packing.gather) + CENTER_SLOTS)
             launch_backward(
-                (programs, 1, 1), *tables, visible if flags is None else flags, visible, centers, packed,
+                (programs, 1, 1), *tables, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
                 count, *options.scalars, SLOTS=partials.shape[1], CENTER=wants_center,
-                GRADIENT_KIND=KINDS[options.precision][1], **_constants(packing, how, options, one_center, flags),
+                GRADIENT_KIND=KINDS[options.precision][1], **_constants(packing, how, options, one_center),
             )  # fmt: skip
             sums = partials.sum(dim=0)
         else:
@@ -175,7 +166,7 @@ class FusedFunction(torch.autograd.Function):
             d_centers = sums[len(packing.gather) : len(packing.gather) + 3]
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
-        return None, None, None, *d_tables, None, None, d_centers if wants_center else None, *d_weights
+        return None, None, None, *d_tables, None, d_centers if wants_center else None, *d_weights
 
 
 def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
@@ -184,10 +175,8 @@ def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
     return torch.cat([*flat, _zero(flat[0].device)]).index_select(0, packing.gather)
 
 
-def _constants(
-    packing: Packing, how: Launch, options: FieldOptions, one_center: bool, flags: Tensor | None
-) -> dict[str, Any]:
-    """Constants of both kernels, and options of Triton's compiler. Without `flags` the kernels read no mask."""
+def _constants(packing: Packing, how: Launch, options: FieldOptions, one_center: bool) -> dict[str, Any]:
+    """Constants of both kernels, and options of Triton's compiler."""
     return {
         "D": packing.latent_dim,
         "P": packing.width,
@@ -198,12 +187,11 @@ def _constants(
         "ONE_CENTER": one_center,
         "BOUND": options.bound,
         "KIND": KINDS[options.precision][0],
-        "DIFFUSE": flags is not None,
         **how.options(packing.hidden),
     }
 
 
-def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool) -> Launches:
+def first_that_runs(packing: Packing, options: FieldOptions) -> Launches:
     """The fastest launches that this device can run at these sizes; else raise what goes wrong.
 
     A missing C compiler and a lack of shared memory show only here. Out-of-memory is re-raised: otherwise a slower
@@ -211,7 +199,7 @@ def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool)
     """
     for launches in LAUNCHES[options.precision]:
         try:
-            probe(packing, launches, options, some_diffuse)
+            probe(packing, launches, options)
             return launches
         except torch.OutOfMemoryError:
             raise
@@ -220,14 +208,13 @@ def first_that_runs(packing: Packing, options: FieldOptions, some_diffuse: bool)
     raise reason
 
 
-def probe(packing: Packing, launches: Launches, options: FieldOptions, some_diffuse: bool) -> None:
+def probe(packing: Packing, launches: Launches, options: FieldOptions) -> None:
     """Compile and run both kernels on one splat, for one camera; raise whatever goes wrong."""
     device = packing.gather.device
     tables = [torch.zeros(1, n, device=device, requires_grad=True) for n in (3, packing.latent_dim, 3, 1)]
     weights = [torch.zeros(shape, device=device, requires_grad=True) for shape in packing.shapes]
     visible, center = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(3, device=device)
-    diffuse = torch.zeros(1, dtype=torch.bool, device=device) if some_diffuse else None
-    outputs = FusedFunction.apply(packing, launches, options, *tables, diffuse, visible, center, *weights)
+    outputs = FusedFunction.apply(packing, launches, options, *tables, visible, center, *weights)
     sum(output.sum() for output in outputs).backward()
 
 

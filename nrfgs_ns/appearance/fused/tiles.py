@@ -132,24 +132,11 @@ def load_three(table, rows, lanes, B: tl.constexpr):
 
 
 @triton.jit
-def read_four(threes, ones, rows, mask, lanes):
-    """Rows [B, 1] of a table of three columns, and in lane 3 of a table of one; 0 where `mask` [B, 1] is false. In the
-    order of a load."""
+def load_four(threes, ones, rows, mask, lanes, B: tl.constexpr):
+    """Rows [B, 1] of a table of three columns, and in lane 3 of a table of one; 0 where `mask` [B, 1] is false."""
     three = tl.load(threes + rows * 3 + lanes, mask=mask & (lanes < 3), other=0.0)
     one = tl.load(ones + rows + (lanes - 3), mask=mask & (lanes == 3), other=0.0)
-    return tl.where(lanes < 3, three, one)
-
-
-@triton.jit
-def load_four(threes, ones, rows, mask, lanes, B: tl.constexpr):
-    """The same in the order of tensor cores."""
-    return regroup(read_four(threes, ones, rows, mask, lanes), B)
-
-
-@triton.jit
-def load_flags(flags, rows, B: tl.constexpr):
-    """Rows [B, 1] of a table of int32: whether they are not 0, the same in all lanes."""
-    return regroup(tl.broadcast_to(tl.load(flags + rows), (B, 4)), B) != 0
+    return regroup(tl.where(lanes < 3, three, one), B)
 
 
 @triton.jit

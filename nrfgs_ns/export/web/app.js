@@ -420,7 +420,7 @@ async function main() {
   tell("Preparing", 1);
   fit();
   painter = new Painter(canvas, scene);
-  byId("count").textContent = `${scene.count.toLocaleString("en")} splats, ${scene.viewDependent.toLocaleString("en")} view-dependent.`;
+  byId("count").textContent = `${scene.count.toLocaleString("en")} splats.`;
   listen();
   const asked = readAddress();
   wake();

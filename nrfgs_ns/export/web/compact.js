@@ -2,7 +2,7 @@
 // Reads a compact file (docs/compact-format.md says where it is specified): container, xz streams, coded tables, splats. Runs in the worker.
 
 const MAGIC = [0x89, 0x4e, 0x52, 0x46, 0x0d, 0x0a, 0x1a, 0x0a];
-const VERSION = 2;
+const VERSION = 3;
 const BYTES = { uint8: 1, uint16: 2, uint32: 4, uint64: 8, float16: 2, float32: 4, int16: 2, int32: 4 };
 const CODINGS = new Map([
   ["xz", ["uint8", "uint16", "uint32", "uint64", "float16", "float32"]], ["rans", ["int16", "int32", "uint32"]],
@@ -49,7 +49,7 @@ function hasKeys(value, keys, optional = []) {
 // The scene in a file's bytes; BadFile where docs/compact-format.md has a file refused. `progress` is told the share
 // that is done.
 //   table    Float32Array [N, 16]: mean, logit of opacity; rotation (w, x, y, z); standard deviations, 0; base colour, 0
-//   latents  Float32Array [V, rank filled up to a multiple of 4]; the first V of the N splats are view-dependent
+//   latents  Float32Array [N, rank filled up to a multiple of 4]
 //   weights  name -> {shape, values}
 function readScene(bytes, progress) {
   try {
@@ -95,8 +95,7 @@ function checkHeader(header) {
     }
     expect(grids[name].step.every((step) => step > 0), `the grid of its ${name} has steps that are not positive`);
   }
-  expect(hasKeys(splats, ["view", "diffuse"]) && Object.values(splats).every(isCount), "its number of splats is unknown");
-  expect(splats.view + splats.diffuse > 0, "it has no splats");
+  expect(isCount(splats) && splats > 0, "it has no splats");
 }
 
 // The network's weights and their shapes.
@@ -116,22 +115,19 @@ function shapesOf(config) {
 }
 
 function sceneOf(header, streams) {
-  const { view, diffuse } = header.splats, count = view + diffuse, { config } = header.head, rank = config.latent_dim;
-  const shapes = shapesOf(config).set("means", [2, count]).set("splats", [11, count]).set("latents", [rank, view]);
+  const count = header.splats, { config } = header.head, rank = config.latent_dim;
+  const shapes = shapesOf(config).set("means", [2, count]).set("splats", [10, count]).set("latents", [rank, count]);
   expect(streams.size === shapes.size, "it has other streams than its field needs");
-  let unpacked = 0;
   for (const [name, shape] of shapes) {
     const stream = streams.get(name), table = TABLES.get(name);
     expect(stream && String(stream.shape) === String(shape), `its ${name} does not fit its field or its splats`);
     expect(stream.coding === (table ? "rans" : "xz"), `its ${name} is in another coding`);
     expect((table ?? ["float16", "float32"]).includes(stream.dtype), `its ${name} holds other numbers`);
-    unpacked += BYTES[stream.dtype] * shape.reduce((a, b) => a * b, 1);
   }
-  expect(4 * count * (rank + 14) <= Math.max(LARGEST_RATIO * unpacked, SMALL), "it asks for too much memory");
   const scene = {
-    header, count, viewDependent: view, weights: {},
+    header, count, weights: {},
     table: new Float32Array(16 * count),
-    latents: new Float32Array(4 * Math.ceil(rank / 4) * view),
+    latents: new Float32Array(4 * Math.ceil(rank / 4) * count),
   };
   for (const [name, stream] of streams) {
     if (TABLES.has(name)) continue;
@@ -186,41 +182,36 @@ function readContainer(bytes, progress) {
   return { header, streams };
 }
 
-// The tables: all splats in one order; the scene has the view-dependent ones first.
 function readTables(streams, scene, rank) {
   const [means, splats, latents] = ["means", "splats", "latents"].map((name) => streams.get(name).columns);
-  const n = scene.count, of = scene.viewDependent, { grids } = scene.header, { table } = scene;
-  const diffuse = splats[0], place = new Uint32Array(n);
-  let first = 0, last = of;
-  for (let i = 0; i < n; i++) place[i] = diffuse[i] ? last++ : first++;
-  expect(first === of, "its tables do not fit its number of splats");
+  const n = scene.count, { grids } = scene.header, { table } = scene;
   expect(means[0].every((upper) => upper < 2 ** 31), "its means are beyond 63 bits");
-  readPlaces(means[1], means[0], grids.means, table, place);
+  readPlaces(means[1], means[0], grids.means, table);
   // `stored` is what Python keeps of a value, and must be finite in float32; `drawn` what the page keeps.
   const same = (x) => x;
   const put = (column, { low, step }, c, offset, stored = same, drawn = same) => {
     for (let i = 0; i < n; i++) {
       const value = low[c] + step[c] * column[i];
       expect(Number.isFinite(Math.fround(stored(value))), "its splats are not finite");
-      table[16 * place[i] + offset] = drawn(value);
+      table[16 * i + offset] = drawn(value);
     }
   };
-  put(splats[1], grids.opacities, 0, 3);
+  put(splats[0], grids.opacities, 0, 3);
   for (let c = 0; c < 3; c++) {
-    put(splats[2 + c], grids.scales, c, 8 + c, same, Math.exp);
-    put(splats[5 + c], grids.colors, c, 12 + c, (x) => (x - 0.5) / SH_C0);
+    put(splats[1 + c], grids.scales, c, 8 + c, same, Math.exp);
+    put(splats[4 + c], grids.colors, c, 12 + c, (x) => (x - 0.5) / SH_C0);
   }
-  const turns = splats.slice(8), { low, step } = grids.turns;
+  const turns = splats.slice(7), { low, step } = grids.turns;
   for (let i = 0; i < n; i++) {
     const [x, y, z] = turns.map((column, c) => low[c] + step[c] * column[i]);
     const w = Math.sqrt(Math.max(1 - (x * x + y * y + z * z), 1e-6)), norm = Math.sqrt(w * w + x * x + y * y + z * z);
-    table.set([w / norm, x / norm, y / norm, z / norm], 16 * place[i] + 4);
-    for (const c of [0, 1, 2, 4, 5, 6, 7]) expect(Number.isFinite(table[16 * place[i] + c]), "its splats are not finite");
+    table.set([w / norm, x / norm, y / norm, z / norm], 16 * i + 4);
+    for (const c of [0, 1, 2, 4, 5, 6, 7]) expect(Number.isFinite(table[16 * i + c]), "its splats are not finite");
   }
   const width = 4 * Math.ceil(rank / 4);
   for (let r = 0; r < rank; r++) {
     const column = latents[r], low = grids.latents.low[r], step = grids.latents.step[r];
-    for (let i = 0; i < of; i++) scene.latents[width * i + r] = low + step * column[i];
+    for (let i = 0; i < n; i++) scene.latents[width * i + r] = low + step * column[i];
   }
   expect(scene.latents.every(Number.isFinite), "its latents are not finite");
 }
@@ -268,10 +259,9 @@ function thirds(x) {
 }
 
 // Running sums of 64-bit differences, given as lower and upper 32 bits, and the coordinates whose bits alternate in them.
-// Splat i goes to row place[i] of the table.
-function readPlaces(lowers, uppers, { low, step }, table, place) {
+function readPlaces(lowers, uppers, { low, step }, table) {
   let lower = 0, upper = 0;
-  for (let i = 0; i < place.length; i++) {
+  for (let i = 0; i < lowers.length; i++) {
     const sum = lower + lowers[i];
     const carry = sum >= 2 ** 32 ? 1 : 0;
     lower = sum >>> 0;
@@ -279,7 +269,7 @@ function readPlaces(lowers, uppers, { low, step }, table, place) {
     const middle = (lower >>> 30) | ((upper & 0x0fffffff) << 2);
     for (let a = 0; a < 3; a++) {
       const code = thirds(lower >>> a & 0x3fffffff >>> a) | (thirds(middle >>> a) << 10) | (((upper >>> (28 + a)) & 1) << 20);
-      table[16 * place[i] + a] = low[a] + step[a] * code;
+      table[16 * i + a] = low[a] + step[a] * code;
     }
   }
 }

@@ -111,7 +111,6 @@ class Painter {
     this.exact = Boolean(floats || halfs);  // else pictures are blended in 8 bits
     this.header = scene.header;
     this.count = scene.count;
-    this.viewDependent = scene.viewDependent;
     this.background = scene.header.render.background;
     this.near = scene.header.render.near_plane ?? 0.01 * scene.header.head.scene_unit;
     this.largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
@@ -143,14 +142,14 @@ class Painter {
     const room = gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
     if (view.byteLength > room) throw new Lacking(`This device's shaders have no room for ${view.length} weights.`);
     const ownTexture = this._texture(gl.RGBA32F, own.width, plan.groups, own.values);
-    const latents = this._floats(scene.latents, plan.latentTexels, scene.viewDependent);
-    const height = this._height(scene.viewDependent, plan.groups);
+    const latents = this._floats(scene.latents, plan.latentTexels, scene.count);
+    const height = this._height(scene.count, plan.groups);
     const fits = this.exact && height <= this.largest && 8 * WIDTH * height <= LARGEST_KEPT;
     this.kept = null;
     if (fits) {
       this.kept = this._texture(gl.RGBA16F, WIDTH, height);
       const target = this._target(this.kept);
-      const keep = this._program(WHOLE_VERTEX, keepShader(plan, scene.viewDependent));
+      const keep = this._program(WHOLE_VERTEX, keepShader(plan, scene.count));
       gl.useProgram(keep.program);
       gl.disable(gl.BLEND);
       this._bind(keep, { table: this.table, latents, ownWeights: ownTexture });
@@ -164,7 +163,7 @@ class Painter {
       this.latents = latents;
       this.ownTexture = ownTexture;
     }
-    this.look = this._program(WHOLE_VERTEX, lookShader(plan, scene.header, this, fits));
+    this.look = this._program(WHOLE_VERTEX, lookShader(plan, scene.header, scene.count, fits));
     const block = gl.createBuffer();
     gl.bindBuffer(gl.UNIFORM_BUFFER, block);
     gl.bufferData(gl.UNIFORM_BUFFER, view, gl.STATIC_DRAW);

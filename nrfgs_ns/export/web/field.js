@@ -113,7 +113,7 @@ vec4 ownPart(int i, int j, vec4 color, float opacity) {
 `;
 }
 
-function keepShader(plan, viewDependent) {
+function keepShader(plan, count) {
   return `${HEAD}
 uniform sampler2D table;
 ${ownPart(plan)}
@@ -121,7 +121,7 @@ out vec4 kept;
 void main() {
   ivec2 here = ivec2(gl_FragCoord.xy);
   int i = here.y * ${PER_ROW(plan.groups)} + here.x / ${plan.groups};
-  if (here.x >= ${PER_ROW(plan.groups) * plan.groups} || i >= ${viewDependent}) discard;
+  if (here.x >= ${PER_ROW(plan.groups) * plan.groups} || i >= ${count}) discard;
   ivec2 at = ${texel(TABLE_TEXELS)};
   float opacity = 1.0 / (1.0 + exp(-texelFetch(table, at, 0).w));
   kept = ownPart(i, here.x % ${plan.groups}, texelFetch(table, at + ivec2(3, 0), 0), opacity);
@@ -130,7 +130,7 @@ void main() {
 }
 
 // Colours and opacities of all splats. `kept` says whether `keep` has run, or its part is computed here each time.
-function lookShader(plan, header, counts, kept) {
+function lookShader(plan, header, count, kept) {
   const { config } = plan;
   const number = (x) => (Number.isInteger(x) ? x.toFixed(1) : String(x));
   let offset = 0;
@@ -172,7 +172,7 @@ out uvec4 look;
 
 void main() {
   int i = int(gl_FragCoord.y) * ${PER_ROW(TABLE_TEXELS)} + int(gl_FragCoord.x);
-  if (i >= ${counts.count}) discard;
+  if (i >= ${count}) discard;
   ivec2 own = ${texel(TABLE_TEXELS)};
   vec4 place = texelFetch(table, own, 0);
   if (only_seen) {
@@ -185,7 +185,7 @@ void main() {
   vec4 base = vec4(max(color.rgb, 0.0), 1.0 / (1.0 + exp(-logit)));
   vec4 residual = vec4(0.0);  // of the colour before it is cut off at black, and of the opacity
   vec4 seen = base;
-  if (i < ${counts.viewDependent} && gain > 0.0) {
+  if (gain > 0.0) {
     vec3 v = center - place.xyz;
     float r = max(length(v), ${number(config.distance_eps * header.head.scene_unit)});
     vec3 d = v / r;

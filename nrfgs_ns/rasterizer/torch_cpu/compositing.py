@@ -50,7 +50,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ..contract import Projection
+from .. import Projection
 from . import batches
 from .batches import LN_2, Batch, Numbers, Sheet, expand, pairs_of, similar_tiles
 from .tiles import TileLists, footprints, list_tiles, split_into_blocks

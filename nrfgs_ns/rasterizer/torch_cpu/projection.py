@@ -36,7 +36,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..contract import EPS2D, Projection, ProjectionOptions
+from .. import EPS2D, Projection, ProjectionOptions
 
 FOV_MARGIN = 0.3  # how far beyond the image edge J may be evaluated, in units of tan(fov / 2)
 RADIUS_SIGMAS = 3.0  # a splat ends at this many standard deviations

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ..contract import TILE_SIZE, Projection
+from .. import TILE_SIZE, Projection
 
 SUB_TILE = 8  # pixels, a divisor of TILE_SIZE; smaller wastes work on lists, larger on pixels out of a splat's reach
 MIN_ALPHA = 1.0 / 255.0

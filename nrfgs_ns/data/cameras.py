@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intrinsics of a data set, checked, and nerfstudio's cameras with them, whose distortion can be undone."""
+"""Cameras of a data set: intrinsics and poses, checked, in the capture's world and in the training's.
+
+In float32, numbers near ten million are a metre apart. Cameras far from the origin, such as georeferenced ones, are
+therefore moved there in float64 first, and the way back is float64, too.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,9 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from nerfstudio.cameras import camera_utils
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs, transform_poses_to_original_space
+from torch import Tensor
 
-from nrfgs_ns.data.checks import number, shown, some
+from nrfgs_ns.data.checks import matrix, number, shown, some
 from nrfgs_ns.data.sight import MARGIN
 from nrfgs_ns.errors import InputError
 
@@ -33,6 +40,128 @@ LEFT_OF_IMAGE = 0.25
 """Share of an image's pixels that undistortion must leave."""
 LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
 """Change of the focal length by undistortion: a fisheye of 170 degrees becomes a pinhole of a fifth."""
+ROTATION_TOLERANCE = 1e-2
+"""Largest entry of |R^T R - 1| of a rotation: rounding to three decimals leaves 3e-3, a scale of 1 % gives 2e-2."""
+LAST_ROW_TOLERANCE = 1e-6
+POSITION_TOLERANCE = 1e-8
+"""Relative difference of camera positions that count as one place; in UTM coordinates it is 5 cm."""
+FAR_OUTSIDE = 100.0
+"""A camera this many times as far from the middle as three in four has a wrong pose: the farthest scales the scene."""
+FAR = 100.0
+"""Distance of the cameras' mean from the origin, in their extents, above which they are moved in float64. Nearer ones
+lose less than a hundredth of a pixel, and stay to the bit where nerfstudio puts them."""
+
+
+def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
+    """Rigid camera-to-world matrices, float64 [V, 4, 4]; with `need_spread`, not all at one place."""
+    names = np.array([frame["file_path"] for frame in frames])
+    matrices = [matrix(frame.get("transform_matrix")) for frame in frames]
+
+    def reject(bad: Any, finding: str) -> None:
+        if np.any(bad):
+            where = some(names[np.flatnonzero(bad)])
+            raise InputError(f"{source}: transform_matrix of {where} {finding}, or remove the frame.")
+
+    last_row = (0, 0, 0, 1)
+    reject(
+        [
+            pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(pose[3] - last_row).max() > LAST_ROW_TOLERANCE
+            for pose in matrices
+        ],
+        "is not a 4 x 4 matrix of finite numbers with the last row 0 0 0 1. Give the camera-to-world matrix",
+    )
+    poses = np.stack(matrices)
+    rotation = poses[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        skew = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max((1, 2))
+    reject(
+        ~(skew <= ROTATION_TOLERANCE),
+        f"is not rigid (R^T R differs from 1 by {skew.max():.2g}). Take scale and shear out of the rotation",
+    )
+    reject(np.linalg.det(rotation) < 0, "mirrors (its rotation has determinant -1). Flip one camera axis")
+
+    position = poses[:, :3, 3]
+    if need_spread and np.ptp(position, axis=0).max() <= POSITION_TOLERANCE * np.abs(position).max():
+        raise InputError(
+            f"{source}: all {len(frames)} cameras stand at the same place, so the scene has no scale and no depth. "
+            "Recompute the poses from images with parallax, or set --auto-scale-poses False."
+        )
+    distance = np.linalg.norm(position - np.median(position, axis=0), axis=1)
+    usual = np.quantile(distance, 0.75)
+    reject(
+        (distance > FAR_OUTSIDE * usual) & (usual > 0),
+        f"is more than {FAR_OUTSIDE:g} times as far from the middle of the cameras as three quarters of them, so the "
+        "scene would shrink to a speck. Correct the pose",
+    )
+    return poses
+
+
+def check_applied(meta: dict[str, Any], source: Path) -> None:
+    """If present, applied_transform is a 3 x 4 matrix and applied_scale a positive number."""
+    if "applied_transform" in meta:
+        applied = matrix(meta["applied_transform"])
+        if applied.shape != (3, 4) or not np.isfinite(applied).all():
+            raise InputError(f"{source}: applied_transform is not a 3 x 4 matrix of numbers. Correct or remove it.")
+    scale = meta.get("applied_scale", 1.0)
+    if not 0 < number(scale) < np.inf:
+        raise InputError(f"{source}: applied_scale is {shown(repr(scale))}. Give a positive number or remove it.")
+
+
+class PlacedOutputs(DataparserOutputs):
+    """nerfstudio's outputs, whose way back may be in float64."""
+
+    def transform_poses_to_original_space(self, poses: Tensor, camera_convention="opencv") -> Tensor:
+        way_back = self.dataparser_transform
+        return transform_poses_to_original_space(
+            poses.to(way_back.dtype), way_back, self.dataparser_scale, camera_convention=camera_convention
+        )
+
+
+def place(
+    poses: np.ndarray, orientation: str, centering: str, auto_scale: bool, factor: float
+) -> tuple[Tensor, Tensor, float]:
+    """Orient, centre and scale camera-to-world poses, float64 [V, 4, 4], as nerfstudio does.
+
+    Returns:
+        The poses, float32 [V, 3, 4]; the transform [3, 4] before scaling, float64 if they were far from the origin and
+        otherwise float32; and the scale.
+    """
+    if len(poses) == 1 and orientation == "vertical":  # needs two cameras
+        orientation = "up"
+    positions = poses[:, :3, 3]
+    center, extent = positions.mean(axis=0), np.ptp(positions, axis=0).max()
+    far = centering != "none" and np.abs(center).max() > FAR * extent > 0
+    offset = rounded(center, extent) if far else np.zeros(3)
+    near = poses.copy()
+    near[:, :3, 3] -= offset
+    placed, transform = camera_utils.auto_orient_and_center_poses(
+        torch.from_numpy(near.astype(np.float32)), method=orientation, center_method=centering
+    )
+    if not torch.isfinite(transform).all():
+        raise InputError(
+            "The poses cannot be oriented, since their up directions cancel. Set the data parser's option "
+            "--orientation-method none, or recompute the poses."
+        )
+    reach = float(torch.max(torch.abs(placed[:, :3, 3])))
+    scale = (1.0 / reach if auto_scale and reach > 0 else 1.0) * factor
+    placed[:, :3, 3] *= scale
+    if far:
+        transform = transform.double()
+        transform[:, 3] -= transform[:, :3] @ torch.from_numpy(offset)
+    return placed[:, :3, :4], transform, scale
+
+
+def rounded(place: np.ndarray, extent: float) -> np.ndarray:
+    """A place rounded to units, or to a power of two of the extent if that is less."""
+    step = min(1.0, 2.0 ** np.floor(np.log2(extent)))
+    return np.round(place / step) * step
+
+
+def after(transform: Tensor, earlier: Tensor | None) -> Tensor:
+    """The product [3, 4] of two transforms, in the first one's precision."""
+    if earlier is None:
+        return transform
+    return transform @ torch.cat([earlier.to(transform), torch.tensor([[0, 0, 0, 1]]).to(transform)], 0)
 
 
 def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
@@ -92,7 +221,7 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
                 )
 
 
-def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: torch.Tensor, source: Path) -> Cameras:
+def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: Tensor, source: Path) -> Cameras:
     """The cameras in full size, with intrinsics by `read_lenses` and poses [V, 3, 4]; InputError if undistorting would
     leave next to nothing of an image."""
     kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
