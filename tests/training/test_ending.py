@@ -240,7 +240,7 @@ def test_another_scene_and_other_options_are_refused(finished, tiny_scene, tmp_p
 def test_a_checkpoint_of_nerfstudios_own_method_is_refused(tiny_scene, tmp_path):
     own = {"step": 9, "pipeline": {"_model.gauss_params.means": torch.zeros(3, 3)}, "optimizers": {}, "schedulers": {}}
     torch.save(own, tmp_path / "step-000000009.ckpt")
-    with pytest.raises(InputError, match="another method"):
+    with pytest.raises(InputError, match="of another method"):
         ready(tiny_scene, tmp_path / "a", {"--load-dir": tmp_path}, steps=STEPS)
 
 
